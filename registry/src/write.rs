@@ -1,0 +1,149 @@
+//! What may be written, as data. One call of [`Store::write`](crate::Store::write) is one transaction: all of it or none.
+//!
+//! A write that carries a [`Grant`] is checked against the task's fence inside that transaction, so that no code path can
+//! forget it; an older fence refuses the whole transaction with [`WriteError::StaleFence`].
+
+use std::collections::BTreeMap;
+
+use protocol::message::{Grant, MetricRow};
+use protocol::{Alias, Digest, Fence, ModelName, RunId, StageName, TaskId};
+use serde_json::Value;
+
+/// One row or change.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Write {
+    /// Appends an event to the coordinator's journal; recovery replays them in order.
+    Journal(Value),
+    /// Sets a task's fence; it must be larger than the one stored.
+    Fence {
+        /// The task.
+        task: TaskId,
+        /// Its new fence.
+        fence: Fence,
+    },
+    /// A run and its pipeline, so that queries need not replay the journal.
+    Run {
+        /// Which.
+        run: RunId,
+        /// The validated pipeline.
+        pipeline: Value,
+        /// The YAML as written.
+        source: String,
+        /// `running`, `paused`, `finished`, `failed`, `cancelled`.
+        state: String,
+        /// Unique when given.
+        idempotency_key: Option<String>,
+    },
+    /// Values by step; stored once per (task, attempt, key, step) however often they are sent.
+    Metrics {
+        /// Checked.
+        grant: Grant,
+        /// Rows.
+        rows: Vec<MetricRow>,
+    },
+    /// Log lines; stored once per (task, attempt, worker, line number).
+    Logs {
+        /// Checked.
+        grant: Grant,
+        /// Number of the first line.
+        first: u64,
+        /// Lines.
+        lines: Vec<String>,
+    },
+    /// Makes a manifest whose blobs are stored the task's newest checkpoint.
+    Checkpoint {
+        /// Checked.
+        grant: Grant,
+        /// Steps applied.
+        step: u64,
+        /// The manifest.
+        manifest: Digest,
+        /// Values that retention may rank by.
+        metrics: BTreeMap<String, f64>,
+    },
+    /// One shard's artifact.
+    Shard {
+        /// Checked.
+        grant: Grant,
+        /// The artifact.
+        output: Digest,
+    },
+    /// A stage's value under its key: from here on the stage is cached. The first writer of a key wins; a second one with
+    /// another output is refused as [`WriteError::Conflict`].
+    StageResult {
+        /// Checked when a worker made it; `None` when the coordinator did.
+        grant: Option<Grant>,
+        /// The stage's key.
+        key: Digest,
+        /// Which run made it.
+        run: RunId,
+        /// Which stage.
+        stage: StageName,
+        /// Its kind.
+        kind: String,
+        /// Outputs by name.
+        outputs: BTreeMap<String, Digest>,
+        /// Final values.
+        metrics: BTreeMap<String, f64>,
+        /// The artifacts it was made of: lineage edges.
+        inputs: BTreeMap<String, Digest>,
+        /// Seconds of work.
+        wall_s: f64,
+    },
+    /// A model version. Registering the same artifact for the same model again adds its metrics and makes no new version.
+    Version {
+        /// Model.
+        model: ModelName,
+        /// What is registered: a manifest of kind `model`.
+        artifact: Digest,
+        /// Metrics by name.
+        metrics: BTreeMap<String, f64>,
+        /// Where it came from: run, stage, stage key.
+        source: Value,
+    },
+    /// Moves an alias to the version of `artifact`, and logs it.
+    Promote {
+        /// Model.
+        model: ModelName,
+        /// Alias.
+        alias: Alias,
+        /// The registered artifact.
+        artifact: Digest,
+        /// Gates as written; evaluated on stored metrics inside the transaction.
+        require: Vec<String>,
+        /// Why.
+        reason: String,
+        /// Who.
+        actor: String,
+    },
+}
+
+/// Why nothing of a transaction was stored.
+#[derive(Debug, thiserror::Error)]
+pub enum WriteError {
+    /// Somebody else holds the task now.
+    #[error("stale fence: task `{task}` is at fence {current}, the write carries {carried}")]
+    StaleFence {
+        /// The task.
+        task: TaskId,
+        /// The fence in the store.
+        current: Fence,
+        /// The fence of the write.
+        carried: Fence,
+    },
+    /// What is stored contradicts it.
+    #[error("{0}")]
+    Conflict(String),
+    /// A promotion gate does not hold; the message says by how much.
+    #[error("{0}")]
+    Gate(String),
+    /// No such thing.
+    #[error("{0}")]
+    NotFound(String),
+    /// Full or not writable.
+    #[error("{0}")]
+    Storage(String),
+    /// A fault of ours or of the database.
+    #[error("{0}")]
+    Internal(String),
+}

@@ -1,0 +1,76 @@
+//! The manifest: what an artifact or a checkpoint is made of.
+//!
+//! A manifest is a small canonical JSON document that lists blobs by digest; its own digest names the artifact. Parts
+//! that two artifacts share (a frozen VAE in every student) are stored once.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{Digest, canonical};
+
+/// What kind of thing an artifact is. A stage that is handed another kind is refused before anything runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ArtifactKind {
+    /// Clips, captions, splits and normalisation.
+    Dataset,
+    /// Caption embeddings.
+    Embeddings,
+    /// A motion VAE.
+    Vae,
+    /// VAE posteriors of a dataset.
+    Latents,
+    /// A latent denoiser: teacher or student.
+    Denoiser,
+    /// Metrics of an evaluation.
+    Report,
+    /// A registered model: everything `generate` needs.
+    Model,
+    /// All that continuing a training stage bit for bit needs.
+    Checkpoint,
+    /// What one shard of a map stage made; merged into the stage's artifact.
+    Shard,
+}
+
+/// One file of an artifact.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FileEntry {
+    /// The blob.
+    pub digest: Digest,
+    /// Its length.
+    pub bytes: u64,
+}
+
+/// What an artifact is made of.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Manifest {
+    /// The version of this document, [`Manifest::FORMAT`].
+    pub format: u32,
+    /// What it is.
+    pub kind: ArtifactKind,
+    /// What a reader must know before it opens a file: shapes, settings, lineage. Never a clock, a host or a path.
+    pub meta: serde_json::Value,
+    /// Files by name.
+    pub files: BTreeMap<String, FileEntry>,
+}
+
+impl Manifest {
+    /// The version that this build writes.
+    pub const FORMAT: u32 = 1;
+
+    /// An artifact without files yet.
+    pub fn new(kind: ArtifactKind, meta: serde_json::Value) -> Self {
+        Self { format: Self::FORMAT, kind, meta, files: BTreeMap::new() }
+    }
+
+    /// The bytes that are stored and hashed.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        canonical::to_bytes(self)
+    }
+
+    /// The artifact's name.
+    pub fn digest(&self) -> Digest {
+        Digest::of(&self.to_bytes())
+    }
+}

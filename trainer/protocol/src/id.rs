@@ -1,0 +1,152 @@
+//! Names of things. A type each, so that a fence is never handed over as an attempt.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+macro_rules! text_id {
+    ($(#[$doc:meta])* $name:ident) => {
+        $(#[$doc])*
+        #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+        #[serde(transparent)]
+        pub struct $name(String);
+
+        impl $name {
+            /// Wraps a text that is known to be well formed.
+            pub fn new(text: impl Into<String>) -> Self {
+                Self(text.into())
+            }
+
+            /// The text.
+            pub fn as_str(&self) -> &str {
+                &self.0
+            }
+        }
+
+        impl fmt::Display for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str(&self.0)
+            }
+        }
+
+        impl From<&str> for $name {
+            fn from(text: &str) -> Self {
+                Self(text.to_owned())
+            }
+        }
+    };
+}
+
+macro_rules! number_id {
+    ($(#[$doc:meta])* $name:ident) => {
+        $(#[$doc])*
+        #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+        #[serde(transparent)]
+        pub struct $name(pub u64);
+
+        impl $name {
+            /// The one after this.
+            #[must_use]
+            pub fn next(self) -> Self {
+                Self(self.0 + 1)
+            }
+        }
+
+        impl fmt::Display for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                write!(f, "{}", self.0)
+            }
+        }
+    };
+}
+
+text_id! {
+    /// One execution of a pipeline: `<pipeline name>-<first digits of its digest>-<number>`.
+    RunId
+}
+text_id! {
+    /// A node of a pipeline, as its author named it: `[a-z][a-z0-9_-]*`.
+    StageName
+}
+text_id! {
+    /// One stage of one run on one shard, to be done once: `<run>/<stage>` or `<run>/<stage>/<shard>`.
+    TaskId
+}
+text_id! {
+    /// A worker by name. Not a process: that is a `WorkerId` with an [`Incarnation`].
+    WorkerId
+}
+text_id! {
+    /// A registered model: `[a-z0-9][a-z0-9._-]*`.
+    ModelName
+}
+text_id! {
+    /// A movable name for a model version, such as `staging`.
+    Alias
+}
+
+number_id! {
+    /// One try at a task, numbered from 1.
+    Attempt
+}
+number_id! {
+    /// Grows with every grant of a task; the store refuses a write that carries an older one.
+    Fence
+}
+number_id! {
+    /// Grows each time a gang's membership changes. For a gang task it is also the [`Fence`].
+    Generation
+}
+number_id! {
+    /// Grows each time a worker process starts.
+    Incarnation
+}
+number_id! {
+    /// What all of a run's randomness is keyed by, together with stage, purpose, step and index.
+    Seed
+}
+
+impl TaskId {
+    /// The task of a stage that is not cut into shards, or of one shard of it.
+    pub fn of(run: &RunId, stage: &StageName, shard: Option<u32>) -> Self {
+        match shard {
+            None => Self(format!("{run}/{stage}")),
+            Some(shard) => Self(format!("{run}/{stage}/{shard}")),
+        }
+    }
+}
+
+/// A name with characters that have a meaning elsewhere.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("`{text}` is not a {what}: expected a letter or digit, then letters, digits, `.`, `_` or `-`, at most 64")]
+pub struct ParseNameError {
+    /// What the text was meant to be.
+    pub what: &'static str,
+    /// The text.
+    pub text: String,
+}
+
+/// Whether `text` can stand in a path, a URL and a reference such as `model@alias` without quoting.
+pub fn is_name(text: &str) -> bool {
+    let mut bytes = text.bytes();
+    text.len() <= 64
+        && bytes.next().is_some_and(|b| b.is_ascii_alphanumeric())
+        && bytes.all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
+}
+
+impl FromStr for ModelName {
+    type Err = ParseNameError;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        if is_name(text) { Ok(Self(text.to_owned())) } else { Err(ParseNameError { what: "model name", text: text.to_owned() }) }
+    }
+}
+
+impl FromStr for Alias {
+    type Err = ParseNameError;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        if is_name(text) { Ok(Self(text.to_owned())) } else { Err(ParseNameError { what: "alias", text: text.to_owned() }) }
+    }
+}

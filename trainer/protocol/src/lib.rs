@@ -1,0 +1,17 @@
+//! What two builds of Stride must agree on: names, pipelines, stage settings and messages.
+//!
+//! Not its job: I/O, clocks, async, tensors. Everything here is plain data with serde, so that the control plane
+//! builds in seconds and a message can be read without running anything.
+
+pub mod artifact;
+pub mod canonical;
+pub mod digest;
+pub mod id;
+pub mod message;
+pub mod stage;
+pub mod units;
+
+pub use artifact::{ArtifactKind, FileEntry, Manifest};
+pub use digest::Digest;
+pub use id::{Alias, Attempt, Fence, Generation, Incarnation, ModelName, RunId, Seed, StageName, TaskId, WorkerId};
+pub use units::Steps;

@@ -1,0 +1,73 @@
+//! Quantities that users write with a unit or a suffix.
+
+use std::fmt;
+
+use serde::de::{self, Visitor};
+use serde::{Deserialize, Deserializer, Serialize};
+
+/// A number of optimizer updates. Written `300000`, `300k`, `1.2M` or `2000 steps`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
+#[serde(transparent)]
+pub struct Steps(pub u64);
+
+impl fmt::Display for Steps {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.0)
+    }
+}
+
+impl Steps {
+    /// Reads `300k`, `1.2M`, `2000 steps`.
+    pub fn parse(text: &str) -> Option<Self> {
+        let text = text.trim();
+        let text = text.strip_suffix("steps").or_else(|| text.strip_suffix("step")).unwrap_or(text).trim();
+        let (digits, factor) = match text.as_bytes().last()? {
+            b'k' => (&text[..text.len() - 1], 1e3),
+            b'M' => (&text[..text.len() - 1], 1e6),
+            _ => (text, 1.0),
+        };
+        let steps = digits.trim().replace('_', "").parse::<f64>().ok()? * factor;
+        ((0.0..1e15).contains(&steps) && steps.fract() == 0.0).then_some(Self(steps as u64))
+    }
+}
+
+impl<'de> Deserialize<'de> for Steps {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct StepsVisitor;
+        impl Visitor<'_> for StepsVisitor {
+            type Value = Steps;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("a whole number of steps, such as 2000, `300k` or `2000 steps`")
+            }
+
+            fn visit_u64<E: de::Error>(self, steps: u64) -> Result<Steps, E> {
+                Ok(Steps(steps))
+            }
+
+            fn visit_i64<E: de::Error>(self, steps: i64) -> Result<Steps, E> {
+                u64::try_from(steps).map(Steps).map_err(|_| E::invalid_value(de::Unexpected::Signed(steps), &self))
+            }
+
+            fn visit_str<E: de::Error>(self, text: &str) -> Result<Steps, E> {
+                Steps::parse(text).ok_or_else(|| E::invalid_value(de::Unexpected::Str(text), &self))
+            }
+        }
+        deserializer.deserialize_any(StepsVisitor)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn steps_are_read_as_people_write_them() {
+        for (text, steps) in [("300k", 300_000), ("1.2M", 1_200_000), ("2000 steps", 2000), ("7", 7)] {
+            assert_eq!(Steps::parse(text), Some(Steps(steps)), "{text}");
+        }
+        for text in ["", "k", "-1", "1.5", "many"] {
+            assert_eq!(Steps::parse(text), None, "{text}");
+        }
+    }
+}
