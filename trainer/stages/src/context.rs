@@ -111,6 +111,8 @@ pub enum Exchange {
 pub trait AttemptContext {
     /// What to do.
     fn task(&self) -> &StageTask;
+    /// Where to compute: the plain device. Training takes `.autodiff()` of it.
+    fn device(&self) -> burn::tensor::Device;
     /// Reads and stages blobs; every blob read is verified against its digest.
     fn blobs(&self) -> Arc<dyn Blobs>;
     /// Reads a manifest by digest.
@@ -134,7 +136,11 @@ pub trait GangContext: AttemptContext {
 
     /// Meets the other members of the current generation. `applied` is the number of steps in the caller's state, `None`
     /// when it has only initialised itself; `state` gives its bytes and is called only if a peer needs them.
-    fn rendezvous(&mut self, applied: Option<u64>, state: &mut dyn FnMut() -> Vec<u8>) -> Result<Rendezvous, ContextError>;
+    fn rendezvous(
+        &mut self,
+        applied: Option<u64>,
+        state: &mut dyn FnMut() -> Vec<u8>,
+    ) -> Result<Rendezvous, ContextError>;
 
     /// The slices of the coming step that are this worker's: a contiguous range of `0..slices`. Changes only with
     /// [`rendezvous`](Self::rendezvous).
@@ -148,7 +154,12 @@ pub trait GangContext: AttemptContext {
     fn leads(&self) -> bool;
 
     /// Commits an uploaded manifest as the newest checkpoint; returns once it is durable. Rank 0 only.
-    fn commit_checkpoint(&mut self, step: u64, manifest: &Manifest, metrics: &BTreeMap<String, f64>) -> Result<(), ContextError>;
+    fn commit_checkpoint(
+        &mut self,
+        step: u64,
+        manifest: &Manifest,
+        metrics: &BTreeMap<String, f64>,
+    ) -> Result<(), ContextError>;
 }
 
 /// What a map stage's shard or merge is.

@@ -1,1 +1,6 @@
+//! The stage kinds: artifacts in, artifacts out, training in between.
+//!
+//! Not its job: leases, databases, HTTP. A stage sees the world through [`context`] alone.
+
+pub mod artifacts;
 pub mod context;

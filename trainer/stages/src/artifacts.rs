@@ -1,0 +1,438 @@
+//! Reading and writing artifacts through an [`AttemptContext`], and what the metas of our artifacts say.
+//!
+//! An artifact is a manifest with files. The meta is all that a reader must know before it opens a file; the structs
+//! here are its schema, one per artifact kind, shared by the stage that writes it and those that read it. Tensors are
+//! safetensors in f32 or i64. Not its job: networks, and what a checkpoint holds.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
+
+use checkpoint::{BlobError, Blobs};
+use protocol::artifact::FileEntry;
+use protocol::stage::{DataFormat, LatentShape, Network, Split};
+use protocol::{ArtifactKind, Digest, Manifest};
+use safetensors::tensor::TensorView;
+use safetensors::{Dtype, SafeTensors};
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+
+use crate::context::{AttemptContext, ContextError, StageError};
+
+/// Where the weights of a VAE or a denoiser are.
+pub const MODEL_FILE: &str = "model.safetensors";
+/// Where latents are: `mu` and `sigma` `[rows, N, d]`, `entry` `[rows]`.
+pub const LATENTS_FILE: &str = "latents.safetensors";
+/// Where caption embeddings are: `captions` `[n, dim]` in the dataset's caption order, `null` `[dim]`.
+pub const EMBEDDINGS_FILE: &str = "embeddings.safetensors";
+
+/// Meta of an artifact of kind `dataset`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct DatasetMeta {
+    /// Which of the two formats.
+    pub format: DataFormat,
+    /// Clips kept.
+    pub clips: usize,
+    /// Captions of all clips.
+    pub captions: usize,
+    /// Entries of the three splits together.
+    pub entries: usize,
+    /// Frames of all clips.
+    pub frames: usize,
+    /// Clips and captions left out; the file `report.txt` says which and why.
+    pub skipped: usize,
+}
+
+/// Meta of an artifact of kind `embeddings`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct EmbeddingsMeta {
+    /// The encoder, as in the settings: `hashed`.
+    pub encoder: String,
+    /// Width of an embedding.
+    pub dim: usize,
+    /// Captions embedded.
+    pub captions: usize,
+}
+
+/// Meta of an artifact of kind `vae`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct VaeMeta {
+    /// The data it was trained on.
+    pub format: DataFormat,
+    /// Width of a feature vector.
+    pub features: usize,
+    /// Latent shape.
+    pub latent: LatentShape,
+    /// Size.
+    pub network: Network,
+    /// Mean of the training features, `[features]`.
+    pub mean: Vec<f32>,
+    /// Their standard deviation, `[features]`.
+    pub std: Vec<f32>,
+}
+
+/// Meta of an artifact of kind `latents`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct LatentsMeta {
+    /// The data.
+    pub format: DataFormat,
+    /// The VAE that encoded.
+    pub vae: Digest,
+    /// Latent shape.
+    pub latent: LatentShape,
+    /// Crops per entry; row `e * crops + c` is crop `c` of entry `e`.
+    pub crops: usize,
+    /// Split of each entry, never [`Split::All`].
+    pub splits: Vec<Split>,
+    /// Captions of each entry, by number in the dataset and so by row in the embeddings.
+    pub captions: Vec<Vec<usize>>,
+    /// Frames of each row.
+    pub lengths: Vec<usize>,
+}
+
+/// What a denoiser was trained to do, and so how motions are drawn from it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "family", rename_all = "lowercase")]
+pub enum Family {
+    /// Predicts noise; DDIM with classifier-free guidance.
+    Mld,
+    /// Latent consistency model: jumps to the data, re-noises between jumps.
+    Lcm {
+        /// Solver step k; the grid has 1000/k points.
+        skip: usize,
+        /// Guidance scales w it was trained for.
+        guidance: (f64, f64),
+    },
+    /// Phased consistency model: deterministic jumps between phase edges.
+    Pcm {
+        /// Solver step k; the grid has 1000/k points.
+        skip: usize,
+        /// Guidance scales w it was trained for.
+        guidance: (f64, f64),
+        /// M: phases, and sampling steps.
+        phases: usize,
+    },
+}
+
+/// Meta of an artifact of kind `denoiser`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct DenoiserMeta {
+    /// What it does.
+    #[serde(flatten)]
+    pub family: Family,
+    /// Latent shape; that of `vae`.
+    pub latent: LatentShape,
+    /// Size.
+    pub network: Network,
+    /// A ReLU on the text embedding (v1).
+    pub text_relu: bool,
+    /// Width of the guidance embedding; 0 for a teacher, which has none.
+    pub guidance_dim: usize,
+    /// Text encoder, as in [`EmbeddingsMeta`].
+    pub encoder: String,
+    /// Width of a caption embedding.
+    pub text_dim: usize,
+    /// The VAE whose latents it makes.
+    pub vae: Digest,
+}
+
+/// Reads a manifest's meta as `T`; `what` names the artifact in the error.
+pub fn meta<T: DeserializeOwned>(manifest: &Manifest, what: &str) -> Result<T, StageError> {
+    serde_json::from_value(manifest.meta.clone())
+        .map_err(|e| StageError::Input(format!("{what}: its manifest is not one that this build writes: {e}")))
+}
+
+/// A meta as JSON.
+pub fn to_meta<T: Serialize>(meta: &T) -> serde_json::Value {
+    serde_json::to_value(meta).expect("metas are plain data with string keys")
+}
+
+/// What a failed blob means for the stage.
+pub fn blob_error(error: BlobError) -> StageError {
+    let text = error.to_string();
+    StageError::Context(match error {
+        BlobError::NotFound(_) | BlobError::Corrupt { .. } => ContextError::Corrupt(text),
+        BlobError::Refused(_) => ContextError::GrantEnded(text),
+        BlobError::Storage(_) => ContextError::Storage(text),
+        BlobError::Unavailable(_) => ContextError::Unavailable(text),
+    })
+}
+
+/// The digest and manifest of the input that the settings field `field` names; refused when it is of another kind.
+pub fn input(cx: &dyn AttemptContext, field: &str, kind: ArtifactKind) -> Result<(Digest, Manifest), StageError> {
+    let digest = *cx.task().inputs.get(field).ok_or_else(|| {
+        StageError::Fault(format!("stage `{}` was started without its input `{field}`", cx.task().name))
+    })?;
+    let manifest = cx.manifest(digest)?;
+    if manifest.kind != kind {
+        return Err(StageError::Input(format!(
+            "stage `{}`: `{field}` is an artifact of kind {:?}, expected {kind:?}",
+            cx.task().name,
+            manifest.kind
+        )));
+    }
+    Ok((digest, manifest))
+}
+
+/// One file of an artifact.
+pub fn file(blobs: &dyn Blobs, manifest: &Manifest, name: &str) -> Result<Arc<[u8]>, StageError> {
+    let entry = manifest.files.get(name).ok_or_else(|| {
+        let have: Vec<_> = manifest.files.keys().map(String::as_str).collect();
+        StageError::Input(format!("an artifact of kind {:?} has no file `{name}`; it has {have:?}", manifest.kind))
+    })?;
+    blobs.get(entry.digest).map_err(blob_error)
+}
+
+/// All files of an artifact.
+pub fn files(blobs: &dyn Blobs, manifest: &Manifest) -> Result<BTreeMap<String, Arc<[u8]>>, StageError> {
+    manifest
+        .files
+        .iter()
+        .map(|(name, entry)| Ok((name.clone(), blobs.get(entry.digest).map_err(blob_error)?)))
+        .collect()
+}
+
+/// Uploads files and their manifest.
+pub fn publish(
+    cx: &mut dyn AttemptContext,
+    kind: ArtifactKind,
+    meta: serde_json::Value,
+    files: BTreeMap<String, Vec<u8>>,
+) -> Result<Digest, StageError> {
+    let blobs = cx.blobs();
+    let mut manifest = Manifest::new(kind, meta);
+    for (name, bytes) in files {
+        let length = bytes.len() as u64;
+        let digest = blobs.put(bytes).map_err(blob_error)?;
+        manifest.files.insert(name, FileEntry { digest, bytes: length });
+    }
+    Ok(cx.put_manifest(&manifest)?)
+}
+
+/// A tensor on the host.
+#[derive(Debug, Clone, PartialEq)]
+pub struct HostTensor<T> {
+    /// Its shape.
+    pub shape: Vec<usize>,
+    /// Row-major values.
+    pub values: Vec<T>,
+}
+
+impl<T> HostTensor<T> {
+    /// Wraps values of a shape.
+    ///
+    /// # Panics
+    /// If the counts differ.
+    pub fn new(shape: impl Into<Vec<usize>>, values: Vec<T>) -> Self {
+        let shape = shape.into();
+        assert_eq!(shape.iter().product::<usize>(), values.len(), "values for shape {shape:?}");
+        Self { shape, values }
+    }
+
+    /// Values in one row, that is in everything but the first axis.
+    pub fn row_len(&self) -> usize {
+        self.shape.iter().skip(1).product()
+    }
+
+    /// Row `i`.
+    pub fn row(&self, i: usize) -> &[T] {
+        let n = self.row_len();
+        &self.values[i * n..(i + 1) * n]
+    }
+}
+
+/// Named tensors on their way into or out of a safetensors file.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Tensors {
+    floats: BTreeMap<String, HostTensor<f32>>,
+    integers: BTreeMap<String, HostTensor<i64>>,
+}
+
+impl Tensors {
+    /// Adds an f32 tensor.
+    #[must_use]
+    pub fn with(mut self, name: &str, shape: impl Into<Vec<usize>>, values: Vec<f32>) -> Self {
+        self.floats.insert(name.to_owned(), HostTensor::new(shape, values));
+        self
+    }
+
+    /// Adds an i64 tensor.
+    #[must_use]
+    pub fn with_integers(mut self, name: &str, shape: impl Into<Vec<usize>>, values: Vec<i64>) -> Self {
+        self.integers.insert(name.to_owned(), HostTensor::new(shape, values));
+        self
+    }
+
+    /// The bytes of a safetensors file; the same tensors always give the same bytes.
+    pub fn to_bytes(&self) -> Result<Vec<u8>, StageError> {
+        let mut raw: BTreeMap<&str, (Dtype, &[usize], Vec<u8>)> = BTreeMap::new();
+        for (name, tensor) in &self.floats {
+            let bytes = tensor.values.iter().flat_map(|v| v.to_le_bytes()).collect();
+            raw.insert(name, (Dtype::F32, &tensor.shape, bytes));
+        }
+        for (name, tensor) in &self.integers {
+            let bytes = tensor.values.iter().flat_map(|v| v.to_le_bytes()).collect();
+            raw.insert(name, (Dtype::I64, &tensor.shape, bytes));
+        }
+        let fault = |e: safetensors::SafeTensorError| StageError::Fault(format!("writing tensors: {e}"));
+        let views: Vec<_> = raw
+            .iter()
+            .map(|(name, (dtype, shape, bytes))| Ok((*name, TensorView::new(*dtype, shape.to_vec(), bytes)?)))
+            .collect::<Result<_, _>>()
+            .map_err(fault)?;
+        safetensors::serialize(views, None::<HashMap<String, String>>).map_err(fault)
+    }
+
+    /// Reads a safetensors file of f32 and i64 tensors; `what` names it in errors.
+    pub fn from_bytes(bytes: &[u8], what: &str) -> Result<Self, StageError> {
+        let bad = |text: String| StageError::Context(ContextError::Corrupt(format!("{what}: {text}")));
+        let parsed = SafeTensors::deserialize(bytes).map_err(|e| bad(e.to_string()))?;
+        let mut out = Self::default();
+        for (name, view) in parsed.iter() {
+            let shape = view.shape().to_vec();
+            let name = name.to_owned();
+            match view.dtype() {
+                Dtype::F32 => {
+                    let values = view.data().as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
+                    out.floats.insert(name, HostTensor::new(shape, values));
+                }
+                Dtype::I64 => {
+                    let values = view.data().as_chunks::<8>().0.iter().map(|b| i64::from_le_bytes(*b)).collect();
+                    out.integers.insert(name, HostTensor::new(shape, values));
+                }
+                other => return Err(bad(format!("tensor `{name}` is {other:?}, expected F32 or I64"))),
+            }
+        }
+        Ok(out)
+    }
+
+    /// Takes the f32 tensor `name`, which must have `rank` axes.
+    pub fn take(&mut self, name: &str, rank: usize, what: &str) -> Result<HostTensor<f32>, StageError> {
+        Self::checked(self.floats.remove(name), name, rank, what, self.floats.keys())
+    }
+
+    /// Takes the i64 tensor `name`, which must have `rank` axes.
+    pub fn take_integers(&mut self, name: &str, rank: usize, what: &str) -> Result<HostTensor<i64>, StageError> {
+        Self::checked(self.integers.remove(name), name, rank, what, self.integers.keys())
+    }
+
+    fn checked<'a, T>(
+        found: Option<HostTensor<T>>,
+        name: &str,
+        rank: usize,
+        what: &str,
+        others: impl Iterator<Item = &'a String>,
+    ) -> Result<HostTensor<T>, StageError> {
+        let bad = |text: String| StageError::Context(ContextError::Corrupt(format!("{what}: {text}")));
+        let tensor =
+            found.ok_or_else(|| bad(format!("no tensor `{name}`; there are {:?}", others.collect::<Vec<_>>())))?;
+        if tensor.shape.len() != rank {
+            return Err(bad(format!("tensor `{name}` has shape {:?}, expected {rank} axes", tensor.shape)));
+        }
+        Ok(tensor)
+    }
+}
+
+/// Caption embeddings with their meta.
+#[derive(Debug, Clone)]
+pub struct Embeddings {
+    /// What they are.
+    pub meta: EmbeddingsMeta,
+    /// `[captions, dim]`.
+    pub captions: HostTensor<f32>,
+    /// The empty caption, `[dim]`.
+    pub null: Vec<f32>,
+}
+
+impl Embeddings {
+    /// Reads an artifact of kind `embeddings`.
+    pub fn read(blobs: &dyn Blobs, manifest: &Manifest) -> Result<Self, StageError> {
+        let meta: EmbeddingsMeta = meta(manifest, "the caption embeddings")?;
+        let mut tensors = Tensors::from_bytes(&file(blobs, manifest, EMBEDDINGS_FILE)?, EMBEDDINGS_FILE)?;
+        let captions = tensors.take("captions", 2, EMBEDDINGS_FILE)?;
+        let null = tensors.take("null", 1, EMBEDDINGS_FILE)?.values;
+        if captions.shape != [meta.captions, meta.dim] || null.len() != meta.dim {
+            return Err(StageError::Context(ContextError::Corrupt(format!(
+                "{EMBEDDINGS_FILE}: `captions` has shape {:?} and `null` {}, the manifest says {} x {}",
+                captions.shape,
+                null.len(),
+                meta.captions,
+                meta.dim
+            ))));
+        }
+        Ok(Self { meta, captions, null })
+    }
+}
+
+/// VAE posteriors with their meta.
+#[derive(Debug, Clone)]
+pub struct Latents {
+    /// What they are.
+    pub meta: LatentsMeta,
+    /// Posterior means, `[rows, N, d]`.
+    pub mu: HostTensor<f32>,
+    /// Posterior standard deviations, `[rows, N, d]`.
+    pub sigma: HostTensor<f32>,
+}
+
+impl Latents {
+    /// Reads an artifact of kind `latents`.
+    pub fn read(blobs: &dyn Blobs, manifest: &Manifest) -> Result<Self, StageError> {
+        let meta: LatentsMeta = meta(manifest, "the latents")?;
+        let mut tensors = Tensors::from_bytes(&file(blobs, manifest, LATENTS_FILE)?, LATENTS_FILE)?;
+        let mu = tensors.take("mu", 3, LATENTS_FILE)?;
+        let sigma = tensors.take("sigma", 3, LATENTS_FILE)?;
+        let expected = [meta.splits.len() * meta.crops, meta.latent.tokens, meta.latent.dim];
+        if mu.shape != expected || sigma.shape != expected {
+            return Err(StageError::Context(ContextError::Corrupt(format!(
+                "{LATENTS_FILE}: `mu` has shape {:?} and `sigma` {:?}, the manifest says {expected:?}",
+                mu.shape, sigma.shape
+            ))));
+        }
+        Ok(Self { meta, mu, sigma })
+    }
+
+    /// Entries.
+    pub fn entries(&self) -> usize {
+        self.meta.splits.len()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tensors_survive_their_bytes() {
+        let tensors = Tensors::default()
+            .with("b", [2, 3], vec![1.0, -2.5, 3.0, 0.1, f32::MIN_POSITIVE, 6.0])
+            .with("a", [0, 3], vec![])
+            .with_integers("entry", [2], vec![-1, i64::MAX]);
+        let bytes = tensors.to_bytes().unwrap();
+        assert_eq!(bytes, tensors.to_bytes().unwrap());
+        assert_eq!(Tensors::from_bytes(&bytes, "x").unwrap(), tensors);
+    }
+
+    #[test]
+    fn a_missing_tensor_is_named_with_those_there_are() {
+        let error = Tensors::default().with("b", [1], vec![0.0]).take("mu", 1, "latents.safetensors").unwrap_err();
+        assert_eq!(error.to_string(), "latents.safetensors: no tensor `mu`; there are [\"b\"]");
+        assert!(Tensors::from_bytes(&[1, 2, 3], "x").is_err());
+    }
+
+    #[test]
+    fn a_denoiser_meta_survives_json() {
+        let meta = DenoiserMeta {
+            family: Family::Pcm { skip: 100, guidance: (0.5, 5.0), phases: 4 },
+            latent: LatentShape::default(),
+            network: Network::default(),
+            text_relu: false,
+            guidance_dim: 256,
+            encoder: "hashed".into(),
+            text_dim: 768,
+            vae: Digest::of(b"vae"),
+        };
+        let json = to_meta(&meta);
+        assert_eq!(json["family"], "pcm");
+        assert_eq!(serde_json::from_value::<DenoiserMeta>(json).unwrap(), meta);
+    }
+}
