@@ -1,0 +1,67 @@
+//! Dependencies point one way: the control plane builds without Burn, the training library without a database.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::process::Command;
+
+use serde_json::Value;
+
+fn closure(metadata: &Value) -> BTreeMap<String, BTreeSet<String>> {
+    let nodes = metadata["resolve"]["nodes"].as_array().expect("nodes");
+    let name_of: BTreeMap<&str, &str> = metadata["packages"]
+        .as_array()
+        .expect("packages")
+        .iter()
+        .map(|p| (p["id"].as_str().expect("id"), p["name"].as_str().expect("name")))
+        .collect();
+    let direct: BTreeMap<&str, Vec<&str>> = nodes
+        .iter()
+        .map(|node| {
+            let needed = node["deps"].as_array().expect("deps").iter().filter(|dep| {
+                dep["dep_kinds"].as_array().expect("dep_kinds").iter().any(|kind| kind["kind"].is_null())
+            });
+            (node["id"].as_str().expect("id"), needed.map(|dep| dep["pkg"].as_str().expect("pkg")).collect())
+        })
+        .collect();
+    let mut all = BTreeMap::new();
+    for id in direct.keys() {
+        let mut seen = BTreeSet::new();
+        let mut next = vec![*id];
+        while let Some(id) = next.pop() {
+            for dep in &direct[id] {
+                if seen.insert(name_of[dep].to_owned()) {
+                    next.push(dep);
+                }
+            }
+        }
+        all.entry(name_of[id].to_owned()).or_insert_with(BTreeSet::new).extend(seen);
+    }
+    all
+}
+
+#[test]
+fn dependencies_point_one_way() {
+    let root = cluster_tests::Bench::repository();
+    let output = Command::new(env!("CARGO"))
+        .args(["metadata", "--format-version", "1", "--locked", "--offline"])
+        .current_dir(root)
+        .output()
+        .expect("cargo metadata runs");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let metadata: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    let needs = closure(&metadata);
+
+    let never = |package: &str, forbidden: &[&str]| {
+        for name in &needs[package] {
+            let hit = forbidden.iter().find(|f| name == *f || name.starts_with(&format!("{f}-")));
+            assert!(hit.is_none(), "`{package}` must not need `{name}`");
+        }
+    };
+    never("protocol", &["burn", "tokio", "sqlx", "axum", "reqwest", "registry", "stages", "models", "motion"]);
+    never("checkpoint", &["burn", "tokio", "sqlx", "axum", "registry", "stages"]);
+    never("registry", &["burn", "coordinator", "stages", "models", "worker"]);
+    never("coordinator", &["burn", "stages", "models", "worker"]);
+    never("motion", &["burn", "tokio", "sqlx", "axum", "registry", "checkpoint"]);
+    never("models", &["tokio", "sqlx", "axum", "reqwest", "registry", "checkpoint", "stages"]);
+    never("stages", &["sqlx", "axum", "reqwest", "registry", "coordinator", "worker"]);
+    never("worker", &["sqlx", "coordinator", "registry"]);
+}
