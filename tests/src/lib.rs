@@ -39,8 +39,9 @@ pub struct Said {
 impl Said {
     /// The one JSON object on stdout.
     pub fn json(&self) -> Value {
-        serde_json::from_str(&self.stdout)
-            .unwrap_or_else(|e| panic!("stdout is not one JSON object ({e}):\n{}\n--- stderr\n{}", self.stdout, self.stderr))
+        serde_json::from_str(&self.stdout).unwrap_or_else(|e| {
+            panic!("stdout is not one JSON object ({e}):\n{}\n--- stderr\n{}", self.stdout, self.stderr)
+        })
     }
 
     /// Panics with all that was said unless the exit code is `code`.
@@ -145,7 +146,9 @@ impl Running {
     }
 
     fn said(&mut self, status: ExitStatus) -> Said {
-        let mut text = |handle: &mut Option<JoinHandle<String>>| handle.take().map_or_else(String::new, |h| h.join().unwrap_or_default());
+        let text = |handle: &mut Option<JoinHandle<String>>| {
+            handle.take().map_or_else(String::new, |h| h.join().unwrap_or_default())
+        };
         Said {
             code: status.code(),
             stdout: text(&mut self.stdout),
@@ -212,7 +215,7 @@ fn collect(mut pipe: impl Read + Send + 'static) -> JoinHandle<String> {
 /// Sends a signal; a process that is gone already is fine.
 pub fn signal(pid: u32, signal: nix::sys::signal::Signal) {
     let pid = nix::unistd::Pid::from_raw(i32::try_from(pid).expect("a pid"));
-    drop(nix::sys::signal::kill(pid, signal));
+    let _gone = nix::sys::signal::kill(pid, signal);
 }
 
 /// Waits until `condition` gives something.
@@ -231,10 +234,7 @@ pub fn wait_for<T>(what: &str, mut condition: impl FnMut() -> Option<T>) -> T {
 /// Every stage's outputs: stage -> name -> digest.
 pub fn digests(report: &Value) -> BTreeMap<String, Value> {
     let stages = report["stages"].as_array().expect("`stages` is a list");
-    stages
-        .iter()
-        .map(|stage| (stage["name"].as_str().expect("`name`").to_owned(), stage["outputs"].clone()))
-        .collect()
+    stages.iter().map(|stage| (stage["name"].as_str().expect("`name`").to_owned(), stage["outputs"].clone())).collect()
 }
 
 /// Stage -> state.
