@@ -19,12 +19,15 @@ const WEIGHTS: &str = "model.safetensors";
 
 /// The model made of `denoiser` and `vae`, drawn from as its family is by default.
 pub fn bundle(denoiser: &Manifest, vae: &Manifest) -> Result<Manifest, String> {
-    let sampler = default_sampler(&denoiser.meta)?;
-    bundle_with(denoiser, vae, &sampler)
+    assemble(denoiser, vae, None)
 }
 
 /// The model made of `denoiser` and `vae`, drawn from with `sampler` when nobody says otherwise.
 pub fn bundle_with(denoiser: &Manifest, vae: &Manifest, sampler: &Sampler) -> Result<Manifest, String> {
+    assemble(denoiser, vae, Some(sampler))
+}
+
+fn assemble(denoiser: &Manifest, vae: &Manifest, sampler: Option<&Sampler>) -> Result<Manifest, String> {
     let weights = |manifest: &Manifest, kind: ArtifactKind, what: &str| -> Result<FileEntry, String> {
         if manifest.kind != kind {
             return Err(format!("the {what} is an artifact of kind {:?}, expected {kind:?}", manifest.kind));
@@ -48,6 +51,7 @@ pub fn bundle_with(denoiser: &Manifest, vae: &Manifest, sampler: &Sampler) -> Re
         return Err(format!("the denoiser's latent is {theirs}, the VAE's is {ours}"));
     }
 
+    let sampler = sampler.cloned().map_or_else(|| default_sampler(&denoiser.meta), Ok)?;
     let mut model = Manifest::new(
         ArtifactKind::Model,
         json!({
