@@ -1,1 +1,17 @@
+//! Motion data without tensors: folders, features, skeletons, captions, synthetic clips, drawings, keyed randomness.
+//!
+//! Not its job: Burn, training, anything that is asynchronous. Everything here works on plain slices, so that the
+//! numbers can be checked against the published files without a backend.
+//!
+//! Shapes: `T` raw frames, `L = T - 1` feature frames, `J` joints, `D` feature width (263 or 251). All arrays are
+//! row-major and frame-major.
 
+pub mod dataset;
+pub mod npy;
+pub mod random;
+pub mod skeleton;
+pub mod text;
+
+pub use dataset::Dataset;
+pub use random::Stream;
+pub use skeleton::Skeleton;

@@ -1,0 +1,535 @@
+//! Opening a folder in the HumanML3D or KIT-ML layout.
+//!
+//! Two kinds of findings, kept apart: what the published rules leave out (a clip too short or too long, a listed file
+//! that is not there) is a [`Skip`] in the report; what would train on wrong numbers (another width, NaN, a truncated
+//! file, a caption that does not parse) is a [`Problem`], and all problems of a folder come back together.
+//!
+//! Load rules, from the published loaders, with our decisions:
+//! * A clip is used if `min <= L < max` (40, or 24 for KIT, and 200).
+//! * A caption whose two times are 0 belongs to the whole clip; any other becomes an entry of its own over frames
+//!   `trunc(from * fps) .. trunc(to * fps)`, under the same length rule. The loaders name such entries with random
+//!   letters; ours are named by their frames, so that the same folder always gives the same dataset.
+//! * KIT times are read at KIT's 12.5 fps. (Some loaders use 20 for both. Published KIT texts carry no times, so no
+//!   published number depends on it, and seconds should be seconds.)
+//! * `007975` and `M007975` of HumanML3D are known to hold NaN in some builds. They are skipped by name then; NaN in any
+//!   other clip is a problem.
+
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::fmt;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use protocol::stage::DataFormat;
+
+use super::{Clip, Dataset, Entry, Split};
+use crate::npy::{self, NpyError};
+use crate::skeleton::Skeleton;
+use crate::text::{self, Caption};
+
+/// Clips of the published HumanML3D that hold NaN in some builds.
+const KNOWN_NOT_FINITE: [&str; 2] = ["007975", "M007975"];
+
+/// A folder that cannot be used, with everything that is wrong with it.
+#[derive(Debug)]
+pub struct OpenError {
+    /// The folder.
+    pub folder: PathBuf,
+    /// In the order of the files.
+    pub problems: Vec<Problem>,
+}
+
+/// How many problems are printed one by one.
+const PRINTED: usize = 40;
+
+impl fmt::Display for OpenError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: {} problem(s) in the dataset folder", self.folder.display(), self.problems.len())?;
+        for problem in self.problems.iter().take(PRINTED) {
+            write!(f, "\n  {problem}")?;
+        }
+        if self.problems.len() > PRINTED {
+            write!(f, "\n  ... and {} more", self.problems.len() - PRINTED)?;
+        }
+        Ok(())
+    }
+}
+
+impl std::error::Error for OpenError {}
+
+/// What kind of problem; the text is in [`Problem::what`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum ProblemKind {
+    /// The folder, a list, or the statistics are not there.
+    Missing,
+    /// A file or folder cannot be read.
+    Io,
+    /// A `.npy` header, element type or order that is not the format's.
+    Type,
+    /// A `.npy` file shorter or longer than its header says.
+    Size,
+    /// An array of another shape.
+    Shape,
+    /// NaN or infinity.
+    NotFinite,
+    /// A caption line or a list line that does not parse.
+    Text,
+    /// Nothing is left to train on.
+    Empty,
+}
+
+/// Something that must be repaired before the folder is used.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Problem {
+    /// What kind.
+    pub kind: ProblemKind,
+    /// File (and line), what was found, what was expected, what to do.
+    pub what: String,
+}
+
+impl Problem {
+    fn new(kind: ProblemKind, what: impl Into<String>) -> Self {
+        Self { kind, what: what.into() }
+    }
+}
+
+impl fmt::Display for Problem {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.what)
+    }
+}
+
+impl From<NpyError> for Problem {
+    fn from(error: NpyError) -> Self {
+        let kind = match &error {
+            NpyError::Io { .. } if error.is_missing() => ProblemKind::Missing,
+            NpyError::Io { .. } => ProblemKind::Io,
+            NpyError::Size { .. } => ProblemKind::Size,
+            NpyError::Header { .. } | NpyError::Type { .. } | NpyError::Order { .. } => ProblemKind::Type,
+        };
+        Self::new(kind, error.to_string())
+    }
+}
+
+/// Why a clip or one of its captions is not used.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum SkipReason {
+    /// Fewer frames than the format's minimum.
+    TooShort {
+        /// Frames.
+        frames: usize,
+        /// The minimum.
+        min: usize,
+    },
+    /// As many frames as the format's bound, or more.
+    TooLong {
+        /// Frames.
+        frames: usize,
+        /// The bound, exclusive.
+        bound: usize,
+    },
+    /// Listed, but without features.
+    NoMotion,
+    /// Listed, but without a text file.
+    NoText,
+    /// Its text file has no caption, or none that covers enough frames.
+    NoCaption,
+    /// The part of the clip that a caption describes is too short or too long.
+    CaptionRange {
+        /// Line of the text file.
+        line: usize,
+        /// Frames in the range.
+        frames: usize,
+    },
+    /// Listed twice in one split.
+    Repeated,
+    /// One of the published clips that are known to hold NaN.
+    KnownNotFinite,
+}
+
+impl SkipReason {
+    fn heading(&self) -> &'static str {
+        match self {
+            Self::TooShort { .. } => "too short",
+            Self::TooLong { .. } => "too long",
+            Self::NoMotion => "no features in new_joint_vecs",
+            Self::NoText => "no file in texts",
+            Self::NoCaption => "no usable caption",
+            Self::CaptionRange { .. } => "caption dropped: its time range is too short or too long",
+            Self::Repeated => "listed twice",
+            Self::KnownNotFinite => "known to hold NaN",
+        }
+    }
+}
+
+/// A clip, or a caption of it, that is not used.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Skip {
+    /// The clip.
+    pub id: String,
+    /// Where it is listed.
+    pub split: Split,
+    /// Why.
+    pub reason: SkipReason,
+}
+
+impl fmt::Display for Skip {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.id)?;
+        match &self.reason {
+            SkipReason::TooShort { frames, min } => write!(f, " ({frames} frames, needs {min})"),
+            SkipReason::TooLong { frames, bound } => write!(f, " ({frames} frames, must be below {bound})"),
+            SkipReason::CaptionRange { line, frames } => write!(f, " line {line} ({frames} frames)"),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// What was opened and what was left out. Prints as text.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OpenReport {
+    /// Which format the folder was read as.
+    pub format: DataFormat,
+    /// Ids in the lists, by split.
+    pub listed: BTreeMap<Split, usize>,
+    /// Entries, by split.
+    pub entries: BTreeMap<Split, usize>,
+    /// Clips that at least one entry uses.
+    pub clips: usize,
+    /// Frames of these clips.
+    pub frames: usize,
+    /// Captions that at least one entry uses.
+    pub captions: usize,
+    /// Everything that was left out.
+    pub skips: Vec<Skip>,
+    /// Ids that stand in more than one split: their evaluation would be on training data.
+    pub shared: Vec<String>,
+}
+
+impl fmt::Display for OpenReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let seconds = self.frames as f64 / Skeleton::of(self.format).fps;
+        writeln!(
+            f,
+            "{} clips, {} frames ({:.1} minutes), {} captions",
+            self.clips,
+            self.frames,
+            seconds / 60.0,
+            self.captions
+        )?;
+        for (split, entries) in &self.entries {
+            let listed = self.listed.get(split).copied().unwrap_or(0);
+            writeln!(f, "{split}: {entries} entries from {listed} listed clips")?;
+        }
+        if !self.shared.is_empty() {
+            writeln!(f, "warning: in more than one split: {}", self.shared.join(", "))?;
+        }
+        writeln!(f, "left out: {}", self.skips.len())?;
+        let mut by_reason: BTreeMap<(&str, Split), Vec<&Skip>> = BTreeMap::new();
+        for skip in &self.skips {
+            by_reason.entry((skip.reason.heading(), skip.split)).or_default().push(skip);
+        }
+        for ((heading, split), skips) in by_reason {
+            let names: Vec<String> = skips.iter().map(|s| s.to_string()).collect();
+            writeln!(f, "  {heading}, {split} ({}): {}", names.len(), names.join(", "))?;
+        }
+        Ok(())
+    }
+}
+
+/// What reading one listed clip gave.
+enum Loaded {
+    Clip { frames: usize, features: Vec<f32>, captions: Vec<(usize, Caption)> },
+    Skip(SkipReason),
+    Bad(Vec<Problem>),
+}
+
+impl Dataset {
+    /// Opens a folder. Reads `train.txt`, `val.txt`, `test.txt`, `new_joint_vecs/`, `texts/`, `Mean.npy`, `Std.npy`.
+    pub fn open(path: &Path, format: DataFormat) -> Result<(Self, OpenReport), OpenError> {
+        let fail = |problems| OpenError { folder: path.into(), problems };
+        if !path.is_dir() {
+            let what = if path.exists() { "is not a folder" } else { "no such folder" };
+            return Err(fail(vec![Problem::new(
+                ProblemKind::Missing,
+                format!(
+                    "{}: {what}; set dataset.path to the folder that holds new_joint_vecs/ and texts/",
+                    path.display()
+                ),
+            )]));
+        }
+        let skeleton = Skeleton::of(format);
+        let mut problems = vec![];
+        let mut lists = vec![];
+        for split in Split::ALL {
+            match read_list(&path.join(format!("{split}.txt"))) {
+                Ok(ids) => lists.push((split, ids)),
+                Err(found) => problems.extend(found),
+            }
+        }
+        for folder in ["new_joint_vecs", "texts"] {
+            if !path.join(folder).is_dir() {
+                let file = path.join(folder);
+                problems.push(Problem::new(ProblemKind::Missing, format!("{}: no such folder", file.display())));
+            }
+        }
+        let mean = read_statistic(&path.join("Mean.npy"), skeleton, false).unwrap_or_else(|p| {
+            problems.push(p);
+            vec![]
+        });
+        let std = read_statistic(&path.join("Std.npy"), skeleton, true).unwrap_or_else(|p| {
+            problems.push(p);
+            vec![]
+        });
+        if !problems.is_empty() {
+            return Err(fail(problems));
+        }
+
+        let mut ids: Vec<&str> = vec![];
+        let mut seen = HashSet::new();
+        for id in lists.iter().flat_map(|(_, ids)| ids) {
+            if seen.insert(id.as_str()) {
+                ids.push(id);
+            }
+        }
+        let loaded: HashMap<&str, Loaded> = ids.iter().copied().zip(load_all(path, &ids, skeleton)).collect();
+        for id in &ids {
+            if let Loaded::Bad(found) = &loaded[id] {
+                problems.extend(found.iter().cloned());
+            }
+        }
+        if !problems.is_empty() {
+            return Err(fail(problems));
+        }
+        let mut dataset = Self { format, mean, std, clips: vec![], captions: vec![], entries: vec![] };
+        let report = dataset.collect(&lists, loaded);
+        if report.entries.get(&Split::Train).copied().unwrap_or(0) == 0 {
+            let what = format!("{}: no usable training clip\n{report}", path.join("train.txt").display());
+            return Err(fail(vec![Problem::new(ProblemKind::Empty, what)]));
+        }
+        Ok((dataset, report))
+    }
+
+    /// Turns loaded clips into entries by the load rules, and writes down what is left out.
+    fn collect(&mut self, lists: &[(Split, Vec<String>)], mut loaded: HashMap<&str, Loaded>) -> OpenReport {
+        let skeleton = self.skeleton();
+        let usable = |frames: usize| (skeleton.min_frames..skeleton.max_frames).contains(&frames);
+        let mut skips = vec![];
+        let mut shared = vec![];
+        // Where a clip that is already stored lies, and its captions by line.
+        let mut stored: HashMap<String, (usize, Vec<(usize, usize)>)> = HashMap::new();
+        for (split, ids) in lists {
+            let mut listed = HashSet::new();
+            for id in ids {
+                let mut skip = |reason| skips.push(Skip { id: id.clone(), split: *split, reason });
+                if !listed.insert(id) {
+                    skip(SkipReason::Repeated);
+                    continue;
+                }
+                if let Some(Loaded::Skip(reason)) = loaded.get(id.as_str()) {
+                    skip(reason.clone());
+                    continue;
+                }
+                if let Some(Loaded::Clip { frames, features, captions }) = loaded.remove(id.as_str()) {
+                    let lines = captions.iter().map(|(line, _)| *line);
+                    let lines = lines.zip(self.captions.len()..).collect();
+                    self.captions.extend(captions.into_iter().map(|(_, caption)| caption));
+                    stored.insert(id.clone(), (self.clips.len(), lines));
+                    self.clips.push(Clip { id: id.clone(), frames, features });
+                } else {
+                    shared.push(id.clone());
+                }
+                let Some((clip, lines)) = stored.get(id) else { continue };
+                let frames = self.clips[*clip].frames;
+                let mut whole = vec![];
+                let mut parts: Vec<Entry> = vec![];
+                for (line, index) in lines {
+                    let Some((from, to)) = self.captions[*index].frames(skeleton.fps) else {
+                        whole.push(*index);
+                        continue;
+                    };
+                    let (start, end) = (from.min(frames), to.min(frames));
+                    if !usable(end - start) {
+                        skip(SkipReason::CaptionRange { line: *line, frames: end - start });
+                        continue;
+                    }
+                    let mut name = format!("{id}@{start}-{end}");
+                    if parts.iter().any(|p| p.id == name) {
+                        name = format!("{name}.{line}");
+                    }
+                    parts.push(Entry {
+                        id: name,
+                        clip: *clip,
+                        start,
+                        len: end - start,
+                        captions: vec![*index],
+                        split: *split,
+                    });
+                }
+                if whole.is_empty() && parts.is_empty() {
+                    skip(SkipReason::NoCaption);
+                }
+                if !whole.is_empty() {
+                    let (id, clip) = (id.clone(), *clip);
+                    self.entries.push(Entry { id, clip, start: 0, len: frames, captions: whole, split: *split });
+                }
+                self.entries.extend(parts);
+            }
+        }
+        self.drop_unused();
+        let count = |split| self.entries.iter().filter(|e| e.split == split).count();
+        OpenReport {
+            format: self.format,
+            listed: lists.iter().map(|(split, ids)| (*split, ids.len())).collect(),
+            entries: Split::ALL.into_iter().map(|split| (split, count(split))).collect(),
+            clips: self.clips.len(),
+            frames: self.clips.iter().map(|c| c.frames).sum(),
+            captions: self.captions.len(),
+            skips,
+            shared,
+        }
+    }
+
+    /// Drops clips and captions that no entry uses, so that they do not change the dataset's digest.
+    fn drop_unused(&mut self) {
+        let mut clip_used = vec![false; self.clips.len()];
+        let mut caption_used = vec![false; self.captions.len()];
+        for entry in &self.entries {
+            clip_used[entry.clip] = true;
+            entry.captions.iter().for_each(|c| caption_used[*c] = true);
+        }
+        let renumber = |used: &[bool]| -> Vec<usize> {
+            used.iter().scan(0, |next, used| Some(std::mem::replace(next, *next + usize::from(*used)))).collect()
+        };
+        let (clip_at, caption_at) = (renumber(&clip_used), renumber(&caption_used));
+        let mut keep = clip_used.iter();
+        self.clips.retain(|_| keep.next().copied().unwrap_or(true));
+        let mut keep = caption_used.iter();
+        self.captions.retain(|_| keep.next().copied().unwrap_or(true));
+        for entry in &mut self.entries {
+            entry.clip = clip_at[entry.clip];
+            entry.captions.iter_mut().for_each(|c| *c = caption_at[*c]);
+        }
+    }
+}
+
+/// Ids of a list, stripped, without blank lines.
+fn read_list(file: &Path) -> Result<Vec<String>, Vec<Problem>> {
+    let content = fs::read_to_string(file).map_err(|e| {
+        let (kind, hint) = match e.kind() {
+            std::io::ErrorKind::NotFound => (ProblemKind::Missing, "; expected a list with one clip id a line"),
+            _ => (ProblemKind::Io, ""),
+        };
+        vec![Problem::new(kind, format!("{}: {e}{hint}", file.display()))]
+    })?;
+    let lines = || content.lines().enumerate().map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.is_empty());
+    let bad: Vec<Problem> = lines()
+        .filter(|(_, id)| id.contains(['/', '\\', '\0']) || id.starts_with('.'))
+        .map(|(n, id)| {
+            let what = format!("{}:{n}: `{id}` is not a clip id; expected a file name without folder", file.display());
+            Problem::new(ProblemKind::Text, what)
+        })
+        .collect();
+    if bad.is_empty() { Ok(lines().map(|(_, id)| id.to_owned()).collect()) } else { Err(bad) }
+}
+
+fn read_statistic(file: &Path, skeleton: &Skeleton, positive: bool) -> Result<Vec<f32>, Problem> {
+    let array = npy::read_any_float(file).map_err(|e| {
+        let mut problem = Problem::from(e);
+        if problem.kind == ProblemKind::Missing {
+            problem.what += "; a HumanML3D or KIT-ML folder holds Mean.npy and Std.npy over its features";
+        }
+        problem
+    })?;
+    if array.shape != [skeleton.features] {
+        let what = format!("{}: shape {:?}, expected [{}]", file.display(), array.shape, skeleton.features);
+        return Err(Problem::new(ProblemKind::Shape, what));
+    }
+    let wanted = if positive { "a positive number" } else { "a finite number" };
+    if let Some(i) = array.data.iter().position(|v| !v.is_finite() || (positive && *v <= 0.0)) {
+        let what = format!("{}: value {} at index {i}, expected {wanted}", file.display(), array.data[i]);
+        return Err(Problem::new(ProblemKind::NotFinite, what));
+    }
+    Ok(array.data)
+}
+
+/// Loads all clips, a contiguous part of the list on each core. The order of the result is that of `ids`.
+fn load_all(root: &Path, ids: &[&str], skeleton: &Skeleton) -> Vec<Loaded> {
+    let threads = std::thread::available_parallelism().map_or(1, |n| n.get()).min(8);
+    let part = ids.len().div_ceil(threads).max(1);
+    std::thread::scope(|scope| {
+        let handles: Vec<_> = ids
+            .chunks(part)
+            .map(|ids| scope.spawn(move || ids.iter().map(|id| load(root, id, skeleton)).collect::<Vec<_>>()))
+            .collect();
+        handles.into_iter().flat_map(|h| h.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))).collect()
+    })
+}
+
+fn load(root: &Path, id: &str, skeleton: &Skeleton) -> Loaded {
+    let (motion_file, text_file) =
+        (root.join("new_joint_vecs").join(format!("{id}.npy")), root.join("texts").join(format!("{id}.txt")));
+    let motion = match npy::read(&motion_file) {
+        Err(e) if e.is_missing() => return Loaded::Skip(SkipReason::NoMotion),
+        motion => motion.map_err(Problem::from),
+    };
+    let text = match fs::read(&text_file) {
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Loaded::Skip(SkipReason::NoText),
+        text => parse_text(&text_file, text),
+    };
+    let motion = motion.and_then(|array| check_motion(&motion_file, array, skeleton));
+    let (array, captions) = match (motion, text) {
+        (Ok(motion), Ok(captions)) => (motion, captions),
+        (motion, text) => {
+            return Loaded::Bad(motion.err().into_iter().chain(text.err().into_iter().flatten()).collect());
+        }
+    };
+    let frames = array.shape[0];
+    if frames < skeleton.min_frames {
+        return Loaded::Skip(SkipReason::TooShort { frames, min: skeleton.min_frames });
+    }
+    if frames >= skeleton.max_frames {
+        return Loaded::Skip(SkipReason::TooLong { frames, bound: skeleton.max_frames });
+    }
+    if let Some(at) = array.data.iter().position(|v| !v.is_finite()) {
+        if KNOWN_NOT_FINITE.contains(&id) && skeleton.format == DataFormat::Humanml3d {
+            return Loaded::Skip(SkipReason::KnownNotFinite);
+        }
+        return Loaded::Bad(vec![Problem::new(
+            ProblemKind::NotFinite,
+            format!(
+                "{}: {} in frame {}, column {}; make the clip's features again or take it off the lists",
+                motion_file.display(),
+                array.data[at],
+                at / skeleton.features,
+                at % skeleton.features
+            ),
+        )]);
+    }
+    Loaded::Clip { frames, features: array.data, captions }
+}
+
+fn parse_text(file: &Path, content: std::io::Result<Vec<u8>>) -> Result<Vec<(usize, Caption)>, Vec<Problem>> {
+    let content = content.map_err(|e| vec![Problem::new(ProblemKind::Io, format!("{}: {e}", file.display()))])?;
+    let content = String::from_utf8(content).map_err(|e| {
+        let line = e.as_bytes()[..e.utf8_error().valid_up_to()].iter().filter(|b| **b == b'\n').count() + 1;
+        vec![Problem::new(ProblemKind::Text, format!("{}:{line}: not UTF-8 text", file.display()))]
+    })?;
+    text::parse_file(file, &content)
+        .map_err(|errors| errors.iter().map(|e| Problem::new(ProblemKind::Text, e.to_string())).collect())
+}
+
+fn check_motion(file: &Path, array: npy::Array, skeleton: &Skeleton) -> Result<npy::Array, Problem> {
+    let expected = skeleton.features;
+    match array.shape[..] {
+        [_, width] if width == expected => Ok(array),
+        [_, width] => {
+            let other = if width == 251 || width == 263 { "; is dataset.format the right one?" } else { "" };
+            let what = format!("{}: {width} features a frame, expected {expected}{other}", file.display());
+            Err(Problem::new(ProblemKind::Shape, what))
+        }
+        _ => {
+            let what = format!("{}: shape {:?}, expected [frames, {expected}]", file.display(), array.shape);
+            Err(Problem::new(ProblemKind::Shape, what))
+        }
+    }
+}

@@ -1,0 +1,157 @@
+//! Reading and writing `.npy` files of f32, with errors that say which file and what was expected.
+//!
+//! A thin layer over `npyz`: it adds the checks on type, order and size that make a truncated or foreign file a clear
+//! message instead of wrong numbers.
+
+use std::fs;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use npyz::{DType, NpyHeader, Order, TypeChar, WriterBuilder as _};
+
+/// An array as it lay in the file, row-major.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Array {
+    /// Length of each axis.
+    pub shape: Vec<usize>,
+    /// The numbers.
+    pub data: Vec<f32>,
+}
+
+/// Why a `.npy` file could not be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum NpyError {
+    /// The file system refused.
+    #[error("{}: {source}", file.display())]
+    Io {
+        /// The file.
+        file: PathBuf,
+        /// What it said.
+        source: std::io::Error,
+    },
+    /// The header is not that of a `.npy` file.
+    #[error("{}: not a .npy file ({source})", file.display())]
+    Header {
+        /// The file.
+        file: PathBuf,
+        /// What is wrong with it.
+        source: std::io::Error,
+    },
+    /// The element type is another.
+    #[error("{}: holds {found}, expected {expected}; save it with numpy.save(..., x.astype(numpy.float32))", file.display())]
+    Type {
+        /// The file.
+        file: PathBuf,
+        /// Type in the header.
+        found: String,
+        /// What is read here.
+        expected: &'static str,
+    },
+    /// The array is column-major.
+    #[error("{}: stored column by column (fortran_order), expected rows; save numpy.ascontiguousarray(x)", file.display())]
+    Order {
+        /// The file.
+        file: PathBuf,
+    },
+    /// The file is shorter or longer than its header says.
+    #[error("{}: {} bytes of data for shape {shape:?}, expected {expected}; the file is {}", file.display(), found,
+        if found < expected { "truncated: copy or download it again" } else { "longer than its header says" })]
+    Size {
+        /// The file.
+        file: PathBuf,
+        /// Shape in the header.
+        shape: Vec<u64>,
+        /// Bytes that this shape takes.
+        expected: u64,
+        /// Bytes that follow the header.
+        found: u64,
+    },
+}
+
+impl NpyError {
+    /// Whether the file is simply not there.
+    pub fn is_missing(&self) -> bool {
+        matches!(self, Self::Io { source, .. } if source.kind() == std::io::ErrorKind::NotFound)
+    }
+}
+
+/// Reads an f32 array.
+pub fn read(file: &Path) -> Result<Array, NpyError> {
+    let bytes = fs::read(file).map_err(|source| NpyError::Io { file: file.into(), source })?;
+    parse(file, &bytes, false)
+}
+
+/// Reads an f32 or f64 array; f64 is rounded. For statistics, which published sets store either way.
+pub fn read_any_float(file: &Path) -> Result<Array, NpyError> {
+    let bytes = fs::read(file).map_err(|source| NpyError::Io { file: file.into(), source })?;
+    parse(file, &bytes, true)
+}
+
+/// Reads an array from bytes; `file` only names it in errors.
+pub fn parse(file: &Path, bytes: &[u8], allow_f64: bool) -> Result<Array, NpyError> {
+    let mut rest = bytes;
+    let header = NpyHeader::from_reader(&mut rest).map_err(|source| NpyError::Header { file: file.into(), source })?;
+    let expected = if allow_f64 { "f32 or f64 (<f4, <f8)" } else { "f32 (<f4)" };
+    let wrong_type = |found: String| NpyError::Type { file: file.into(), found, expected };
+    let width = match header.dtype() {
+        DType::Plain(ty)
+            if ty.type_char() == TypeChar::Float && (ty.size_field() == 4 || (allow_f64 && ty.size_field() == 8)) =>
+        {
+            ty.size_field()
+        }
+        other => return Err(wrong_type(other.descr())),
+    };
+    if header.order() == Order::Fortran && header.shape().len() > 1 {
+        return Err(NpyError::Order { file: file.into() });
+    }
+    let size = |shape: &[u64]| shape.iter().try_fold(width, |n, axis| n.checked_mul(*axis));
+    let found = rest.len() as u64;
+    let expected = size(header.shape()).unwrap_or(u64::MAX);
+    if found != expected {
+        return Err(NpyError::Size { file: file.into(), shape: header.shape().to_vec(), expected, found });
+    }
+    let shape = header.shape().iter().map(|n| *n as usize).collect();
+    let body = npyz::NpyFile::with_header(header, rest);
+    let data = if width == 4 {
+        body.into_vec::<f32>()
+    } else {
+        body.into_vec::<f64>().map(|v| v.into_iter().map(|x| x as f32).collect())
+    };
+    Ok(Array { shape, data: data.map_err(|source| NpyError::Header { file: file.into(), source })? })
+}
+
+/// An f32 array as the bytes of a `.npy` file.
+pub fn to_bytes(shape: &[usize], data: &[f32]) -> std::io::Result<Vec<u8>> {
+    let shape: Vec<u64> = shape.iter().map(|n| *n as u64).collect();
+    let mut bytes = Vec::with_capacity(128 + 4 * data.len());
+    let mut writer = npyz::WriteOptions::new().default_dtype().shape(&shape).writer(&mut bytes).begin_nd()?;
+    writer.extend(data.iter().copied())?;
+    writer.finish()?;
+    Ok(bytes)
+}
+
+/// Writes an f32 array.
+pub fn write(file: &Path, shape: &[usize], data: &[f32]) -> Result<(), NpyError> {
+    let io = |source| NpyError::Io { file: file.into(), source };
+    let bytes = to_bytes(shape, data).map_err(io)?;
+    fs::File::create(file).and_then(|mut f| f.write_all(&bytes)).map_err(io)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_array_survives_its_file_and_a_truncated_one_is_named() {
+        let file = Path::new("clip.npy");
+        let data: Vec<f32> = (0..6).map(|v| v as f32 / 3.0).collect();
+        let bytes = to_bytes(&[2, 3], &data).unwrap();
+        assert_eq!(parse(file, &bytes, false).unwrap(), Array { shape: vec![2, 3], data });
+        let cut = parse(file, &bytes[..bytes.len() - 5], false).unwrap_err().to_string();
+        assert!(
+            cut.contains("clip.npy: 19 bytes of data") && cut.contains("expected 24") && cut.contains("truncated"),
+            "{cut}"
+        );
+        assert!(matches!(parse(file, b"hello", false), Err(NpyError::Header { .. })));
+    }
+}

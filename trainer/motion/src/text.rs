@@ -1,0 +1,228 @@
+//! Captions: the line grammar of the `texts/` folder, the token form of the evaluators, and the built-in embedding.
+//!
+//! A line is `caption#token token ...#from#to`, a token `word/POS`, the times seconds (`nan` reads as 0). Both times 0
+//! mean that the caption describes the whole clip. Source of grammar, classes and word lists: the HumanML3D and
+//! text-to-motion data definitions.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+/// Width of [`hashed_embedding`].
+pub const EMBEDDING_WIDTH: usize = 768;
+
+/// Tokens that the evaluators read of a caption, without the two markers.
+pub const MAX_TOKENS: usize = 20;
+
+/// One caption of a clip.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Caption {
+    /// The sentence.
+    pub text: String,
+    /// `word/POS` each.
+    pub tokens: Vec<String>,
+    /// Seconds; with `to_s` 0 too, the caption describes the whole clip.
+    pub from_s: f64,
+    /// Seconds.
+    pub to_s: f64,
+}
+
+/// A caption line that does not parse.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{}:{line}: {what}; expected `caption#word/POS word/POS ...#from_seconds#to_seconds`", file.display())]
+pub struct TextError {
+    /// The text file.
+    pub file: PathBuf,
+    /// Line, from 1.
+    pub line: usize,
+    /// What is wrong with it.
+    pub what: String,
+}
+
+impl Caption {
+    /// A caption of a whole clip.
+    pub fn whole(text: impl Into<String>, tokens: Vec<String>) -> Self {
+        Self { text: text.into(), tokens, from_s: 0.0, to_s: 0.0 }
+    }
+
+    /// Whether it describes the whole clip.
+    pub fn is_whole(&self) -> bool {
+        self.from_s == 0.0 && self.to_s == 0.0
+    }
+
+    /// The frames `from..to` that it describes at `fps`; both truncated, `None` for the whole clip.
+    pub fn frames(&self, fps: f64) -> Option<(usize, usize)> {
+        (!self.is_whole()).then(|| ((self.from_s * fps) as usize, (self.to_s * fps) as usize))
+    }
+
+    /// Reads one line. The error says what is wrong, without file and line.
+    pub fn parse(line: &str) -> Result<Self, String> {
+        let fields: Vec<&str> = line.trim().split('#').collect();
+        let [text, tokens, from, to] = fields[..] else {
+            return Err(format!("{} field(s) separated by `#`, expected 4", fields.len()));
+        };
+        if text.trim().is_empty() {
+            return Err("the caption is empty".into());
+        }
+        let tokens: Vec<String> = tokens.split_whitespace().map(str::to_owned).collect();
+        if let Some(token) = tokens.iter().find(|t| split_token(t).is_none()) {
+            return Err(format!("token `{token}` is not `word/POS`"));
+        }
+        let (from_s, to_s) = (seconds(from)?, seconds(to)?);
+        if (from_s, to_s) != (0.0, 0.0) && to_s <= from_s {
+            return Err(format!("the time range {from_s} to {to_s} s is empty"));
+        }
+        Ok(Self { text: text.to_owned(), tokens, from_s, to_s })
+    }
+
+    /// The line that [`Caption::parse`] reads.
+    pub fn to_line(&self) -> String {
+        format!("{}#{}#{:?}#{:?}", self.text, self.tokens.join(" "), self.from_s, self.to_s)
+    }
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    let value: f64 = text.trim().parse().map_err(|_| format!("time `{text}` is not a number of seconds"))?;
+    if value.is_nan() {
+        return Ok(0.0);
+    }
+    if !value.is_finite() || value < 0.0 {
+        return Err(format!("time `{text}` is not a number of seconds from 0 on"));
+    }
+    Ok(value)
+}
+
+/// Word and POS of a token that has exactly these two parts.
+pub fn split_token(token: &str) -> Option<(&str, &str)> {
+    token.split_once('/').filter(|(word, pos)| !word.is_empty() && !pos.is_empty() && !pos.contains('/'))
+}
+
+/// Reads a text file: line number and caption of every line that is not blank, or every line that does not parse.
+pub fn parse_file(file: &Path, content: &str) -> Result<Vec<(usize, Caption)>, Vec<TextError>> {
+    let (mut captions, mut errors) = (vec![], vec![]);
+    for (i, line) in content.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
+        match Caption::parse(line) {
+            Ok(caption) => captions.push((i + 1, caption)),
+            Err(what) => errors.push(TextError { file: file.into(), line: i + 1, what }),
+        }
+    }
+    if errors.is_empty() { Ok(captions) } else { Err(errors) }
+}
+
+/// Tokens as the evaluators take them: `sos/OTHER`, at most 20 tokens, `eos/OTHER`, filled up to 22 with `unk/OTHER`;
+/// and how many there are before filling.
+pub fn padded_tokens(tokens: &[String]) -> (Vec<String>, usize) {
+    let mut padded = vec!["sos/OTHER".to_owned()];
+    padded.extend(tokens.iter().take(MAX_TOKENS).cloned());
+    padded.push("eos/OTHER".to_owned());
+    let sent_len = padded.len();
+    padded.resize(MAX_TOKENS + 2, "unk/OTHER".to_owned());
+    (padded, sent_len)
+}
+
+/// Names of the 15 POS classes, by class number.
+pub const POS_CLASSES: [&str; 15] = [
+    "VERB", "NOUN", "DET", "ADP", "NUM", "AUX", "PRON", "ADJ", "ADV", "Loc_VIP", "Body_VIP", "Obj_VIP", "Act_VIP",
+    "Desc_VIP", "OTHER",
+];
+
+const PLACES: &str = "left right clockwise counterclockwise anticlockwise forward back backward up down straight curve";
+const BODY: &str = "arm chin foot feet face hand mouth leg waist eye knee shoulder thigh";
+const OBJECTS: &str = "stair dumbbell chair window floor car ball handrail baseball basketball";
+const ACTIONS: &str = "walk run swing pick bring kick put squat throw hop dance jump turn stumble stop sit lift lower \
+    raise wash stand kneel stroll rub bend balance flap jog shuffle lean rotate spin spread climb";
+const MANNERS: &str = "slowly carefully fast careful slow quickly happy angry sad happily angrily sadly";
+
+/// POS class of a token whose word is in the evaluator's vocabulary. A word of one of the five lists has the list's
+/// class whatever its tag. (A word outside the vocabulary is `unk` with class OTHER; only the vocabulary's owner can
+/// tell, so that case is the caller's.)
+pub fn pos_class(token: &str) -> usize {
+    let (word, pos) = split_token(token).unwrap_or((token, "OTHER"));
+    let lists = [PLACES, BODY, OBJECTS, ACTIONS, MANNERS];
+    if let Some(i) = lists.iter().position(|list| list.split_whitespace().any(|w| w == word)) {
+        return 9 + i;
+    }
+    POS_CLASSES[..9].iter().position(|class| *class == pos).unwrap_or(14)
+}
+
+fn fnv1a(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(*b)).wrapping_mul(0x0100_0000_01b3))
+}
+
+/// The last mixing steps of MurmurHash3 (64 bit): FNV alone leaves the upper bits of short words too alike.
+fn finalise(mut h: u64) -> u64 {
+    h = (h ^ (h >> 33)).wrapping_mul(0xff51_afd7_ed55_8ccd);
+    h = (h ^ (h >> 33)).wrapping_mul(0xc4ce_b9fe_1a85_ec53);
+    h ^ (h >> 33)
+}
+
+/// The built-in text encoder: words and word pairs hashed to signed coordinates, unit length.
+///
+/// The caption is lower-cased and everything outside `[a-z0-9]` separates words. Hashed are `</s>`, every word and every
+/// pair of neighbours joined by one space; coordinate `h mod 768`, `+1` if bit 63 of `h` is 0, else `-1`. The empty
+/// caption, the null condition of classifier-free guidance, is `</s>` alone.
+pub fn hashed_embedding(caption: &str) -> [f32; EMBEDDING_WIDTH] {
+    let lower = caption.to_lowercase();
+    let words: Vec<&str> =
+        lower.split(|c: char| !matches!(c, 'a'..='z' | '0'..='9')).filter(|w| !w.is_empty()).collect();
+    let pairs = words.windows(2).map(|pair| pair.join(" "));
+    let mut sums = [0_i32; EMBEDDING_WIDTH];
+    for gram in std::iter::once("</s>".to_owned()).chain(words.iter().map(|w| (*w).to_owned())).chain(pairs) {
+        let h = finalise(fnv1a(gram.as_bytes()));
+        sums[(h % EMBEDDING_WIDTH as u64) as usize] += if h >> 63 == 0 { 1 } else { -1 };
+    }
+    let squares: i32 = sums.iter().map(|v| v * v).sum();
+    // Grams can cancel each other out; then there is no direction to normalise.
+    let scale = if squares == 0 { 0.0 } else { 1.0 / f64::from(squares).sqrt() };
+    sums.map(|v| (f64::from(v) * scale) as f32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_hash_has_its_published_check_values() {
+        assert_eq!(fnv1a(b"a"), 0xaf63_dc4c_8601_ec8c);
+        assert_eq!(finalise(fnv1a(b"a")), 0x82a2_a958_a9be_ce5b);
+        assert_eq!(finalise(fnv1a(b"walks forward")), 0xe88f_1947_4a1b_b973);
+    }
+
+    #[test]
+    fn embeddings_have_their_published_check_values() {
+        let set = |v: [f32; EMBEDDING_WIDTH]| {
+            v.iter().enumerate().filter(|(_, x)| **x != 0.0).map(|(i, x)| (i, *x)).collect::<Vec<_>>()
+        };
+        assert_eq!(set(hashed_embedding("")), [(247, -1.0)]);
+        assert_eq!(set(hashed_embedding(" ... ")), [(247, -1.0)]);
+        let signs =
+            [(247, -1.0), (347, -1.0), (356, 1.0), (371, -1.0), (379, -1.0), (462, 1.0), (594, 1.0), (668, 1.0)];
+        let found = set(hashed_embedding("a person walks forward."));
+        assert_eq!(found.len(), signs.len());
+        for ((i, x), (j, sign)) in found.into_iter().zip(signs) {
+            assert!(i == j && (x - sign * 0.353_553).abs() < 1e-5, "{i} {x} against {j} {sign}");
+        }
+    }
+
+    #[test]
+    fn a_line_survives_and_a_bad_one_is_explained() {
+        let caption = Caption::parse("a man kicks.#a/DET man/NOUN kick/VERB#2.0#6.5").unwrap();
+        assert_eq!(Caption::parse(&caption.to_line()), Ok(caption.clone()));
+        assert_eq!(caption.frames(20.0), Some((40, 130)));
+        assert!(Caption::parse("x#x/X#nan#nan").unwrap().is_whole());
+        for (line, part) in [
+            ("a man kicks.", "1 field"),
+            ("#a/DET#0.0#0.0", "empty"),
+            ("a#a#0.0#0.0", "`a` is not"),
+            ("a#a/b/c#0.0#0.0", "`a/b/c`"),
+            ("a#a/DET#zero#0.0", "`zero`"),
+            ("a#a/DET#-1#0.0", "from 0 on"),
+            ("a#a/DET#3#2", "empty"),
+        ] {
+            let error = Caption::parse(line).unwrap_err();
+            assert!(error.contains(part), "{line}: {error}");
+        }
+        let errors = parse_file(Path::new("texts/1.txt"), "a#a/DET#0#0\n\nb#b\n").unwrap_err();
+        assert!(errors[0].to_string().starts_with("texts/1.txt:3: 2 field(s)"), "{}", errors[0]);
+    }
+}
