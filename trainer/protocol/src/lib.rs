@@ -8,10 +8,12 @@ pub mod canonical;
 pub mod digest;
 pub mod id;
 pub mod message;
+pub mod pipeline;
 pub mod stage;
 pub mod units;
 
 pub use artifact::{ArtifactKind, FileEntry, Manifest};
 pub use digest::Digest;
 pub use id::{Alias, Attempt, Fence, Generation, Incarnation, ModelName, RunId, Seed, StageName, TaskId, WorkerId};
+pub use pipeline::Pipeline;
 pub use units::Steps;

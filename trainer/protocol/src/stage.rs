@@ -624,6 +624,45 @@ impl StageSettings {
         ]
     }
 
+    /// The settings as they enter a stage's key: references to other stages and paths are blank, because the digests of
+    /// what they name stand beside them.
+    #[must_use]
+    pub fn without_references(&self) -> Self {
+        let mut settings = self.clone();
+        match &mut settings {
+            Self::DataOpen(s) => s.path.clear(),
+            Self::DataSynthetic(_) => {}
+            Self::TextEmbed(s) => s.dataset.clear(),
+            Self::TrainVae(s) => s.dataset.clear(),
+            Self::EncodeLatents(s) => {
+                s.dataset.clear();
+                s.vae.clear();
+            }
+            Self::TrainMld(s) => {
+                s.vae.clear();
+                s.latents.clear();
+                s.text.clear();
+            }
+            Self::DistillLcm(DistillLcm { distillation: s }) | Self::DistillPcm(DistillPcm { distillation: s, .. }) => {
+                s.teacher.clear();
+                s.latents.clear();
+                s.text.clear();
+            }
+            Self::EvaluateReconstruction(s) => {
+                s.vae.clear();
+                s.dataset.clear();
+            }
+            Self::EvaluateLatentFid(s) => {
+                s.model.clear();
+                s.latents.clear();
+                s.text.clear();
+                s.teacher.clear();
+            }
+            Self::Register(s) => s.from.clear(),
+        }
+        settings
+    }
+
     /// The name in YAML, such as `train.vae`.
     pub fn kind(&self) -> &'static str {
         match self {

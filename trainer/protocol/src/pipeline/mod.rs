@@ -1,0 +1,111 @@
+//! A pipeline: stages, what each reads from which other, and what all of them share.
+//!
+//! [`read`] makes one from YAML and reports every mistake of the file at once; [`Pipeline::check`] repeats the rules that
+//! do not need the text, for pipelines that arrive as JSON. Not its job: touching the file system. The content digests of
+//! dataset folders are put in by the caller ([`Pipeline::fill_external`]).
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::stage::{Backend, DataOpen, Placement, StageIdentity, StageSettings};
+use crate::{ArtifactKind, Digest, Seed, StageName};
+
+/// An immutable DAG of stages, in an order in which each stage comes after those it reads.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Pipeline {
+    /// For people and for run names: a letter or digit, then letters, digits, `.`, `_`, `-`.
+    pub name: String,
+    /// What all randomness is keyed by.
+    pub seed: Seed,
+    /// Where tensors live.
+    pub backend: Backend,
+    /// Stages in topological order.
+    pub stages: Vec<PipelineStage>,
+}
+
+/// A node of a pipeline.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PipelineStage {
+    /// Its name, unique in the pipeline.
+    pub name: StageName,
+    /// What it does.
+    pub settings: StageSettings,
+    /// Where it runs and how often it saves; not part of its key.
+    pub placement: Placement,
+    /// The stages it reads.
+    pub inputs: Vec<StageInput>,
+    /// Digests of what it reads from outside the pipeline: `folder` is the content of a dataset folder.
+    pub external: BTreeMap<String, Digest>,
+}
+
+/// An edge of the DAG.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct StageInput {
+    /// The field that names the stage, such as `vae` or `from[0]`. A `register` stage also reads the evaluations of its
+    /// candidates; their fields are `evaluations.<stage>`.
+    pub field: String,
+    /// The stage that is read.
+    pub stage: StageName,
+    /// What it must give.
+    pub kind: ArtifactKind,
+}
+
+impl Pipeline {
+    /// The stage of that name.
+    pub fn stage(&self, name: &StageName) -> Option<&PipelineStage> {
+        self.stages.iter().find(|stage| &stage.name == name)
+    }
+
+    /// The digest that names the pipeline: everything but the paths of dataset folders, whose contents count instead.
+    pub fn digest(&self) -> Digest {
+        let mut pipeline = self.clone();
+        for stage in &mut pipeline.stages {
+            if let StageSettings::DataOpen(settings) = &mut stage.settings {
+                settings.path.clear();
+            }
+        }
+        crate::canonical::digest(&pipeline)
+    }
+
+    /// Asks `folder_digest` for the content of every dataset folder and keeps the answers as `folder`.
+    ///
+    /// # Errors
+    /// The first error of `folder_digest`.
+    pub fn fill_external<E>(
+        &mut self,
+        mut folder_digest: impl FnMut(&StageName, &DataOpen) -> Result<Digest, E>,
+    ) -> Result<(), E> {
+        for stage in &mut self.stages {
+            if let StageSettings::DataOpen(settings) = &stage.settings {
+                let digest = folder_digest(&stage.name, settings)?;
+                stage.external.insert("folder".into(), digest);
+            }
+        }
+        Ok(())
+    }
+
+    /// The identity of `stage`, once the artifacts it reads are known.
+    pub fn identity(&self, stage: &PipelineStage, inputs: &BTreeMap<String, Digest>) -> StageIdentity {
+        identity(stage, inputs, self.seed, self.backend)
+    }
+}
+
+/// All that decides the value of `stage`. `inputs` are artifacts by field; what the stage reads from outside is added.
+pub fn identity(
+    stage: &PipelineStage,
+    inputs: &BTreeMap<String, Digest>,
+    seed: Seed,
+    backend: Backend,
+) -> StageIdentity {
+    let mut all = stage.external.clone();
+    all.extend(inputs.iter().map(|(field, digest)| (field.clone(), *digest)));
+    StageIdentity {
+        settings: stage.settings.without_references(),
+        code_version: stage.settings.code_version(),
+        inputs: all,
+        seed,
+        name: stage.name.clone(),
+        backend,
+    }
+}
