@@ -7,7 +7,10 @@
 //! row-major and frame-major.
 
 pub mod dataset;
+pub mod folder_digest;
+pub mod features;
 pub mod npy;
+pub mod quaternion;
 pub mod random;
 pub mod skeleton;
 pub mod text;

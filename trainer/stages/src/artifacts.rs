@@ -4,12 +4,14 @@
 //! here are its schema, one per artifact kind, shared by the stage that writes it and those that read it. Tensors are
 //! safetensors in f32 or i64. Not its job: networks, and what a checkpoint holds.
 
+use std::cell::RefCell;
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
 use checkpoint::{BlobError, Blobs};
+use motion::dataset::{Caption, Dataset, PackError, Split};
 use protocol::artifact::FileEntry;
-use protocol::stage::{DataFormat, LatentShape, Network, Split};
+use protocol::stage::{DataFormat, LatentShape, Network};
 use protocol::{ArtifactKind, Digest, Manifest};
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
@@ -81,7 +83,7 @@ pub struct LatentsMeta {
     pub latent: LatentShape,
     /// Crops per entry; row `e * crops + c` is crop `c` of entry `e`.
     pub crops: usize,
-    /// Split of each entry, never [`Split::All`].
+    /// Split of each entry.
     pub splits: Vec<Split>,
     /// Captions of each entry, by number in the dataset and so by row in the embeddings.
     pub captions: Vec<Vec<usize>>,
@@ -191,21 +193,77 @@ pub fn files(blobs: &dyn Blobs, manifest: &Manifest) -> Result<BTreeMap<String, 
         .collect()
 }
 
-/// Uploads files and their manifest.
+/// An artifact in the making: files are uploaded one by one, so that only one is in memory at a time.
+#[derive(Debug)]
+pub struct Draft {
+    manifest: Manifest,
+    blobs: Arc<dyn Blobs>,
+}
+
+impl Draft {
+    /// An artifact without files.
+    pub fn new(cx: &dyn AttemptContext, kind: ArtifactKind, meta: serde_json::Value) -> Self {
+        Self { manifest: Manifest::new(kind, meta), blobs: cx.blobs() }
+    }
+
+    /// Uploads one file.
+    pub fn add(&mut self, name: &str, bytes: Vec<u8>) -> Result<(), StageError> {
+        let length = bytes.len() as u64;
+        let digest = self.blobs.put(bytes).map_err(blob_error)?;
+        self.manifest.files.insert(name.to_owned(), FileEntry { digest, bytes: length });
+        Ok(())
+    }
+
+    /// Uploads the manifest; its digest names the artifact.
+    pub fn finish(self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
+        Ok(cx.put_manifest(&self.manifest)?)
+    }
+}
+
+/// Uploads one file and a manifest around it.
 pub fn publish(
     cx: &mut dyn AttemptContext,
     kind: ArtifactKind,
     meta: serde_json::Value,
-    files: BTreeMap<String, Vec<u8>>,
+    name: &str,
+    bytes: Vec<u8>,
 ) -> Result<Digest, StageError> {
-    let blobs = cx.blobs();
-    let mut manifest = Manifest::new(kind, meta);
-    for (name, bytes) in files {
-        let length = bytes.len() as u64;
-        let digest = blobs.put(bytes).map_err(blob_error)?;
-        manifest.files.insert(name, FileEntry { digest, bytes: length });
-    }
-    Ok(cx.put_manifest(&manifest)?)
+    let mut draft = Draft::new(cx, kind, meta);
+    draft.add(name, bytes)?;
+    draft.finish(cx)
+}
+
+/// The dataset of an artifact of kind `dataset`.
+pub fn dataset(blobs: &dyn Blobs, manifest: &Manifest) -> Result<Dataset, StageError> {
+    from_files(blobs, manifest, |fetch| Dataset::from_files(fetch))
+}
+
+/// Its captions alone.
+pub fn captions(blobs: &dyn Blobs, manifest: &Manifest) -> Result<Vec<Caption>, StageError> {
+    from_files(blobs, manifest, |fetch| Dataset::captions_from_files(fetch))
+}
+
+type Fetch<'a> = dyn Fn(&str) -> Result<Vec<u8>, String> + 'a;
+
+fn from_files<T>(
+    blobs: &dyn Blobs,
+    manifest: &Manifest,
+    read: impl FnOnce(&Fetch<'_>) -> Result<T, PackError>,
+) -> Result<T, StageError> {
+    // What the store said is kept, so that a lost connection is not taken for a broken dataset.
+    let refused = RefCell::new(None);
+    let fetch = |name: &str| {
+        let bytes = file(blobs, manifest, name).map(|bytes| bytes.to_vec());
+        bytes.map_err(|error| {
+            let text = error.to_string();
+            refused.replace(Some(error));
+            text
+        })
+    };
+    read(&fetch).map_err(|error| {
+        let corrupt = || StageError::Context(ContextError::Corrupt(format!("the dataset: {error}")));
+        refused.take().unwrap_or_else(corrupt)
+    })
 }
 
 /// A tensor on the host.

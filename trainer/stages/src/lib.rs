@@ -4,3 +4,4 @@
 
 pub mod artifacts;
 pub mod context;
+pub mod evaluation;

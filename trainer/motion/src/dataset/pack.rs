@@ -150,6 +150,14 @@ impl Dataset {
         Ok(files)
     }
 
+    /// The captions alone, without fetching a clip.
+    pub fn captions_from_files(fetch: &dyn Fn(&str) -> Result<Vec<u8>, String>) -> Result<Vec<Caption>, PackError> {
+        let bytes = fetch(INDEX).map_err(|why| PackError::Fetch { file: INDEX.into(), why })?;
+        let index: Index = serde_json::from_slice(&bytes)
+            .map_err(|e| PackError::Content { file: INDEX.into(), what: e.to_string() })?;
+        Ok(index.captions)
+    }
+
     /// Reads what [`Dataset::write_files`] wrote; `fetch` gives a file's content by its name.
     pub fn from_files(fetch: &dyn Fn(&str) -> Result<Vec<u8>, String>) -> Result<Self, PackError> {
         let get = |file: &str| fetch(file).map_err(|why| PackError::Fetch { file: file.into(), why });

@@ -1,0 +1,338 @@
+//! A gang of threads around one lock.
+//!
+//! A change of membership starts a new generation; whoever waits in an older one is told to regroup. Contributions of an
+//! unfinished step are dropped with their generation, a finished sum stays readable.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::sync::{Arc, Condvar, Mutex};
+
+use burn::tensor::Device;
+use checkpoint::Blobs;
+use protocol::message::StageTask;
+use protocol::{Digest, Manifest};
+
+use super::{MemoryAttempt, Ran, Told, lock};
+use crate::context::{AttemptContext, ContextError, Exchange, GangContext, Outcome, Rendezvous, StageError};
+use crate::kinds;
+
+/// Who leaves or joins a gang, and when. Members are numbered from 0; the lowest alive leads.
+#[derive(Debug, Clone, Default)]
+pub struct Script {
+    /// Member and step: it is lost when it would contribute to that step.
+    pub lost: Vec<(usize, u64)>,
+    /// Member and step: it starts once that step is summed. Its number is above those of the first members.
+    pub joins: Vec<(usize, u64)>,
+    /// All members are told to stop after applying this step.
+    pub wind_down: Option<u64>,
+}
+
+/// The sum of `parts` along the fixed tree: a range is split at the largest power of two below its length.
+///
+/// # Panics
+/// If there are no parts, or parts of several lengths.
+pub fn tree_sum(parts: &[Vec<f32>]) -> Vec<f32> {
+    if let [only] = parts {
+        return only.clone();
+    }
+    let (left, right) = parts.split_at(parts.len().next_power_of_two() / 2);
+    let (mut sum, right) = (tree_sum(left), tree_sum(right));
+    assert_eq!(sum.len(), right.len(), "slices give vectors of one length");
+    for (a, b) in sum.iter_mut().zip(right) {
+        *a += b;
+    }
+    sum
+}
+
+#[derive(Debug, Default)]
+struct State {
+    generation: u64,
+    members: Vec<usize>,
+    arrived: BTreeMap<usize, Option<u64>>,
+    donated: Option<Vec<u8>>,
+    step: u64,
+    slices: BTreeMap<usize, Vec<f32>>,
+    summed: Option<(u64, Arc<Vec<f32>>)>,
+    checkpoints: Vec<(u64, Manifest)>,
+    /// Some member's thread has ended: nobody joins any more.
+    over: bool,
+}
+
+impl State {
+    fn regroup(&mut self, change: impl FnOnce(&mut Vec<usize>)) {
+        self.generation += 1;
+        change(&mut self.members);
+        self.members.sort_unstable();
+        self.arrived.clear();
+        self.donated = None;
+        self.slices.clear();
+    }
+}
+
+#[derive(Debug, Default)]
+struct Gang {
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Debug)]
+struct Member {
+    attempt: MemoryAttempt,
+    me: usize,
+    gang: Arc<Gang>,
+    generation: u64,
+    members: Vec<usize>,
+    lost_at: Option<u64>,
+    wind_down: Option<u64>,
+}
+
+impl Member {
+    fn rank(&self) -> usize {
+        self.members.iter().position(|m| *m == self.me).expect("a member is in its own gang")
+    }
+}
+
+/// Runs a gang stage with `count` members; `saved` are its checkpoints, old and new.
+pub(super) fn run(
+    attempt: impl Fn() -> MemoryAttempt,
+    count: usize,
+    script: &Script,
+    saved: &mut Vec<(u64, Manifest)>,
+) -> Result<Ran, StageError> {
+    let gang = Arc::new(Gang::default());
+    {
+        let mut state = lock(&gang.state);
+        state.members = (0..count).collect();
+        state.checkpoints = std::mem::take(saved);
+    }
+    let member = |me: usize| Member {
+        attempt: attempt(),
+        me,
+        gang: Arc::clone(&gang),
+        generation: 0,
+        members: (0..count).collect(),
+        lost_at: script.lost.iter().find(|(who, _)| *who == me).map(|(_, step)| *step),
+        wind_down: script.wind_down,
+    };
+    let starters = (0..count).map(|me| (member(me), None));
+    let joiners = script.joins.iter().map(|&(me, step)| (member(me), Some(step)));
+    let members: Vec<_> = starters.chain(joiners).collect();
+
+    let results: Vec<(usize, Option<Result<Outcome, StageError>>, Told)> = std::thread::scope(|scope| {
+        let threads: Vec<_> = members
+            .into_iter()
+            .map(|(mut member, join_after)| {
+                scope.spawn(move || {
+                    let started = join_after.is_none_or(|step| join(&mut member, step));
+                    // A panic must not leave the others waiting for this member.
+                    let run = || started.then(|| kinds::run_gang(&mut member));
+                    let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run));
+                    let mut state = lock(&member.gang.state);
+                    if !matches!(result, Ok(Some(Ok(_)) | None)) && state.members.contains(&member.me) {
+                        state.regroup(|members| members.retain(|m| *m != member.me));
+                    }
+                    state.over |= matches!(result, Ok(Some(Ok(_))));
+                    state.over |= state.members.is_empty();
+                    drop(state);
+                    member.gang.changed.notify_all();
+                    match result {
+                        Ok(result) => (member.me, result, member.attempt.told),
+                        Err(panic) => std::panic::resume_unwind(panic),
+                    }
+                })
+            })
+            .collect();
+        threads
+            .into_iter()
+            .map(|thread| thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+            .collect()
+    });
+
+    *saved = std::mem::take(&mut lock(&gang.state).checkpoints);
+    let lost = |me: usize| script.lost.iter().any(|(who, _)| *who == me);
+    let mut ran: Option<Ran> = None;
+    for (me, result, told) in results {
+        match result {
+            Some(Ok(outcome)) => {
+                // The lowest that is left led at the end and reports; the others must agree with it on how it ended.
+                if let Some(leader) = &ran {
+                    let agree = std::mem::discriminant(&leader.outcome) == std::mem::discriminant(&outcome);
+                    assert!(agree, "member {me} ended with {outcome:?}, the leader with {:?}", leader.outcome);
+                } else {
+                    ran = Some(Ran { outcome, told });
+                }
+            }
+            Some(Err(StageError::Context(ContextError::GrantEnded(_)))) if lost(me) => {}
+            Some(Err(error)) => return Err(error),
+            None => {}
+        }
+    }
+    ran.ok_or_else(|| StageError::Fault("every member of the gang was lost".into()))
+}
+
+/// Waits until `step` is summed, then becomes a member. False if the stage ended before.
+fn join(member: &mut Member, step: u64) -> bool {
+    let mut state = lock(&member.gang.state);
+    while !state.over && state.summed.as_ref().is_none_or(|(at, _)| *at < step) {
+        state = member.gang.changed.wait(state).unwrap_or_else(std::sync::PoisonError::into_inner);
+    }
+    if state.over {
+        return false;
+    }
+    state.regroup(|members| members.push(member.me));
+    drop(state);
+    member.gang.changed.notify_all();
+    true
+}
+
+impl AttemptContext for Member {
+    fn task(&self) -> &StageTask {
+        self.attempt.task()
+    }
+    fn device(&self) -> Device {
+        self.attempt.device()
+    }
+    fn blobs(&self) -> Arc<dyn Blobs> {
+        self.attempt.blobs()
+    }
+    fn manifest(&self, digest: Digest) -> Result<Manifest, ContextError> {
+        self.attempt.manifest(digest)
+    }
+    fn put_manifest(&mut self, manifest: &Manifest) -> Result<Digest, ContextError> {
+        self.attempt.put_manifest(manifest)
+    }
+    fn progress(&mut self, done: u64, total: u64, unit: &str, metrics: &[(&str, f64)]) {
+        self.attempt.progress(done, total, unit, metrics);
+    }
+    fn record(&mut self, step: u64, metrics: &[(&str, f64)]) {
+        self.attempt.record(step, metrics);
+    }
+    fn log(&mut self, line: &str) {
+        self.attempt.log(line);
+    }
+    fn interrupted(&self) -> bool {
+        self.attempt.interrupted()
+    }
+}
+
+impl GangContext for Member {
+    fn latest_checkpoint(&self) -> Result<Option<Manifest>, ContextError> {
+        Ok(lock(&self.gang.state).checkpoints.last().map(|(_, manifest)| manifest.clone()))
+    }
+
+    fn rendezvous(
+        &mut self,
+        applied: Option<u64>,
+        bytes: &mut dyn FnMut() -> Vec<u8>,
+    ) -> Result<Rendezvous, ContextError> {
+        let gang = Arc::clone(&self.gang);
+        let mut state = lock(&gang.state);
+        loop {
+            if !state.members.contains(&self.me) {
+                return Err(ContextError::GrantEnded("the gang went on without this member".into()));
+            }
+            self.generation = state.generation;
+            self.members.clone_from(&state.members);
+            state.arrived.insert(self.me, applied);
+            gang.changed.notify_all();
+            while state.generation == self.generation && state.arrived.len() < state.members.len() {
+                state = gang.changed.wait(state).unwrap_or_else(std::sync::PoisonError::into_inner);
+            }
+            if state.generation != self.generation {
+                continue;
+            }
+            let newest = *state.arrived.values().max().expect("this member has arrived");
+            if state.arrived.values().all(|a| *a == newest) {
+                return Ok(Rendezvous::Keep);
+            }
+            let donor = state.arrived.iter().find(|(_, a)| **a == newest).map(|(who, _)| *who);
+            if donor == Some(self.me) {
+                state.donated = Some(bytes());
+                gang.changed.notify_all();
+            }
+            if applied == newest {
+                return Ok(Rendezvous::Keep);
+            }
+            while state.generation == self.generation && state.donated.is_none() {
+                state = gang.changed.wait(state).unwrap_or_else(std::sync::PoisonError::into_inner);
+            }
+            if let (true, Some(donated)) = (state.generation == self.generation, &state.donated) {
+                return Ok(Rendezvous::Adopt(donated.clone()));
+            }
+        }
+    }
+
+    fn share(&self, slices: usize) -> Range<usize> {
+        let (rank, of) = (self.rank(), self.members.len());
+        slices * rank / of..slices * (rank + 1) / of
+    }
+
+    fn exchange(&mut self, step: u64, slices: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError> {
+        let gang = Arc::clone(&self.gang);
+        let mut state = lock(&gang.state);
+        if self.lost_at.is_some_and(|at| step >= at) {
+            let me = self.me;
+            state.regroup(|members| members.retain(|m| *m != me));
+            gang.changed.notify_all();
+            return Err(ContextError::GrantEnded(format!("member {me} was lost at step {step}")));
+        }
+        let found = |state: &State| match &state.summed {
+            Some((at, sum)) if *at == step => Some(Arc::clone(sum)),
+            _ => None,
+        };
+        let wind_down = self.wind_down.is_some_and(|at| step >= at);
+        if state.generation != self.generation {
+            return Ok(Exchange::Regroup);
+        }
+        if state.step != step {
+            state.step = step;
+            state.slices.clear();
+        }
+        assert!(parts.iter().map(|(slice, _)| *slice).eq(self.share(slices)), "a member gives its own slices, in order");
+        state.slices.extend(parts.iter().cloned());
+        if state.slices.len() == slices {
+            let parts: Vec<_> = std::mem::take(&mut state.slices).into_values().collect();
+            state.summed = Some((step, Arc::new(tree_sum(&parts))));
+            gang.changed.notify_all();
+        }
+        loop {
+            if let Some(sum) = found(&state) {
+                return Ok(Exchange::Sum { sum: sum.to_vec(), wind_down });
+            }
+            if state.generation != self.generation {
+                return Ok(Exchange::Regroup);
+            }
+            state = gang.changed.wait(state).unwrap_or_else(std::sync::PoisonError::into_inner);
+        }
+    }
+
+    fn leads(&self) -> bool {
+        self.rank() == 0
+    }
+
+    fn commit_checkpoint(
+        &mut self,
+        step: u64,
+        manifest: &Manifest,
+        _metrics: &BTreeMap<String, f64>,
+    ) -> Result<(), ContextError> {
+        assert!(self.leads(), "only the leader saves");
+        self.put_manifest(manifest)?;
+        lock(&self.gang.state).checkpoints.push((step, manifest.clone()));
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_tree_does_not_depend_on_who_computed_its_leaves() {
+        let parts: Vec<Vec<f32>> = (0..6).map(|i| vec![0.1 + i as f32 * 1e7, 3.0]).collect();
+        let by_hand = |i: usize| parts[i][0];
+        let expected = ((by_hand(0) + by_hand(1)) + (by_hand(2) + by_hand(3))) + (by_hand(4) + by_hand(5));
+        assert_eq!(tree_sum(&parts), [expected, 18.0]);
+        assert_eq!(tree_sum(&parts[..1]), parts[0]);
+    }
+}
