@@ -1,1 +1,27 @@
+//! What is kept: blobs, the coordinator's journal, metrics, checkpoints, stage results, model versions and aliases.
+//!
+//! [`Store`] is the whole. What may be written is data ([`Write`]); a call of [`Store::write`] is one transaction that also
+//! checks the fences of the tasks it writes about, and returns once it would survive a loss of power. A blob is stored
+//! before the row that names it; the row is the point from which it counts.
+//!
+//! Not its job: who works on what (the coordinator), what tensors mean (the stages).
 
+pub mod blob;
+pub mod catalog;
+mod clock;
+mod db;
+pub mod failpoints;
+mod lock;
+mod metrics;
+pub mod query;
+pub mod retention;
+mod store;
+mod write;
+
+pub use blob::BlobStore;
+pub use catalog::{Expect, Gate, Model, ModelRef, Pick, Promotion, Version};
+pub use lock::Holder;
+pub use metrics::{Curve, Point};
+pub use query::{CheckpointRow, LineageNode, LogRow, QueryError, RunRow, StageResultRow};
+pub use store::{OpenError, Store};
+pub use write::{Write, WriteError};

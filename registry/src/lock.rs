@@ -1,0 +1,156 @@
+//! Who holds a store. The lock is the operating system's (`flock`), so it ends with its process however that ends; the
+//! file only says who holds it, and means nothing without the lock.
+
+use std::fmt;
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io::{self, Read};
+use std::os::unix::fs::FileExt;
+use std::path::Path;
+use std::sync::Mutex;
+
+use serde::{Deserialize, Serialize};
+
+/// Who holds a store.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Holder {
+    /// Process id; 0 if unknown.
+    pub pid: u32,
+    /// What it is, for people: `trainer run configs/quickstart.yaml`.
+    pub what: String,
+    /// Where it answers requests, once it does: `http://127.0.0.1:7070`.
+    pub address: Option<String>,
+}
+
+impl Holder {
+    /// This process.
+    pub fn this_process(what: impl Into<String>) -> Self {
+        Self { pid: std::process::id(), what: what.into(), address: None }
+    }
+}
+
+impl fmt::Display for Holder {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.pid {
+            0 => f.write_str(&self.what)?,
+            pid => write!(f, "`{}` (process {pid})", self.what)?,
+        }
+        match &self.address {
+            Some(address) => write!(f, " at {address}"),
+            None => Ok(()),
+        }
+    }
+}
+
+/// The lock, held as long as this lives.
+#[derive(Debug)]
+pub(crate) struct StoreLock {
+    file: File,
+    holder: Mutex<Holder>,
+}
+
+/// What came of trying.
+pub(crate) enum Taken {
+    Ours(StoreLock),
+    Busy(Holder),
+}
+
+impl StoreLock {
+    pub(crate) fn take(path: &Path, holder: Holder) -> io::Result<Taken> {
+        let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)?;
+        match file.try_lock() {
+            Ok(()) => {
+                let lock = Self { file, holder: Mutex::new(holder.clone()) };
+                lock.write(&holder)?;
+                Ok(Taken::Ours(lock))
+            }
+            Err(TryLockError::WouldBlock) => Ok(Taken::Busy(read(file)?)),
+            Err(TryLockError::Error(e)) => Err(e),
+        }
+    }
+
+    pub(crate) fn holder(&self) -> Holder {
+        self.holder.lock().unwrap_or_else(std::sync::PoisonError::into_inner).clone()
+    }
+
+    pub(crate) fn set_address(&self, address: String) -> io::Result<()> {
+        let mut holder = self.holder.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        holder.address = Some(address);
+        self.write(&holder)
+    }
+
+    /// One write that ends its line, then the cut: a reader in between sees one whole line, the old or the new.
+    fn write(&self, holder: &Holder) -> io::Result<()> {
+        let mut text = serde_json::to_string(holder)?;
+        text.push('\n');
+        self.file.write_all_at(text.as_bytes(), 0)?;
+        self.file.set_len(text.len() as u64)
+    }
+}
+
+fn read(mut file: File) -> io::Result<Holder> {
+    let mut text = String::new();
+    file.read_to_string(&mut text)?;
+    let line = text.lines().next().unwrap_or_default();
+    // The holder may not have written its name yet.
+    Ok(serde_json::from_str(line).unwrap_or(Holder { pid: 0, what: "another process".into(), address: None }))
+}
+
+/// The kind of network file system that `path` is on, if it is on one that does not keep SQLite's locks.
+#[cfg(target_os = "linux")]
+pub(crate) fn network_filesystem(path: &Path) -> io::Result<Option<&'static str>> {
+    let kind = nix::sys::statfs::statfs(path)?.filesystem_type().0;
+    // The width of the field differs between targets; the magic numbers have 32 bits.
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "magic numbers have 32 bits")]
+    Ok(network_kind(kind as u32))
+}
+
+/// Elsewhere the kind is not a number; nothing is refused.
+#[cfg(not(target_os = "linux"))]
+pub(crate) fn network_filesystem(_: &Path) -> io::Result<Option<&'static str>> {
+    Ok(None)
+}
+
+#[cfg(any(target_os = "linux", test))]
+fn network_kind(magic: u32) -> Option<&'static str> {
+    // statfs(2) and the kernel's `magic.h`.
+    Some(match magic {
+        0x6969 => "NFS",
+        0xFF53_4D42 | 0xFE53_4D42 | 0x517B => "SMB",
+        0x5346_414F | 0x6B41_4653 => "AFS",
+        0x00C3_6400 => "CephFS",
+        0x0BD0_0BD0 => "Lustre",
+        0x4750_4653 => "GPFS",
+        0x1983_0326 => "BeeGFS",
+        _ => return None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn network_kinds_are_told_from_local_ones() {
+        assert_eq!(network_kind(0x6969), Some("NFS"));
+        assert_eq!(network_kind(0xEF53), None, "ext4");
+        assert_eq!(network_kind(0x0102_1994), None, "tmpfs");
+    }
+
+    #[test]
+    fn the_second_learns_who_was_first_and_the_lock_ends_with_its_holder() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("lock");
+        let Taken::Ours(first) = StoreLock::take(&path, Holder::this_process("first, with a long name")).unwrap()
+        else {
+            panic!("the first takes it")
+        };
+        first.set_address("http://127.0.0.1:1".into()).unwrap();
+        let Taken::Busy(holder) = StoreLock::take(&path, Holder::this_process("second")).unwrap() else {
+            panic!("the second does not")
+        };
+        assert_eq!(holder, first.holder());
+        assert!(holder.to_string().ends_with("at http://127.0.0.1:1"), "{holder}");
+        drop(first);
+        assert!(matches!(StoreLock::take(&path, Holder::this_process("third")).unwrap(), Taken::Ours(_)));
+    }
+}
