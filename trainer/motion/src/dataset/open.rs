@@ -147,7 +147,8 @@ pub enum SkipReason {
 }
 
 impl SkipReason {
-    fn heading(&self) -> &'static str {
+    /// In a few words.
+    pub fn heading(&self) -> &'static str {
         match self {
             Self::TooShort { .. } => "too short",
             Self::TooLong { .. } => "too long",
