@@ -1,1 +1,25 @@
+//! Who works on what, and whose results count.
+//!
+//! The crate has two halves. The pure one ([`decide`], [`observe`], [`state`], [`journal`]) is a function of state, time and
+//! event; it is tested under virtual time in microseconds. The thin one (the shell) is the HTTP server, the clock and the
+//! runner of effects. The store is the fence: nothing here is trusted to notice in time that a worker lost its lease,
+//! because every write carries a fence that the transaction checks.
+//!
+//! Not its job: what a stage computes, what a blob holds, how gang members talk to each other.
 
+pub mod decide;
+pub mod event;
+pub mod journal;
+pub mod observe;
+mod outcome;
+pub mod policy;
+pub mod register;
+mod schedule;
+pub mod state;
+mod view;
+
+pub use decide::decide;
+pub use event::{Control, Effect, Event, Millis, Moment, Observation, Rejected};
+pub use observe::observe;
+pub use policy::Policy;
+pub use state::State;

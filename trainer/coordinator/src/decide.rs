@@ -1,0 +1,604 @@
+//! The only writer of durable state: (state, moment, event) to state and effects.
+//!
+//! Nothing here reads a clock, a socket or a generator. Every event that changes something is journaled in the same
+//! transaction as the rows it changes, before any other effect; recovery replays the journal through this very function
+//! and drops the effects. After the event itself, every run is settled (stages whose work is over, stages whose inputs
+//! are there), work that nobody wants is asked to wind down, and idle workers are given what is ready.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use protocol::message::{Join, PROTOCOL_VERSION, RunState, StageState};
+use protocol::pipeline::Pipeline;
+use protocol::stage::{Shape, StageSettings};
+use protocol::{Digest, Fence, RunId, StageName, TaskId, WorkerId};
+use registry::Write;
+
+use crate::event::{Control, Effect, Event, Known, Millis, Moment, Rejected};
+use crate::register::Registration;
+use crate::state::State;
+use crate::state::gang::{self, Change};
+use crate::state::run::{Run, Status};
+use crate::state::task::{Hold, Part, Task};
+use crate::state::work::{Work, WorkState};
+use crate::state::worker::{Sign, Worker};
+use crate::{journal, schedule};
+
+/// Decides what `event` does. `state` is changed only by an accepted event; an event that changes nothing has no effect
+/// but the answer to whoever sent it.
+pub fn decide(state: &mut State, moment: Moment, event: Event) -> Result<Vec<Effect>, Rejected> {
+    let moment = Moment { now: moment.now.max(state.now), ..moment };
+    let entry = journal::entry(&moment, &event);
+    let mut cx = Deciding { state, moment, writes: Vec::new(), fences: Vec::new(), effects: Vec::new() };
+    if !cx.happen(event)? {
+        return Ok(cx.effects);
+    }
+    cx.state.now = moment.now;
+    cx.settle();
+    cx.wind();
+    cx.count_time();
+    schedule::schedule(&mut cx);
+    cx.count_time();
+    let mut writes = vec![Write::Journal(entry)];
+    // What a grant vouches for comes before the fences that may end that very grant.
+    writes.append(&mut cx.writes);
+    writes.append(&mut cx.fences);
+    let mut effects = vec![Effect::Store(writes)];
+    effects.append(&mut cx.effects);
+    effects.push(Effect::Wake);
+    Ok(effects)
+}
+
+/// A decision under way.
+#[derive(Debug)]
+pub(crate) struct Deciding<'a> {
+    pub(crate) state: &'a mut State,
+    pub(crate) moment: Moment,
+    pub(crate) writes: Vec<Write>,
+    pub(crate) fences: Vec<Write>,
+    pub(crate) effects: Vec<Effect>,
+}
+
+/// Why a worker no longer holds what it held.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Loss {
+    /// It was lost: counts against the task's budget.
+    Lost,
+    /// The coordinator's own restart: counts against nothing.
+    Restart,
+}
+
+impl Deciding<'_> {
+    pub(crate) fn now(&self) -> Millis {
+        self.moment.now
+    }
+
+    /// The event itself. `false`: it changes nothing.
+    fn happen(&mut self, event: Event) -> Result<bool, Rejected> {
+        let now = self.now();
+        match event {
+            Event::Started { alone, park } => self.started(alone, park),
+            Event::Submit { pipeline, source, idempotency_key, until } => {
+                return self.submit(*pipeline, source, idempotency_key, until);
+            }
+            Event::Join { join } => self.join(join)?,
+            Event::WorkerBack { worker } => return self.sign(&worker, Sign::Back),
+            Event::LeaseExpired { worker, incarnation } => {
+                if self.state.process(&worker, incarnation).is_err() || !self.sign(&worker, Sign::LeaseExpired)? {
+                    return Ok(false);
+                }
+                self.drop_worker(&worker, Loss::Lost);
+            }
+            Event::WorkerGone { worker } => {
+                if !self.sign(&worker, Sign::Gone)? {
+                    return Ok(false);
+                }
+                self.drop_worker(&worker, Loss::Lost);
+            }
+            Event::PeersLost { grant, lost } => {
+                let (_, task) = self.state.task(&grant.task)?;
+                task.check(&grant)?;
+                let lost: Vec<WorkerId> = task
+                    .holders()
+                    .iter()
+                    .map(|member| &member.worker)
+                    .filter(|worker| **worker != grant.worker && lost.contains(worker))
+                    .cloned()
+                    .collect();
+                if lost.is_empty() {
+                    return Ok(false);
+                }
+                self.suspect(&grant.task, &lost)?;
+            }
+            Event::Checkpoint { commit } => return self.checkpoint(commit),
+            Event::Outcome { report } => return self.outcome(report),
+            Event::Control { run, action } => return self.control(&run, action),
+            Event::Drain => {
+                if self.state.draining {
+                    return Ok(false);
+                }
+                self.state.draining = true;
+            }
+            Event::BackoffOver { task } => {
+                let (key, i) = self.place(&task)?;
+                match &mut self.state.work_mut(key).tasks[i].hold {
+                    Hold::Waiting { not_before } if not_before.is_some_and(|time| time <= now) => *not_before = None,
+                    Hold::Waiting { .. } | Hold::Held { .. } | Hold::Done { .. } => return Ok(false),
+                }
+            }
+            Event::GraceOver { task, fence } => return self.grace_over(&task, fence),
+            Event::LookedUp { key, known } => return Ok(self.looked_up(key, known)),
+            Event::Bundled { key, bundles } => return self.bundled(key, &bundles),
+            Event::RegisterRefused { key, message } => {
+                if self.state.works.get(&key).is_none_or(|work| work.state != WorkState::Bundling) {
+                    return Ok(false);
+                }
+                self.fail_work(key, message);
+            }
+        }
+        Ok(true)
+    }
+
+    fn started(&mut self, alone: bool, park: bool) {
+        let (now, before) = (self.now(), self.state.now);
+        self.state.draining = false;
+        for key in self.keys() {
+            let work = self.state.work_mut(key);
+            // The time during which no coordinator ran is nobody's work.
+            if let Some(since) = work.busy_since.take() {
+                work.wall_ms += before.since(since);
+            }
+            if work.state == WorkState::Open && work.has_something() {
+                work.resumed = true;
+            }
+            match work.state {
+                WorkState::Looking => self.effects.push(Effect::Lookup { key }),
+                WorkState::Bundling => {
+                    let registration = work.registration.as_ref().expect("bundling is registering");
+                    let candidates = registration.candidates.clone();
+                    self.effects.push(Effect::Register { key, candidates });
+                }
+                WorkState::Open | WorkState::Done { .. } | WorkState::Failed { .. } => {}
+            }
+        }
+        let names: Vec<WorkerId> = self.state.workers.keys().cloned().collect();
+        for worker in names {
+            if alone {
+                self.set_presence(&worker, Sign::Gone);
+                self.drop_worker(&worker, Loss::Restart);
+            } else {
+                self.state.heard.workers.insert(worker, now);
+            }
+        }
+        if park {
+            for i in 0..self.state.runs.len() {
+                if self.state.runs[i].state == RunState::Running {
+                    Arc::make_mut(&mut self.state.runs[i]).parked = true;
+                    self.set_run_state(i, RunState::Paused);
+                }
+            }
+        }
+    }
+
+    fn submit(
+        &mut self,
+        pipeline: Pipeline,
+        source: String,
+        key: Option<String>,
+        until: Option<StageName>,
+    ) -> Result<bool, Rejected> {
+        let twin = self.state.runs.iter().find(|run| key.is_some() && run.idempotency_key == key);
+        if let Some(twin) = twin {
+            self.effects.push(Effect::Submitted(twin.id.clone()));
+            return Ok(false);
+        }
+        check_pipeline(&pipeline, until.as_ref())?;
+        let number = self.state.runs.len() as u64 + 1;
+        let run = Run::new(number, Arc::new(pipeline), source, key, until);
+        let id = run.id.clone();
+        for i in 0..self.state.runs.len() {
+            let old = &self.state.runs[i];
+            if old.parked && old.state == RunState::Paused && *old.pipeline == *run.pipeline {
+                Arc::make_mut(&mut self.state.runs[i]).skip_rest(&format!("taken over by run `{id}`"));
+                self.set_run_state(i, RunState::Cancelled);
+            }
+        }
+        self.state.runs.push(Arc::new(run));
+        self.write_run(self.state.runs.len() - 1);
+        self.effects.push(Effect::Submitted(id));
+        Ok(true)
+    }
+
+    fn join(&mut self, join: Join) -> Result<(), Rejected> {
+        if join.protocol != PROTOCOL_VERSION {
+            return Err(Rejected::Invalid(format!(
+                "worker `{}` speaks version {} of the protocol, this coordinator speaks {PROTOCOL_VERSION}; use one build for both",
+                join.worker, join.protocol
+            )));
+        }
+        if !protocol::id::is_name(join.worker.as_str()) {
+            return Err(Rejected::Invalid(format!("`{}` is not a worker name", join.worker)));
+        }
+        self.drop_worker(&join.worker, Loss::Lost);
+        let last = self.state.workers.get(&join.worker).map(|worker| worker.incarnation).unwrap_or_default();
+        let worker = Worker::joined(&join, last.next());
+        self.effects.push(Effect::Joined(worker.incarnation));
+        self.state.heard.workers.insert(join.worker.clone(), self.now());
+        self.state.workers.insert(join.worker, worker);
+        Ok(())
+    }
+
+    fn control(&mut self, run: &RunId, action: Control) -> Result<bool, Rejected> {
+        let i = self.state.run(run)?.number as usize - 1;
+        let before = self.state.runs[i].state;
+        let Some(after) = self.state.runs[i].after(action) else {
+            return Err(Rejected::Conflict(format!("run `{run}` is {before:?} and cannot be asked to {action:?}")));
+        };
+        let run = Arc::make_mut(&mut self.state.runs[i]);
+        run.parked = false;
+        if after == before {
+            return Ok(false);
+        }
+        match action {
+            Control::Pause => {}
+            Control::Cancel => run.skip_rest("cancelled"),
+            Control::Resume => run.reopen(),
+        }
+        self.set_run_state(i, after);
+        Ok(true)
+    }
+
+    fn looked_up(&mut self, key: Digest, known: Option<Known>) -> bool {
+        if self.state.works.get(&key).is_none_or(|work| work.state != WorkState::Looking) {
+            return false;
+        }
+        let work = self.state.work_mut(key);
+        match (known, &work.registration) {
+            (Some(known), _) => work.state = WorkState::Done { known, cached: true },
+            (None, Some(registration)) => {
+                let candidates = registration.candidates.clone();
+                work.state = WorkState::Bundling;
+                self.effects.push(Effect::Register { key, candidates });
+            }
+            (None, None) => {
+                work.open();
+                let tasks: Vec<TaskId> = work.tasks.iter().map(|task| task.id.clone()).collect();
+                self.state.tasks.extend(tasks.into_iter().map(|task| (task, key)));
+            }
+        }
+        true
+    }
+
+    fn bundled(&mut self, key: Digest, bundles: &[Digest]) -> Result<bool, Rejected> {
+        if self.state.works.get(&key).is_none_or(|work| work.state != WorkState::Bundling) {
+            return Ok(false);
+        }
+        let now = self.now();
+        let work = self.state.work_mut(key);
+        let registration = work.registration.as_ref().expect("bundling is registering");
+        if bundles.len() != registration.candidates.len() {
+            return Err(Rejected::Invalid(format!("stage `{}` needs a bundle for each candidate", work.stage)));
+        }
+        let (known, mut writes) = registration.writes(&work.run, &work.stage, bundles);
+        writes.push(result(work, None, &known, now));
+        work.state = WorkState::Done { known, cached: false };
+        self.writes.append(&mut writes);
+        Ok(true)
+    }
+
+    fn grace_over(&mut self, task: &TaskId, fence: Fence) -> Result<bool, Rejected> {
+        let now = self.now();
+        let (key, i) = self.place(task)?;
+        let task = &mut self.state.work_mut(key).tasks[i];
+        let over = match task.hold {
+            Hold::Held { winding, .. } => winding.is_some_and(|deadline| deadline <= now) && task.fence == fence,
+            Hold::Waiting { .. } | Hold::Done { .. } => false,
+        };
+        if over {
+            let fence = task.release(None);
+            self.fences.push(fence);
+        }
+        Ok(over)
+    }
+
+    /// Takes note of a sign of a known worker; `false` if it says nothing new.
+    fn sign(&mut self, worker: &WorkerId, sign: Sign) -> Result<bool, Rejected> {
+        let known = self.state.workers.get(worker);
+        let known = known.ok_or_else(|| Rejected::NotFound(format!("worker `{worker}` is not known")))?;
+        let before = known.presence;
+        self.set_presence(worker, sign);
+        Ok(self.state.workers[worker].presence != before)
+    }
+
+    fn set_presence(&mut self, worker: &WorkerId, sign: Sign) {
+        let now = self.now();
+        if let Some(worker) = self.state.workers.get_mut(worker) {
+            worker.presence = worker.presence.after(sign, now);
+            worker.suspicions += u32::from(sign == Sign::PeersLost);
+        }
+    }
+
+    /// Takes members out of a gang whose peers cannot reach them.
+    pub(crate) fn suspect(&mut self, task: &TaskId, lost: &[WorkerId]) -> Result<(), Rejected> {
+        for worker in lost {
+            self.set_presence(worker, Sign::PeersLost);
+        }
+        let (key, i) = self.place(task)?;
+        self.take_from(key, i, lost, Loss::Lost);
+        Ok(())
+    }
+
+    fn drop_worker(&mut self, worker: &WorkerId, loss: Loss) {
+        let held: Vec<TaskId> = self.state.held_by(worker).map(|(_, task)| task.id.clone()).collect();
+        for task in held {
+            let (key, i) = self.place(&task).expect("a held task is known");
+            self.take_from(key, i, std::slice::from_ref(worker), loss);
+        }
+    }
+
+    fn take_from(&mut self, key: Digest, i: usize, lost: &[WorkerId], loss: Loss) {
+        let work = &self.state.works[&key];
+        let task = &work.tasks[i];
+        let change = match task.part {
+            Part::Gang => gang::without(task.holders(), lost, work.placement.workers),
+            Part::Alone | Part::Shard { .. } | Part::Merge => Change::Disband,
+        };
+        match change {
+            Change::Keep => {}
+            Change::Regroup(members) => self.regroup(key, i, members),
+            Change::Disband if loss == Loss::Restart => {
+                let fence = self.state.work_mut(key).tasks[i].release(None);
+                self.fences.push(fence);
+            }
+            Change::Disband => {
+                let names: Vec<&str> = lost.iter().map(WorkerId::as_str).collect();
+                self.try_again(key, i, &format!("lost worker {}", names.join(", ")), false);
+            }
+        }
+    }
+
+    /// Ends a try. The next begins after a back-off, unless the budget is spent: then the work has failed.
+    pub(crate) fn try_again(&mut self, key: Digest, i: usize, why: &str, fault: bool) {
+        let (now, policy) = (self.now(), self.state.policy.clone());
+        let work = self.state.work_mut(key);
+        let task = &mut work.tasks[i];
+        let winding = matches!(task.hold, Hold::Held { winding: Some(_), .. });
+        task.streak += 1;
+        let (count, budget, what) = if fault {
+            (&mut task.faults, policy.fault_budget, "faults")
+        } else {
+            (&mut task.losses, policy.infrastructure_budget, "lost workers and network errors")
+        };
+        *count += u32::from(!winding);
+        if *count > budget {
+            let message = format!("gave up after {count} {what}; the last: {why}");
+            self.fail_work(key, message);
+            return;
+        }
+        let fence = task.release((!winding).then(|| now.after(policy.backoff(task.streak))));
+        self.fences.push(fence);
+    }
+
+    pub(crate) fn fail_work(&mut self, key: Digest, message: String) {
+        let mut fences = self.state.work_mut(key).fail(message);
+        self.fences.append(&mut fences);
+    }
+
+    pub(crate) fn regroup(&mut self, key: Digest, i: usize, members: Vec<protocol::message::Member>) {
+        let secret = self.secret(&self.state.works[&key].tasks[i]);
+        let fence = self.state.work_mut(key).tasks[i].regroup(members, secret);
+        self.fences.push(fence);
+    }
+
+    /// Unpredictable, and different for every generation.
+    pub(crate) fn secret(&self, task: &Task) -> impl FnOnce(Fence) -> String + use<> {
+        let (entropy, id) = (self.moment.entropy, task.id.clone());
+        move |fence| Digest::of(format!("{entropy} {id} {fence}").as_bytes()).hex()
+    }
+
+    pub(crate) fn place(&self, task: &TaskId) -> Result<(Digest, usize), Rejected> {
+        let (work, _) = self.state.task(task)?;
+        Ok((work.key, work.position(task).expect("it was just found")))
+    }
+
+    fn keys(&self) -> Vec<Digest> {
+        self.state.works.keys().copied().collect()
+    }
+
+    fn set_run_state(&mut self, i: usize, state: RunState) {
+        Arc::make_mut(&mut self.state.runs[i]).state = state;
+        self.write_run(i);
+    }
+
+    fn write_run(&mut self, i: usize) {
+        let run = &self.state.runs[i];
+        let state = serde_json::to_value(run.state).expect("a state is a word");
+        self.writes.push(Write::Run {
+            run: run.id.clone(),
+            pipeline: serde_json::to_value(&*run.pipeline).expect("a pipeline serialises"),
+            source: run.source.clone(),
+            state: state.as_str().unwrap_or_default().to_owned(),
+            idempotency_key: run.idempotency_key.clone(),
+        });
+    }
+
+    /// Brings every run up to date with its works, until nothing moves.
+    fn settle(&mut self) {
+        for i in 0..self.state.runs.len() {
+            loop {
+                let over = self.take_over_results(i);
+                let settled = self.state.runs[i].settled();
+                if settled != self.state.runs[i].state {
+                    if settled == RunState::Failed {
+                        let run = Arc::make_mut(&mut self.state.runs[i]);
+                        let failed = run.stages.iter().position(|s| matches!(s, Status::Failed { .. }));
+                        let name = failed.map(|j| run.pipeline.stages[j].name.to_string()).unwrap_or_default();
+                        run.skip_rest(&format!("stage `{name}` failed"));
+                    }
+                    self.set_run_state(i, settled);
+                }
+                if !self.attach_ready(i) && !over {
+                    break;
+                }
+            }
+        }
+    }
+
+    fn take_over_results(&mut self, i: usize) -> bool {
+        let now = self.now();
+        let mut moved = false;
+        for j in 0..self.state.runs[i].stages.len() {
+            let Status::Active { key } = self.state.runs[i].stages[j] else { continue };
+            self.state.work_mut(key).count_time(now);
+            let work = &self.state.works[&key];
+            let status = match &work.state {
+                WorkState::Looking | WorkState::Open | WorkState::Bundling => continue,
+                WorkState::Failed { message } => Status::Failed { key, message: message.clone() },
+                WorkState::Done { known, cached } => {
+                    let how = match (cached, work.resumed) {
+                        (true, _) => StageState::Cached,
+                        (false, true) => StageState::Resumed,
+                        (false, false) => StageState::Ran,
+                    };
+                    let wall_s = if *cached { 0.0 } else { work.wall_s(now) };
+                    Status::Done { key, how, known: known.clone(), wall_s, attempt: work.attempt() }
+                }
+            };
+            Arc::make_mut(&mut self.state.runs[i]).stages[j] = status;
+            moved = true;
+        }
+        moved
+    }
+
+    /// Starts the stages of a running run whose inputs are there.
+    fn attach_ready(&mut self, i: usize) -> bool {
+        if self.state.runs[i].state != RunState::Running {
+            return false;
+        }
+        let mut moved = false;
+        for j in 0..self.state.runs[i].stages.len() {
+            if self.state.runs[i].stages[j] == Status::Waiting
+                && let Some(inputs) = self.state.runs[i].inputs(j)
+            {
+                let status = self.attach(i, j, inputs);
+                Arc::make_mut(&mut self.state.runs[i]).stages[j] = status;
+                moved = true;
+            }
+        }
+        moved
+    }
+
+    fn attach(&mut self, i: usize, j: usize, inputs: std::collections::BTreeMap<String, Digest>) -> Status {
+        let run = Arc::clone(&self.state.runs[i]);
+        let stage = &run.pipeline.stages[j];
+        let key = run.pipeline.identity(stage, &inputs).key();
+        let registration = match &stage.settings {
+            StageSettings::Register(settings) => match Registration::gather(&run, &stage.name, settings) {
+                Ok(registration) => Some(registration),
+                Err(message) => return Status::Failed { key, message },
+            },
+            other => {
+                assert!(other.shape() != Shape::Registry, "only `register` changes the registry");
+                None
+            }
+        };
+        match self.state.works.contains_key(&key).then(|| self.state.work_mut(key)) {
+            Some(work) => {
+                work.placement = stage.placement.clone();
+                match work.state {
+                    WorkState::Looking | WorkState::Open | WorkState::Bundling => return Status::Active { key },
+                    WorkState::Done { .. } => work.want_again(true),
+                    WorkState::Failed { .. } => {
+                        work.resumed |= work.has_something();
+                        work.want_again(false);
+                    }
+                }
+            }
+            None => {
+                let work = Work {
+                    key,
+                    run: run.id.clone(),
+                    stage: stage.name.clone(),
+                    settings: stage.settings.clone(),
+                    inputs,
+                    seed: run.pipeline.seed,
+                    backend: run.pipeline.backend,
+                    placement: stage.placement.clone(),
+                    registration,
+                    state: WorkState::Looking,
+                    tasks: Vec::new(),
+                    wall_ms: 0,
+                    busy_since: None,
+                    resumed: false,
+                };
+                self.state.works.insert(key, Arc::new(work));
+            }
+        }
+        self.effects.push(Effect::Lookup { key });
+        Status::Active { key }
+    }
+
+    /// Work that no running run waits for is asked to wind down; work that one waits for again carries on.
+    fn wind(&mut self) {
+        let deadline = self.now().after(self.state.policy.grace_ms);
+        let wanted: BTreeSet<Digest> = self.state.wanted().into_iter().collect();
+        for key in self.keys() {
+            let carry_on = wanted.contains(&key) && !self.state.draining;
+            if self.state.works[&key].tasks.iter().any(Task::is_held) {
+                for task in &mut self.state.work_mut(key).tasks {
+                    task.wind((!carry_on).then_some(deadline));
+                }
+            }
+        }
+    }
+
+    fn count_time(&mut self) {
+        let now = self.now();
+        for key in self.keys() {
+            let work = &self.state.works[&key];
+            if work.is_busy() != work.busy_since.is_some() {
+                self.state.work_mut(key).count_time(now);
+            }
+        }
+    }
+}
+
+/// The write that makes a stage's value known under its key.
+pub(crate) fn result(work: &Work, grant: Option<protocol::message::Grant>, known: &Known, now: Millis) -> Write {
+    Write::StageResult {
+        grant,
+        key: work.key,
+        run: work.run.clone(),
+        stage: work.stage.clone(),
+        kind: work.settings.kind().to_owned(),
+        outputs: known.outputs.clone(),
+        metrics: known.metrics.clone(),
+        inputs: work.inputs.clone(),
+        wall_s: work.wall_s(now),
+    }
+}
+
+/// What even a pipeline from an honest client of another build may get wrong.
+fn check_pipeline(pipeline: &Pipeline, until: Option<&StageName>) -> Result<(), Rejected> {
+    let mut seen = BTreeSet::new();
+    for stage in &pipeline.stages {
+        for input in &stage.inputs {
+            if !seen.contains(&input.stage) {
+                return Err(Rejected::Invalid(format!(
+                    "stage `{}`: `{}` names stage `{}`, which does not stand before it",
+                    stage.name, input.field, input.stage
+                )));
+            }
+        }
+        if !seen.insert(&stage.name) {
+            return Err(Rejected::Invalid(format!("stage `{}` stands twice in the pipeline", stage.name)));
+        }
+    }
+    match until {
+        Some(until) if !seen.contains(until) => {
+            let names: Vec<&str> = seen.iter().map(|name| name.as_str()).collect();
+            Err(Rejected::Invalid(format!("`until`: there is no stage `{until}`; there is: {}", names.join(", "))))
+        }
+        Some(_) | None => Ok(()),
+    }
+}

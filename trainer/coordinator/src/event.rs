@@ -1,0 +1,248 @@
+//! What happens to the coordinator, and what it wants done about it.
+//!
+//! An [`Event`] is a fact that recovery can replay: it is journaled with the [`Moment`] it was decided at. What a worker
+//! merely says (a poll, a tick of the clock) is an [`Observation`]; [`observe`](crate::observe) turns it into events when
+//! it means something, so that heartbeats cost no disk write.
+
+use std::collections::BTreeMap;
+
+use protocol::message::{CommitCheckpoint, Grant, Join, Poll, ReportOutcome};
+use protocol::pipeline::Pipeline;
+use protocol::stage::Keep;
+use protocol::{Digest, Fence, Incarnation, RunId, StageName, TaskId, WorkerId};
+use registry::Write;
+use serde::{Deserialize, Serialize};
+
+/// Milliseconds since 1970. Handed in, never read.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Millis(pub u64);
+
+impl Millis {
+    /// This much later.
+    #[must_use]
+    pub fn after(self, milliseconds: u64) -> Self {
+        Self(self.0.saturating_add(milliseconds))
+    }
+
+    /// Milliseconds from `earlier` to here; 0 when that is later.
+    pub fn since(self, earlier: Self) -> u64 {
+        self.0.saturating_sub(earlier.0)
+    }
+}
+
+/// When an event is decided, and the randomness it may use. Both are journaled, so that a replay decides the same.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Moment {
+    /// The time.
+    pub now: Millis,
+    /// Unpredictable bytes from which the secrets of new gangs are derived.
+    pub entropy: Digest,
+}
+
+/// What a client asks of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Control {
+    /// Hold back; work yields.
+    Pause,
+    /// Go on: after a pause, a failure or a cancellation.
+    Resume,
+    /// End it.
+    Cancel,
+}
+
+/// A stage's value as the store knows it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Known {
+    /// Outputs by name.
+    pub outputs: BTreeMap<String, Digest>,
+    /// Final values.
+    pub metrics: BTreeMap<String, f64>,
+}
+
+/// A fact.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "event", rename_all = "kebab-case")]
+pub enum Event {
+    /// The coordinator started. Every lease gets one interval of grace.
+    Started {
+        /// No worker of before can reach this coordinator: all are gone for certain.
+        alone: bool,
+        /// Runs that were under way are paused until somebody asks for them.
+        park: bool,
+    },
+    /// A client submitted a pipeline.
+    Submit {
+        /// The pipeline.
+        pipeline: Box<Pipeline>,
+        /// The YAML as written.
+        source: String,
+        /// Submitting twice with one key gives one run.
+        idempotency_key: Option<String>,
+        /// Stop after this stage.
+        until: Option<StageName>,
+    },
+    /// A worker process offered itself.
+    Join {
+        /// What it said.
+        join: Join,
+    },
+    /// A worker that had lost its lease, or whose peers had lost it, was heard again.
+    WorkerBack {
+        /// Who.
+        worker: WorkerId,
+    },
+    /// A worker was not heard of for the length of its lease.
+    LeaseExpired {
+        /// Who.
+        worker: WorkerId,
+        /// Which process.
+        incarnation: Incarnation,
+    },
+    /// Whoever launched the process saw it exit: certain, unlike an expired lease.
+    WorkerGone {
+        /// Who.
+        worker: WorkerId,
+    },
+    /// A gang member could not reach others.
+    PeersLost {
+        /// The reporter's grant.
+        grant: Grant,
+        /// Whom.
+        lost: Vec<WorkerId>,
+    },
+    /// A checkpoint was uploaded and shall count.
+    Checkpoint {
+        /// Which.
+        commit: CommitCheckpoint,
+    },
+    /// An assignment ended.
+    Outcome {
+        /// How.
+        report: ReportOutcome,
+    },
+    /// A client asked something of a run.
+    Control {
+        /// Which.
+        run: RunId,
+        /// What.
+        action: Control,
+    },
+    /// The coordinator is about to stop: workers save and leave.
+    Drain,
+    /// A back-off ended.
+    BackoffOver {
+        /// Whose.
+        task: TaskId,
+    },
+    /// A worker that was asked to wind down did not within the grace period.
+    GraceOver {
+        /// Of which task.
+        task: TaskId,
+        /// Under which fence.
+        fence: Fence,
+    },
+    /// The answer to [`Effect::Lookup`].
+    LookedUp {
+        /// The stage's key.
+        key: Digest,
+        /// Its value, if the store has it.
+        known: Option<Known>,
+    },
+    /// The answer to [`Effect::Register`]: the model bundles are stored.
+    Bundled {
+        /// The register stage's key.
+        key: Digest,
+        /// One for each candidate, in order.
+        bundles: Vec<Digest>,
+    },
+    /// A register stage was refused: a bundle that cannot be made, or a gate that does not hold.
+    RegisterRefused {
+        /// Its key.
+        key: Digest,
+        /// Why, for the user.
+        message: String,
+    },
+}
+
+/// What was merely heard.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Observation {
+    /// A worker polled.
+    Poll {
+        /// Who.
+        worker: WorkerId,
+        /// What it said.
+        poll: Poll,
+    },
+    /// Time passed.
+    Tick,
+}
+
+/// A denoiser that a register stage makes a version of.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Candidate {
+    /// The stage that made it.
+    pub stage: StageName,
+    /// The denoiser.
+    pub denoiser: Digest,
+    /// The VAE whose latents it works on.
+    pub vae: Digest,
+}
+
+/// What is to be done about an event.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Effect {
+    /// One transaction. It comes before all other effects, and if it is refused the event has not happened.
+    Store(Vec<Write>),
+    /// Ask the store for a stage's value and answer with [`Event::LookedUp`].
+    Lookup {
+        /// The stage's key.
+        key: Digest,
+    },
+    /// Bundle each candidate with its VAE and answer with [`Event::Bundled`] or [`Event::RegisterRefused`].
+    Register {
+        /// The register stage's key.
+        key: Digest,
+        /// In the order of the stage's `from`.
+        candidates: Vec<Candidate>,
+    },
+    /// Forget a task's checkpoints but those to keep. Never before the newer one is stored.
+    Prune {
+        /// The task.
+        task: TaskId,
+        /// Which stay.
+        keep: Keep,
+    },
+    /// Which run a submission gave.
+    Submitted(RunId),
+    /// Which process a joining worker is.
+    Joined(Incarnation),
+    /// Somebody's orders or a run's state may have changed: waiting polls look again.
+    Wake,
+}
+
+/// Why an event did not happen. Nothing has changed.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum Rejected {
+    /// The grant has been superseded.
+    #[error("stale fence: task `{task}` is at fence {current}, the call carries {carried}")]
+    StaleFence {
+        /// The task.
+        task: TaskId,
+        /// Its fence now.
+        current: Fence,
+        /// The fence of the call.
+        carried: Fence,
+    },
+    /// No such thing.
+    #[error("{0}")]
+    NotFound(String),
+    /// It contradicts what is.
+    #[error("{0}")]
+    Conflict(String),
+    /// It cannot be.
+    #[error("{0}")]
+    Invalid(String),
+}

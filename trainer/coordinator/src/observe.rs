@@ -1,0 +1,87 @@
+//! What is heard, and what it means. Heartbeats change only [`Heard`](crate::state::Heard); the facts that follow from them
+//! are returned as events, to be decided and journaled one by one.
+
+use protocol::WorkerId;
+use protocol::message::Poll;
+
+use crate::event::{Event, Millis, Observation, Rejected};
+use crate::state::State;
+use crate::state::task::Hold;
+use crate::state::worker::Presence;
+
+/// Takes note of `observation` and says which facts follow from it.
+pub fn observe(state: &mut State, now: Millis, observation: Observation) -> Result<Vec<Event>, Rejected> {
+    let now = now.max(state.now);
+    match observation {
+        Observation::Poll { worker, poll } => heard(state, now, worker, poll),
+        Observation::Tick => Ok(tick(state, now)),
+    }
+}
+
+fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result<Vec<Event>, Rejected> {
+    let known = state.process(&worker, poll.incarnation)?;
+    let mut events = Vec::new();
+    match known.presence {
+        Presence::Here => {}
+        Presence::Silent => events.push(Event::WorkerBack { worker: worker.clone() }),
+        Presence::Suspect { since } => {
+            let penalty = state.policy.penalty_ms << known.suspicions.saturating_sub(1).min(6);
+            if now.since(since) >= penalty {
+                events.push(Event::WorkerBack { worker: worker.clone() });
+            }
+        }
+        Presence::Gone => {
+            return Err(Rejected::Conflict(format!(
+                "worker `{worker}` (incarnation {}) was reported gone; join again",
+                poll.incarnation
+            )));
+        }
+    }
+    state.heard.workers.insert(worker, now);
+    for doing in poll.doing {
+        let Ok((_, task)) = state.task(&doing.grant.task) else { continue };
+        let Ok(rank) = task.check(&doing.grant) else { continue };
+        if rank == 0 {
+            state.heard.progress.insert(doing.grant.task.clone(), doing.progress);
+        }
+        if !doing.lost.is_empty() {
+            events.push(Event::PeersLost { grant: doing.grant, lost: doing.lost });
+        }
+    }
+    Ok(events)
+}
+
+fn tick(state: &mut State, now: Millis) -> Vec<Event> {
+    // When the clock was not looked at for long, nobody was listening either: that is not the workers' fault.
+    let late = state.heard.ticked.map_or(0, |before| now.since(before));
+    if late > state.policy.lease_ms / 3 {
+        for heard in state.heard.workers.values_mut() {
+            *heard = heard.after(late);
+        }
+    }
+    state.heard.ticked = Some(now);
+    let mut events = Vec::new();
+    for (name, worker) in &state.workers {
+        match worker.presence {
+            Presence::Here | Presence::Suspect { .. } => {
+                let heard = *state.heard.workers.entry(name.clone()).or_insert(now);
+                if now.since(heard) > state.policy.lease_ms {
+                    events.push(Event::LeaseExpired { worker: name.clone(), incarnation: worker.incarnation });
+                }
+            }
+            Presence::Silent | Presence::Gone => {}
+        }
+    }
+    for task in state.works.values().flat_map(|work| &work.tasks) {
+        match task.hold {
+            Hold::Waiting { not_before: Some(time) } if time <= now => {
+                events.push(Event::BackoffOver { task: task.id.clone() });
+            }
+            Hold::Held { winding: Some(deadline), .. } if deadline <= now => {
+                events.push(Event::GraceOver { task: task.id.clone(), fence: task.fence });
+            }
+            Hold::Waiting { .. } | Hold::Held { .. } | Hold::Done { .. } => {}
+        }
+    }
+    events
+}

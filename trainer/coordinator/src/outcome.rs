@@ -1,0 +1,138 @@
+//! What holders of a task report: checkpoints and ends. The part of `decide` that checks whose word counts.
+//!
+//! | report \ from | rank 0 (or alone) | another member | an old grant |
+//! |---|---|---|---|
+//! | checkpoint | committed | refused | refused: stale fence |
+//! | finished | done | refused | refused, unless it is the accepted report sent again |
+//! | yielded | waits | refused | as above |
+//! | failed: infrastructure | tried again | the member leaves the gang | as above |
+//! | failed: fault | tried again | tried again | as above |
+//! | failed: input, diverged, memory, storage | final | final | as above |
+
+use std::collections::BTreeMap;
+
+use protocol::message::{CommitCheckpoint, FailureClass, ReportOutcome, TaskOutcome};
+use protocol::stage::Keep;
+use protocol::{Digest, WorkerId};
+use registry::Write;
+
+use crate::decide::{Deciding, result};
+use crate::event::{Effect, Known, Rejected};
+use crate::state::task::{Hold, Part, Saved};
+use crate::state::work::WorkState;
+
+impl Deciding<'_> {
+    pub(crate) fn checkpoint(&mut self, commit: CommitCheckpoint) -> Result<bool, Rejected> {
+        let CommitCheckpoint { grant, step, manifest, metrics } = commit;
+        let (work, task) = self.state.task(&grant.task)?;
+        if task.check(&grant)? != 0 {
+            return Err(only_rank_0(&grant.worker, "commits checkpoints"));
+        }
+        match task.newest() {
+            Some(newest) if newest.step == step && newest.manifest == manifest => return Ok(false),
+            Some(newest) if newest.step > step => {
+                return Err(Rejected::Conflict(format!(
+                    "task `{}` has a checkpoint at step {} already; one at step {step} would go back",
+                    task.id, newest.step
+                )));
+            }
+            Some(_) | None => {}
+        }
+        let keep = work.placement.checkpoint.keep;
+        let (key, i) = self.place(&grant.task)?;
+        let saved = Saved { step, manifest, metrics: metrics.clone() };
+        let dropped = self.state.work_mut(key).tasks[i].save(saved, keep);
+        if !dropped.is_empty() {
+            self.effects.push(Effect::Prune { task: grant.task.clone(), keep });
+        }
+        self.writes.push(Write::Checkpoint { grant, step, manifest, metrics });
+        Ok(true)
+    }
+
+    pub(crate) fn outcome(&mut self, report: ReportOutcome) -> Result<bool, Rejected> {
+        let grant = &report.grant;
+        let (work, task) = self.state.task(&grant.task)?;
+        if task.reported.as_ref() == Some(&report) {
+            return Ok(false);
+        }
+        let rank = task.check(grant)?;
+        let stage = work.stage.clone();
+        let (key, i) = self.place(&grant.task)?;
+        let worker = grant.worker.clone();
+        match &report.outcome {
+            TaskOutcome::Finished { output, metrics } => {
+                if rank != 0 {
+                    return Err(only_rank_0(&worker, "reports the end"));
+                }
+                self.finished(&report, key, i, *output, metrics.clone());
+            }
+            TaskOutcome::Yielded { .. } => {
+                if rank != 0 {
+                    return Err(only_rank_0(&worker, "reports the end"));
+                }
+                let now = self.now();
+                let soon = now.after(self.state.policy.backoff_ms);
+                let task = &mut self.state.work_mut(key).tasks[i];
+                let asked = matches!(task.hold, Hold::Held { winding: Some(_), .. });
+                task.give_back((!asked).then_some(soon));
+            }
+            TaskOutcome::Failed { class, message } => {
+                let fault = match class {
+                    FailureClass::Fault => true,
+                    FailureClass::Infrastructure => false,
+                    FailureClass::Input
+                    | FailureClass::Diverged
+                    | FailureClass::OutOfMemory
+                    | FailureClass::Storage => {
+                        self.fail_work(key, format!("stage `{stage}`: {message}"));
+                        self.accepted(key, i, &report);
+                        return Ok(true);
+                    }
+                };
+                if rank != 0 && !fault {
+                    self.suspect(&grant.task.clone(), &[worker])?;
+                } else {
+                    self.try_again(key, i, message, fault);
+                }
+            }
+        }
+        self.accepted(key, i, &report);
+        Ok(true)
+    }
+
+    fn accepted(&mut self, key: Digest, i: usize, report: &ReportOutcome) {
+        self.state.work_mut(key).tasks[i].reported = Some(report.clone());
+    }
+
+    fn finished(
+        &mut self,
+        report: &ReportOutcome,
+        key: Digest,
+        i: usize,
+        output: Digest,
+        metrics: BTreeMap<String, f64>,
+    ) {
+        let now = self.now();
+        let grant = report.grant.clone();
+        let work = self.state.work_mut(key);
+        work.tasks[i].finish(output);
+        if let Part::Shard { .. } = work.tasks[i].part {
+            self.writes.push(Write::Shard { grant, output });
+            return;
+        }
+        let (name, _) = work.settings.output();
+        let known = Known { outputs: BTreeMap::from([(name.to_owned(), output)]), metrics };
+        let write = result(work, Some(grant), &known, now);
+        work.state = WorkState::Done { known, cached: false };
+        self.writes.push(write);
+        // The value is there: what an interrupted try would have gone on from is of no use any more.
+        if !std::mem::take(&mut self.state.work_mut(key).tasks[i].checkpoints).is_empty() {
+            let keep = Keep { latest: 0, best: 0 };
+            self.effects.push(Effect::Prune { task: report.grant.task.clone(), keep });
+        }
+    }
+}
+
+fn only_rank_0(worker: &WorkerId, what: &str) -> Rejected {
+    Rejected::Conflict(format!("worker `{worker}` is not rank 0 of its gang, which alone {what}"))
+}

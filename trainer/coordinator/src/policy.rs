@@ -1,0 +1,48 @@
+//! The numbers of coordination. Configuration, so that tests can vary them; the defaults are the promises.
+
+/// Times, budgets and periods.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Policy {
+    /// A worker that was not heard of for so long loses its assignments. Milliseconds.
+    pub lease_ms: u64,
+    /// How often the clock is looked at; a dead worker's task is free after at most a lease and a tick. Milliseconds.
+    pub tick_ms: u64,
+    /// How long a poll waits for news. Milliseconds.
+    pub poll_ms: u64,
+    /// How long work that was asked to wind down may take before it is released. Milliseconds.
+    pub grace_ms: u64,
+    /// How long a worker whose peers could not reach it stays out. Milliseconds.
+    pub penalty_ms: u64,
+    /// First back-off; it doubles with each failure in a row. Milliseconds.
+    pub backoff_ms: u64,
+    /// Longest back-off. Milliseconds.
+    pub backoff_max_ms: u64,
+    /// Faults of ours that a task survives.
+    pub fault_budget: u32,
+    /// Losses of workers and networks that a task survives.
+    pub infrastructure_budget: u32,
+}
+
+impl Default for Policy {
+    fn default() -> Self {
+        Self {
+            lease_ms: 15_000,
+            tick_ms: 1_000,
+            poll_ms: 2_000,
+            grace_ms: 30_000,
+            penalty_ms: 3_000,
+            backoff_ms: 500,
+            backoff_max_ms: 30_000,
+            fault_budget: 5,
+            infrastructure_budget: 100,
+        }
+    }
+}
+
+impl Policy {
+    /// The wait after `failures` failures in a row.
+    pub fn backoff(&self, failures: u32) -> u64 {
+        let doublings = failures.saturating_sub(1).min(16);
+        self.backoff_ms.saturating_mul(1 << doublings).min(self.backoff_max_ms)
+    }
+}

@@ -1,0 +1,154 @@
+//! What a `register` stage registers: which bundles, with which metrics, and which of them is best.
+//!
+//! The coordinator does it itself, because it changes the registry: versions, the move of the alias and the stage's value
+//! are one transaction, so that a gate that does not hold leaves nothing behind.
+
+use std::collections::BTreeMap;
+
+use protocol::pipeline::Pipeline;
+use protocol::stage::{Mode, Register, StageSettings};
+use protocol::{Alias, ArtifactKind, Digest, ModelName, RunId, StageName};
+use registry::Write;
+use serde_json::json;
+
+use crate::event::{Candidate, Known};
+use crate::state::run::Run;
+
+/// All that a register stage needs to know, once its inputs are there.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Registration {
+    /// In the order of `from`.
+    pub candidates: Vec<Candidate>,
+    /// Metrics of each.
+    pub metrics: Vec<BTreeMap<String, f64>>,
+    /// Keys of the stages that made them.
+    pub keys: Vec<Digest>,
+    /// Which of them is best.
+    pub best: usize,
+    /// The model.
+    pub model: ModelName,
+    /// The alias that moves, and its gates.
+    pub promote: Option<(Alias, Vec<String>)>,
+}
+
+impl Registration {
+    /// Gathers candidates and their metrics from the stages of `run`, which are all done.
+    pub fn gather(run: &Run, name: &StageName, settings: &Register) -> Result<Self, String> {
+        let at = |message: String| format!("stage `{name}`: {message}");
+        let model = settings.model.parse::<ModelName>().map_err(|e| at(format!("`model`: {e}")))?;
+        let promote = match settings.promote.to.as_str() {
+            "" => None,
+            alias => {
+                let alias = alias.parse::<Alias>().map_err(|e| at(format!("`promote.to`: {e}")))?;
+                Some((alias, settings.promote.require.clone()))
+            }
+        };
+        let (mut candidates, mut metrics, mut keys) = (Vec::new(), Vec::new(), Vec::new());
+        for from in &settings.from {
+            let stage = StageName::new(from.as_str());
+            let denoiser = output(run, &stage).ok_or_else(|| at(format!("`from`: stage `{from}` has no output")))?;
+            let vae = vae_of(&run.pipeline, &stage)
+                .and_then(|vae| output(run, &vae))
+                .ok_or_else(|| at(format!("`from`: no VAE is found behind stage `{from}`")))?;
+            keys.extend(run.status(&stage).and_then(|status| status.key()));
+            metrics.push(metrics_of(run, from));
+            candidates.push(Candidate { stage, denoiser, vae });
+        }
+        let best = best(&settings.from, &metrics, settings).map_err(at)?;
+        Ok(Self { candidates, metrics, keys, best, model, promote })
+    }
+
+    /// The stage's value and the writes that make it so, given the stored bundle of each candidate.
+    pub fn writes(&self, run: &RunId, stage: &StageName, bundles: &[Digest]) -> (Known, Vec<Write>) {
+        let mut writes = Vec::new();
+        for (i, artifact) in bundles.iter().enumerate() {
+            writes.push(Write::Version {
+                model: self.model.clone(),
+                artifact: *artifact,
+                metrics: self.metrics[i].clone(),
+                source: json!({"run": run, "stage": self.candidates[i].stage, "key": self.keys[i]}),
+            });
+        }
+        if let Some((alias, require)) = &self.promote {
+            writes.push(Write::Promote {
+                model: self.model.clone(),
+                alias: alias.clone(),
+                artifact: bundles[self.best],
+                require: require.clone(),
+                reason: format!("best of stage `{stage}`"),
+                actor: format!("run {run}"),
+            });
+        }
+        let outputs = BTreeMap::from([("model".to_owned(), bundles[self.best])]);
+        (Known { outputs, metrics: self.metrics[self.best].clone() }, writes)
+    }
+}
+
+fn output(run: &Run, stage: &StageName) -> Option<Digest> {
+    run.status(stage)?.known()?.outputs.values().next().copied()
+}
+
+/// The VAE behind a denoiser: the one it reads, or its teacher's.
+fn vae_of(pipeline: &Pipeline, stage: &StageName) -> Option<StageName> {
+    let mut stage = pipeline.stages.iter().find(|s| s.name == *stage)?;
+    // Stages stand after what they read, so this ends.
+    loop {
+        let input = |kind| stage.inputs.iter().find(|input| input.kind == kind).map(|input| &input.stage);
+        if let Some(vae) = input(ArtifactKind::Vae) {
+            return Some(vae.clone());
+        }
+        let teacher = input(ArtifactKind::Denoiser)?;
+        stage = pipeline.stages.iter().find(|s| s.name == *teacher)?;
+    }
+}
+
+/// The metrics of every evaluation that looks at `model`. Two evaluations that give one metric (a student at one and at
+/// four steps) keep both as `stage.metric`; the plain name is the first one's.
+fn metrics_of(run: &Run, model: &str) -> BTreeMap<String, f64> {
+    let mut all: BTreeMap<String, Vec<(&StageName, f64)>> = BTreeMap::new();
+    for (stage, status) in run.pipeline.stages.iter().zip(&run.stages) {
+        let looks_at_it = match &stage.settings {
+            StageSettings::EvaluateLatentFid(settings) => settings.model == model,
+            _ => false,
+        };
+        if let (true, Some(known)) = (looks_at_it, status.known()) {
+            for (metric, value) in &known.metrics {
+                all.entry(metric.clone()).or_default().push((&stage.name, *value));
+            }
+        }
+    }
+    let mut metrics = BTreeMap::new();
+    for (metric, values) in all {
+        if values.len() > 1 {
+            metrics.extend(values.iter().map(|(stage, value)| (format!("{stage}.{metric}"), *value)));
+        }
+        metrics.insert(metric, values[0].1);
+    }
+    metrics
+}
+
+/// The candidate with the best value; the first of equals.
+fn best(from: &[String], metrics: &[BTreeMap<String, f64>], settings: &Register) -> Result<usize, String> {
+    if from.len() == 1 {
+        return Ok(0);
+    }
+    let mut best: Option<(usize, f64)> = None;
+    for (i, stage) in from.iter().enumerate() {
+        let value = metrics[i].get(&settings.metric).copied().filter(|value| value.is_finite()).ok_or_else(|| {
+            let known: Vec<&str> = metrics[i].keys().map(String::as_str).collect();
+            format!(
+                "`metric`: no evaluation gives `{}` for `{stage}` (there is: {}); add an `evaluate.latent_fid` stage with `model: {stage}`",
+                settings.metric,
+                if known.is_empty() { "nothing".to_owned() } else { known.join(", ") }
+            )
+        })?;
+        let better = best.is_none_or(|(_, other)| match settings.mode {
+            Mode::Min => value < other,
+            Mode::Max => value > other,
+        });
+        if better {
+            best = Some((i, value));
+        }
+    }
+    best.map(|(i, _)| i).ok_or_else(|| "`from`: names no stage".to_owned())
+}

@@ -1,0 +1,108 @@
+//! Who gets what. Deterministic in state and moment.
+//!
+//! Works are served in the order of [`State::wanted`](crate::state::State::wanted). First, plain tasks, shards and merges
+//! that are ready, one worker each: they are short, and much waits for them. Then gangs that are under way take in whoever
+//! is left, up to their `max`; then gangs that wait start with everybody who is left. A gang does not start while a map
+//! stage that its workers could merge is almost done (its last shards are out), or the merge would wait for the whole
+//! training.
+
+use protocol::message::Member;
+use protocol::stage::Backend;
+use protocol::{Digest, WorkerId};
+
+use crate::decide::Deciding;
+use crate::state::State;
+use crate::state::gang::{self, Change};
+use crate::state::task::{Hold, Part};
+use crate::state::worker::Presence;
+
+/// Gives idle workers what is ready.
+pub(crate) fn schedule(cx: &mut Deciding<'_>) {
+    if cx.state.draining {
+        return;
+    }
+    let wanted = cx.state.wanted();
+    for key in &wanted {
+        small_tasks(cx, *key);
+    }
+    for key in &wanted {
+        grow_gangs(cx, *key);
+    }
+    for key in &wanted {
+        start_gangs(cx, *key);
+    }
+}
+
+/// Workers of a backend that can be given work and have none, by name.
+pub(crate) fn idle(state: &State, backend: Backend) -> Vec<Member> {
+    let busy: Vec<&WorkerId> = state
+        .works
+        .values()
+        .flat_map(|work| &work.tasks)
+        .flat_map(|task| task.holders())
+        .map(|member| &member.worker)
+        .collect();
+    state
+        .workers
+        .iter()
+        .filter(|(name, w)| w.presence == Presence::Here && w.backend == backend && !busy.contains(name))
+        .map(|(name, worker)| worker.member(name))
+        .collect()
+}
+
+fn small_tasks(cx: &mut Deciding<'_>, key: Digest) {
+    let now = cx.now();
+    for i in 0..cx.state.works[&key].tasks.len() {
+        let work = &cx.state.works[&key];
+        let task = &work.tasks[i];
+        if task.part == Part::Gang || !task.is_free(now) || !work.is_ready(task) {
+            continue;
+        }
+        let Some(worker) = idle(cx.state, work.backend).into_iter().next() else { return };
+        grant(cx, key, i, vec![worker]);
+    }
+}
+
+fn grow_gangs(cx: &mut Deciding<'_>, key: Digest) {
+    for i in 0..cx.state.works[&key].tasks.len() {
+        let work = &cx.state.works[&key];
+        let task = &work.tasks[i];
+        let under_way = matches!(task.hold, Hold::Held { winding: None, .. });
+        if task.part == Part::Gang && under_way {
+            match gang::with(task.holders(), &idle(cx.state, work.backend), work.placement.workers) {
+                Change::Keep | Change::Disband => {}
+                Change::Regroup(members) => cx.regroup(key, i, members),
+            }
+        }
+    }
+}
+
+fn start_gangs(cx: &mut Deciding<'_>, key: Digest) {
+    let now = cx.now();
+    for i in 0..cx.state.works[&key].tasks.len() {
+        let work = &cx.state.works[&key];
+        let task = &work.tasks[i];
+        if task.part == Part::Gang && task.is_free(now) && !merge_is_near(cx.state, work.backend) {
+            if let Some(members) = gang::start(&idle(cx.state, work.backend), work.placement.workers) {
+                grant(cx, key, i, members);
+            }
+        }
+    }
+}
+
+/// Whether some map stage has only shards out that are being done.
+fn merge_is_near(state: &State, backend: Backend) -> bool {
+    state.works.values().filter(|work| work.backend == backend).any(|work| {
+        work.tasks.iter().any(|task| matches!(task.part, Part::Shard { .. }) && task.is_held())
+            && state.wanted().contains(&work.key)
+    })
+}
+
+fn grant(cx: &mut Deciding<'_>, key: Digest, i: usize, holders: Vec<Member>) {
+    let secret = cx.secret(&cx.state.works[&key].tasks[i]);
+    let work = cx.state.work_mut(key);
+    let task = &mut work.tasks[i];
+    work.resumed |= task.newest().is_some();
+    let fence = task.grant(holders, secret);
+    cx.fences.push(fence);
+}

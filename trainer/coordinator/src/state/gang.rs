@@ -1,0 +1,81 @@
+//! Who is in a gang. Membership is a list by rank; rank 0 leads: it saves, records and reports.
+//!
+//! | members \ change | some lost, `min` left | lost below `min` | joiners, room | joiners, full |
+//! |---|---|---|---|---|
+//! | n | Regroup, survivors keep their order | Disband | Regroup, joiners behind | Keep |
+//!
+//! Survivors keep their order, so rank 0 stays rank 0 for as long as it lives. A regrouped gang is a new generation of the
+//! same attempt; a disbanded one starts its next attempt from the newest checkpoint.
+
+use protocol::WorkerId;
+use protocol::message::Member;
+use protocol::stage::WorkerRange;
+
+/// What becomes of a gang.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Change {
+    /// Nothing.
+    Keep,
+    /// A new generation of these.
+    Regroup(Vec<Member>),
+    /// Too few are left.
+    Disband,
+}
+
+/// The gang without `lost`.
+pub fn without(members: &[Member], lost: &[WorkerId], range: WorkerRange) -> Change {
+    let left: Vec<Member> = members.iter().filter(|member| !lost.contains(&member.worker)).cloned().collect();
+    if left.len() == members.len() {
+        Change::Keep
+    } else if left.len() < range.min.max(1) {
+        Change::Disband
+    } else {
+        Change::Regroup(left)
+    }
+}
+
+/// The gang with as many of `idle` as there is room for.
+pub fn with(members: &[Member], idle: &[Member], range: WorkerRange) -> Change {
+    let room = room(members.len(), range).min(idle.len());
+    if room == 0 { Change::Keep } else { Change::Regroup(members.iter().chain(&idle[..room]).cloned().collect()) }
+}
+
+/// The first members of a gang, if there are enough.
+pub fn start(idle: &[Member], range: WorkerRange) -> Option<Vec<Member>> {
+    (idle.len() >= range.min.max(1)).then(|| idle[..room(0, range).min(idle.len())].to_vec())
+}
+
+fn room(members: usize, range: WorkerRange) -> usize {
+    if range.max == 0 { usize::MAX } else { range.max.max(range.min).saturating_sub(members) }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::Incarnation;
+
+    use super::*;
+
+    fn members(names: &[&str]) -> Vec<Member> {
+        names
+            .iter()
+            .map(|name| Member { worker: (*name).into(), incarnation: Incarnation(1), peer_address: String::new() })
+            .collect()
+    }
+
+    #[test]
+    fn survivors_keep_their_order_and_joiners_come_behind() {
+        let two_to_three = WorkerRange { min: 2, max: 3 };
+        let abc = members(&["a", "b", "c"]);
+        assert_eq!(without(&abc, &["x".into()], two_to_three), Change::Keep);
+        assert_eq!(without(&abc, &["a".into()], two_to_three), Change::Regroup(members(&["b", "c"])));
+        assert_eq!(without(&abc, &["a".into(), "c".into()], two_to_three), Change::Disband);
+        assert_eq!(with(&abc, &members(&["d"]), two_to_three), Change::Keep);
+        assert_eq!(
+            with(&members(&["c", "a"]), &members(&["b", "d"]), two_to_three),
+            Change::Regroup(members(&["c", "a", "b"]))
+        );
+        assert_eq!(start(&members(&["a"]), two_to_three), None);
+        assert_eq!(start(&members(&["a", "b", "c", "d"]), two_to_three), Some(abc));
+        assert_eq!(start(&members(&["a", "b"]), WorkerRange::default()), Some(members(&["a", "b"])));
+    }
+}

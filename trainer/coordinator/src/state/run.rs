@@ -1,0 +1,236 @@
+//! One execution of a pipeline.
+//!
+//! | state \ event | pause | resume | cancel | a stage failed | all wanted stages done |
+//! |---|---|---|---|---|---|
+//! | Running | Paused | Running | Cancelled | Failed | Finished |
+//! | Paused | Paused | Running | Cancelled | Failed | Finished |
+//! | Finished | - | - | - | - | - |
+//! | Failed | - | Running | - | - | - |
+//! | Cancelled | - | Running | Cancelled | - | - |
+//!
+//! `-` is refused when a client asks for it. There is no state from which a run cannot be ended or, short of `Finished`,
+//! taken up again: finished stages are remembered by their keys, unfinished ones by their checkpoints.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use protocol::message::{RunState, StageState};
+use protocol::pipeline::Pipeline;
+use protocol::{Attempt, Digest, RunId, StageName, canonical};
+
+use crate::event::{Control, Known};
+
+/// Where a stage of a run stands.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Status {
+    /// Its inputs are not there yet.
+    Waiting,
+    /// Its work is under way, under the stage's key.
+    Active {
+        /// The key.
+        key: Digest,
+    },
+    /// It has its value.
+    Done {
+        /// The key.
+        key: Digest,
+        /// `Ran`, `Cached` or `Resumed`.
+        how: StageState,
+        /// The value.
+        known: Known,
+        /// Seconds of work.
+        wall_s: f64,
+        /// The try that made it.
+        attempt: Attempt,
+    },
+    /// It failed for good.
+    Failed {
+        /// The key.
+        key: Digest,
+        /// Why.
+        message: String,
+    },
+    /// It will not run.
+    Skipped {
+        /// Its key, if it had begun.
+        key: Option<Digest>,
+        /// Why.
+        reason: String,
+    },
+}
+
+impl Status {
+    /// The stage's key, once known.
+    pub fn key(&self) -> Option<Digest> {
+        match self {
+            Self::Waiting => None,
+            Self::Active { key } | Self::Done { key, .. } | Self::Failed { key, .. } => Some(*key),
+            Self::Skipped { key, .. } => *key,
+        }
+    }
+
+    /// The stage's value, once done.
+    pub fn known(&self) -> Option<&Known> {
+        match self {
+            Self::Done { known, .. } => Some(known),
+            Self::Waiting | Self::Active { .. } | Self::Failed { .. } | Self::Skipped { .. } => None,
+        }
+    }
+}
+
+/// A run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Run {
+    /// Its name.
+    pub id: RunId,
+    /// Its place in the order of submission.
+    pub number: u64,
+    /// What it executes.
+    pub pipeline: Arc<Pipeline>,
+    /// The YAML as written.
+    pub source: String,
+    /// The client's key.
+    pub idempotency_key: Option<String>,
+    /// The last stage asked for.
+    pub until: Option<StageName>,
+    /// Where it stands.
+    pub state: RunState,
+    /// Paused by a restart of the coordinator, not by a user.
+    pub parked: bool,
+    /// Stage by stage, as in the pipeline.
+    pub stages: Vec<Status>,
+}
+
+impl Run {
+    /// A run that has just been submitted.
+    pub fn new(
+        number: u64,
+        pipeline: Arc<Pipeline>,
+        source: String,
+        key: Option<String>,
+        until: Option<StageName>,
+    ) -> Self {
+        let digest = canonical::digest(&*pipeline);
+        let id = RunId::new(format!("{}-{}-{number}", pipeline.name, &digest.hex()[..8]));
+        let wanted = wanted(&pipeline, until.as_ref());
+        let stages = (0..pipeline.stages.len())
+            .map(|i| if wanted.contains(&i) { Status::Waiting } else { not_asked_for() })
+            .collect();
+        Self {
+            id,
+            number,
+            pipeline,
+            source,
+            idempotency_key: key,
+            until,
+            state: RunState::Running,
+            parked: false,
+            stages,
+        }
+    }
+
+    /// The place of a stage in the pipeline.
+    pub fn position(&self, stage: &StageName) -> Option<usize> {
+        self.pipeline.stages.iter().position(|s| s.name == *stage)
+    }
+
+    /// The status of a stage by name.
+    pub fn status(&self, stage: &StageName) -> Option<&Status> {
+        self.stages.get(self.position(stage)?)
+    }
+
+    /// The stages that this run has work under way for, with their keys. Paused and ended runs have none.
+    pub fn active(&self) -> impl Iterator<Item = (usize, Digest)> + '_ {
+        let running = self.state == RunState::Running;
+        self.stages.iter().enumerate().filter_map(move |(i, status)| match status {
+            Status::Active { key } if running => Some((i, *key)),
+            _ => None,
+        })
+    }
+
+    /// The values of a stage's inputs by the field that names them, or `None` while one is missing.
+    pub fn inputs(&self, stage: usize) -> Option<BTreeMap<String, Digest>> {
+        let stage = &self.pipeline.stages[stage];
+        let mut inputs = stage.external.clone();
+        for input in &stage.inputs {
+            let known = self.status(&input.stage)?.known()?;
+            inputs.insert(input.field.clone(), *known.outputs.values().next()?);
+        }
+        Some(inputs)
+    }
+
+    /// What `action` makes of the run's state; `None` if it is refused.
+    pub fn after(&self, action: Control) -> Option<RunState> {
+        match (self.state, action) {
+            (RunState::Running | RunState::Paused, Control::Pause) => Some(RunState::Paused),
+            (RunState::Running | RunState::Paused, Control::Resume) => Some(RunState::Running),
+            (RunState::Running | RunState::Paused, Control::Cancel) => Some(RunState::Cancelled),
+            (RunState::Failed | RunState::Cancelled, Control::Resume) => Some(RunState::Running),
+            (RunState::Cancelled, Control::Cancel) => Some(RunState::Cancelled),
+            (RunState::Failed | RunState::Cancelled, Control::Pause) => None,
+            (RunState::Failed, Control::Cancel) => None,
+            (RunState::Finished, Control::Pause | Control::Resume | Control::Cancel) => None,
+        }
+    }
+
+    /// What the stages make of the run's state.
+    pub fn settled(&self) -> RunState {
+        match self.state {
+            RunState::Running | RunState::Paused => {
+                let not_asked_for = not_asked_for();
+                if self.stages.iter().any(|status| matches!(status, Status::Failed { .. })) {
+                    RunState::Failed
+                } else if self.stages.iter().all(|s| matches!(s, Status::Done { .. }) || *s == not_asked_for) {
+                    RunState::Finished
+                } else {
+                    self.state
+                }
+            }
+            RunState::Finished | RunState::Failed | RunState::Cancelled => self.state,
+        }
+    }
+
+    /// Skips everything that is not over.
+    pub fn skip_rest(&mut self, reason: &str) {
+        for status in &mut self.stages {
+            match status {
+                Status::Waiting => *status = Status::Skipped { key: None, reason: reason.to_owned() },
+                Status::Active { key } => *status = Status::Skipped { key: Some(*key), reason: reason.to_owned() },
+                Status::Done { .. } | Status::Failed { .. } | Status::Skipped { .. } => {}
+            }
+        }
+    }
+
+    /// Takes up again whatever was asked for and is not done.
+    pub fn reopen(&mut self) {
+        let wanted = wanted(&self.pipeline, self.until.as_ref());
+        for (i, status) in self.stages.iter_mut().enumerate() {
+            match status {
+                Status::Failed { .. } | Status::Skipped { .. } if wanted.contains(&i) => *status = Status::Waiting,
+                Status::Failed { .. }
+                | Status::Skipped { .. }
+                | Status::Waiting
+                | Status::Active { .. }
+                | Status::Done { .. } => {}
+            }
+        }
+    }
+}
+
+fn not_asked_for() -> Status {
+    Status::Skipped { key: None, reason: "not asked for".to_owned() }
+}
+
+/// `until` and all that it needs; everything without it.
+fn wanted(pipeline: &Pipeline, until: Option<&StageName>) -> BTreeSet<usize> {
+    let Some(until) = until else { return (0..pipeline.stages.len()).collect() };
+    let mut names = BTreeSet::from([until]);
+    let mut wanted = BTreeSet::new();
+    for (i, stage) in pipeline.stages.iter().enumerate().rev() {
+        if names.contains(&stage.name) {
+            wanted.insert(i);
+            names.extend(stage.inputs.iter().map(|input| &input.stage));
+        }
+    }
+    wanted
+}

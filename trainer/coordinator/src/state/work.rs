@@ -1,0 +1,172 @@
+//! The work of one stage, by the stage's key: done once however many runs wait for it.
+//!
+//! | progress \ event | looked up: known | looked up: unknown | all tasks done | bundled | failed for good | wanted again |
+//! |---|---|---|---|---|---|---|
+//! | Looking | Done | Open or Bundling | - | - | - | Looking |
+//! | Open | - | - | Done | - | Failed | Open |
+//! | Bundling | - | - | - | Done | Failed | Bundling |
+//! | Done | - | - | - | - | - | Looking |
+//! | Failed | - | - | - | - | - | Looking |
+//!
+//! A run owns its statuses, not the work: cancelling one of two runs that want the same stage does not disturb the other,
+//! and a run that is submitted again after a failure finds tasks, checkpoints and the seconds already spent.
+
+use std::collections::BTreeMap;
+
+use protocol::stage::{Backend, Placement, Shape, StageSettings};
+use protocol::{Attempt, Digest, RunId, Seed, StageName, TaskId};
+
+use super::task::{Part, Task};
+use crate::event::{Known, Millis};
+use crate::register::Registration;
+
+/// How far the work is.
+#[derive(Debug, Clone, PartialEq)]
+pub enum WorkState {
+    /// The store is asked whether it has the value.
+    Looking,
+    /// Tasks are to be done.
+    Open,
+    /// The coordinator itself makes the model bundles.
+    Bundling,
+    /// Done.
+    Done {
+        /// The value.
+        known: Known,
+        /// The store had it already.
+        cached: bool,
+    },
+    /// Failed for good, or until somebody wants it again.
+    Failed {
+        /// Why.
+        message: String,
+    },
+}
+
+/// The work of one stage.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Work {
+    /// The stage's key.
+    pub key: Digest,
+    /// The run that wanted it first; tasks bear its name.
+    pub run: RunId,
+    /// The stage.
+    pub stage: StageName,
+    /// Its settings, as written.
+    pub settings: StageSettings,
+    /// Artifacts by the field that names them.
+    pub inputs: BTreeMap<String, Digest>,
+    /// The seed.
+    pub seed: Seed,
+    /// Where it must be computed.
+    pub backend: Backend,
+    /// Workers and checkpoints, as the run that wanted it last asks.
+    pub placement: Placement,
+    /// What a register stage registers.
+    pub registration: Option<Registration>,
+    /// How far it is.
+    pub state: WorkState,
+    /// Its tasks: none, one, or the shards and their merge.
+    pub tasks: Vec<Task>,
+    /// Milliseconds of work, up to `busy_since`.
+    pub wall_ms: u64,
+    /// Set while some task is held.
+    pub busy_since: Option<Millis>,
+    /// It went on from something that an earlier try had saved.
+    pub resumed: bool,
+}
+
+impl Work {
+    /// Makes its tasks, if it has none yet.
+    pub fn open(&mut self) {
+        self.state = WorkState::Open;
+        if !self.tasks.is_empty() {
+            return;
+        }
+        let task = |shard, part| Task::new(TaskId::of(&self.run, &self.stage, shard), part);
+        self.tasks = match self.settings.shape() {
+            Shape::Plain => vec![task(None, Part::Alone)],
+            Shape::Gang => vec![task(None, Part::Gang)],
+            Shape::Map => {
+                let of = self.settings.shards();
+                let mut tasks: Vec<Task> = (0..of).map(|index| task(Some(index), Part::Shard { index, of })).collect();
+                tasks.push(task(None, Part::Merge));
+                tasks
+            }
+            Shape::Registry => panic!("a register stage has no tasks: {self:?}"),
+        };
+    }
+
+    /// The shards' artifacts in order, once all are there.
+    pub fn shards(&self) -> Option<Vec<Digest>> {
+        self.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. })).map(Task::output).collect()
+    }
+
+    /// Whether a task can be done now, given that it is free: a merge needs its shards.
+    pub fn is_ready(&self, task: &Task) -> bool {
+        match task.part {
+            Part::Merge => self.shards().is_some(),
+            Part::Alone | Part::Gang | Part::Shard { .. } => true,
+        }
+    }
+
+    /// The place of a task.
+    pub fn position(&self, task: &TaskId) -> Option<usize> {
+        self.tasks.iter().position(|t| t.id == *task)
+    }
+
+    /// Whether somebody works on it.
+    pub fn is_busy(&self) -> bool {
+        self.state == WorkState::Bundling || self.tasks.iter().any(Task::is_held)
+    }
+
+    /// Whether it is over, one way or the other.
+    pub fn is_over(&self) -> bool {
+        match self.state {
+            WorkState::Done { .. } | WorkState::Failed { .. } => true,
+            WorkState::Looking | WorkState::Open | WorkState::Bundling => false,
+        }
+    }
+
+    /// Starts or stops the count of seconds.
+    pub fn count_time(&mut self, now: Millis) {
+        match (self.is_busy(), self.busy_since) {
+            (true, None) => self.busy_since = Some(now),
+            (false, Some(since)) => {
+                self.wall_ms += now.since(since);
+                self.busy_since = None;
+            }
+            (true, Some(_)) | (false, None) => {}
+        }
+    }
+
+    /// Seconds of work up to `now`.
+    pub fn wall_s(&self, now: Millis) -> f64 {
+        let running = self.busy_since.map_or(0, |since| now.since(since));
+        (self.wall_ms + running) as f64 / 1000.0
+    }
+
+    /// The newest try of any task.
+    pub fn attempt(&self) -> Attempt {
+        self.tasks.iter().map(|task| task.attempt).max().unwrap_or_default()
+    }
+
+    /// Whether an earlier try left something to go on from.
+    pub fn has_something(&self) -> bool {
+        self.tasks.iter().any(|task| task.output().is_some() || task.newest().is_some())
+    }
+
+    /// Ends it: whoever still works on it can write no more. The fences that this takes are returned.
+    pub fn fail(&mut self, message: String) -> Vec<registry::Write> {
+        self.state = WorkState::Failed { message };
+        self.tasks.iter_mut().filter(|task| task.is_held()).map(|task| task.release(None)).collect()
+    }
+
+    /// Wanted again after it was over: the store is asked first, and budgets are whole again.
+    pub fn want_again(&mut self, lost_value: bool) {
+        self.state = WorkState::Looking;
+        for task in &mut self.tasks {
+            if lost_value { task.reopen() } else { task.reset_budgets() }
+        }
+    }
+}

@@ -1,0 +1,127 @@
+//! A worker by name, and whether its newest process can be given work.
+//!
+//! | presence \ event | Join | WorkerBack | LeaseExpired | PeersLost | WorkerGone |
+//! |---|---|---|---|---|---|
+//! | Here | Here | Here | Silent | Suspect | Gone |
+//! | Suspect | Here | Here | Silent | Suspect | Gone |
+//! | Silent | Here | Here | Silent | Silent | Gone |
+//! | Gone | Here | Gone | Gone | Gone | Gone |
+//!
+//! Unknown is not dead: a silent worker may well be computing, and its next poll brings it back. Only whoever launched
+//! the process can say that it is gone, and only a new process (a join, with the next incarnation) returns from that.
+//! Whatever a worker held it loses on leaving `Here`; that is the business of `decide`.
+
+use protocol::Incarnation;
+use protocol::message::{Join, Member};
+use protocol::stage::Backend;
+
+use crate::event::Millis;
+
+/// Whether a worker can be given work.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Presence {
+    /// Polls.
+    Here,
+    /// Peers could not reach it; it must poll again after a penalty.
+    Suspect {
+        /// Since when.
+        since: Millis,
+    },
+    /// Its lease ran out.
+    Silent,
+    /// Its process is known to have ended.
+    Gone,
+}
+
+/// What may change a worker's presence.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Sign {
+    /// A new process took the name.
+    Join,
+    /// It polled again.
+    Back,
+    /// It did not.
+    LeaseExpired,
+    /// Peers could not reach it.
+    PeersLost,
+    /// Its process ended.
+    Gone,
+}
+
+impl Presence {
+    /// The presence after `sign`.
+    #[must_use]
+    pub fn after(self, sign: Sign, now: Millis) -> Self {
+        match (self, sign) {
+            (Self::Here | Self::Suspect { .. } | Self::Silent | Self::Gone, Sign::Join) => Self::Here,
+            (Self::Here | Self::Suspect { .. } | Self::Silent, Sign::Back) => Self::Here,
+            (Self::Here | Self::Suspect { .. } | Self::Silent, Sign::LeaseExpired) => Self::Silent,
+            (Self::Here | Self::Suspect { .. }, Sign::PeersLost) => Self::Suspect { since: now },
+            (Self::Silent, Sign::PeersLost) => Self::Silent,
+            (Self::Here | Self::Suspect { .. } | Self::Silent, Sign::Gone) => Self::Gone,
+            (Self::Gone, Sign::Back | Sign::LeaseExpired | Sign::PeersLost | Sign::Gone) => Self::Gone,
+        }
+    }
+
+    /// Its name in the table above.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Here => "Here",
+            Self::Suspect { .. } => "Suspect",
+            Self::Silent => "Silent",
+            Self::Gone => "Gone",
+        }
+    }
+}
+
+/// A worker's newest process.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Worker {
+    /// Which process of that name.
+    pub incarnation: Incarnation,
+    /// Its process id, for people.
+    pub pid: u32,
+    /// Where it computes.
+    pub backend: Backend,
+    /// Where peers reach it.
+    pub peer_address: String,
+    /// Whether it can be given work.
+    pub presence: Presence,
+    /// How often peers could not reach this process; each time it stays out for longer.
+    pub suspicions: u32,
+}
+
+impl Worker {
+    /// The process that `join` announces.
+    pub fn joined(join: &Join, incarnation: Incarnation) -> Self {
+        Self {
+            incarnation,
+            pid: join.pid,
+            backend: join.backend,
+            peer_address: join.peer_address.clone(),
+            presence: Presence::Here,
+            suspicions: 0,
+        }
+    }
+
+    /// The worker as a holder of a task.
+    pub fn member(&self, name: &protocol::WorkerId) -> Member {
+        Member { worker: name.clone(), incarnation: self.incarnation, peer_address: self.peer_address.clone() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_table_in_the_header_is_what_the_code_does() {
+        let presences = [Presence::Here, Presence::Suspect { since: Millis(0) }, Presence::Silent, Presence::Gone];
+        let signs = [Sign::Join, Sign::Back, Sign::LeaseExpired, Sign::PeersLost, Sign::Gone];
+        for presence in presences {
+            let cells: Vec<_> = signs.iter().map(|sign| presence.after(*sign, Millis(1)).name()).collect();
+            let row = format!("//! | {} | {} |", presence.name(), cells.join(" | "));
+            assert!(include_str!("worker.rs").lines().any(|line| line == row), "{row}");
+        }
+    }
+}

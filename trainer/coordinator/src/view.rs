@@ -1,0 +1,151 @@
+//! What workers and clients are told. Read-only.
+
+use protocol::message::{Assignment, Orders, Progress, Role, RunState, RunView, StageState, StageTask, StageView};
+use protocol::{Generation, Incarnation, WorkerId, canonical};
+
+use crate::event::{Millis, Rejected};
+use crate::state::State;
+use crate::state::run::{Run, Status};
+use crate::state::task::{Hold, Part, Task};
+use crate::state::work::{Work, WorkState};
+
+impl State {
+    /// All that a worker process should be doing.
+    pub fn orders(&self, worker: &WorkerId, incarnation: Incarnation) -> Result<Orders, Rejected> {
+        self.process(worker, incarnation)?;
+        let mut assignments: Vec<Assignment> =
+            self.held_by(worker).filter_map(|(work, task)| assignment(work, task, worker, incarnation)).collect();
+        assignments.sort_by(|a, b| a.grant.cmp(&b.grant));
+        let leave = self.draining && assignments.is_empty();
+        // A new checkpoint is not news for whoever made it, so it does not end a wait.
+        let news: Vec<Assignment> =
+            assignments.iter().map(|assignment| Assignment { resume: None, ..assignment.clone() }).collect();
+        let digest = canonical::digest(&(&news, leave));
+        // 53 bits, so that no JSON reader rounds it.
+        let version = digest.as_bytes()[..8].iter().fold(0, |number, byte| number << 8 | u64::from(*byte)) >> 11;
+        Ok(Orders { version, assignments, leave })
+    }
+
+    /// A run as clients see it at `now`.
+    pub fn view(&self, run: &Run, now: Millis) -> RunView {
+        let stages = (0..run.stages.len()).map(|i| self.stage_view(run, i, now)).collect();
+        RunView { run: run.id.clone(), pipeline: run.pipeline.name.clone(), state: run.state, stages }
+    }
+
+    fn stage_view(&self, run: &Run, i: usize, now: Millis) -> StageView {
+        let (stage, status) = (&run.pipeline.stages[i], &run.stages[i]);
+        let work = self.work_of(run, &stage.name).map(|work| &**work);
+        let mut view = StageView {
+            name: stage.name.clone(),
+            kind: stage.settings.kind().to_owned(),
+            state: StageState::Waiting,
+            key: status.key(),
+            outputs: Default::default(),
+            metrics: Default::default(),
+            progress: Progress::default(),
+            wall_s: work.map_or(0.0, |work| work.wall_s(now)),
+            attempt: work.map(Work::attempt).unwrap_or_default(),
+            workers: Vec::new(),
+            message: None,
+        };
+        match status {
+            Status::Waiting => {}
+            Status::Active { .. } => {
+                if let Some(work) = work {
+                    view.workers = workers(work);
+                    view.progress = self.progress(work);
+                    view.metrics = view.progress.metrics.clone();
+                    (view.state, view.message) = self.active(run, work);
+                }
+            }
+            Status::Done { how, known, wall_s, attempt, .. } => {
+                view.state = *how;
+                view.outputs = known.outputs.clone();
+                view.metrics = known.metrics.clone();
+                (view.wall_s, view.attempt) = (*wall_s, *attempt);
+                view.progress = work.map(|work| self.progress(work)).unwrap_or_default();
+            }
+            Status::Failed { message, .. } => {
+                view.state = StageState::Failed;
+                view.message = Some(message.clone());
+            }
+            Status::Skipped { reason, .. } => {
+                view.state = StageState::Skipped;
+                view.message = Some(reason.clone());
+            }
+        }
+        view
+    }
+
+    fn active(&self, run: &Run, work: &Work) -> (StageState, Option<String>) {
+        let held = work.is_busy();
+        match work.state {
+            WorkState::Looking => (StageState::Ready, None),
+            WorkState::Bundling => (StageState::Running, None),
+            WorkState::Open if held => (StageState::Running, None),
+            WorkState::Open if run.state == RunState::Paused => (StageState::Ready, Some("paused".to_owned())),
+            WorkState::Open => {
+                let backing_off =
+                    work.tasks.iter().any(|task| matches!(task.hold, Hold::Waiting { not_before: Some(_) }));
+                let waits_for = if backing_off {
+                    format!("tries again soon (attempt {} failed)", work.attempt())
+                } else {
+                    let min = work.placement.workers.min.max(1);
+                    format!("waits for {min} idle `{}` worker(s)", work.backend.name())
+                };
+                (StageState::Ready, Some(waits_for))
+            }
+            WorkState::Done { .. } | WorkState::Failed { .. } => (StageState::Running, None),
+        }
+    }
+
+    /// How far a work is: its one task, or the sum over its shards while they are done.
+    pub fn progress(&self, work: &Work) -> Progress {
+        let of = |task: &Task| self.heard.progress.get(&task.id).cloned();
+        let shards = work.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. })).count();
+        let done = work.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. }) && task.output().is_some());
+        match work.tasks.as_slice() {
+            [] => Progress::default(),
+            [task] => of(task).unwrap_or_default(),
+            _ => Progress {
+                done: done.count() as u64,
+                total: shards as u64,
+                unit: "shards".to_owned(),
+                metrics: Default::default(),
+            },
+        }
+    }
+}
+
+fn workers(work: &Work) -> Vec<WorkerId> {
+    work.tasks.iter().flat_map(Task::holders).map(|member| member.worker.clone()).collect()
+}
+
+fn assignment(work: &Work, task: &Task, worker: &WorkerId, incarnation: Incarnation) -> Option<Assignment> {
+    let Hold::Held { holders, secret, winding } = &task.hold else { return None };
+    if !holders.iter().any(|member| member.worker == *worker && member.incarnation == incarnation) {
+        return None;
+    }
+    let role = match task.part {
+        Part::Alone => Role::Alone,
+        Part::Shard { index, of } => Role::Shard { index, of },
+        Part::Merge => Role::Merge { shards: work.shards().unwrap_or_default() },
+        Part::Gang => {
+            Role::Member { generation: Generation(task.fence.0), members: holders.clone(), secret: secret.clone() }
+        }
+    };
+    Some(Assignment {
+        grant: task.grant_of(worker, incarnation),
+        stage: StageTask {
+            run: work.run.clone(),
+            name: work.stage.clone(),
+            settings: work.settings.clone(),
+            inputs: work.inputs.clone(),
+            seed: work.seed,
+            checkpoint: work.placement.checkpoint.clone(),
+        },
+        role,
+        resume: task.newest().map(|saved| saved.manifest),
+        wind_down: winding.is_some(),
+    })
+}
