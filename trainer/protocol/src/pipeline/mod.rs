@@ -4,12 +4,23 @@
 //! do not need the text, for pipelines that arrive as JSON. Not its job: touching the file system. The content digests of
 //! dataset folders are put in by the caller ([`Pipeline::fill_external`]).
 
+mod diagnostic;
+mod graph;
+mod overrides;
+mod read;
+mod rules;
+mod schema;
+mod yaml;
+
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
 use crate::stage::{Backend, DataOpen, Placement, StageIdentity, StageSettings};
 use crate::{ArtifactKind, Digest, Seed, StageName};
+
+pub use diagnostic::{Diagnostic, Diagnostics};
+pub use read::read;
 
 /// An immutable DAG of stages, in an order in which each stage comes after those it reads.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -83,6 +94,40 @@ impl Pipeline {
             }
         }
         Ok(())
+    }
+
+    /// Repeats the rules that need no text, for a pipeline that came as JSON.
+    ///
+    /// # Errors
+    /// What does not hold, a line for each.
+    pub fn check(&self) -> Result<(), String> {
+        let mut wrong = Vec::new();
+        if !crate::id::is_name(&self.name) {
+            wrong.push(format!("`{}` is not a pipeline name", self.name));
+        }
+        let mut found = graph::ByStage::new();
+        for (i, stage) in self.stages.iter().enumerate() {
+            if self.stages[..i].iter().any(|other| other.name == stage.name) {
+                wrong.push(format!("two stages are called `{}`", stage.name));
+            }
+            let before = |input: &&StageInput| !self.stages[..i].iter().any(|other| other.name == input.stage);
+            for input in stage.inputs.iter().filter(before) {
+                wrong.push(format!("stage `{}` reads `{}`, which does not come before it", stage.name, input.stage));
+            }
+            let references = graph::references(&stage.settings);
+            if references.iter().any(|reference| !stage.inputs.contains(reference)) {
+                wrong.push(format!("the inputs of stage `{}` are not those of its settings", stage.name));
+            }
+            found.entry(stage.name.clone()).or_default().0.extend(rules::stage(&stage.settings, &stage.placement));
+        }
+        graph::check_references(&self.stages, &mut found);
+        if wrong.is_empty() && found.values().all(|problems| problems.0.is_empty()) {
+            graph::check_agreement(&self.stages, &mut found);
+        }
+        for (stage, problems) in &found {
+            wrong.extend(problems.0.iter().map(|problem| format!("stage `{stage}`: {}", problem.message)));
+        }
+        if wrong.is_empty() { Ok(()) } else { Err(wrong.join("\n")) }
     }
 
     /// The identity of `stage`, once the artifacts it reads are known.

@@ -1,0 +1,392 @@
+//! From YAML to a validated [`Pipeline`], with all mistakes of the file at once.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use super::diagnostic::{Diagnostic, Diagnostics, Position, nearest};
+use super::overrides::{self, TOP_KEYS};
+use super::rules::{self, Problem};
+use super::schema::{Mistake, list_keys, overlay};
+use super::yaml::{self, Content, Entry, Node};
+use super::{Pipeline, PipelineStage, graph};
+use crate::id::is_name;
+use crate::stage::{Backend, DataOpen, DataSynthetic, Placement, StageSettings, TextEmbed};
+use crate::{Seed, StageName};
+
+/// Reads a pipeline. `file` is its name for messages, `sets` are overrides such as `stages.vae.lr=1e-4`.
+///
+/// # Errors
+/// Every mistake, in the order of the file.
+pub fn read(file: &str, text: &str, sets: &[String]) -> Result<Pipeline, Diagnostics> {
+    let mut reader = Reader { mistakes: Vec::new() };
+    let pipeline = reader.pipeline(text, sets);
+    if reader.mistakes.is_empty()
+        && let Some(pipeline) = pipeline
+    {
+        return Ok(pipeline);
+    }
+    reader.mistakes.sort_by_key(|mistake| mistake.at);
+    let lines: Vec<&str> = text.lines().collect();
+    let render = |mistake: Mistake| {
+        let Position { source, line, column } = mistake.at;
+        let (source, text) = match source.checked_sub(1).and_then(|i| sets.get(i)) {
+            Some(set) => (format!("--set {set}"), set.clone()),
+            None => (file.to_owned(), lines.get(line - 1).copied().unwrap_or_default().to_owned()),
+        };
+        Diagnostic { source, line, column, path: mistake.path, message: mistake.message, help: mistake.help, text }
+    };
+    Err(Diagnostics(reader.mistakes.into_iter().map(render).collect()))
+}
+
+/// What a pipeline says of itself.
+#[derive(Debug, Serialize, Deserialize)]
+struct Head {
+    name: String,
+    seed: Seed,
+    backend: Backend,
+}
+
+/// A stage as it stands in the file.
+struct Written {
+    name: StageName,
+    key_at: Position,
+    /// The mapping with its settings; `None` for a stage that the file does not write.
+    node: Option<Node>,
+    /// Path of the mapping.
+    path: String,
+}
+
+struct Reader {
+    mistakes: Vec<Mistake>,
+}
+
+impl Reader {
+    fn mistake(&mut self, at: Position, path: &str, message: impl Into<String>, help: Option<String>) {
+        self.mistakes.push(Mistake { at, path: path.to_owned(), message: message.into(), help });
+    }
+
+    fn pipeline(&mut self, text: &str, sets: &[String]) -> Option<Pipeline> {
+        let mut root = match yaml::parse(text, 0) {
+            Ok(root) => root,
+            Err(mistakes) => {
+                for mistake in mistakes {
+                    self.mistake(mistake.at, "", mistake.message, mistake.help);
+                }
+                return None;
+            }
+        };
+        if root.map().is_none() {
+            let found = root.describe();
+            let help = format!("its keys are {}", list_keys(TOP_KEYS));
+            self.mistake(root.at, "", format!("the document is {found}; expected a mapping"), Some(help));
+            return None;
+        }
+        for (i, set) in sets.iter().enumerate() {
+            if let Err(message) = overrides::apply(&mut root, set, i + 1) {
+                self.mistake(Position { source: i + 1, line: 1, column: 1 }, "", message, None);
+            }
+        }
+        let head = self.head(&root);
+        let (written, stages) = self.stages(&root);
+        let stages = self.connect(&root, &written, stages);
+        let (head, stages) = (head?, stages?);
+        Some(Pipeline { name: head.name, seed: head.seed, backend: head.backend, stages })
+    }
+
+    fn head(&mut self, root: &Node) -> Option<Head> {
+        let head = Head { name: String::new(), seed: Seed(0), backend: Backend::default() };
+        let mut base = serde_json::to_value(head).ok()?;
+        overlay::<Head>(&mut base, root, "the pipeline", "", &["dataset", "text", "stages"], &mut self.mistakes);
+        match root.entry("name") {
+            None => {
+                let help = Some("begin with such as `name: my-first-pipeline`".to_owned());
+                self.mistake(root.at, "name", "the pipeline has no `name`", help);
+            }
+            Some(entry) => {
+                if let Some(name) = entry.value.as_text()
+                    && !is_name(name)
+                {
+                    let message = format!(
+                        "`{name}` is not a pipeline name; expected a letter or digit, then letters, digits, `.`, `_`, `-`, at most 64"
+                    );
+                    self.mistake(entry.value.at, "name", message, None);
+                }
+            }
+        }
+        serde_json::from_value(base).ok()
+    }
+
+    /// Every stage that could be read, and where each stands. A stage with mistakes is in the first only.
+    fn stages(&mut self, root: &Node) -> (Vec<Written>, Vec<PipelineStage>) {
+        let mut written = Vec::new();
+        let mut stages = Vec::new();
+        let declared = |name: &str| {
+            root.entry("stages").and_then(|e| e.value.entry(name)).map(|e| e.key_at)
+        };
+
+        if let Some(entry) = root.entry("dataset") {
+            if let Some(at) = declared("dataset") {
+                self.mistake(at, "stages.dataset", "the top-level key `dataset` already makes a stage of this name", None);
+            }
+            written.push(Written::implicit("dataset", entry));
+            if let Some(settings) = self.dataset(entry) {
+                stages.push(stage("dataset", settings, Placement::default()));
+            }
+        } else if declared("dataset").is_none() {
+            let help = "such as `dataset: {format: synthetic}` or `dataset: {format: humanml3d, path: data/HumanML3D}`";
+            self.mistake(root.at, "dataset", "the pipeline has no `dataset`", Some(help.into()));
+        }
+
+        match root.entry("text") {
+            Some(entry) => {
+                if let Some(at) = declared("text") {
+                    self.mistake(at, "stages.text", "the top-level key `text` already makes a stage of this name", None);
+                }
+                written.push(Written::implicit("text", entry));
+                if let Some(settings) = self.typed::<TextEmbed>(&entry.value, "`text`", "text", &[]) {
+                    stages.push(stage("text", StageSettings::TextEmbed(settings), Placement::default()));
+                }
+            }
+            None if declared("text").is_none() => {
+                written.push(Written { name: "text".into(), key_at: root.at, node: None, path: "text".into() });
+                stages.push(stage("text", StageSettings::TextEmbed(TextEmbed::default()), Placement::default()));
+            }
+            None => {}
+        }
+
+        match root.entry("stages") {
+            None => self.mistake(
+                root.at,
+                "stages",
+                "the pipeline has no `stages`",
+                Some("such as `stages: {vae: {kind: train.vae}}`".into()),
+            ),
+            Some(entry) => match entry.value.map() {
+                Some([]) => self.mistake(entry.key_at, "stages", "`stages` is empty; expected at least one stage", None),
+                Some(entries) => {
+                    for entry in entries {
+                        written.push(Written {
+                            name: StageName::new(&*entry.key),
+                            key_at: entry.key_at,
+                            node: Some(entry.value.clone()),
+                            path: format!("stages.{}", entry.key),
+                        });
+                        if let Some((settings, placement)) = self.stage(entry) {
+                            stages.push(stage(&entry.key, settings, placement));
+                        }
+                    }
+                }
+                None => {
+                    let found = entry.value.describe();
+                    let message = format!("`stages` is {found}; expected a mapping from names to stages");
+                    self.mistake(entry.value.at, "stages", message, Some("such as `vae: {kind: train.vae}`".into()));
+                }
+            },
+        }
+        (written, stages)
+    }
+
+    fn dataset(&mut self, entry: &Entry) -> Option<StageSettings> {
+        let formats = ["synthetic", "humanml3d", "kit"];
+        let node = &entry.value;
+        if node.map().is_none() {
+            let message = format!("`dataset` is {}; expected a mapping with `format`", node.describe());
+            self.mistake(node.at, "dataset", message, Some("such as `{format: humanml3d, path: data/HumanML3D}`".into()));
+            return None;
+        }
+        let Some(format) = node.entry("format") else {
+            let message = format!("`dataset` has no `format`; expected one of {}", list_keys(formats));
+            self.mistake(entry.key_at, "dataset.format", message, None);
+            return None;
+        };
+        match format.value.as_text() {
+            Some("synthetic") => self
+                .typed::<DataSynthetic>(node, "`dataset`", "dataset", &["format"])
+                .map(StageSettings::DataSynthetic),
+            Some("humanml3d" | "kit") => {
+                self.typed::<DataOpen>(node, "`dataset`", "dataset", &[]).map(StageSettings::DataOpen)
+            }
+            other => {
+                let near = other.and_then(|text| nearest(text, formats)).map(|near| format!("did you mean `{near}`?"));
+                let message = format!("`format` of `dataset` is {}; expected one of {}", format.value.describe(), list_keys(formats));
+                self.mistake(format.value.at, "dataset.format", message, near);
+                None
+            }
+        }
+    }
+
+    /// A settings struct by itself; `None` if anything in it is wrong.
+    fn typed<T: Default + Serialize + serde::de::DeserializeOwned>(
+        &mut self,
+        node: &Node,
+        owner: &str,
+        path: &str,
+        skip: &[&str],
+    ) -> Option<T> {
+        self.overlaid(serde_json::to_value(T::default()).ok()?, node, owner, path, skip)
+    }
+
+    fn overlaid<T: serde::de::DeserializeOwned>(
+        &mut self,
+        mut base: Value,
+        node: &Node,
+        owner: &str,
+        path: &str,
+        skip: &[&str],
+    ) -> Option<T> {
+        let before = self.mistakes.len();
+        overlay::<T>(&mut base, node, owner, path, skip, &mut self.mistakes);
+        if self.mistakes.len() > before {
+            return None;
+        }
+        match serde_json::from_value(base) {
+            Ok(value) => Some(value),
+            Err(error) => {
+                self.mistake(node.at, path, format!("{owner} does not fit together: {error}"), None);
+                None
+            }
+        }
+    }
+
+    fn stage(&mut self, entry: &Entry) -> Option<(StageSettings, Placement)> {
+        let (name, node) = (&entry.key, &entry.value);
+        let path = format!("stages.{name}");
+        let owner = format!("stage `{name}`");
+        if !is_stage_name(name) {
+            let message = format!("`{name}` is not a stage name; expected a small letter, then small letters, digits, `_`, `-`, at most 64");
+            self.mistake(entry.key_at, &path, message, None);
+        }
+        if node.map().is_none() {
+            let message = format!("{owner} is {}; expected a mapping with `kind`", node.describe());
+            self.mistake(node.at, &path, message, Some(format!("such as `{name}: {{kind: train.vae}}`")));
+            return None;
+        }
+        let all = StageSettings::all();
+        let kinds: Vec<&str> = all.iter().map(StageSettings::kind).collect();
+        let Some(kind) = node.entry("kind") else {
+            let message = format!("{owner} has no `kind`");
+            self.mistake(entry.key_at, &format!("{path}.kind"), message, Some(format!("kinds: {}", list_keys(kinds))));
+            return None;
+        };
+        let Some(default) = kind.value.as_text().and_then(|text| all.iter().find(|s| s.kind() == text)) else {
+            let near = kind.value.as_text().and_then(|text| nearest(text, kinds.iter().copied()));
+            let question = near.map(|near| format!("; did you mean `{near}`?")).unwrap_or_default();
+            let message = match kind.value.as_text() {
+                Some(text) => format!("unknown kind `{text}` of {owner}{question}"),
+                None => format!("`kind` of {owner} is {}; expected a text", kind.value.describe()),
+            };
+            let help = Some(format!("kinds: {}", list_keys(kinds)));
+            self.mistake(kind.value.at, &format!("{path}.kind"), message, help);
+            return None;
+        };
+        let placed = Node {
+            at: node.at,
+            value: Content::Map(
+                node.map().unwrap_or(&[]).iter().filter(|e| matches!(&*e.key, "workers" | "checkpoint")).cloned().collect(),
+            ),
+        };
+        let placement = self.typed::<Placement>(&placed, &owner, &path, &[]);
+        let settings = self.overlaid(serde_json::to_value(default).ok()?, node, &owner, &path, &["workers", "checkpoint"]);
+        Some((settings?, placement?))
+    }
+
+    /// Adds edges, applies rules, sorts. Rules between stages wait until every stage could be read.
+    fn connect(&mut self, root: &Node, written: &[Written], mut stages: Vec<PipelineStage>) -> Option<Vec<PipelineStage>> {
+        for stage in &stages {
+            for problem in rules::stage(&stage.settings, &stage.placement) {
+                self.problem(written, &stage.name, problem);
+            }
+        }
+        graph::add_evaluations(&mut stages);
+        // The captions are embedded only if somebody asks for them, or the file does.
+        let text = StageName::new("text");
+        let all_read = stages.len() == written.len();
+        let asked = |stages: &[PipelineStage]| stages.iter().any(|s| s.inputs.iter().any(|input| input.stage == text));
+        if all_read && root.entry("text").is_none() && !asked(&stages) {
+            stages.retain(|stage| stage.name != text || !is_implicit(written, &stage.name));
+        }
+
+        let mut found = BTreeMap::new();
+        graph::check_references(&stages, &mut found);
+        if !all_read {
+            // A stage that could not be read may be what a reference is looking for.
+            let unread = |name: &str| {
+                written.iter().any(|w| w.name.as_str() == name) && !stages.iter().any(|s| s.name.as_str() == name)
+            };
+            for stage in &stages {
+                let broken: Vec<&str> =
+                    stage.inputs.iter().filter(|i| unread(i.stage.as_str())).map(|i| i.field.as_str()).collect();
+                if let Some(problems) = found.get_mut(&stage.name) {
+                    problems.0.retain(|problem| !broken.contains(&problem.field.as_str()));
+                }
+            }
+        }
+        let sound = all_read && found.values().all(|problems| problems.0.is_empty());
+        let sorted = match graph::sort(stages) {
+            Ok(stages) => {
+                if sound {
+                    graph::check_agreement(&stages, &mut found);
+                }
+                Some(stages)
+            }
+            Err(cycle) => {
+                let first = cycle.first().cloned();
+                let path = cycle.iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(" -> ");
+                let at = written.iter().find(|w| Some(&w.name) == first.as_ref()).map_or(root.at, |w| w.key_at);
+                let help = "each stage of the cycle reads the next one; let one of them read another stage";
+                self.mistake(at, "stages", format!("stages wait for each other: {path}"), Some(help.into()));
+                None
+            }
+        };
+        for (name, problems) in found {
+            for problem in problems.0 {
+                self.problem(written, &name, problem);
+            }
+        }
+        sorted
+    }
+
+    /// Puts a problem where its field stands, or its nearest parent.
+    fn problem(&mut self, written: &[Written], stage: &StageName, problem: Problem) {
+        let Some(written) = written.iter().find(|w| &w.name == stage) else { return };
+        let mut at = written.key_at;
+        let mut node = written.node.as_ref();
+        for part in problem.field.split(['.', '[', ']']).filter(|part| !part.is_empty()) {
+            let next = match node.map(|node| &node.value) {
+                Some(Content::Map(entries)) => entries.iter().find(|entry| entry.key == part).map(|entry| &entry.value),
+                Some(Content::List(items)) => part.parse::<usize>().ok().and_then(|i| items.get(i)),
+                _ => None,
+            };
+            let Some(next) = next else { break };
+            at = next.at;
+            node = Some(next);
+        }
+        let path = if problem.field.is_empty() { written.path.clone() } else { format!("{}.{}", written.path, problem.field) };
+        let owner = if written.path.starts_with("stages.") { format!("stage `{stage}`: ") } else { format!("`{stage}`: ") };
+        self.mistake(at, &path, format!("{owner}{}", problem.message), problem.help);
+    }
+}
+
+impl Written {
+    fn implicit(name: &str, entry: &Entry) -> Self {
+        Self { name: name.into(), key_at: entry.key_at, node: Some(entry.value.clone()), path: name.into() }
+    }
+}
+
+fn is_implicit(written: &[Written], name: &StageName) -> bool {
+    written.iter().any(|w| &w.name == name && w.node.is_none())
+}
+
+fn stage(name: &str, settings: StageSettings, placement: Placement) -> PipelineStage {
+    let inputs = graph::references(&settings);
+    PipelineStage { name: name.into(), settings, placement, inputs, external: BTreeMap::new() }
+}
+
+/// `[a-z][a-z0-9_-]*`, at most 64.
+fn is_stage_name(text: &str) -> bool {
+    is_name(text)
+        && text.starts_with(|c: char| c.is_ascii_lowercase())
+        && text.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || matches!(b, b'_' | b'-'))
+}
