@@ -1,0 +1,125 @@
+//! Bad input: a message with file, line or field and what to do, exit 2, and the store untouched.
+
+use std::fs;
+use std::path::Path;
+
+use cluster_tests::{Bench, wait_for};
+
+const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
+
+/// Runs a pipeline that must be refused with all of `parts` in the message.
+#[track_caller]
+fn refused(bench: &Bench, arguments: &[&str], parts: &[&str]) {
+    let said = bench.run(arguments).expect_code(2);
+    for part in parts {
+        assert!(said.stderr.contains(part), "`{part}` is missing in:\n{}", said.stderr);
+    }
+    assert_eq!(said.stdout, "", "data goes to stdout, messages to stderr");
+    assert!(!bench.store().exists(), "the store must be untouched");
+}
+
+fn changed(bench: &Bench, from: &str, to: &str) -> String {
+    let text = fs::read_to_string(Bench::config("smoke.yaml")).expect("the shipped pipeline");
+    assert!(text.contains(from), "smoke.yaml has no `{from}`");
+    let path = bench.path().join("p.yaml");
+    fs::write(&path, text.replacen(from, to, 1)).expect("written");
+    path.display().to_string()
+}
+
+#[test]
+fn p11_a_pipeline_with_mistakes() {
+    let bench = Bench::new(TRAINER);
+    for (from, to, parts) in [
+        ("kind: train.vae", "kind: train.vae\n    warmpu: 3", vec!["p.yaml:", "warmpu", "warmup"]),
+        ("kind: train.vae", "kind: train.vea", vec!["p.yaml:", "train.vea", "train.vae"]),
+        ("kind: train.mld", "kind: train.mld\n    lr: fast", vec!["p.yaml:", "lr", "number"]),
+        ("kind: encode.latents", "kind: encode.latents\n    vae: nobody", vec!["p.yaml:", "nobody"]),
+        ("kind: train.vae", "kind: train.vae\n    dataset: latents", vec!["p.yaml:", "latents"]),
+    ] {
+        let path = changed(&bench, from, to);
+        refused(&bench, &["run", &path], &parts);
+    }
+    let path = changed(&bench, "kind: train.vae", "kind: train.vae\n    dataset: vae");
+    refused(&bench, &["run", &path], &["vae"]);
+    refused(&bench, &["run", "nowhere.yaml"], &["nowhere.yaml"]);
+    refused(&bench, &["run", &path, "--set", "stages.nobody.lr=1"], &["nobody"]);
+}
+
+/// A folder in the published layout with three good clips.
+fn folder(path: &Path) {
+    let shared = std::env::var_os("STRIDE_SHARED").map_or_else(|| Bench::repository().join("../shared"), Into::into);
+    let source = shared.join("data/humanml3d-mini");
+    for sub in ["new_joint_vecs", "texts"] {
+        fs::create_dir_all(path.join(sub)).expect("created");
+    }
+    for name in ["Mean.npy", "Std.npy"] {
+        fs::copy(source.join(name), path.join(name)).expect("copied");
+    }
+    let train = fs::read_to_string(source.join("train.txt")).expect("train.txt");
+    let ids: Vec<_> = train.lines().take(12).collect();
+    for id in &ids {
+        fs::copy(source.join(format!("new_joint_vecs/{id}.npy")), path.join(format!("new_joint_vecs/{id}.npy"))).expect("copied");
+        fs::copy(source.join(format!("texts/{id}.txt")), path.join(format!("texts/{id}.txt"))).expect("copied");
+    }
+    fs::write(path.join("train.txt"), ids[..8].join("\n")).expect("written");
+    fs::write(path.join("val.txt"), ids[8..10].join("\n")).expect("written");
+    fs::write(path.join("test.txt"), ids[10..].join("\n")).expect("written");
+}
+
+#[test]
+fn a_broken_dataset_folder_is_named_file_by_file() {
+    let shared = std::env::var_os("STRIDE_SHARED").map_or_else(|| Bench::repository().join("../shared"), Into::into);
+    if !shared.join("data/humanml3d-mini").exists() {
+        eprintln!("SKIPPED: no real motion under {} (set STRIDE_SHARED)", shared.display());
+        return;
+    }
+    let bench = Bench::new(TRAINER);
+    let config = Bench::config("humanml3d-mini.yaml");
+    let run = |data: &Path, parts: &[&str]| {
+        refused(&bench, &["run", &config, "--set", &format!("dataset.path={}", data.display()), "--until", "dataset"], parts);
+    };
+    run(&bench.path().join("missing"), &["missing"]);
+
+    let data = bench.path().join("data");
+    folder(&data);
+    let first = fs::read_to_string(data.join("train.txt")).expect("train.txt").lines().next().expect("an id").to_owned();
+    let clip = data.join(format!("new_joint_vecs/{first}.npy"));
+    let good = fs::read(&clip).expect("a clip");
+
+    fs::write(&clip, &good[..good.len() - 100]).expect("written");
+    run(&data, &[&first, "bytes"]);
+
+    let header = good.windows(1).position(|b| b[0] == b'\n').expect("an .npy header") + 1;
+    let mut nan = good.clone();
+    nan[header + 4 * 263 * 2 + 20..header + 4 * 263 * 2 + 24].copy_from_slice(&f32::NAN.to_le_bytes());
+    fs::write(&clip, &nan).expect("written");
+    run(&data, &[&first, "frame 2", "NaN"]);
+
+    let text = String::from_utf8_lossy(&good[..header]).into_owned();
+    let mut narrow = text.replace("263)", "251)").into_bytes();
+    let frames = (good.len() - header) / (4 * 263);
+    narrow.extend_from_slice(&good[header..header + frames * 251 * 4]);
+    fs::write(&clip, &narrow).expect("written");
+    run(&data, &[&first, "263", "251"]);
+
+    fs::write(&clip, &good).expect("written");
+    let caption = data.join(format!("texts/{first}.txt"));
+    fs::write(&caption, "a person walks.#a/DET person/NOUN#0.0#0.0\nno fields here\n").expect("written");
+    run(&data, &[&format!("{first}.txt:2")]);
+}
+
+#[test]
+fn a_second_run_says_who_holds_the_store() {
+    let bench = Bench::new(TRAINER);
+    let config = Bench::config("smoke.yaml");
+    let mut first = bench.spawn(&["run", &config]);
+    let second = wait_for("the first run to hold the store", || {
+        let said = bench.run(&["status", "-o", "json"]);
+        (said.code == Some(0) && said.stdout.contains("running")).then(|| bench.run(&["run", &config]))
+    });
+    assert!(first.alive(), "the first run goes on");
+    let second = second.expect_code(2);
+    assert!(second.stderr.contains(&first.pid().to_string()), "it should name process {}:\n{}", first.pid(), second.stderr);
+    first.kill();
+    first.wait();
+}

@@ -1,0 +1,8 @@
+//! Real trainers, really killed. Each promise of the design that a process can break is broken here on purpose.
+//!
+//! The pipeline is `configs/smoke.yaml`: every stage kind of the quickstart at toy sizes.
+
+mod bad_input;
+mod determinism;
+mod registry;
+mod storage;

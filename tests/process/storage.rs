@@ -1,0 +1,65 @@
+//! A full disk and a read-only store: nothing is half written, and the message says what to do.
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use cluster_tests::Bench;
+
+const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
+
+/// A small file system of its own, unmounted on drop.
+struct Mounted<'a>(&'a Path);
+
+impl<'a> Mounted<'a> {
+    /// `None`, loudly, where mounting is not allowed.
+    fn tmpfs(path: &'a Path, options: &str) -> Option<Self> {
+        fs::create_dir_all(path).expect("created");
+        let done = Command::new("mount").args(["-t", "tmpfs", "-o", options, "tmpfs"]).arg(path).output();
+        if done.is_ok_and(|output| output.status.success()) {
+            Some(Self(path))
+        } else {
+            eprintln!("SKIPPED: this test mounts a small file system and needs root");
+            None
+        }
+    }
+
+    fn remount(&self, options: &str) {
+        let done = Command::new("mount").args(["-o", &format!("remount,{options}")]).arg(self.0).status();
+        assert!(done.expect("mount runs").success(), "remount {options}");
+    }
+}
+
+impl Drop for Mounted<'_> {
+    fn drop(&mut self) {
+        drop(Command::new("umount").arg("-l").arg(self.0).status());
+    }
+}
+
+#[test]
+fn p7_a_full_disk_stops_the_run_and_freeing_space_lets_it_go_on() {
+    let bench = Bench::new(TRAINER);
+    let disk = bench.path().join("disk");
+    let Some(mounted) = Mounted::tmpfs(&disk, "size=2500k") else { return };
+    let (config, store) = (Bench::config("smoke.yaml"), disk.join("store").display().to_string());
+    let full = bench.run(&["run", &config, "--store", &store]);
+    assert!(matches!(full.code, Some(1 | 2)), "exit code {:?}\n{}", full.code, full.stderr);
+    assert!(full.stderr.contains("space"), "{}", full.stderr);
+
+    mounted.remount("size=200m");
+    bench.run(&["registry", "fsck", "--store", &store]).expect_code(0);
+    let report = bench.run(&["run", &config, "--store", &store, "-o", "json"]).expect_code(0).json();
+    let fresh = Bench::new(TRAINER).pipeline("smoke.yaml", &[]);
+    assert_eq!(cluster_tests::digests(&report), cluster_tests::digests(&fresh));
+}
+
+#[test]
+fn a_read_only_store_is_refused() {
+    let bench = Bench::new(TRAINER);
+    let disk = bench.path().join("disk");
+    let Some(mounted) = Mounted::tmpfs(&disk, "size=50m") else { return };
+    mounted.remount("ro");
+    let (config, store) = (Bench::config("smoke.yaml"), disk.join("store").display().to_string());
+    let said = bench.run(&["run", &config, "--store", &store]).expect_code(2);
+    assert!(said.stderr.to_lowercase().contains("read-only"), "{}", said.stderr);
+}
