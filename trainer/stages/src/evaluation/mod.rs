@@ -2,4 +2,6 @@
 
 pub mod frechet;
 pub mod joints;
+pub mod latent_fid;
+pub mod reconstruction;
 pub mod retrieval;

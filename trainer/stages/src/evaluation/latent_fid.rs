@@ -1,0 +1,257 @@
+//! How well sampled latents match real ones, and their captions, without an evaluator network.
+//!
+//! Source: our own definitions, made to rank students on sets that are too small for a learned evaluator.
+//! * `latent_fid`: Frechet distance between samples and real latents in the first principal components of the train latents,
+//!   divided by the total variance of the real ones there. 0 is perfect, 1 is every sample at the data's mean.
+//! * R-precision: each sample ranks the mean latent of its own entry among those of 31 random entries that share no caption.
+//! * `match`: squared distance to another model's samples from the same noise and captions, as a share of their variance.
+
+use std::collections::{BTreeSet, HashMap};
+
+use motion::Stream;
+use protocol::Seed;
+
+use super::frechet::{Gaussian, PrincipalComponents, to_f64};
+use super::retrieval;
+
+/// Entries that a sample's own one is ranked among, itself included.
+pub const POOL: usize = 32;
+
+/// What samples are compared with.
+#[derive(Debug)]
+pub struct Reference {
+    components: PrincipalComponents,
+    real: Gaussian,
+    total_variance: f64,
+    /// Mean latent of each entry along the components, `[entries, components]`.
+    anchors: Vec<f64>,
+    /// Captions of each entry; equal captions have equal numbers.
+    captions: Vec<BTreeSet<usize>>,
+}
+
+/// Real latents, all `[entries, crops, width]`.
+#[derive(Debug, Clone, Copy)]
+pub struct Real<'a> {
+    /// One draw of z from each posterior.
+    pub z: &'a [f32],
+    /// Posterior means.
+    pub mu: &'a [f32],
+    /// Crops per entry.
+    pub crops: usize,
+    /// N d.
+    pub width: usize,
+}
+
+/// Values of one set of samples.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SetMetrics {
+    /// Frechet distance over the real variance.
+    pub latent_fid: f64,
+    /// Rank of its own entry for each sample, 0 for the nearest.
+    pub ranks: Vec<usize>,
+    /// Standard deviation over all values of all samples.
+    pub latent_std: f64,
+}
+
+impl Reference {
+    /// Fits the components to the entries `train` and the real distribution to the entries `compared`.
+    pub fn new(
+        real: Real<'_>,
+        train: &[usize],
+        compared: &[usize],
+        captions: Vec<BTreeSet<usize>>,
+        components: usize,
+    ) -> Self {
+        let entry = real.crops * real.width;
+        let rows = |entries: &[usize]| -> Vec<f64> {
+            entries.iter().flat_map(|e| to_f64(&real.z[e * entry..(e + 1) * entry])).collect()
+        };
+        let components = PrincipalComponents::fit(&rows(train), real.width, components);
+        let gaussian = Gaussian::fit(&components.project(&rows(compared)), components.len());
+        let mut means = Vec::with_capacity(real.mu.len() / real.crops);
+        for crops in real.mu.chunks_exact(entry) {
+            let sum = |i: usize| crops.iter().skip(i).step_by(real.width).map(|v| f64::from(*v)).sum::<f64>();
+            means.extend((0..real.width).map(|i| sum(i) / real.crops as f64));
+        }
+        let anchors = components.project(&means);
+        let total_variance = gaussian.total_variance();
+        Self { components, real: gaussian, total_variance, anchors, captions }
+    }
+
+    /// Share of the train latents' variance that the components hold.
+    pub fn explained(&self) -> f64 {
+        self.components.explained()
+    }
+
+    /// Trace of the real covariance along the components.
+    pub fn total_variance(&self) -> f64 {
+        self.total_variance
+    }
+
+    /// Frechet distance of `samples`, rows of the latents' width, over the real variance.
+    pub fn distance(&self, samples: &[f32]) -> f64 {
+        self.projected_distance(&self.components.project(&to_f64(samples)))
+    }
+
+    fn projected_distance(&self, projected: &[f64]) -> f64 {
+        self.real.distance(&Gaussian::fit(projected, self.components.len())) / self.total_variance
+    }
+
+    /// The metrics of `samples`, one row for each of `entries`; pools are drawn for `repeat`.
+    pub fn measure(&self, samples: &[f32], entries: &[usize], seed: Seed, repeat: u64) -> SetMetrics {
+        let dim = self.components.len();
+        let projected = self.components.project(&to_f64(samples));
+        let rank = |(i, &entry): (usize, &usize)| {
+            let mut stream = Stream::new(seed, "evaluate.latent_fid/pool", repeat, i as u64);
+            let others = self.pool(entry, &mut stream);
+            let anchor = |e: usize| retrieval::row(&self.anchors, e, dim);
+            let others = others.into_iter().map(anchor);
+            retrieval::rank(retrieval::row(&projected, i, dim), anchor(entry), others)
+        };
+        SetMetrics {
+            latent_fid: self.projected_distance(&projected),
+            ranks: entries.iter().enumerate().map(rank).collect(),
+            latent_std: standard_deviation(samples),
+        }
+    }
+
+    /// Up to 31 different entries that share no caption with `entry`; fewer on tiny sets.
+    fn pool(&self, entry: usize, stream: &mut Stream) -> Vec<usize> {
+        let count = self.captions.len();
+        // A shuffle that only remembers what it has swapped, since most of a large set is never looked at.
+        let mut swapped: HashMap<usize, usize> = HashMap::new();
+        let mut pool = Vec::with_capacity(POOL - 1);
+        for first in 0..count {
+            let drawn = first + stream.below(count - first);
+            let candidate = swapped.get(&drawn).copied().unwrap_or(drawn);
+            let displaced = swapped.get(&first).copied().unwrap_or(first);
+            swapped.insert(drawn, displaced);
+            if candidate != entry && self.captions[candidate].is_disjoint(&self.captions[entry]) {
+                pool.push(candidate);
+            }
+            if pool.len() == POOL - 1 {
+                break;
+            }
+        }
+        pool
+    }
+}
+
+/// Share of `ranks` below `k`.
+pub fn top(ranks: impl Iterator<Item = usize>, k: usize) -> f64 {
+    let (hits, count) =
+        ranks.fold((0, 0), |(hits, count): (usize, usize), rank| (hits + usize::from(rank < k), count + 1));
+    hits as f64 / count as f64
+}
+
+/// Numbers captions so that equal embeddings have equal numbers; `rows` are rows of `dim` values.
+pub fn same_captions(rows: &[f32], dim: usize) -> Vec<usize> {
+    let mut known: HashMap<Vec<u32>, usize> = HashMap::new();
+    rows.chunks_exact(dim)
+        .map(|row| {
+            let next = known.len();
+            *known.entry(row.iter().map(|v| v.to_bits()).collect()).or_insert(next)
+        })
+        .collect()
+}
+
+/// Squared distance of `samples` to `others`, row by row, as a share of the variance of `others`; rows of `width` values.
+pub fn relative_distance(samples: &[f32], others: &[f32], width: usize) -> f64 {
+    let rows = others.len() / width;
+    let mut mean = vec![0.0; width];
+    for row in others.chunks_exact(width) {
+        for (sum, value) in mean.iter_mut().zip(row) {
+            *sum += f64::from(*value) / rows as f64;
+        }
+    }
+    let spread: f64 = others.chunks_exact(width).map(|row| squared(row, mean.iter().copied())).sum();
+    let apart: f64 = others
+        .chunks_exact(width)
+        .zip(samples.chunks_exact(width))
+        .map(|(row, sample)| squared(row, sample.iter().map(|v| f64::from(*v))))
+        .sum();
+    apart / spread
+}
+
+fn squared(row: &[f32], other: impl Iterator<Item = f64>) -> f64 {
+    row.iter().zip(other).map(|(a, b)| (f64::from(*a) - b).powi(2)).sum()
+}
+
+/// Standard deviation over all values.
+pub fn standard_deviation(values: &[f32]) -> f64 {
+    let count = values.len() as f64;
+    let mean = values.iter().map(|v| f64::from(*v)).sum::<f64>() / count;
+    (values.iter().map(|v| (f64::from(*v) - mean).powi(2)).sum::<f64>() / count).sqrt()
+}
+
+/// Mean, and standard deviation with n - 1 when there are two values or more.
+pub fn mean_and_spread(values: &[f64]) -> (f64, Option<f64>) {
+    let mean = values.iter().sum::<f64>() / values.len() as f64;
+    let squares: f64 = values.iter().map(|v| (v - mean).powi(2)).sum();
+    (mean, (values.len() > 1).then(|| (squares / (values.len() - 1) as f64).sqrt()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WIDTH: usize = 6;
+    const CROPS: usize = 4;
+
+    /// `entries` clusters far apart, two entries to a caption.
+    fn clusters(entries: usize) -> (Vec<f32>, Vec<BTreeSet<usize>>) {
+        let mut stream = Stream::new(Seed(1), "test", 0, 0);
+        let mut z = vec![];
+        for _ in 0..entries {
+            let centre: Vec<f32> = (0..WIDTH).map(|_| 10.0 * stream.normal()).collect();
+            for _ in 0..CROPS {
+                z.extend(centre.iter().map(|c| c + 0.1 * stream.normal()));
+            }
+        }
+        (z, (0..entries).map(|e| BTreeSet::from([e / 2])).collect())
+    }
+
+    #[test]
+    fn real_latents_are_close_to_themselves_and_find_their_entry() {
+        let (z, captions) = clusters(60);
+        let all: Vec<usize> = (0..60).collect();
+        let real = Real { z: &z, mu: &z, crops: CROPS, width: WIDTH };
+        let reference = Reference::new(real, &all[..50], &all, captions, 4);
+        let entries: Vec<usize> = (0..60 * CROPS).map(|row| row / CROPS).collect();
+        let found = reference.measure(&z, &entries, Seed(3), 0);
+        assert!(found.latent_fid.abs() < 1e-9, "{found:?}");
+        assert_eq!(top(found.ranks.into_iter(), 1), 1.0);
+
+        let (mean, _) = mean_and_spread(&z.iter().map(|v| f64::from(*v)).collect::<Vec<_>>());
+        assert!(mean.is_finite());
+        // Every sample at the data's mean: all of the variance is missing.
+        let middle: Vec<f32> =
+            (0..WIDTH).map(|i| z.iter().skip(i).step_by(WIDTH).sum::<f32>() / (60 * CROPS) as f32).collect();
+        assert!((reference.distance(&middle.repeat(20)) - 1.0).abs() < 1e-3);
+    }
+
+    #[test]
+    fn pools_hold_no_entry_twice_and_none_with_the_same_caption() {
+        let (z, captions) = clusters(40);
+        let all: Vec<usize> = (0..40).collect();
+        let real = Real { z: &z, mu: &z, crops: CROPS, width: WIDTH };
+        let reference = Reference::new(real, &all, &all, captions, 4);
+        for entry in 0..40 {
+            let pool = reference.pool(entry, &mut Stream::new(Seed(1), "pool", 0, entry as u64));
+            assert_eq!(pool.len(), POOL - 1);
+            assert_eq!(pool.iter().collect::<BTreeSet<_>>().len(), pool.len());
+            assert!(pool.iter().all(|other| other / 2 != entry / 2));
+        }
+    }
+
+    #[test]
+    fn the_relative_distance_is_a_share_of_the_variance() {
+        let others = [0.0, 0.0, 2.0, 4.0];
+        assert_eq!(relative_distance(&others, &others, 2), 0.0);
+        // Everything at the mean.
+        assert_eq!(relative_distance(&[1.0, 2.0, 1.0, 2.0], &others, 2), 1.0);
+        assert_eq!(same_captions(&[1.0, 0.0, 0.5, 0.5, 1.0, 0.0], 2), [0, 1, 0]);
+        assert_eq!(mean_and_spread(&[1.0, 3.0]), (2.0, Some(2.0f64.sqrt())));
+        assert_eq!(mean_and_spread(&[1.0]), (1.0, None));
+    }
+}

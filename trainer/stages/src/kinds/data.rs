@@ -1,0 +1,103 @@
+//! `data.open` and `data.synthetic`: a dataset as an artifact.
+//!
+//! Files: those of [`Dataset::write_files`], and `report.txt`, which names every clip and caption that was left out and why.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use motion::Dataset;
+use motion::dataset::{OpenReport, PackError, Split};
+use protocol::ArtifactKind;
+use protocol::stage::{DataFormat, DataOpen, DataSynthetic};
+
+use crate::artifacts::{DatasetMeta, Draft, to_meta};
+use crate::context::{AttemptContext, Outcome, StageError};
+
+/// The file that says what was left out.
+const REPORT_FILE: &str = "report.txt";
+
+/// Opens a folder in the published layout.
+pub(super) fn open(cx: &mut dyn AttemptContext, settings: &DataOpen) -> Result<Outcome, StageError> {
+    let (dataset, report) =
+        Dataset::open(Path::new(&settings.path), settings.format).map_err(|e| StageError::Input(e.to_string()))?;
+    log_report(cx, &report);
+    pack(cx, &dataset, report.skips.len(), report.to_string())
+}
+
+/// A line for each clip that was left out, and the totals.
+fn log_report(cx: &mut dyn AttemptContext, report: &OpenReport) {
+    for skip in &report.skips {
+        cx.log(&format!("skipped {skip}, {}: {}", skip.split, skip.reason.heading()));
+    }
+    if !report.shared.is_empty() {
+        cx.log(&format!("warning: in more than one split: {}", report.shared.join(", ")));
+    }
+}
+
+/// Makes clips from nothing but the seed.
+pub(super) fn synthetic(cx: &mut dyn AttemptContext, settings: &DataSynthetic) -> Result<Outcome, StageError> {
+    let dataset = motion::synthetic::generate(settings, cx.task().seed).map_err(|e| StageError::Input(e.to_string()))?;
+    let text = format!("made by the program: {} clips, {} captions\n", dataset.clips.len(), dataset.captions.len());
+    pack(cx, &dataset, 0, text)
+}
+
+fn pack(
+    cx: &mut dyn AttemptContext,
+    dataset: &Dataset,
+    skipped: usize,
+    report: String,
+) -> Result<Outcome, StageError> {
+    let meta = DatasetMeta {
+        format: dataset.format,
+        clips: dataset.clips.len(),
+        captions: dataset.captions.len(),
+        entries: dataset.entries.len(),
+        frames: dataset.clips.iter().map(|c| c.frames).sum(),
+        skipped,
+    };
+    cx.log(&summary(dataset, &meta));
+    let metrics = [("clips", meta.clips), ("captions", meta.captions), ("frames", meta.frames), ("skipped", skipped)]
+        .into_iter()
+        .map(|(name, count)| (name.to_owned(), count as f64))
+        .collect::<BTreeMap<_, _>>();
+
+    let mut draft = Draft::new(cx, ArtifactKind::Dataset, to_meta(&meta));
+    draft.add(REPORT_FILE, report.into_bytes())?;
+    dataset.write_files::<Failure>(|name, bytes| draft.add(&name, bytes).map_err(Failure::Store)).map_err(
+        |e| match e {
+            Failure::Store(e) => e,
+            Failure::Pack(e) => StageError::Fault(e.to_string()),
+        },
+    )?;
+    Ok(Outcome::Finished { output: draft.finish(cx)?, metrics })
+}
+
+/// Why a file of the dataset was not stored.
+enum Failure {
+    Store(StageError),
+    Pack(PackError),
+}
+
+impl From<PackError> for Failure {
+    fn from(error: PackError) -> Self {
+        Self::Pack(error)
+    }
+}
+
+fn summary(dataset: &Dataset, meta: &DatasetMeta) -> String {
+    let count = |split: Split| dataset.entries.iter().filter(|e| e.split == split).count();
+    let format = match meta.format {
+        DataFormat::Humanml3d => "humanml3d",
+        DataFormat::Kit => "kit",
+    };
+    format!(
+        "{format}: {} clips ({:.1} minutes), {} captions, entries {} train, {} val, {} test; {} left out",
+        meta.clips,
+        meta.frames as f64 / dataset.skeleton().fps / 60.0,
+        meta.captions,
+        count(Split::Train),
+        count(Split::Val),
+        count(Split::Test),
+        meta.skipped
+    )
+}
