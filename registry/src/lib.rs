@@ -8,9 +8,11 @@
 
 pub mod blob;
 pub mod catalog;
+pub mod cli;
 mod clock;
 mod db;
 pub mod failpoints;
+pub mod fsck;
 mod lock;
 mod metrics;
 pub mod query;

@@ -181,6 +181,11 @@ impl Store {
         self.0.lock.set_address(address.into())
     }
 
+    /// What others are told about this process.
+    pub fn holder(&self) -> Holder {
+        self.0.lock.holder()
+    }
+
     /// The folder.
     pub fn dir(&self) -> &Path {
         &self.0.dir

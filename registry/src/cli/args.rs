@@ -1,0 +1,128 @@
+//! The command line: what users type, turned into a [`Command`].
+
+use std::path::PathBuf;
+
+use clap::{Subcommand, ValueEnum};
+
+use super::Command;
+use crate::catalog::Expect;
+
+/// How answers are printed.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum)]
+pub enum Output {
+    /// For people.
+    #[default]
+    Table,
+    /// For programs: one object on stdout; errors as one object on stderr.
+    Json,
+}
+
+/// A verb with its arguments.
+#[derive(Debug, Clone, Subcommand)]
+pub enum Verb {
+    /// Lists models with their versions and aliases
+    List,
+    /// Shows a model with its versions, or one version with its files
+    Show {
+        /// MODEL, MODEL@ALIAS, MODEL@best or MODEL:VERSION
+        model: String,
+    },
+    /// Shows who moved an alias, when, why, from where and to where
+    History {
+        /// The model
+        model: String,
+        /// Only this alias
+        #[arg(long)]
+        alias: Option<String>,
+    },
+    /// Points an alias at a version, if every gate holds
+    Promote {
+        /// MODEL@best, MODEL@ALIAS or MODEL:VERSION
+        model: String,
+        /// The alias to move
+        #[arg(long, value_name = "ALIAS")]
+        to: String,
+        /// Refuse unless the alias points at this version now (`none`: does not exist yet)
+        #[arg(long, value_name = "VERSION|none")]
+        expect: Option<Expect>,
+        /// A gate such as 'latent_fid<=0.2' or 'latent_fid <= staging - 0.01'; may be repeated
+        #[arg(long, value_name = "GATE")]
+        require: Vec<String>,
+        /// Why, for the log
+        #[arg(long)]
+        reason: String,
+        /// Who, for the log; otherwise the user's name
+        #[arg(long, env = "STRIDE_ACTOR")]
+        actor: Option<String>,
+    },
+    /// Points an alias back at the version before its last promotion
+    Rollback {
+        /// The model
+        model: String,
+        /// The alias to move
+        #[arg(long)]
+        alias: String,
+        /// To this version instead
+        #[arg(long, value_name = "VERSION")]
+        to: Option<u64>,
+        /// Refuse unless the alias points at this version now
+        #[arg(long, value_name = "VERSION")]
+        expect: Option<Expect>,
+        /// Why, for the log
+        #[arg(long, default_value = "rollback")]
+        reason: String,
+        /// Who, for the log; otherwise the user's name
+        #[arg(long, env = "STRIDE_ACTOR")]
+        actor: Option<String>,
+    },
+    /// Shows what a version or an artifact was made of
+    Lineage {
+        /// A model version or a digest
+        artifact: String,
+    },
+    /// Hashes every blob again and follows every reference
+    Fsck,
+    /// Removes blobs that nothing needs
+    Gc {
+        /// Only show what would be removed
+        #[arg(long)]
+        dry_run: bool,
+        /// Keep blobs that were stored in the last so many minutes
+        #[arg(long, value_name = "MINUTES", default_value_t = 60)]
+        grace: u32,
+    },
+    /// Copies a version's files to a folder
+    Export {
+        /// MODEL@ALIAS, MODEL@best or MODEL:VERSION
+        model: String,
+        /// The folder; it must be empty or missing
+        dir: PathBuf,
+    },
+}
+
+impl Verb {
+    /// What is asked. Relative paths are resolved here, for the store's holder may run elsewhere.
+    pub fn into_command(self) -> std::io::Result<Command> {
+        Ok(match self {
+            Self::List => Command::List,
+            Self::Show { model } => Command::Show { reference: model },
+            Self::History { model, alias } => Command::History { model, alias },
+            Self::Promote { model, to, expect, require, reason, actor } => {
+                Command::Promote { reference: model, to, expect, require, reason, actor: actor.unwrap_or_else(user) }
+            }
+            Self::Rollback { model, alias, to, expect, reason, actor } => {
+                Command::Rollback { model, alias, to, expect, reason, actor: actor.unwrap_or_else(user) }
+            }
+            Self::Lineage { artifact } => Command::Lineage { reference: artifact },
+            Self::Fsck => Command::Fsck,
+            Self::Gc { dry_run, grace } => Command::Gc { dry_run, grace_minutes: Some(grace) },
+            Self::Export { model, dir } => Command::Export { reference: model, dir: std::path::absolute(dir)? },
+        })
+    }
+}
+
+fn user() -> String {
+    let named =
+        ["USER", "LOGNAME"].into_iter().find_map(|name| std::env::var(name).ok().filter(|user| !user.is_empty()));
+    named.unwrap_or_else(|| "unknown".into())
+}

@@ -1,0 +1,299 @@
+//! The registry's commands, once: the `registry` binary, `trainer registry` and the server's `POST /v1/registry` all call
+//! [`run`].
+//!
+//! [`Command`] is what may be asked and [`Answer`] what comes back, both plain data, so that a client can send the one and
+//! show the other. Exit codes: 0 done, 1 other errors, 2 wrong usage or an unusable store, 3 not found, 4 conflict, 6 the
+//! holder of the store does not answer, 9 damage found, 10 a gate does not hold.
+
+mod args;
+mod client;
+mod export;
+mod print;
+
+use protocol::message::ApiError;
+use protocol::{Alias, Digest, Manifest, ModelName};
+use serde::{Deserialize, Serialize};
+
+pub use args::{Output, Verb};
+pub use client::execute;
+pub use print::{render, show_error};
+
+use crate::catalog::{Expect, Gate, Model, ModelRef, Promotion, Version};
+use crate::retention::{GRACE_MS, Plan};
+use crate::{LineageNode, OpenError, QueryError, Store, WriteError, fsck};
+
+/// What may be asked of a registry.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "command", rename_all = "kebab-case")]
+pub enum Command {
+    /// All models.
+    List,
+    /// A model with its versions, or one version.
+    Show {
+        /// `MODEL`, `MODEL@ALIAS`, `MODEL:VERSION`.
+        reference: String,
+    },
+    /// The moves of a model's aliases.
+    History {
+        /// The model.
+        model: String,
+        /// Only of this alias.
+        alias: Option<String>,
+    },
+    /// Moves an alias to a version.
+    Promote {
+        /// `MODEL@ALIAS`, `MODEL@best`, `MODEL:VERSION`.
+        reference: String,
+        /// The alias.
+        to: String,
+        /// What the alias must point at now.
+        expect: Option<Expect>,
+        /// Gates as written.
+        require: Vec<String>,
+        /// Why.
+        reason: String,
+        /// Who.
+        actor: String,
+    },
+    /// Moves an alias back.
+    Rollback {
+        /// The model.
+        model: String,
+        /// The alias.
+        alias: String,
+        /// To this version; otherwise to the one before the last promotion.
+        to: Option<u64>,
+        /// What the alias must point at now.
+        expect: Option<Expect>,
+        /// Why.
+        reason: String,
+        /// Who.
+        actor: String,
+    },
+    /// What an artifact was made of.
+    Lineage {
+        /// A model version or a digest.
+        reference: String,
+    },
+    /// Checks everything.
+    Fsck,
+    /// Removes what nothing needs.
+    Gc {
+        /// Only says what would go.
+        dry_run: bool,
+        /// Minutes for which a fresh blob is safe.
+        grace_minutes: Option<u32>,
+    },
+    /// Copies a model's files to a folder of the machine that holds the store.
+    Export {
+        /// A model version.
+        reference: String,
+        /// An absolute path; the folder must be empty or missing.
+        dir: std::path::PathBuf,
+    },
+}
+
+/// What a command gives.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "kebab-case")]
+#[expect(missing_docs, clippy::allow_attributes, reason = "each field is the type it holds")]
+pub enum Data {
+    /// Of `list`.
+    Models { models: Vec<Model> },
+    /// Of `show MODEL`.
+    Model { model: Model, versions: Vec<Version> },
+    /// Of `show MODEL@ALIAS`.
+    Version { version: Version, manifest: Manifest },
+    /// Of `history`.
+    History { model: ModelName, history: Vec<Promotion> },
+    /// Of `promote` and `rollback`.
+    Promotion { promotion: Promotion },
+    /// Of `lineage`.
+    Lineage { nodes: Vec<LineageNode> },
+    /// Of `fsck`.
+    Fsck { report: fsck::Report },
+    /// Of `gc`.
+    Gc { dry_run: bool, plan: Plan },
+    /// Of `export`.
+    Exported { version: Version, dir: std::path::PathBuf, files: Vec<String> },
+}
+
+/// What came of a command.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Answer {
+    /// The process's exit code.
+    pub exit: u8,
+    /// What was asked for.
+    pub data: Option<Data>,
+    /// Why it was refused, or what was found to be wrong.
+    pub error: Option<ApiError>,
+}
+
+impl Answer {
+    fn done(data: Data) -> Self {
+        Self { exit: 0, data: Some(data), error: None }
+    }
+
+    /// Refused, with the exit code that belongs to the error's code.
+    pub fn refused(error: ApiError) -> Self {
+        let exit = match error.code.as_str() {
+            "invalid" | "store" => 2,
+            "not-found" => 3,
+            "conflict" | "stale-fence" => 4,
+            "unreachable" => 6,
+            "damaged" => 9,
+            "gate" => 10,
+            _ => 1,
+        };
+        Self { exit, data: None, error: Some(error) }
+    }
+}
+
+fn error(code: &str, message: impl ToString, hint: Option<&str>) -> ApiError {
+    ApiError { code: code.into(), message: message.to_string(), hint: hint.map(str::to_owned) }
+}
+
+impl From<QueryError> for Answer {
+    fn from(e: QueryError) -> Self {
+        Self::refused(match &e {
+            QueryError::NotFound(_) => error("not-found", e, Some("`registry list` shows what there is")),
+            QueryError::Invalid(_) => {
+                error("invalid", e, Some("`registry list` shows models, `registry show MODEL` their versions"))
+            }
+            QueryError::Database(_) | QueryError::Blob(_) => {
+                error("internal", e, Some("`registry fsck` checks the store"))
+            }
+        })
+    }
+}
+
+impl From<WriteError> for Answer {
+    fn from(e: WriteError) -> Self {
+        Self::refused(match &e {
+            WriteError::StaleFence { .. } => error("stale-fence", e, None),
+            WriteError::Conflict(_) => error("conflict", e, Some("`registry history MODEL` shows who moved what")),
+            WriteError::Gate(_) => error(
+                "gate",
+                e,
+                Some("nothing was changed; `registry show MODEL` lists every version with its metrics"),
+            ),
+            WriteError::NotFound(_) => error("not-found", e, Some("`registry list` shows what there is")),
+            WriteError::Storage(_) => error("storage", e, None),
+            WriteError::Internal(_) => error("internal", e, Some("`registry fsck` checks the store")),
+        })
+    }
+}
+
+impl From<&OpenError> for Answer {
+    fn from(e: &OpenError) -> Self {
+        let code = match e {
+            OpenError::NotAStore(_) => "not-found",
+            _ => "store",
+        };
+        Self::refused(error(code, e, Some(&e.hint())))
+    }
+}
+
+fn invalid(message: impl ToString) -> Answer {
+    Answer::refused(error("invalid", message, Some("`registry help` shows how commands are written")))
+}
+
+/// Runs a command on a store that this process holds.
+pub async fn run(command: Command, store: &Store) -> Answer {
+    answer(command, store).await.unwrap_or_else(|refused| refused)
+}
+
+async fn answer(command: Command, store: &Store) -> Result<Answer, Answer> {
+    let data = match command {
+        Command::List => Data::Models { models: store.models().await? },
+        Command::Show { reference } => show(store, &reference).await?,
+        Command::History { model, alias } => {
+            let model = known(store, &model).await?.model;
+            let alias = alias.map(|alias| alias.parse::<Alias>()).transpose().map_err(invalid)?;
+            let history = store.history(&model, alias.as_ref()).await?;
+            Data::History { model, history }
+        }
+        Command::Promote { reference, to, expect, require, reason, actor } => {
+            let reference: ModelRef = reference.parse().map_err(invalid)?;
+            let alias: Alias = to.parse().map_err(invalid)?;
+            for gate in &require {
+                gate.parse::<Gate>().map_err(invalid)?;
+            }
+            let Some(pick) = reference.pick else {
+                let model = reference.model;
+                return Err(invalid(format!(
+                    "`{model}` has several versions: say `{model}@best` or `{model}:VERSION`"
+                )));
+            };
+            let promotion = store.promote(&reference.model, pick, &alias, expect, require, &reason, &actor).await?;
+            Data::Promotion { promotion }
+        }
+        Command::Rollback { model, alias, to, expect, reason, actor } => {
+            let (model, alias): (ModelName, Alias) = (model.parse().map_err(invalid)?, alias.parse().map_err(invalid)?);
+            let promotion = store.rollback(&model, &alias, to, expect, &reason, &actor).await?;
+            Data::Promotion { promotion }
+        }
+        Command::Lineage { reference } => {
+            let digest = match reference.parse::<Digest>() {
+                Ok(digest) => digest,
+                Err(_) => store.resolve(&reference).await?.artifact,
+            };
+            let nodes = store.lineage(digest).await?;
+            if nodes.iter().all(|node| node.kind.is_none() && node.inputs.is_empty()) && !exists(store, digest)? {
+                return Err(Answer::from(QueryError::NotFound(format!("no artifact {digest}"))));
+            }
+            Data::Lineage { nodes }
+        }
+        Command::Fsck => {
+            let report = store.fsck().await?;
+            if !report.problems.is_empty() {
+                let message = format!("{} problems found; the first: {}", report.problems.len(), report.problems[0]);
+                let hint = "restore the store from a backup, or remove the damaged blobs under `blobs/` and run the pipelines \
+                            that made them again";
+                let mut answer = Answer::refused(error("damaged", message, Some(hint)));
+                answer.data = Some(Data::Fsck { report });
+                return Err(answer);
+            }
+            Data::Fsck { report }
+        }
+        Command::Gc { dry_run, grace_minutes } => {
+            let grace_ms = grace_minutes.map_or(GRACE_MS, |minutes| i64::from(minutes) * 60_000);
+            let plan = if dry_run { store.gc_plan(grace_ms).await? } else { store.gc(grace_ms).await? };
+            Data::Gc { dry_run, plan }
+        }
+        Command::Export { reference, dir } => {
+            let version = store.resolve(&reference).await?;
+            let files = export::export(store.blobs(), version.artifact, &dir).map_err(Answer::refused)?;
+            Data::Exported { version, dir, files }
+        }
+    };
+    Ok(Answer::done(data))
+}
+
+async fn known(store: &Store, name: &str) -> Result<Model, Answer> {
+    let name: ModelName = name.parse().map_err(invalid)?;
+    match store.model(&name).await? {
+        Some(model) => Ok(model),
+        // Says which models there are.
+        None => Err(store
+            .resolve(&format!("{name}@latest"))
+            .await
+            .map_or_else(Answer::from, |_| invalid("the model was made just now"))),
+    }
+}
+
+fn exists(store: &Store, digest: Digest) -> Result<bool, Answer> {
+    store.blobs().exists(digest).map_err(|e| Answer::from(QueryError::Blob(e.to_string())))
+}
+
+async fn show(store: &Store, text: &str) -> Result<Data, Answer> {
+    let reference: ModelRef = text.parse().map_err(invalid)?;
+    if reference.pick.is_none() {
+        let model = known(store, reference.model.as_str()).await?;
+        let versions = store.versions(&reference.model).await?;
+        return Ok(Data::Model { model, versions });
+    }
+    let version = store.resolve(text).await?;
+    let manifest = store.blobs().manifest(version.artifact).map_err(|e| QueryError::Blob(e.to_string()))?;
+    Ok(Data::Version { version, manifest })
+}

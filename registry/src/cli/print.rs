@@ -1,0 +1,210 @@
+//! Answers on the terminal. Data goes to stdout, messages to stderr.
+
+use std::io::{self, Write};
+
+use comfy_table::{ContentArrangement, Table, presets};
+use protocol::message::ApiError;
+use serde_json::json;
+
+use super::{Answer, Data, Output};
+use crate::catalog::{Action, Promotion, Version};
+use crate::clock::format_ms;
+
+/// Prints an answer.
+pub(super) fn show(answer: &Answer, output: Output) -> io::Result<()> {
+    if let Some(data) = &answer.data {
+        let text = match output {
+            Output::Table => render(data),
+            Output::Json => {
+                let mut value = serde_json::to_value(data)?;
+                value["schema_version"] = json!(1);
+                format!("{value:#}\n")
+            }
+        };
+        io::stdout().lock().write_all(text.as_bytes())?;
+    }
+    answer.error.as_ref().map_or(Ok(()), |error| show_error(error, output))
+}
+
+/// Prints an error to stderr: message, empty line, hint; or one JSON object.
+pub fn show_error(error: &ApiError, output: Output) -> io::Result<()> {
+    let mut stderr = io::stderr().lock();
+    match output {
+        Output::Json => writeln!(stderr, "{:#}", json!({ "error": error })),
+        Output::Table => {
+            writeln!(stderr, "error: {}", error.message)?;
+            error.hint.as_ref().map_or(Ok(()), |hint| writeln!(stderr, "\nhint: {hint}"))
+        }
+    }
+}
+
+/// An answer's data for people.
+pub fn render(data: &Data) -> String {
+    match data {
+        Data::Models { models } if models.is_empty() => "no models yet: a `register` stage makes one\n".into(),
+        Data::Models { models } => {
+            let mut table = table(&["MODEL", "VERSIONS", "BEST", "METRIC", "ALIASES"]);
+            for model in models {
+                let mode = model.mode.map(|mode| format!(" ({})", json!(mode).as_str().unwrap_or_default()));
+                table.add_row([
+                    model.model.to_string(),
+                    model.versions.to_string(),
+                    dash(model.best),
+                    format!("{}{}", dash(model.metric.as_ref()), mode.unwrap_or_default()),
+                    list(model.aliases.iter().map(|(alias, version)| format!("{alias}={version}"))),
+                ]);
+            }
+            format!("{}\n", table.trim_fmt())
+        }
+        Data::Model { model, versions } => {
+            let mut table = table(&["VERSION", "ALIASES", "METRICS", "FROM", "REGISTERED"]);
+            for version in versions {
+                let best = (model.best == Some(version.version)).then(|| "best".to_owned());
+                table.add_row([
+                    version.version.to_string(),
+                    list(best.into_iter().chain(version.aliases.iter().cloned())),
+                    metrics(version),
+                    source(version),
+                    format_ms(version.created_ms),
+                ]);
+            }
+            format!("{}\n{}\n", model.model, table.trim_fmt())
+        }
+        Data::Version { version, manifest } => {
+            let mut text = format!("{}:{}\n", version.model, version.version);
+            let lines = [
+                ("artifact", version.artifact.to_string()),
+                ("aliases", list(version.aliases.iter().cloned())),
+                ("metrics", metrics(version)),
+                ("from", source(version)),
+                ("registered", format_ms(version.created_ms)),
+            ];
+            for (name, value) in lines {
+                text += &format!("  {name:<11} {value}\n");
+            }
+            let mut table = table(&["FILE", "BYTES", "BLOB"]);
+            for (name, file) in &manifest.files {
+                table.add_row([name.clone(), file.bytes.to_string(), file.digest.short()]);
+            }
+            format!("{text}{}\n", table.trim_fmt())
+        }
+        Data::History { model, history } if history.is_empty() => format!("no alias of `{model}` has moved yet\n"),
+        Data::History { history, .. } => {
+            let mut table = table(&["#", "WHEN", "ALIAS", "ACTION", "FROM", "TO", "WHO", "WHY", "GATES"]);
+            for entry in history {
+                table.add_row([
+                    entry.id.to_string(),
+                    format_ms(entry.at_ms),
+                    entry.alias.to_string(),
+                    action(entry).to_owned(),
+                    dash(entry.from),
+                    entry.to.to_string(),
+                    entry.actor.clone(),
+                    entry.reason.clone(),
+                    list(entry.gates.iter().map(|gate| format!("{} ({})", gate.gate, dash(gate.value)))),
+                ]);
+            }
+            format!("{}\n", table.trim_fmt())
+        }
+        Data::Promotion { promotion } => {
+            let Promotion { model, alias, from, to, .. } = promotion;
+            let from = from.map_or_else(|| "nothing".into(), |from| format!("version {from}"));
+            let mut text = format!("{model}@{alias} points at version {to} (before: {from})\n");
+            for gate in &promotion.gates {
+                text += &format!("  gate `{}` holds: {}\n", gate.gate, gate.message);
+            }
+            text
+        }
+        Data::Lineage { nodes } => {
+            let mut table = table(&["ARTIFACT", "KIND", "STAGE", "RUN", "MADE OF"]);
+            for node in nodes {
+                table.add_row([
+                    format!("{}{}", "  ".repeat(node.depth as usize), node.digest.short()),
+                    dash(node.kind.as_ref()),
+                    dash(node.stage.as_ref()),
+                    dash(node.run.as_ref()),
+                    list(node.inputs.iter().map(|(role, digest)| format!("{role}={}", digest.short()))),
+                ]);
+            }
+            format!("{}\n", table.trim_fmt())
+        }
+        Data::Fsck { report } => {
+            let mut text = format!(
+                "{} blobs ({}) hashed, {} references followed, {} problems\n",
+                report.blobs,
+                size(report.bytes),
+                report.references,
+                report.problems.len()
+            );
+            for problem in &report.problems {
+                text += &format!("  {problem}\n");
+            }
+            text
+        }
+        Data::Gc { dry_run, plan } => {
+            let mut text = String::new();
+            for digest in &plan.remove {
+                text += &format!("  {digest}\n");
+            }
+            let verb = if *dry_run { "would remove" } else { "removed" };
+            let fresh = if plan.fresh == 0 { String::new() } else { format!(", {} too fresh to go", plan.fresh) };
+            text + &format!(
+                "{verb} {} blobs ({}); {} are needed{fresh}\n",
+                plan.remove.len(),
+                size(plan.bytes),
+                plan.kept
+            )
+        }
+        Data::Exported { version, dir, files } => {
+            format!("{}:{} is in `{}`: {}\n", version.model, version.version, dir.display(), files.join(", "))
+        }
+    }
+}
+
+fn table(header: &[&str]) -> Table {
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING).set_content_arrangement(ContentArrangement::Dynamic).set_header(header);
+    table
+}
+
+fn action(entry: &Promotion) -> &'static str {
+    match entry.action {
+        Action::Promote => "promote",
+        Action::Rollback => "rollback",
+    }
+}
+
+fn dash<T: ToString>(value: Option<T>) -> String {
+    value.map_or_else(|| "-".into(), |value| value.to_string())
+}
+
+fn list(items: impl Iterator<Item = String>) -> String {
+    let items: Vec<_> = items.collect();
+    if items.is_empty() { "-".into() } else { items.join(", ") }
+}
+
+fn metrics(version: &Version) -> String {
+    list(version.metrics.iter().map(|(key, value)| format!("{key}={}", digits(*value))))
+}
+
+/// Five significant digits at most.
+fn digits(value: f64) -> String {
+    format!("{value:.4e}").parse::<f64>().unwrap_or(value).to_string()
+}
+
+fn source(version: &Version) -> String {
+    let part = |name: &str| version.source[name].as_str().map(str::to_owned);
+    list(part("run").into_iter().chain(part("stage")))
+}
+
+#[expect(clippy::cast_precision_loss, reason = "for people")]
+fn size(bytes: u64) -> String {
+    let mut value = bytes as f64;
+    for unit in ["B", "KiB", "MiB", "GiB"] {
+        if value < 1024.0 {
+            return if unit == "B" { format!("{bytes} B") } else { format!("{value:.1} {unit}") };
+        }
+        value /= 1024.0;
+    }
+    format!("{value:.1} TiB")
+}

@@ -1,0 +1,70 @@
+//! Whether what is kept is whole: the database's own check, every blob hashed again, every reference resolved.
+
+use protocol::Digest;
+use serde::{Deserialize, Serialize};
+use sqlx::Row;
+
+use crate::blob::BlobStore;
+use crate::{QueryError, Store, retention};
+
+/// What a check found.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Report {
+    /// Blobs that were hashed.
+    pub blobs: u64,
+    /// Their bytes.
+    pub bytes: u64,
+    /// References that were followed.
+    pub references: u64,
+    /// What is wrong, in words.
+    pub problems: Vec<String>,
+}
+
+impl Store {
+    /// Checks everything. Reads every byte, so it takes as long as that takes.
+    pub async fn fsck(&self) -> Result<Report, QueryError> {
+        let mut conn = self.readers().acquire().await?;
+        let mut problems = Vec::new();
+        for row in sqlx::query("PRAGMA integrity_check").fetch_all(&mut *conn).await? {
+            let line: String = row.try_get(0)?;
+            if line != "ok" {
+                problems.push(format!("database: {line}"));
+            }
+        }
+        for row in sqlx::query("PRAGMA foreign_key_check").fetch_all(&mut *conn).await? {
+            problems.push(format!("database: a row of `{}` points at nothing", row.try_get::<String, _>(0)?));
+        }
+        let roots = retention::roots(&mut conn).await?;
+        drop(conn);
+        let blobs = self.blobs().clone();
+        let ended = |e: tokio::task::JoinError| QueryError::Blob(format!("the check ended early: {e}"));
+        let mut report = tokio::task::spawn_blocking(move || check(&blobs, &roots)).await.map_err(ended)?;
+        problems.append(&mut report.problems);
+        Ok(Report { problems, ..report })
+    }
+}
+
+fn check(blobs: &BlobStore, roots: &[(Digest, String)]) -> Report {
+    let mut report = Report::default();
+    match blobs.list() {
+        Ok(all) => {
+            for entry in all.values() {
+                report.blobs += 1;
+                report.bytes += entry.bytes;
+                match blobs.get(entry.digest) {
+                    // Collected since the listing.
+                    Ok(_) | Err(checkpoint::BlobError::NotFound(_)) => {}
+                    Err(e) => report.problems.push(e.to_string()),
+                }
+            }
+        }
+        Err(e) => report.problems.push(e.to_string()),
+    }
+    for (digest, why) in roots {
+        report.references += 1;
+        if let Err(e) = blobs.complete_manifest(*digest) {
+            report.problems.push(format!("{why}: {e}"));
+        }
+    }
+    report
+}

@@ -1,0 +1,34 @@
+//! The `registry` command: on a store's folder, or through the server that holds it. All logic is in `registry::cli`.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::Parser;
+use registry::cli::{Output, Verb, execute};
+
+/// Models, their versions, and the aliases that point at them
+#[derive(Debug, Parser)]
+#[command(name = "registry", version)]
+struct Cli {
+    /// The store's folder
+    #[arg(long, env = "STRIDE_STORE", default_value = ".stride", global = true)]
+    store: PathBuf,
+    /// How the answer is printed
+    #[arg(short, long, value_enum, default_value_t, global = true)]
+    output: Output,
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+fn main() -> ExitCode {
+    registry::failpoints::arm_from_env();
+    let cli = Cli::parse();
+    let runtime = match tokio::runtime::Runtime::new() {
+        Ok(runtime) => runtime,
+        Err(e) => {
+            eprintln!("error: no runtime: {e}");
+            return ExitCode::FAILURE;
+        }
+    };
+    ExitCode::from(runtime.block_on(execute(cli.verb, &cli.store, cli.output)))
+}
