@@ -9,12 +9,14 @@
 
 pub mod decide;
 pub mod event;
+pub mod invariants;
 pub mod journal;
 pub mod observe;
 mod outcome;
 pub mod policy;
 pub mod register;
 mod schedule;
+pub mod shell;
 pub mod state;
 mod view;
 
@@ -22,4 +24,6 @@ pub use decide::decide;
 pub use event::{Control, Effect, Event, Millis, Moment, Observation, Rejected};
 pub use observe::observe;
 pub use policy::Policy;
+pub use shell::{Config, Coordinator, Handle, Refused, StartError};
 pub use state::State;
+pub use view::WorkerView;

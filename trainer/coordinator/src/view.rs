@@ -1,15 +1,58 @@
 //! What workers and clients are told. Read-only.
 
 use protocol::message::{Assignment, Orders, Progress, Role, RunState, RunView, StageState, StageTask, StageView};
-use protocol::{Generation, Incarnation, WorkerId, canonical};
+use protocol::stage::Backend;
+use protocol::{Generation, Incarnation, TaskId, WorkerId, canonical};
+use serde::{Deserialize, Serialize};
 
 use crate::event::{Millis, Rejected};
 use crate::state::State;
 use crate::state::run::{Run, Status};
 use crate::state::task::{Hold, Part, Task};
 use crate::state::work::{Work, WorkState};
+use crate::state::worker::{Presence, Worker};
+
+/// A worker as clients see it: `GET /v1/workers`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WorkerView {
+    /// Who.
+    pub worker: WorkerId,
+    /// Which process of that name.
+    pub incarnation: Incarnation,
+    /// Its process id.
+    pub pid: u32,
+    /// Where it computes.
+    pub backend: Backend,
+    /// `idle`, `working`, `unreachable`, `silent` or `gone`.
+    pub state: String,
+    /// What it works on.
+    pub task: Option<TaskId>,
+}
 
 impl State {
+    /// All workers.
+    pub fn worker_views(&self) -> Vec<WorkerView> {
+        let view = |(name, worker): (&WorkerId, &Worker)| {
+            let task = self.held_by(name).next().map(|(_, task)| task.id.clone());
+            let state = match (worker.presence, &task) {
+                (Presence::Here, None) => "idle",
+                (Presence::Here, Some(_)) => "working",
+                (Presence::Suspect { .. }, _) => "unreachable",
+                (Presence::Silent, _) => "silent",
+                (Presence::Gone, _) => "gone",
+            };
+            WorkerView {
+                worker: name.clone(),
+                incarnation: worker.incarnation,
+                pid: worker.pid,
+                backend: worker.backend,
+                state: state.to_owned(),
+                task,
+            }
+        };
+        self.workers.iter().map(view).collect()
+    }
+
     /// All that a worker process should be doing.
     pub fn orders(&self, worker: &WorkerId, incarnation: Incarnation) -> Result<Orders, Rejected> {
         self.process(worker, incarnation)?;

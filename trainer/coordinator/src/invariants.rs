@@ -1,0 +1,163 @@
+//! What must hold after every event, by number. Checked in debug builds of the server and after every step of the
+//! simulation; `ARCHITECTURE.md` refers to the numbers.
+//!
+//! | | holds |
+//! |---|---|
+//! | C1 | A worker holds at most one task. |
+//! | C2 | Whoever holds a task is the newest process of its name, is here, and computes on the work's backend. |
+//! | C3 | Only tasks of open works are held; a held task has an attempt and a fence. |
+//! | C4 | A gang has at least `min` and at most `max` members, each once; other tasks have one holder. |
+//! | C5 | Fences, attempts and incarnations never go down; whoever gains or loses a task sees the fence go up. |
+//! | C6 | An accepted artifact of a task, and a done stage of a run, never change. |
+//! | C7 | A merge is held only once all shards are there. |
+//! | C8 | Work that no running run waits for is winding down. |
+//! | C9 | A stage is active or done only if everything it reads is done; an active stage has work that is not over. |
+//! | C10 | A run is finished exactly if all that was asked for is done, and failed only with a failed stage. |
+//! | C11 | While a small task is ready and not backing off, no worker of its backend is idle. |
+//! | C12 | A checkpoint's steps grow within a task. |
+
+use std::collections::BTreeSet;
+
+use protocol::message::RunState;
+
+use crate::schedule;
+use crate::state::State;
+use crate::state::run::Status;
+use crate::state::task::{Hold, Part, Task};
+use crate::state::work::{Work, WorkState};
+use crate::state::worker::Presence;
+
+/// Which invariants `state` breaks, each with its number; empty if all is well.
+pub fn check(state: &State) -> Vec<String> {
+    let mut broken = Vec::new();
+    let mut busy = BTreeSet::new();
+    let wanted: BTreeSet<_> = state.wanted().into_iter().collect();
+    for work in state.works.values() {
+        for task in &work.tasks {
+            check_task(state, work, task, &mut broken);
+            for member in task.holders() {
+                if !busy.insert(&member.worker) {
+                    broken.push(format!("C1: worker `{}` holds `{}` and another task", member.worker, task.id));
+                }
+            }
+            let winding = match task.hold {
+                Hold::Held { winding, .. } => winding.is_some(),
+                Hold::Waiting { .. } | Hold::Done { .. } => true,
+            };
+            if !winding && (!wanted.contains(&work.key) || state.draining) {
+                broken.push(format!("C8: nobody waits for `{}`, which is not winding down", task.id));
+            }
+            let small = task.part != Part::Gang && work.state == WorkState::Open && wanted.contains(&work.key);
+            if small && !state.draining && task.is_free(state.now) && work.is_ready(task) {
+                let idle = schedule::idle(state, work.backend);
+                if !idle.is_empty() {
+                    broken.push(format!("C11: `{}` is ready and {idle:?} idle", task.id));
+                }
+            }
+        }
+    }
+    for run in &state.runs {
+        for (i, status) in run.stages.iter().enumerate() {
+            if matches!(status, Status::Active { .. } | Status::Done { .. }) && run.inputs(i).is_none() {
+                broken.push(format!("C9: stage {i} of `{}` runs without its inputs", run.id));
+            }
+            if let Status::Active { key } = status
+                && state.works.get(key).is_none_or(|work| work.is_over())
+            {
+                broken.push(format!("C9: stage {i} of `{}` is active and its work is over", run.id));
+            }
+        }
+        let failed = run.stages.iter().any(|status| matches!(status, Status::Failed { .. }));
+        let open = run.stages.iter().any(|status| matches!(status, Status::Waiting | Status::Active { .. }));
+        let fits = match run.state {
+            RunState::Running | RunState::Paused => !failed && open,
+            RunState::Finished => !failed && !open,
+            RunState::Failed => failed && !open,
+            RunState::Cancelled => !open,
+        };
+        if !fits {
+            broken.push(format!("C10: `{}` is {:?} with stages {:?}", run.id, run.state, run.stages));
+        }
+    }
+    broken
+}
+
+fn check_task(state: &State, work: &Work, task: &Task, broken: &mut Vec<String>) {
+    if !task.checkpoints.is_sorted_by(|a, b| a.step < b.step) {
+        broken.push(format!("C12: checkpoints of `{}` are {:?}", task.id, task.checkpoints));
+    }
+    if !task.is_held() {
+        return;
+    }
+    let holders = task.holders();
+    for member in holders {
+        let good = state.workers.get(&member.worker).is_some_and(|worker| {
+            worker.incarnation == member.incarnation
+                && worker.presence == Presence::Here
+                && worker.backend == work.backend
+        });
+        if !good {
+            broken.push(format!("C2: `{}` is held by {member:?}", task.id));
+        }
+    }
+    if work.state != WorkState::Open || task.attempt.0 == 0 || task.fence.0 == 0 {
+        broken.push(format!("C3: `{}` is held while its work is {:?}", task.id, work.state));
+    }
+    let names: BTreeSet<_> = holders.iter().map(|member| &member.worker).collect();
+    let range = work.placement.workers;
+    let fits = match task.part {
+        // The bounds may have changed since, with the run that asks.
+        Part::Gang => !holders.is_empty() && (range.max == 0 || holders.len() <= range.max.max(range.min)),
+        Part::Alone | Part::Shard { .. } | Part::Merge => holders.len() == 1,
+    };
+    if !fits || names.len() != holders.len() {
+        broken.push(format!("C4: `{}` is held by {holders:?}, with room for {range:?}", task.id));
+    }
+    if task.part == Part::Merge && work.shards().is_none() {
+        broken.push(format!("C7: `{}` is held before its shards are there", task.id));
+    }
+}
+
+/// Which invariants the step from `before` to `after` breaks, or `after` itself.
+pub fn check_change(before: &State, after: &State) -> Vec<String> {
+    let mut broken = check(after);
+    for (name, worker) in &before.workers {
+        if after.workers.get(name).is_none_or(|now| now.incarnation < worker.incarnation) {
+            broken.push(format!("C5: worker `{name}` lost its incarnation {}", worker.incarnation));
+        }
+    }
+    for (key, work) in &before.works {
+        let Some(now) = after.works.get(key) else {
+            broken.push(format!("C5: work {key} is forgotten"));
+            continue;
+        };
+        for task in &work.tasks {
+            let Some(now) = now.tasks.iter().find(|t| t.id == task.id) else {
+                broken.push(format!("C5: task `{}` is forgotten", task.id));
+                continue;
+            };
+            if now.fence < task.fence || now.attempt < task.attempt {
+                broken.push(format!("C5: `{}` went from {:?} to {:?}", task.id, task.fence, now.fence));
+            }
+            let changed_hands = now.is_held() && now.holders() != task.holders();
+            if changed_hands && now.fence == task.fence {
+                broken.push(format!("C5: `{}` changed hands under fence {}", task.id, task.fence));
+            }
+        }
+        if let (WorkState::Open, WorkState::Open) = (&work.state, &now.state) {
+            for task in work.tasks.iter().filter(|task| task.output().is_some()) {
+                if now.tasks.iter().any(|t| t.id == task.id && t.output() != task.output()) {
+                    broken.push(format!("C6: the artifact of `{}` changed", task.id));
+                }
+            }
+        }
+    }
+    for (run, now) in before.runs.iter().zip(&after.runs) {
+        for (i, status) in run.stages.iter().enumerate() {
+            if matches!(status, Status::Done { .. }) && now.stages[i] != *status {
+                broken.push(format!("C6: stage {i} of `{}` was done and changed", run.id));
+            }
+        }
+    }
+    broken
+}

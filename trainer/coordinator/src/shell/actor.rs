@@ -1,0 +1,284 @@
+//! The one task that decides. Events come over a queue; each is decided on a copy of the state, stored, then published.
+
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
+
+use protocol::message::{FailureClass, ReportOutcome, Submit, TaskOutcome};
+use protocol::pipeline::Pipeline;
+use protocol::{Digest, RunId};
+use registry::{Store, WriteError};
+use tokio::sync::{mpsc, oneshot, watch};
+use tokio::task::JoinHandle;
+
+use super::{answer, effects};
+use crate::decide::decide;
+use crate::event::{Effect, Event, Millis, Moment, Observation, Rejected};
+use crate::invariants;
+use crate::observe::observe;
+use crate::state::State;
+
+/// Why a call was refused. Nothing has changed.
+#[derive(Debug, thiserror::Error)]
+pub enum Refused {
+    /// It does not fit what is.
+    #[error(transparent)]
+    Rejected(#[from] Rejected),
+    /// The store did not take it.
+    #[error(transparent)]
+    Write(#[from] WriteError),
+    /// The coordinator is stopping.
+    #[error("the coordinator is stopping")]
+    Stopped,
+}
+
+/// What the actor is asked.
+#[derive(Debug)]
+enum Ask {
+    Event(Box<Event>, oneshot::Sender<Result<Vec<Effect>, Refused>>),
+    Observation(Observation, oneshot::Sender<Result<(), Refused>>),
+}
+
+/// What is shared between the actor and those who ask it.
+#[derive(Debug)]
+pub(crate) struct Desk {
+    asks: mpsc::Sender<Ask>,
+    published: RwLock<Arc<State>>,
+    changed: watch::Sender<u64>,
+    trouble: Mutex<Option<String>>,
+    stop: watch::Sender<bool>,
+    clock: Clock,
+    pub(crate) store: Store,
+}
+
+impl Desk {
+    /// Decides an event; returns once it is stored.
+    pub(crate) async fn decide(&self, event: Event) -> Result<Vec<Effect>, Refused> {
+        let (reply, receiver) = oneshot::channel();
+        self.asks.send(Ask::Event(Box::new(event), reply)).await.map_err(|_| Refused::Stopped)?;
+        answer(receiver).await
+    }
+
+    /// Takes note of what was heard, and decides what follows from it.
+    pub(crate) async fn observe(&self, observation: Observation) -> Result<(), Refused> {
+        let (reply, receiver) = oneshot::channel();
+        self.asks.send(Ask::Observation(observation, reply)).await.map_err(|_| Refused::Stopped)?;
+        answer(receiver).await
+    }
+
+    /// Submits a pipeline.
+    pub(crate) async fn submit(&self, submit: Submit) -> Result<RunId, Refused> {
+        let pipeline: Pipeline = serde_json::from_value(submit.pipeline).map_err(|e| {
+            Rejected::Invalid(format!("the pipeline does not parse: {e}; was it made by another build?"))
+        })?;
+        let event = Event::Submit {
+            pipeline: Box::new(pipeline),
+            source: submit.source,
+            idempotency_key: submit.idempotency_key,
+            until: submit.until,
+        };
+        let run = self.decide(event).await?.into_iter().find_map(|effect| match effect {
+            Effect::Submitted(run) => Some(run),
+            _ => None,
+        });
+        Ok(run.expect("a submission gives a run"))
+    }
+
+    /// The newest published state.
+    pub(crate) fn state(&self) -> Arc<State> {
+        Arc::clone(&self.published.read().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Ticks with every durable change.
+    pub(crate) fn changes(&self) -> watch::Receiver<u64> {
+        self.changed.subscribe()
+    }
+
+    /// Why the store takes no writes, if it does not.
+    pub(crate) fn trouble(&self) -> Option<String> {
+        self.trouble.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Takes note of whether the store took a write.
+    pub(crate) fn wrote<T>(&self, result: &Result<T, WriteError>) {
+        let mut trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner);
+        match result {
+            Ok(_) => *trouble = None,
+            Err(WriteError::Storage(message)) => *trouble = Some(message.clone()),
+            Err(_) => {}
+        }
+    }
+
+    /// The time.
+    pub(crate) fn now(&self) -> Millis {
+        self.clock.now()
+    }
+
+    /// Ends the actor and everything that waits for it.
+    pub(crate) fn stop(&self) {
+        let _ = self.stop.send(true);
+    }
+
+    /// Becomes true when the coordinator stops.
+    pub(crate) fn stopped(&self) -> watch::Receiver<bool> {
+        self.stop.subscribe()
+    }
+
+    fn publish(&self, state: &State, durable: bool) {
+        *self.published.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(state.clone());
+        if durable {
+            self.changed.send_modify(|version| *version += 1);
+        }
+    }
+}
+
+/// The machine's wall clock when the process started, and its monotonic clock since: a wall clock that is set while we run
+/// would end every lease.
+#[derive(Debug)]
+struct Clock {
+    start: Instant,
+    start_ms: u64,
+}
+
+impl Clock {
+    fn new(not_before: Millis) -> Self {
+        let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_millis();
+        Self { start: Instant::now(), start_ms: u64::try_from(wall).unwrap_or(u64::MAX).max(not_before.0) }
+    }
+
+    fn now(&self) -> Millis {
+        let since = u64::try_from(self.start.elapsed().as_millis()).unwrap_or(u64::MAX);
+        Millis(self.start_ms.saturating_add(since))
+    }
+}
+
+/// Unpredictable bytes: a secret of the process, drawn once, and a counter.
+#[derive(Debug)]
+struct Entropy {
+    secret: [u8; 32],
+    count: u64,
+}
+
+impl Entropy {
+    fn new() -> Self {
+        let mut secret = [0; 32];
+        getrandom::fill(&mut secret).expect("the system has random bytes");
+        Self { secret, count: 0 }
+    }
+
+    fn next(&mut self) -> Digest {
+        self.count += 1;
+        let mut bytes = self.secret.to_vec();
+        bytes.extend_from_slice(&self.count.to_le_bytes());
+        Digest::of(&bytes)
+    }
+}
+
+/// Starts the actor on a recovered state.
+pub(crate) fn start(store: Store, state: State) -> (Arc<Desk>, JoinHandle<()>) {
+    let (asks, queue) = mpsc::channel(1024);
+    let desk = Arc::new(Desk {
+        asks,
+        published: RwLock::new(Arc::new(state.clone())),
+        changed: watch::Sender::new(0),
+        trouble: Mutex::new(None),
+        stop: watch::Sender::new(false),
+        clock: Clock::new(state.now),
+        store,
+    });
+    let actor = Actor { desk: Arc::clone(&desk), state, entropy: Entropy::new() };
+    (desk, tokio::spawn(actor.run(queue)))
+}
+
+struct Actor {
+    desk: Arc<Desk>,
+    state: State,
+    entropy: Entropy,
+}
+
+impl Actor {
+    async fn run(mut self, mut queue: mpsc::Receiver<Ask>) {
+        let mut stopped = self.desk.stopped();
+        loop {
+            let ask = tokio::select! {
+                biased;
+                _ = stopped.wait_for(|stop| *stop) => return,
+                ask = queue.recv() => ask,
+            };
+            match ask {
+                // Whoever asked may have gone away meanwhile; what was decided stands.
+                Some(Ask::Event(event, reply)) => drop(reply.send(self.happen(*event).await)),
+                Some(Ask::Observation(observation, reply)) => drop(reply.send(self.hear(observation).await)),
+                None => return,
+            }
+        }
+    }
+
+    async fn hear(&mut self, observation: Observation) -> Result<(), Refused> {
+        let events = observe(&mut self.state, self.desk.now(), observation)?;
+        for event in events {
+            match self.happen(event).await {
+                Ok(_) => {}
+                // What one event of a batch did may make the next one moot.
+                Err(Refused::Rejected(rejected)) => tracing::debug!(%rejected, "moot"),
+                Err(refused) => return Err(refused),
+            }
+        }
+        self.desk.publish(&self.state, false);
+        Ok(())
+    }
+
+    async fn happen(&mut self, event: Event) -> Result<Vec<Effect>, Refused> {
+        match self.try_happen(event.clone()).await {
+            Err(Refused::Write(error)) => {
+                let Some(instead) = refused_for_good(&event, &error) else { return Err(Refused::Write(error)) };
+                tracing::warn!(%error, "refused by the store");
+                self.try_happen(instead).await?;
+                Err(Refused::Write(error))
+            }
+            result => result,
+        }
+    }
+
+    async fn try_happen(&mut self, event: Event) -> Result<Vec<Effect>, Refused> {
+        let mut next = self.state.clone();
+        let moment = Moment { now: self.desk.now(), entropy: self.entropy.next() };
+        tracing::debug!(?event, "event");
+        let mut effects = decide(&mut next, moment, event)?;
+        let position = effects.iter().position(|effect| matches!(effect, Effect::Store(_)));
+        let Some(Effect::Store(writes)) = position.map(|i| effects.remove(i)) else { return Ok(effects) };
+        if cfg!(debug_assertions) {
+            let broken = invariants::check_change(&self.state, &next);
+            assert!(broken.is_empty(), "broken invariants: {broken:#?}");
+        }
+        fail::fail_point!("coordinator::before_commit");
+        let written = self.desk.store.write(writes).await;
+        self.desk.wrote(&written);
+        written?;
+        fail::fail_point!("coordinator::after_commit");
+        self.state = next;
+        self.desk.publish(&self.state, true);
+        for effect in &effects {
+            effects::perform(&self.desk, effect);
+        }
+        Ok(effects)
+    }
+}
+
+/// What happens instead of an event that the store refuses and always will.
+fn refused_for_good(event: &Event, error: &WriteError) -> Option<Event> {
+    let last = match error {
+        WriteError::Conflict(message) | WriteError::Gate(message) | WriteError::NotFound(message) => message.clone(),
+        WriteError::StaleFence { .. } | WriteError::Storage(_) | WriteError::Internal(_) => return None,
+    };
+    match (event, error) {
+        (Event::Bundled { key, .. }, _) => Some(Event::RegisterRefused { key: *key, message: last }),
+        // Two values under one key: the first promise is broken, and computing again would not mend it.
+        (Event::Outcome { report }, WriteError::Conflict(_)) => Some(Event::Outcome {
+            report: ReportOutcome {
+                grant: report.grant.clone(),
+                outcome: TaskOutcome::Failed { class: FailureClass::Storage, message: last },
+            },
+        }),
+        _ => None,
+    }
+}

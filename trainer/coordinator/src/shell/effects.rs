@@ -1,0 +1,140 @@
+//! Doing what was decided. Every effect may be done twice, because recovery asks for it again; each answers with an event.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use checkpoint::bundle::bundle;
+use protocol::Digest;
+use registry::{BlobStore, QueryError};
+use tokio::sync::watch;
+use tokio::time::MissedTickBehavior;
+
+use super::actor::{Desk, Refused};
+use crate::event::{Candidate, Effect, Event, Known, Observation};
+
+/// How long after a failed read of the store it is tried again.
+const RETRY: Duration = Duration::from_secs(1);
+/// How often unneeded blobs are collected.
+const COLLECT_EVERY: Duration = Duration::from_secs(15 * 60);
+
+/// Starts doing `effect`.
+pub(crate) fn perform(desk: &Arc<Desk>, effect: &Effect) {
+    let desk = Arc::clone(desk);
+    match effect.clone() {
+        // Done already, or an answer to whoever sent the event.
+        Effect::Store(_) | Effect::Submitted(_) | Effect::Joined(_) | Effect::Wake => {}
+        Effect::Lookup { key } => drop(tokio::spawn(look_up(desk, key))),
+        Effect::Register { key, candidates } => drop(tokio::spawn(register(desk, key, candidates))),
+        Effect::Prune { task, keep } => drop(tokio::spawn(async move {
+            // What is not pruned now is pruned after the next checkpoint.
+            if let Err(error) = desk.store.prune_checkpoints(&task, keep).await {
+                tracing::warn!(%task, %error, "old checkpoints stay");
+            }
+        })),
+    }
+}
+
+async fn tell(desk: &Desk, event: Event) {
+    loop {
+        match desk.decide(event.clone()).await {
+            Ok(_) | Err(Refused::Stopped) => return,
+            // The state has moved on, or another event has taken this one's place.
+            Err(Refused::Rejected(rejected)) => return tracing::debug!(%rejected, "moot"),
+            Err(Refused::Write(error)) => {
+                tracing::warn!(%error, "not stored; trying again");
+                if let registry::WriteError::Gate(_)
+                | registry::WriteError::Conflict(_)
+                | registry::WriteError::NotFound(_) = error
+                {
+                    return;
+                }
+            }
+        }
+        tokio::time::sleep(RETRY).await;
+    }
+}
+
+async fn look_up(desk: Arc<Desk>, key: Digest) {
+    let known = loop {
+        match known(&desk, key).await {
+            Ok(known) => break known,
+            Err(error) => tracing::warn!(%key, %error, "cannot look up a stage"),
+        }
+        tokio::time::sleep(RETRY).await;
+    };
+    tell(&desk, Event::LookedUp { key, known }).await;
+}
+
+/// A value counts as known only while all of it is there: an artifact that was removed is made again.
+async fn known(desk: &Desk, key: Digest) -> Result<Option<Known>, QueryError> {
+    let Some(row) = desk.store.stage_result(key).await? else { return Ok(None) };
+    let (blobs, outputs) = (desk.store.blobs().clone(), row.outputs.clone());
+    let whole = blocking(move || outputs.values().all(|output| blobs.complete_manifest(*output).is_ok())).await;
+    if !whole {
+        tracing::warn!(%key, "a stage's value is known but not all of it is in the store; it is made again");
+    }
+    Ok(whole.then_some(Known { outputs: row.outputs, metrics: row.metrics }))
+}
+
+async fn register(desk: Arc<Desk>, key: Digest, candidates: Vec<Candidate>) {
+    let blobs = desk.store.blobs().clone();
+    let event = match blocking(move || bundles(&blobs, &candidates)).await {
+        Ok(bundles) => Event::Bundled { key, bundles },
+        Err(message) => Event::RegisterRefused { key, message },
+    };
+    tell(&desk, event).await;
+}
+
+fn bundles(blobs: &BlobStore, candidates: &[Candidate]) -> Result<Vec<Digest>, String> {
+    candidates
+        .iter()
+        .map(|candidate| {
+            let at =
+                |e: &dyn std::fmt::Display| format!("the model of stage `{}` cannot be made: {e}", candidate.stage);
+            let denoiser = blobs.manifest(candidate.denoiser).map_err(|e| at(&e))?;
+            let vae = blobs.manifest(candidate.vae).map_err(|e| at(&e))?;
+            let model = bundle(&denoiser, &vae).map_err(|e| at(&e))?;
+            blobs.put(&model.to_bytes()).map_err(|e| at(&e))
+        })
+        .collect()
+}
+
+/// Runs what blocks on a disk outside the threads that serve requests.
+pub(crate) async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
+    match tokio::task::spawn_blocking(work).await {
+        Ok(value) => value,
+        Err(error) => match error.try_into_panic() {
+            Ok(panic) => std::panic::resume_unwind(panic),
+            // Only at the end of the runtime: this task is about to go as well.
+            Err(_) => std::future::pending().await,
+        },
+    }
+}
+
+/// Looks at the clock until the coordinator stops.
+pub(crate) async fn tick(desk: Arc<Desk>, every_ms: u64, mut stopped: watch::Receiver<bool>) {
+    let mut interval = tokio::time::interval(Duration::from_millis(every_ms.max(1)));
+    interval.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut collected = tokio::time::Instant::now();
+    loop {
+        tokio::select! {
+            biased;
+            _ = stopped.wait_for(|stop| *stop) => return,
+            _ = interval.tick() => {}
+        }
+        match desk.observe(Observation::Tick).await {
+            Ok(()) => {}
+            Err(Refused::Stopped) => return,
+            Err(error) => tracing::warn!(%error, "a tick was not stored; trying again"),
+        }
+        if collected.elapsed() > COLLECT_EVERY {
+            collected = tokio::time::Instant::now();
+            let desk = Arc::clone(&desk);
+            tokio::spawn(async move {
+                if let Err(error) = desk.store.gc(registry::retention::GRACE_MS).await {
+                    tracing::warn!(%error, "unneeded blobs stay");
+                }
+            });
+        }
+    }
+}

@@ -1,0 +1,86 @@
+//! What workers write. Every grant is checked twice: here against what the coordinator knows, which refuses most stale
+//! writers before their bytes are read, and again inside the transaction, which is what counts.
+
+use std::sync::Arc;
+
+use axum::Json;
+use axum::body::Bytes;
+use axum::extract::{Path, State};
+use axum::http::{HeaderMap, header};
+use axum::response::IntoResponse;
+use protocol::Digest;
+use protocol::message::{CommitCheckpoint, Grant, LogBatch, MetricBatch, ReportOutcome};
+use registry::{Write, WriteError};
+
+use super::actor::Desk;
+use super::api::Failure;
+use super::effects::blocking;
+use super::queries::BlobStored;
+use crate::event::Event;
+
+/// The header that carries a blob's grant, as JSON.
+const GRANT_HEADER: &str = "x-stride-grant";
+
+async fn write(desk: &Desk, write: Write) -> Result<Json<()>, Failure> {
+    let written = desk.store.write(vec![write]).await;
+    desk.wrote(&written);
+    written?;
+    Ok(Json(()))
+}
+
+pub(crate) async fn metrics(
+    State(desk): State<Arc<Desk>>,
+    Json(batch): Json<MetricBatch>,
+) -> Result<Json<()>, Failure> {
+    desk.state().check_write(&batch.grant)?;
+    write(&desk, Write::Metrics { grant: batch.grant, rows: batch.rows }).await
+}
+
+pub(crate) async fn logs(State(desk): State<Arc<Desk>>, Json(batch): Json<LogBatch>) -> Result<Json<()>, Failure> {
+    desk.state().check_write(&batch.grant)?;
+    write(&desk, Write::Logs { grant: batch.grant, first: batch.first, lines: batch.lines }).await
+}
+
+pub(crate) async fn checkpoint(
+    State(desk): State<Arc<Desk>>,
+    Json(commit): Json<CommitCheckpoint>,
+) -> Result<Json<()>, Failure> {
+    desk.decide(Event::Checkpoint { commit }).await?;
+    Ok(Json(()))
+}
+
+pub(crate) async fn outcome(
+    State(desk): State<Arc<Desk>>,
+    Json(report): Json<ReportOutcome>,
+) -> Result<Json<()>, Failure> {
+    desk.decide(Event::Outcome { report }).await?;
+    Ok(Json(()))
+}
+
+pub(crate) async fn put_blob(
+    State(desk): State<Arc<Desk>>,
+    headers: HeaderMap,
+    body: Bytes,
+) -> Result<Json<BlobStored>, Failure> {
+    let grant =
+        headers.get(GRANT_HEADER).ok_or_else(|| Failure::invalid(format!("header `{GRANT_HEADER}` is missing")))?;
+    let grant: Grant = serde_json::from_slice(grant.as_bytes())
+        .map_err(|e| Failure::invalid(format!("header `{GRANT_HEADER}` is no grant: {e}")))?;
+    desk.state().check_write(&grant)?;
+    let blobs = desk.store.blobs().clone();
+    let put = blocking(move || blobs.put(&body)).await;
+    if let Err(checkpoint::BlobError::Storage(message)) = &put {
+        desk.wrote::<()>(&Err(WriteError::Storage(message.clone())));
+    }
+    Ok(Json(BlobStored { digest: put? }))
+}
+
+pub(crate) async fn get_blob(
+    State(desk): State<Arc<Desk>>,
+    Path(digest): Path<String>,
+) -> Result<impl IntoResponse, Failure> {
+    let digest: Digest = digest.parse().map_err(|e| Failure::invalid(format!("{e}")))?;
+    let blobs = desk.store.blobs().clone();
+    let bytes = blocking(move || blobs.get(digest)).await?;
+    Ok(([(header::CONTENT_TYPE, "application/octet-stream")], bytes))
+}
