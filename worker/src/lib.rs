@@ -1,1 +1,27 @@
+//! The data plane: a process that takes assignments from a coordinator, runs their stages and uploads what they make.
+//!
+//! Its threads: one computes (`stage_thread`), one drives all HTTP, on which the poll (`orders`) lives, one a running
+//! attempt sends metrics and logs (`spool`), and a few short-stacked ones serve the connections of a gang (`gang::mesh`). What
+//! binds them is [`Held`](held): an assignment, its newest grant, and whether it has ended.
+//!
+//! Not its job: what a stage computes (`stages`), and every decision about who does what (the coordinator's).
 
+mod bell;
+mod blobs;
+mod cache;
+mod cli;
+mod client;
+mod context;
+pub mod failpoints;
+mod gang;
+mod held;
+mod join;
+mod kinds;
+mod orders;
+pub mod process;
+mod retry;
+mod spool;
+mod stage_thread;
+
+pub use cli::JoinArgs;
+pub use join::{JoinError, Options, init_logging, join};

@@ -1,0 +1,56 @@
+//! The arguments of `worker join`, shared by the two binaries that have it.
+
+use std::path::PathBuf;
+
+use protocol::WorkerId;
+use protocol::stage::Backend;
+
+use crate::Options;
+
+/// Offer this machine to a coordinator.
+#[derive(Debug, Clone, clap::Args)]
+pub struct JoinArgs {
+    /// The coordinator, such as `http://127.0.0.1:7700`
+    pub url: String,
+    /// Bearer token of the coordinator
+    #[arg(long, env = "STRIDE_TOKEN", hide_env_values = true)]
+    pub token: Option<String>,
+    /// The worker's name, unique among live workers [default: host and process id]
+    #[arg(long)]
+    pub name: Option<String>,
+    /// Where to compute: flex, ndarray, wgpu or cuda
+    #[arg(long, default_value = "flex", value_parser = backend)]
+    pub backend: Backend,
+    /// Which device of that backend
+    #[arg(long, default_value_t = 0)]
+    pub device: usize,
+    /// Keep downloaded blobs in this folder; workers may share it
+    #[arg(long, value_name = "DIR")]
+    pub cache: Option<PathBuf>,
+    /// Where other workers reach this one [default: the address from which the coordinator is reached, any port]
+    #[arg(long, value_name = "HOST:PORT")]
+    pub peer_address: Option<String>,
+    /// Be killed when the parent process dies, and leave Ctrl-C to it
+    #[arg(long)]
+    pub die_with_parent: bool,
+}
+
+impl From<JoinArgs> for Options {
+    fn from(args: JoinArgs) -> Self {
+        Self {
+            url: args.url,
+            token: args.token,
+            name: args.name.map(WorkerId::new),
+            backend: args.backend,
+            device: args.device,
+            cache: args.cache,
+            peer_address: args.peer_address,
+            die_with_parent: args.die_with_parent,
+        }
+    }
+}
+
+fn backend(text: &str) -> Result<Backend, String> {
+    let all = [Backend::Flex, Backend::Ndarray, Backend::Wgpu, Backend::Cuda];
+    all.into_iter().find(|b| b.name() == text).ok_or_else(|| "expected flex, ndarray, wgpu or cuda".to_owned())
+}

@@ -1,0 +1,158 @@
+//! Calls to the coordinator. Says what an error means for the caller; whether to try again is the caller's.
+//!
+//! One runtime with one thread drives all connections; stages and uploads are synchronous and wait on it.
+
+use std::time::Duration;
+
+use bytes::Bytes;
+use protocol::Digest;
+use protocol::message::{ApiError, Grant, Join, Joined, Orders, Poll};
+use reqwest::{RequestBuilder, Response, StatusCode};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use tokio::runtime::Handle;
+
+/// Why a call did not do what it should.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum CallError {
+    /// The coordinator is away or overloaded: the same call may succeed later.
+    #[error("{0}")]
+    Away(String),
+    /// It answered that it failed, by a fault of its own.
+    #[error("{0}")]
+    Fault(String),
+    /// The grant is not the task's newest.
+    #[error("{0}")]
+    Stale(String),
+    /// The store is full or not writable.
+    #[error("{0}")]
+    Storage(String),
+    /// No such thing.
+    #[error("{0}")]
+    NotFound(String),
+    /// Wrong, and will stay so.
+    #[error("{0}")]
+    Refused(String),
+}
+
+/// A coordinator's address.
+#[derive(Debug, Clone)]
+pub(crate) struct Client {
+    http: reqwest::Client,
+    base: String,
+    token: Option<String>,
+    runtime: Handle,
+}
+
+/// For calls with small bodies.
+const SHORT: Duration = Duration::from_secs(30);
+/// For blobs; a coordinator writes them to disk before it answers.
+const LONG: Duration = Duration::from_secs(600);
+
+impl Client {
+    /// A client of the coordinator at `url`.
+    pub(crate) fn new(url: &str, token: Option<String>, runtime: Handle) -> Result<Self, String> {
+        let parsed =
+            reqwest::Url::parse(url).map_err(|e| format!("`{url}` is not a URL: {e}; expected `http://HOST:PORT`"))?;
+        if parsed.scheme() != "http" || parsed.host().is_none() {
+            return Err(format!("`{url}`: expected `http://HOST:PORT`; for TLS put a proxy in front"));
+        }
+        let http = reqwest::Client::builder().connect_timeout(Duration::from_secs(5)).tcp_nodelay(true).build();
+        let http = http.map_err(|e| format!("no HTTP client: {e}"))?;
+        Ok(Self { http, base: url.trim_end_matches('/').to_owned(), token, runtime })
+    }
+
+    fn request(&self, method: reqwest::Method, path: &str, timeout: Duration) -> RequestBuilder {
+        let request = self.http.request(method, format!("{}{path}", self.base)).timeout(timeout);
+        match &self.token {
+            Some(token) => request.bearer_auth(token),
+            None => request,
+        }
+    }
+
+    /// Runs one call from a thread that is not the runtime's.
+    pub(crate) fn wait<T>(&self, call: impl Future<Output = T>) -> T {
+        self.runtime.block_on(call)
+    }
+
+    pub(crate) async fn join(&self, join: &Join) -> Result<Joined, CallError> {
+        answer(self.post("/v1/workers", join, SHORT).await?).await
+    }
+
+    /// Waits as long as the coordinator does, and somewhat longer.
+    pub(crate) async fn poll(&self, path: &str, poll: &Poll, waits: Duration) -> Result<Orders, CallError> {
+        answer(self.post(path, poll, waits + Duration::from_secs(10)).await?).await
+    }
+
+    /// A call whose answer says no more than that it was done.
+    pub(crate) async fn tell<T: Serialize + Sync>(&self, path: &str, what: &T) -> Result<(), CallError> {
+        self.post(path, what, SHORT).await.map(drop)
+    }
+
+    pub(crate) async fn put_blob(&self, grant: &Grant, bytes: Bytes) -> Result<Digest, CallError> {
+        #[derive(serde::Deserialize)]
+        struct Stored {
+            digest: Digest,
+        }
+        let grant = serde_json::to_string(grant).map_err(|e| CallError::Refused(e.to_string()))?;
+        let request = self.request(reqwest::Method::PUT, "/v1/blobs", LONG);
+        let request = request.header("x-stride-grant", grant).header("content-type", "application/octet-stream");
+        let stored: Stored = answer(check(request.body(bytes).send().await).await?).await?;
+        Ok(stored.digest)
+    }
+
+    pub(crate) async fn get_blob(&self, digest: Digest) -> Result<Bytes, CallError> {
+        let request = self.request(reqwest::Method::GET, &format!("/v1/blobs/{digest}"), LONG);
+        check(request.send().await).await?.bytes().await.map_err(|e| CallError::Away(chain(&e)))
+    }
+
+    async fn post<T: Serialize + Sync>(&self, path: &str, what: &T, timeout: Duration) -> Result<Response, CallError> {
+        check(self.request(reqwest::Method::POST, path, timeout).json(what).send().await).await
+    }
+}
+
+async fn answer<T: DeserializeOwned>(response: Response) -> Result<T, CallError> {
+    let bytes = response.bytes().await.map_err(|e| CallError::Away(chain(&e)))?;
+    serde_json::from_slice(&bytes)
+        .map_err(|e| CallError::Refused(format!("the coordinator's answer does not parse: {e}; is it the same build?")))
+}
+
+async fn check(sent: Result<Response, reqwest::Error>) -> Result<Response, CallError> {
+    let response =
+        sent.map_err(|e| if e.is_builder() { CallError::Refused(chain(&e)) } else { CallError::Away(chain(&e)) })?;
+    let status = response.status();
+    if status.is_success() {
+        return Ok(response);
+    }
+    let body = response.bytes().await.unwrap_or_default();
+    let error = serde_json::from_slice::<ApiError>(&body).unwrap_or_else(|_| ApiError {
+        code: String::new(),
+        message: format!("{status}: {}", String::from_utf8_lossy(&body).chars().take(200).collect::<String>()),
+        hint: None,
+    });
+    let message = match error.hint {
+        Some(hint) => format!("{}; {hint}", error.message),
+        None => error.message,
+    };
+    Err(match (status, error.code.as_str()) {
+        (_, "stale-fence") => CallError::Stale(message),
+        (_, "storage") | (StatusCode::INSUFFICIENT_STORAGE, _) => CallError::Storage(message),
+        (_, "not-found") | (StatusCode::NOT_FOUND, _) => CallError::NotFound(message),
+        (StatusCode::REQUEST_TIMEOUT | StatusCode::TOO_MANY_REQUESTS, _) => CallError::Away(message),
+        (StatusCode::INTERNAL_SERVER_ERROR, _) => CallError::Fault(message),
+        (status, _) if status.is_server_error() => CallError::Away(message),
+        _ => CallError::Refused(message),
+    })
+}
+
+/// The error and what caused it; `reqwest` alone says only "error sending request".
+fn chain(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        text.push_str(": ");
+        text.push_str(&error.to_string());
+        cause = error.source();
+    }
+    text
+}

@@ -1,0 +1,295 @@
+//! What a stage may ask of the world, over HTTP and TCP.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use burn::tensor::Device;
+use checkpoint::{BlobError, Blobs};
+use protocol::message::{CommitCheckpoint, Progress, StageTask};
+use protocol::{ArtifactKind, Digest, Manifest};
+use stages::context::{AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
+
+use crate::blobs::HttpBlobs;
+use crate::cache::Cache;
+use crate::client::{CallError, Client};
+use crate::failpoints;
+use crate::gang::exchange::{self, Bring, Met};
+use crate::gang::mesh::{Halt, Mesh};
+use crate::gang::tree;
+use crate::held::Held;
+use crate::retry::{self, GaveUp};
+use crate::spool::{Sender, Spool};
+
+/// One attempt's view of the coordinator and, in a gang, of its peers.
+#[derive(Debug)]
+pub(crate) struct HttpContext {
+    task: StageTask,
+    device: Device,
+    held: Arc<Held>,
+    client: Client,
+    blobs: Arc<HttpBlobs>,
+    spool: Arc<Spool>,
+    mesh: Option<Arc<Mesh>>,
+    gang: bool,
+    _sender: Sender,
+}
+
+impl HttpContext {
+    pub(crate) fn new(held: Arc<Held>, client: Client, cache: Arc<Cache>, device: Device) -> Self {
+        let assignment = held.assignment();
+        let gang = matches!(assignment.role, protocol::message::Role::Member { .. });
+        let blobs = Arc::new(HttpBlobs { held: held.clone(), client: client.clone(), cache, gang });
+        let (spool, sender) = Spool::open(held.clone(), client.clone());
+        Self { task: assignment.stage, device, held, client, blobs, spool, mesh: None, gang, _sender: sender }
+    }
+
+    /// Waits until everything recorded and logged is stored.
+    pub(crate) fn flush(&self) -> Result<(), ContextError> {
+        self.spool.flush().map_err(given_up)
+    }
+
+    /// Lets the peers go, saying goodbye: to the next generation, or for good.
+    fn part(&mut self) {
+        if let Some(mesh) = self.mesh.take() {
+            let next = match &self.held.assignment().role {
+                protocol::message::Role::Member { generation, .. } if *generation > mesh.terms.generation => {
+                    Some(*generation)
+                }
+                _ => None,
+            };
+            mesh.close(next);
+        }
+    }
+
+    /// After a peer is gone: waits for the coordinator's next generation.
+    fn await_regroup(&mut self, mesh: &Mesh) -> Result<(), ContextError> {
+        let begun = Instant::now();
+        let mut warned = begun;
+        loop {
+            let ticket = self.held.bell().ticket();
+            match self.held.halt(mesh.terms.generation) {
+                Some(Halt::Ended(reason)) => {
+                    self.part();
+                    return Err(ContextError::GrantEnded(reason));
+                }
+                Some(_) => {
+                    self.part();
+                    return Ok(());
+                }
+                None => {}
+            }
+            if warned.elapsed() > Duration::from_secs(20) {
+                let lost: Vec<String> = mesh.lost().iter().map(ToString::to_string).collect();
+                tracing::warn!(
+                    task = %mesh.terms.task,
+                    "waiting for a generation after {} for {:.0} s; lost: {}",
+                    mesh.terms.generation,
+                    begun.elapsed().as_secs_f64(),
+                    if lost.is_empty() { "nobody".to_owned() } else { lost.join(", ") },
+                );
+                warned = Instant::now();
+            }
+            self.held.bell().wait(ticket, Duration::from_secs(1));
+        }
+    }
+
+    fn check(&self) -> Result<(), ContextError> {
+        self.held.ended().map_or(Ok(()), |reason| Err(ContextError::GrantEnded(reason)))
+    }
+}
+
+impl Drop for HttpContext {
+    fn drop(&mut self) {
+        self.part();
+    }
+}
+
+impl AttemptContext for HttpContext {
+    fn task(&self) -> &StageTask {
+        &self.task
+    }
+
+    fn device(&self) -> Device {
+        self.device.clone()
+    }
+
+    fn blobs(&self) -> Arc<dyn Blobs> {
+        self.blobs.clone()
+    }
+
+    fn manifest(&self, digest: Digest) -> Result<Manifest, ContextError> {
+        let bytes = self.blobs.get(digest).map_err(blob_error)?;
+        let manifest: Manifest = serde_json::from_slice(&bytes)
+            .map_err(|e| ContextError::Corrupt(format!("{digest} is not a manifest: {e}")))?;
+        if manifest.format != Manifest::FORMAT {
+            let (found, known) = (manifest.format, Manifest::FORMAT);
+            return Err(ContextError::Corrupt(format!(
+                "manifest {digest} has format {found}, this build reads {known}"
+            )));
+        }
+        Ok(manifest)
+    }
+
+    fn put_manifest(&mut self, manifest: &Manifest) -> Result<Digest, ContextError> {
+        self.blobs.put(manifest.to_bytes()).map_err(blob_error)
+    }
+
+    fn progress(&mut self, done: u64, total: u64, unit: &str, metrics: &[(&str, f64)]) {
+        let metrics = metrics.iter().filter(|(_, v)| v.is_finite()).map(|(k, v)| ((*k).to_owned(), *v)).collect();
+        self.held.set_progress(Progress { done, total, unit: unit.to_owned(), metrics });
+    }
+
+    fn record(&mut self, step: u64, metrics: &[(&str, f64)]) {
+        self.spool.record(step, metrics);
+    }
+
+    fn log(&mut self, line: &str) {
+        tracing::info!(target: "stage", task = %self.held.grant().task, "{line}");
+        self.spool.log(line);
+    }
+
+    /// In a gang a wish to stop is not said here: all members must hear it after the same step, from an exchange.
+    fn interrupted(&self) -> bool {
+        self.held.ended().is_some() || (!self.gang && self.held.wind_down())
+    }
+}
+
+impl GangContext for HttpContext {
+    fn latest_checkpoint(&self) -> Result<Option<Manifest>, ContextError> {
+        let Some(digest) = self.held.checkpoint() else { return Ok(None) };
+        let manifest = self.manifest(digest)?;
+        if manifest.kind != ArtifactKind::Checkpoint {
+            return Err(ContextError::Corrupt(format!("{digest} is a {:?}, expected a checkpoint", manifest.kind)));
+        }
+        Ok(Some(manifest))
+    }
+
+    fn rendezvous(
+        &mut self,
+        applied: Option<u64>,
+        state: &mut dyn FnMut() -> Vec<u8>,
+    ) -> Result<Rendezvous, ContextError> {
+        loop {
+            self.check()?;
+            if let Some(newer) = self.held.take_mesh() {
+                self.part();
+                self.mesh = Some(newer);
+            }
+            let Some(mesh) = self.mesh.clone() else {
+                return Err(ContextError::Unavailable("a rendezvous of a stage that is not a gang's".to_owned()));
+            };
+            let held = self.held.clone();
+            let generation = mesh.terms.generation;
+            match exchange::rendezvous(&mesh, applied, state, &|| held.halt(generation)) {
+                Ok(met) => {
+                    tracing::info!(
+                        task = %mesh.terms.task,
+                        %generation,
+                        rank = mesh.terms.rank,
+                        members = mesh.size(),
+                        adopts = matches!(met, Met::Adopt(_)),
+                        "met the gang"
+                    );
+                    return Ok(match met {
+                        Met::Keep => Rendezvous::Keep,
+                        Met::Adopt(bytes) => Rendezvous::Adopt(bytes),
+                    });
+                }
+                Err(Halt::Ended(reason)) => {
+                    self.part();
+                    return Err(ContextError::GrantEnded(reason));
+                }
+                Err(Halt::Disagree(message)) => return Err(ContextError::Unavailable(message)),
+                Err(Halt::Regroup | Halt::Peer) => self.await_regroup(&mesh)?,
+            }
+        }
+    }
+
+    fn share(&self, slices: usize) -> Range<usize> {
+        self.mesh.as_ref().map_or(0..0, |mesh| tree::share(slices, mesh.terms.rank, mesh.size()))
+    }
+
+    fn exchange(&mut self, step: u64, slices: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError> {
+        self.check()?;
+        let Some(mesh) = self.mesh.clone() else { return Ok(Exchange::Regroup) };
+        let generation = mesh.terms.generation;
+        if self.held.halt(generation).is_some() {
+            self.part();
+            return Ok(Exchange::Regroup);
+        }
+        let share = self.share(slices);
+        let mut own = Vec::with_capacity(share.len());
+        for slice in share.clone() {
+            let part = parts.iter().find(|(at, _)| *at == slice).map(|(_, part)| part.as_slice());
+            let part = part.filter(|part| own.first().is_none_or(|(_, first): &(_, &[f32])| first.len() == part.len()));
+            let Some(part) = part else {
+                return Err(ContextError::Unavailable(format!(
+                    "step {step}: slice {slice} of this member's {share:?} is missing or of another length; a fault of the stage"
+                )));
+            };
+            own.push((slice..slice + 1, part));
+        }
+        let bring = Bring { step, slices, parts: own, wind_down: self.held.wind_down(), durable: self.spool.durable() };
+        let held = self.held.clone();
+        match exchange::exchange(&mesh, &bring, &|| held.halt(generation)) {
+            Ok(total) => {
+                self.spool.forget(total.durable);
+                Ok(Exchange::Sum { sum: total.sum, wind_down: total.wind_down })
+            }
+            Err(Halt::Ended(reason)) => {
+                self.part();
+                Err(ContextError::GrantEnded(reason))
+            }
+            Err(Halt::Disagree(message)) => Err(ContextError::Unavailable(message)),
+            Err(Halt::Regroup | Halt::Peer) => {
+                self.await_regroup(&mesh)?;
+                Ok(Exchange::Regroup)
+            }
+        }
+    }
+
+    fn leads(&self) -> bool {
+        self.mesh.as_ref().map_or_else(|| self.held.leads(), |mesh| mesh.terms.rank == 0)
+    }
+
+    fn commit_checkpoint(
+        &mut self,
+        step: u64,
+        manifest: &Manifest,
+        metrics: &BTreeMap<String, f64>,
+    ) -> Result<(), ContextError> {
+        self.flush()?;
+        // Uploaded by the stage before; storing it again costs one call and makes the commit stand on its own.
+        let digest = self.put_manifest(manifest)?;
+        let metrics: BTreeMap<String, f64> =
+            metrics.iter().filter(|(_, v)| v.is_finite()).map(|(k, v)| (k.clone(), *v)).collect();
+        failpoints::hit("checkpoint::before_commit");
+        retry::until_ended(&self.held, &format!("committing the checkpoint of step {step}"), |grant| {
+            let commit = CommitCheckpoint { grant: grant.clone(), step, manifest: digest, metrics: metrics.clone() };
+            self.client.wait(self.client.tell("/v1/checkpoints", &commit))
+        })
+        .map_err(given_up)?;
+        failpoints::hit("checkpoint::after_commit");
+        self.held.committed(digest);
+        Ok(())
+    }
+}
+
+fn given_up(gave_up: GaveUp) -> ContextError {
+    match gave_up {
+        GaveUp::Ended(reason) | GaveUp::Answer(CallError::Stale(reason)) => ContextError::GrantEnded(reason),
+        GaveUp::Answer(CallError::Storage(message)) => ContextError::Storage(message),
+        GaveUp::Answer(error) => ContextError::Unavailable(error.to_string()),
+    }
+}
+
+fn blob_error(error: BlobError) -> ContextError {
+    match error {
+        BlobError::Refused(reason) => ContextError::GrantEnded(reason),
+        BlobError::Storage(message) => ContextError::Storage(message),
+        BlobError::Unavailable(message) => ContextError::Unavailable(message),
+        error @ (BlobError::NotFound(_) | BlobError::Corrupt { .. }) => ContextError::Corrupt(error.to_string()),
+    }
+}

@@ -1,0 +1,49 @@
+//! Points at which tests kill a worker: `checkpoint::{before,after}_{upload,commit}` and `outcome::{before,after}_report`.
+//!
+//! Built only with the feature `failpoints`. `STRIDE_WORKER_FAILPOINT=name`, or `name@3` for the third time it gets there,
+//! has the process end as by `kill -9` at one of them. The registry has points and a variable of its own.
+
+/// Every point, in the order in which an attempt reaches them. An upload is one blob of a gang's stage.
+pub const ALL: [&str; 6] = [
+    "checkpoint::before_upload",
+    "checkpoint::after_upload",
+    "checkpoint::before_commit",
+    "checkpoint::after_commit",
+    "outcome::before_report",
+    "outcome::after_report",
+];
+
+/// Arms what `STRIDE_WORKER_FAILPOINT` names; called once when a worker starts. Does nothing without the feature.
+///
+/// # Panics
+/// If the variable names no known point: a test would otherwise pass without having killed anything.
+pub fn arm_from_env() {
+    #[cfg(feature = "failpoints")]
+    {
+        use std::sync::atomic::{AtomicU64, Ordering};
+
+        let Ok(text) = std::env::var("STRIDE_WORKER_FAILPOINT") else { return };
+        let (name, nth) = match text.split_once('@') {
+            Some((name, nth)) => (name, nth.parse::<u64>().expect("STRIDE_WORKER_FAILPOINT: a number after `@`")),
+            None => (text.as_str(), 1),
+        };
+        assert!(ALL.contains(&name), "STRIDE_WORKER_FAILPOINT: `{name}` is none of {ALL:?}");
+        let seen = AtomicU64::new(0);
+        let kill = move || {
+            if seen.fetch_add(1, Ordering::SeqCst) + 1 == nth {
+                let _ = nix::sys::signal::kill(nix::unistd::Pid::this(), nix::sys::signal::Signal::SIGKILL);
+                // The signal is on its way; nothing may happen after it.
+                loop {
+                    std::thread::park();
+                }
+            }
+        };
+        fail::cfg_callback(name, kill).expect("a fail point takes a callback");
+    }
+}
+
+/// Gets to a point.
+pub(crate) fn hit(name: &'static str) {
+    debug_assert!(ALL.contains(&name));
+    fail::fail_point!(name);
+}

@@ -1,0 +1,268 @@
+//! What members do together: agree on whose state is newest, and sum gradients.
+//!
+//! **Rendezvous.** Everybody tells everybody how many updates its state has seen. Whoever is behind the largest number
+//! takes the state of the lowest rank that has it. Members differ by one step at most: a sum is complete for nobody
+//! before everybody has sent its part, so the one that applied it last is at most one ahead of the one that lost a peer
+//! before it had the whole sum. If all have only initialised themselves there is nothing to take: they are equal.
+//!
+//! **Exchange.** A reduce-scatter and an all-gather. A member's contiguous slices are a few nodes of the summation tree.
+//! The buffer is cut into one chunk per member; member m receives every node's partial sum of chunk m, follows the tree to
+//! the root, and sends the result to all. Nothing is added in order of arrival. Partial sums are made piece by piece
+//! while they are sent, so the buffer exists once per slice and once for the sum.
+//!
+//! The wish to wind down travels in front of the parts and is ORed by everybody over the same messages, so that all
+//! members stop after the same step.
+
+use std::ops::Range;
+
+use bytemuck::cast_slice;
+
+use super::frame::{Frame, Head, Kind, MAX_PAYLOAD, PIECE, Payload};
+use super::mesh::{Halt, Mesh};
+use super::tree::{self, Node};
+
+const WIND_DOWN: u32 = 1;
+
+/// A state larger than this is refused before memory is taken for it.
+const MAX_STATE: u64 = 64 << 30;
+
+/// Whether to give up, asked often.
+pub(crate) type Interrupt<'a> = &'a dyn Fn() -> Option<Halt>;
+
+/// What a rendezvous says to this member.
+#[derive(Debug)]
+pub(crate) enum Met {
+    Keep,
+    Adopt(Vec<u8>),
+}
+
+/// Finds the newest state among members and brings everybody to it.
+pub(crate) fn rendezvous(
+    mesh: &Mesh,
+    applied: Option<u64>,
+    state: &mut dyn FnMut() -> Vec<u8>,
+    interrupt: Interrupt<'_>,
+) -> Result<Met, Halt> {
+    let barrier = format!("barrier `rendezvous` of generation {}", mesh.terms.generation);
+    let own = mesh.terms.rank;
+    let head = Head::new(Kind::Applied, applied.unwrap_or(0), u32::from(applied.is_some()), 0);
+    for peer in mesh.others() {
+        mesh.send(peer, &barrier, head, &[], interrupt)?;
+    }
+    let mut at = vec![None; mesh.size()];
+    at[own] = applied;
+    for peer in mesh.others() {
+        let frame = expect(mesh.next(peer, &barrier, interrupt)?, Kind::Applied, mesh, peer)?;
+        at[peer] = (frame.a == 1).then_some(frame.step);
+    }
+    let Some(newest) = at.iter().flatten().max().copied() else { return Ok(Met::Keep) };
+    let source = at.iter().position(|&a| a == Some(newest)).expect("the maximum is one of them");
+    let behind: Vec<usize> = mesh.others().filter(|&peer| at[peer] != Some(newest)).collect();
+
+    if own == source && !behind.is_empty() {
+        let bytes = state();
+        tracing::info!(
+            step = newest,
+            bytes = bytes.len(),
+            receivers = behind.len(),
+            "sending the state to members behind"
+        );
+        for peer in behind {
+            mesh.send(peer, &barrier, Head::new(Kind::StateLength, bytes.len() as u64, 0, 0), &[], interrupt)?;
+            for piece in bytes.chunks(MAX_PAYLOAD) {
+                mesh.send(peer, &barrier, Head::new(Kind::State, newest, 0, 0), piece, interrupt)?;
+            }
+        }
+        return Ok(Met::Keep);
+    }
+    if applied == Some(newest) {
+        return Ok(Met::Keep);
+    }
+    let length = expect(mesh.next(source, &barrier, interrupt)?, Kind::StateLength, mesh, source)?.step;
+    if length > MAX_STATE {
+        return Err(Halt::Disagree(format!(
+            "{barrier}: a state of {length} bytes is offered, at most {MAX_STATE} are taken"
+        )));
+    }
+    let mut bytes = Vec::new();
+    while (bytes.len() as u64) < length {
+        let piece = expect(mesh.next(source, &barrier, interrupt)?, Kind::State, mesh, source)?;
+        bytes.extend_from_slice(piece.bytes());
+        if piece.bytes().is_empty() || bytes.len() as u64 > length {
+            return Err(Halt::Disagree(format!(
+                "{barrier}: a state of {length} bytes arrives in pieces of another length"
+            )));
+        }
+    }
+    Ok(Met::Adopt(bytes))
+}
+
+/// What a member brings to an exchange.
+#[derive(Debug)]
+pub(crate) struct Bring<'a> {
+    pub(crate) step: u64,
+    pub(crate) slices: usize,
+    /// The gradients of this member's share, slice by slice; all of one length.
+    pub(crate) parts: Vec<(Node, &'a [f32])>,
+    pub(crate) wind_down: bool,
+    /// The last step of which the lead knows that everything recorded is stored.
+    pub(crate) durable: u64,
+}
+
+/// What an exchange gives.
+#[derive(Debug)]
+pub(crate) struct Total {
+    pub(crate) sum: Vec<f32>,
+    pub(crate) wind_down: bool,
+    /// The lead's [`Bring::durable`].
+    pub(crate) durable: u64,
+}
+
+/// Sums over all slices of a step.
+pub(crate) fn exchange(mesh: &Mesh, bring: &Bring<'_>, interrupt: Interrupt<'_>) -> Result<Total, Halt> {
+    let (own, size) = (mesh.terms.rank, mesh.size());
+    let root = 0..bring.slices;
+    let mut length = bring.parts.first().map(|(_, part)| part.len());
+    if size == 1 {
+        let mut sum = vec![0.0; length.unwrap_or(0)];
+        tree::sum(&root, &bring.parts, &mut sum);
+        return Ok(Total { sum, wind_down: bring.wind_down, durable: bring.durable });
+    }
+    let barrier = format!("barrier `exchange` of step {} in generation {}", bring.step, mesh.terms.generation);
+    let disagree = |peer: usize, what: String| {
+        Halt::Disagree(format!("{barrier}: `{}` {what}; is it the same build?", mesh.terms.members[peer].worker))
+    };
+
+    // Reduce-scatter, our half: everybody's chunk of our nodes.
+    let flags = if bring.wind_down { WIND_DOWN } else { 0 };
+    let own_nodes = tree::cover(bring.slices, &tree::share(bring.slices, own, size));
+    let mut piece = vec![0.0f32; PIECE];
+    for peer in mesh.others() {
+        let mut greeting = [0u8; 16];
+        greeting[..8].copy_from_slice(&(length.unwrap_or(0) as u64).to_le_bytes());
+        greeting[8..].copy_from_slice(&bring.durable.to_le_bytes());
+        let head = Head::new(Kind::Begin, bring.step, number(bring.slices), flags);
+        mesh.send(peer, &barrier, head, &greeting, interrupt)?;
+        let chunk = length.map_or(0..0, |length| tree::share(length, peer, size));
+        for (n, node) in own_nodes.iter().enumerate() {
+            for (p, range) in pieces(&chunk).enumerate() {
+                let leaves: Vec<(Node, &[f32])> = bring.parts[within(&bring.parts, node)]
+                    .iter()
+                    .map(|(slice, part)| (slice.clone(), &part[range.clone()]))
+                    .collect();
+                let out = &mut piece[..range.len()];
+                tree::sum(node, &leaves, out);
+                let head = Head::new(Kind::Part, bring.step, number(n), number(p));
+                mesh.send(peer, &barrier, head, cast_slice(out), interrupt)?;
+            }
+        }
+    }
+
+    // Reduce-scatter, their half: our chunk of their nodes.
+    let mut wind_down = bring.wind_down;
+    let mut durable = if own == 0 { bring.durable } else { 0 };
+    let mut theirs: Vec<(usize, Vec<(Node, Vec<f32>)>)> = Vec::new();
+    for peer in mesh.others() {
+        let begin = expect(mesh.next(peer, &barrier, interrupt)?, Kind::Begin, mesh, peer)?;
+        if begin.step != bring.step || begin.a != number(bring.slices) {
+            return Err(disagree(
+                peer,
+                format!("is at step {} with {} slices, not {}", begin.step, begin.a, bring.slices),
+            ));
+        }
+        let (at, stored) = numbers(&begin).ok_or_else(|| disagree(peer, "sends a malformed greeting".to_owned()))?;
+        wind_down |= begin.b & WIND_DOWN != 0;
+        if peer == 0 {
+            durable = stored;
+        }
+        let nodes = tree::cover(bring.slices, &tree::share(bring.slices, peer, size));
+        if nodes.is_empty() {
+            continue;
+        }
+        let at = usize::try_from(at).map_err(|_| disagree(peer, format!("has a buffer of {at} numbers")))?;
+        let length = *length.get_or_insert(at);
+        if at != length {
+            return Err(disagree(peer, format!("has a buffer of {at} numbers, not {length}")));
+        }
+        let chunk = tree::share(length, own, size);
+        let mut sums = Vec::with_capacity(nodes.len());
+        for (n, node) in nodes.into_iter().enumerate() {
+            let mut numbers = Vec::with_capacity(chunk.len());
+            for (p, range) in pieces(&chunk).enumerate() {
+                let frame = expect(mesh.next(peer, &barrier, interrupt)?, Kind::Part, mesh, peer)?;
+                let place = (frame.a, frame.b) == (number(n), number(p));
+                let Some(part) = floats(frame).filter(|part| place && part.len() == range.len()) else {
+                    return Err(disagree(peer, format!("sends parts out of place at node {n}, piece {p}")));
+                };
+                if numbers.is_empty() && range.len() == chunk.len() { numbers = part } else { numbers.extend(part) }
+            }
+            sums.push((node, numbers));
+        }
+        theirs.push((peer, sums));
+    }
+    let length = length.ok_or_else(|| Halt::Disagree(format!("{barrier}: no member has a slice")))?;
+
+    // Our chunk, to the root of the tree.
+    let chunk = tree::share(length, own, size);
+    let mut known: Vec<(Node, &[f32])> =
+        bring.parts.iter().map(|(slice, part)| (slice.clone(), &part[chunk.clone()])).collect();
+    known.extend(theirs.iter().flat_map(|(_, sums)| sums).map(|(node, sum)| (node.clone(), sum.as_slice())));
+    known.sort_by_key(|(node, _)| node.start);
+    let mut sum = vec![0.0; length];
+    tree::sum(&root, &known, &mut sum[chunk.clone()]);
+
+    // All-gather.
+    for peer in mesh.others() {
+        for (p, range) in pieces(&chunk).enumerate() {
+            let head = Head::new(Kind::Sum, bring.step, 0, number(p));
+            mesh.send(peer, &barrier, head, cast_slice(&sum[range]), interrupt)?;
+        }
+    }
+    for peer in mesh.others() {
+        for (p, range) in pieces(&tree::share(length, peer, size)).enumerate() {
+            let frame = expect(mesh.next(peer, &barrier, interrupt)?, Kind::Sum, mesh, peer)?;
+            let place = frame.b == number(p) && frame.step == bring.step;
+            let Some(part) = floats(frame).filter(|part| place && part.len() == range.len()) else {
+                return Err(disagree(peer, format!("sends its sum out of place at piece {p}")));
+            };
+            sum[range].copy_from_slice(&part);
+        }
+    }
+    Ok(Total { sum, wind_down, durable })
+}
+
+fn number(n: usize) -> u32 {
+    u32::try_from(n).expect("slices and pieces are counted in thousands")
+}
+
+fn numbers(begin: &Frame) -> Option<(u64, u64)> {
+    let (a, b) = begin.bytes().split_at_checked(8)?;
+    Some((u64::from_le_bytes(a.try_into().ok()?), u64::from_le_bytes(b.try_into().ok()?)))
+}
+
+fn floats(frame: Frame) -> Option<Vec<f32>> {
+    match frame.payload {
+        Payload::Floats(floats) => Some(floats),
+        Payload::Bytes(_) => None,
+    }
+}
+
+/// The pieces in which a chunk travels.
+fn pieces(chunk: &Range<usize>) -> impl Iterator<Item = Range<usize>> + use<> {
+    let chunk = chunk.clone();
+    chunk.clone().step_by(PIECE).map(move |start| start..(start + PIECE).min(chunk.end))
+}
+
+/// Where in `parts` (slices in order) those of `node` are.
+fn within(parts: &[(Node, &[f32])], node: &Node) -> Range<usize> {
+    let first = parts.partition_point(|(slice, _)| slice.start < node.start);
+    first..first + node.len()
+}
+
+fn expect(frame: Frame, kind: Kind, mesh: &Mesh, peer: usize) -> Result<Frame, Halt> {
+    if frame.kind == kind {
+        return Ok(frame);
+    }
+    let (who, found) = (&mesh.terms.members[peer].worker, frame.kind);
+    Err(Halt::Disagree(format!("`{who}` sent a frame of kind {found:?} where {kind:?} was due; is it the same build?")))
+}

@@ -1,0 +1,536 @@
+//! The connections of one generation of a gang: rank i dials every rank below it.
+//!
+//! A mesh is opened the moment a generation is known, by threads of its own, so that a member whose stage is deep in a
+//! slice still answers its peers. Each link has a reader thread that queues frames, and one thread sends a sign of life
+//! over every idle link: a peer that computes for minutes is told from one that is gone. Whether a peer is lost is said
+//! when its connection ends without a farewell, or when somebody waits for it and it was silent for too long.
+//!
+//! Not its job: what the frames mean (`exchange`), and what follows from a loss (the coordinator's decision).
+
+use std::collections::{BTreeSet, HashMap, VecDeque};
+use std::io::{self, Write};
+use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream, ToSocketAddrs};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, Weak};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use protocol::message::Member;
+use protocol::{Generation, TaskId, WorkerId};
+use tokio::sync::Notify;
+
+use super::frame::{self, Frame, FrameError, Head, Kind, MAX_PAYLOAD};
+use super::handshake::{self, HandshakeError};
+use crate::bell::{Bell, lock};
+
+/// How patient members are with each other.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Timing {
+    /// A peer that is waited for and silent for so long is lost.
+    pub(crate) patience: Duration,
+    /// A sign of life goes out so often.
+    pub(crate) keep_alive: Duration,
+    /// A peer that shows signs of life but does not take its turn for so long is lost.
+    pub(crate) stall: Duration,
+    /// A peer at whose address nothing listens for so long is lost.
+    pub(crate) refused: Duration,
+}
+
+impl Default for Timing {
+    fn default() -> Self {
+        Self {
+            patience: Duration::from_secs(20),
+            keep_alive: Duration::from_secs(3),
+            stall: Duration::from_secs(30 * 60),
+            refused: Duration::from_secs(3),
+        }
+    }
+}
+
+/// Why a wait ended without what was waited for.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Halt {
+    /// A newer generation has come.
+    Regroup,
+    /// The grant has ended.
+    Ended(String),
+    /// A peer is gone or has moved on; a newer generation will come.
+    Peer,
+    /// Peers do not speak of the same thing; a fault.
+    Disagree(String),
+}
+
+#[derive(Debug, Clone, PartialEq)]
+enum Fate {
+    /// Not connected yet; why the last try failed.
+    Unmet(Option<String>),
+    Up,
+    /// It left the gang in good order.
+    Left,
+    /// It is at a newer generation.
+    Moved,
+    Lost(String),
+}
+
+#[derive(Debug)]
+struct Peer {
+    link: Option<Arc<Link>>,
+    inbox: VecDeque<Frame>,
+    heard: Instant,
+    fate: Fate,
+}
+
+#[derive(Debug)]
+struct Link {
+    writer: Mutex<TcpStream>,
+}
+
+impl Link {
+    /// Writes a frame. `abort` is asked while the socket takes nothing, for up to `patience`.
+    fn send(&self, head: Head, payload: &[u8], patience: Duration, abort: &dyn Fn() -> bool) -> io::Result<()> {
+        let mut stream = lock(&self.writer);
+        send(&mut stream, head, payload, patience, abort)
+    }
+}
+
+fn send(
+    out: &mut TcpStream,
+    head: Head,
+    payload: &[u8],
+    patience: Duration,
+    abort: &dyn Fn() -> bool,
+) -> io::Result<()> {
+    let header = frame::header(head, payload);
+    for mut rest in [header.as_slice(), payload] {
+        let mut moved = Instant::now();
+        while !rest.is_empty() {
+            match out.write(rest) {
+                Ok(0) => return Err(io::ErrorKind::WriteZero.into()),
+                Ok(n) => {
+                    rest = &rest[n..];
+                    moved = Instant::now();
+                }
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {
+                    if abort() {
+                        return Err(io::ErrorKind::Interrupted.into());
+                    }
+                    if moved.elapsed() > patience {
+                        return Err(io::ErrorKind::TimedOut.into());
+                    }
+                }
+                Err(error) => return Err(error),
+            }
+        }
+    }
+    Ok(())
+}
+
+/// All that a mesh needs to know.
+#[derive(Debug, Clone)]
+pub(crate) struct Terms {
+    pub(crate) task: TaskId,
+    pub(crate) generation: Generation,
+    pub(crate) rank: usize,
+    pub(crate) members: Vec<Member>,
+    pub(crate) secret: String,
+}
+
+/// The connections of one generation.
+#[derive(Debug)]
+pub(crate) struct Mesh {
+    pub(crate) terms: Terms,
+    timing: Timing,
+    peers: Mutex<Vec<Peer>>,
+    bell: Arc<Bell>,
+    /// Wakes the poll, which reports what is lost.
+    wake: Arc<Notify>,
+    closed: AtomicBool,
+}
+
+impl Mesh {
+    /// Begins to connect, in the background.
+    pub(crate) fn open(terms: Terms, endpoint: &Arc<Endpoint>, bell: Arc<Bell>, wake: Arc<Notify>) -> Arc<Self> {
+        let peer =
+            |_: &Member| Peer { link: None, inbox: VecDeque::new(), heard: Instant::now(), fate: Fate::Unmet(None) };
+        let peers = Mutex::new(terms.members.iter().map(peer).collect());
+        let timing = endpoint.timing;
+        let mesh = Arc::new(Self { terms, timing, peers, bell, wake, closed: AtomicBool::new(false) });
+        if mesh.size() > 1 {
+            endpoint.announce(&mesh);
+            for rank in 0..mesh.terms.rank {
+                let mesh = mesh.clone();
+                spawn("gang-dial", move || mesh.dial(rank));
+            }
+            let weak = Arc::downgrade(&mesh);
+            spawn("gang-alive", move || keep_alive(&weak, timing));
+        }
+        mesh
+    }
+
+    /// How many members.
+    pub(crate) fn size(&self) -> usize {
+        self.terms.members.len()
+    }
+
+    /// Ranks of the others, beginning after ours, so that not all send to the same one first.
+    pub(crate) fn others(&self) -> impl Iterator<Item = usize> + use<> {
+        let (rank, size) = (self.terms.rank, self.size());
+        (1..size).map(move |i| (rank + i) % size)
+    }
+
+    /// Who could not be reached in this generation.
+    pub(crate) fn lost(&self) -> BTreeSet<WorkerId> {
+        let peers = lock(&self.peers);
+        let lost = peers.iter().zip(&self.terms.members).filter(|(peer, _)| matches!(peer.fate, Fate::Lost(_)));
+        lost.map(|(_, member)| member.worker.clone()).collect()
+    }
+
+    /// Says goodbye and lets go. What was sent still arrives: only our direction of each connection is closed, and the
+    /// readers drain the other until the peer does the same.
+    pub(crate) fn close(&self, next: Option<Generation>) {
+        if self.closed.swap(true, Ordering::SeqCst) {
+            return;
+        }
+        let links: Vec<_> = lock(&self.peers).iter_mut().filter_map(|peer| peer.link.take()).collect();
+        for link in links {
+            if let Ok(mut stream) = link.writer.try_lock() {
+                let head = Head::new(Kind::Bye, next.map_or(0, |g| g.0), 0, 0);
+                // A farewell is a courtesy: a peer that does not get it finds the connection closed.
+                let _ = send(&mut stream, head, &[], Duration::ZERO, &|| true);
+                let _ = stream.shutdown(Shutdown::Write);
+            }
+        }
+    }
+
+    fn is_closed(&self) -> bool {
+        self.closed.load(Ordering::SeqCst)
+    }
+
+    fn name(&self, rank: usize) -> &WorkerId {
+        &self.terms.members[rank].worker
+    }
+
+    /// Gives a peer up and has the next poll say so.
+    fn lose(&self, rank: usize, reason: String) {
+        if self.is_closed() {
+            return;
+        }
+        {
+            let peer = &mut lock(&self.peers)[rank];
+            if matches!(peer.fate, Fate::Lost(_) | Fate::Moved) {
+                return;
+            }
+            peer.fate = Fate::Lost(reason.clone());
+            if let Some(link) = peer.link.take()
+                && let Ok(stream) = link.writer.try_lock()
+            {
+                let _ = stream.shutdown(Shutdown::Write);
+            }
+        }
+        let (task, generation) = (&self.terms.task, self.terms.generation);
+        tracing::warn!(%task, %generation, peer = %self.name(rank), "lost a gang member: {reason}");
+        self.wake.notify_one();
+        self.bell.ring();
+    }
+
+    fn dial(self: Arc<Self>, rank: usize) {
+        let mut refused: Option<Instant> = None;
+        let mut pause = Duration::from_millis(10);
+        while !self.is_closed() {
+            match self.connect(rank) {
+                Ok(stream) => {
+                    self.attach(rank, stream);
+                    return;
+                }
+                Err(error) => {
+                    let since =
+                        if error.is_refused() { *refused.get_or_insert_with(Instant::now) } else { Instant::now() };
+                    if since.elapsed() > self.timing.refused {
+                        self.lose(rank, format!("nothing listens at {}", self.terms.members[rank].peer_address));
+                        return;
+                    }
+                    if !error.is_refused() {
+                        refused = None;
+                    }
+                    if let Fate::Unmet(last) = &mut lock(&self.peers)[rank].fate {
+                        *last = Some(error.to_string());
+                    }
+                }
+            }
+            thread::sleep(pause);
+            pause = (pause * 2).min(Duration::from_millis(200));
+        }
+    }
+
+    fn connect(&self, rank: usize) -> Result<TcpStream, HandshakeError> {
+        let address = &self.terms.members[rank].peer_address;
+        let mut last = io::Error::new(io::ErrorKind::AddrNotAvailable, format!("`{address}` names no address"));
+        for socket in address.to_socket_addrs()? {
+            match TcpStream::connect_timeout(&socket, Duration::from_secs(5)) {
+                Ok(mut stream) => {
+                    let Terms { task, generation, rank: from, secret, .. } = &self.terms;
+                    handshake::dial(&mut stream, task, *generation, *from, rank, secret)?;
+                    return Ok(stream);
+                }
+                Err(error) => last = error,
+            }
+        }
+        Err(last.into())
+    }
+
+    /// Takes a connection whose other side has proved to be `rank`.
+    fn attach(self: &Arc<Self>, rank: usize, stream: TcpStream) {
+        let reader = stream.try_clone().and_then(|reader| {
+            // Signs of life come far more often than this; it only keeps a reader from outliving everything.
+            reader.set_read_timeout(Some(self.timing.patience * 3))?;
+            stream.set_write_timeout(Some(Duration::from_millis(200)))?;
+            Ok(reader)
+        });
+        let reader = match reader {
+            Ok(reader) => reader,
+            Err(error) => return self.lose(rank, error.to_string()),
+        };
+        {
+            let mut peers = lock(&self.peers);
+            if self.is_closed() || !matches!(peers[rank].fate, Fate::Unmet(_)) {
+                return;
+            }
+            let peer = &mut peers[rank];
+            peer.link = Some(Arc::new(Link { writer: Mutex::new(stream) }));
+            peer.heard = Instant::now();
+            peer.fate = Fate::Up;
+        }
+        self.bell.ring();
+        let mesh = Arc::downgrade(self);
+        spawn("gang-read", move || read(&mesh, rank, reader));
+    }
+
+    /// What a frame means for the connection; those of the exchange are queued.
+    fn receive(&self, rank: usize, frame: Frame) {
+        if self.is_closed() {
+            return;
+        }
+        {
+            let peer = &mut lock(&self.peers)[rank];
+            peer.heard = Instant::now();
+            match frame.kind {
+                Kind::KeepAlive => return,
+                Kind::Bye => peer.fate = if frame.step == 0 { Fate::Left } else { Fate::Moved },
+                _ => peer.inbox.push_back(frame),
+            }
+        }
+        self.bell.ring();
+    }
+
+    /// Waits for a link to `rank` and sends over it. `interrupt` says whether to give up.
+    pub(crate) fn send(
+        &self,
+        rank: usize,
+        barrier: &str,
+        head: Head,
+        payload: &[u8],
+        interrupt: &dyn Fn() -> Option<Halt>,
+    ) -> Result<(), Halt> {
+        let link = self.wait(rank, barrier, interrupt, |peer| peer.link.clone())?;
+        link.send(head, payload, self.timing.patience, &|| interrupt().is_some()).map_err(|error| {
+            if let Some(halt) = interrupt() {
+                return halt;
+            }
+            self.lose(rank, format!("{barrier}: sending failed: {error}"));
+            Halt::Peer
+        })
+    }
+
+    /// The next frame from `rank`. What came before a connection ended is still handed out.
+    pub(crate) fn next(&self, rank: usize, barrier: &str, interrupt: &dyn Fn() -> Option<Halt>) -> Result<Frame, Halt> {
+        self.wait(rank, barrier, interrupt, |peer| peer.inbox.pop_front())
+    }
+
+    fn wait<T>(
+        &self,
+        rank: usize,
+        barrier: &str,
+        interrupt: &dyn Fn() -> Option<Halt>,
+        mut take: impl FnMut(&mut Peer) -> Option<T>,
+    ) -> Result<T, Halt> {
+        const GLANCE: Duration = Duration::from_millis(250);
+        let begun = Instant::now();
+        // If we were stopped ourselves, the peers were not silent: we were deaf.
+        let mut awake = begun;
+        let mut looked = begun;
+        loop {
+            let ticket = self.bell.ticket();
+            let now = Instant::now();
+            if now.duration_since(looked) > GLANCE * 8 {
+                awake = now;
+            }
+            looked = now;
+            let verdict = {
+                let peer = &mut lock(&self.peers)[rank];
+                if let Some(taken) = take(peer) {
+                    return Ok(taken);
+                }
+                let silent = now.duration_since(peer.heard.max(awake));
+                match &peer.fate {
+                    Fate::Lost(_) | Fate::Moved => return Err(interrupt().unwrap_or(Halt::Peer)),
+                    Fate::Left => Some(format!("{barrier}: it has left")),
+                    Fate::Unmet(why) if silent > self.timing.patience => {
+                        let why = why.as_deref().unwrap_or("it did not call");
+                        Some(format!("{barrier}: not met within {} s: {why}", self.timing.patience.as_secs_f32()))
+                    }
+                    Fate::Up if silent > self.timing.patience => {
+                        Some(format!("{barrier}: no sign of life for {} s", self.timing.patience.as_secs_f32()))
+                    }
+                    Fate::Up if now.duration_since(begun) > self.timing.stall => {
+                        Some(format!("{barrier}: alive, but not there after {} s", self.timing.stall.as_secs_f32()))
+                    }
+                    Fate::Unmet(_) | Fate::Up => None,
+                }
+            };
+            if let Some(halt) = interrupt() {
+                return Err(halt);
+            }
+            if let Some(reason) = verdict {
+                self.lose(rank, reason);
+                return Err(Halt::Peer);
+            }
+            self.bell.wait(ticket, GLANCE);
+        }
+    }
+}
+
+impl Drop for Mesh {
+    fn drop(&mut self) {
+        self.close(None);
+    }
+}
+
+/// Threads that outlive their mesh's owner hold it weakly.
+fn read(mesh: &Weak<Mesh>, rank: usize, mut stream: TcpStream) {
+    let mut buffered = io::BufReader::with_capacity(64 << 10, &mut stream);
+    loop {
+        let frame = frame::read(&mut buffered, MAX_PAYLOAD);
+        let Some(mesh) = mesh.upgrade() else {
+            // Our side is closed. Until the peer's is, what it sends must be taken, or the kernel resets the connection
+            // and the peer may lose what we sent last.
+            let _ = io::copy(&mut buffered, &mut io::sink());
+            return;
+        };
+        match frame {
+            Ok(frame) => mesh.receive(rank, frame),
+            Err(error) => {
+                let parted = matches!(lock(&mesh.peers)[rank].fate, Fate::Left | Fate::Moved);
+                if !parted {
+                    mesh.lose(rank, error.to_string());
+                }
+                if !matches!(error, FrameError::Closed) {
+                    // The other side must not go on talking into the void.
+                    let _ = stream.shutdown(Shutdown::Both);
+                }
+                return;
+            }
+        }
+    }
+}
+
+fn keep_alive(mesh: &Weak<Mesh>, timing: Timing) {
+    loop {
+        thread::sleep(timing.keep_alive);
+        let Some(mesh) = mesh.upgrade() else { return };
+        if mesh.is_closed() {
+            return;
+        }
+        let links: Vec<_> = lock(&mesh.peers).iter().map(|peer| peer.link.clone()).collect();
+        for link in links.into_iter().flatten() {
+            // A link that is being written to shows that we are alive.
+            if let Ok(mut stream) = link.writer.try_lock() {
+                // An error shows up where somebody waits for the peer.
+                let _ =
+                    send(&mut stream, Head::new(Kind::KeepAlive, 0, 0, 0), &[], timing.patience, &|| mesh.is_closed());
+            }
+        }
+    }
+}
+
+fn spawn(name: &str, work: impl FnOnce() + Send + 'static) {
+    // Without threads there is no worker either.
+    thread::Builder::new().name(name.to_owned()).stack_size(512 << 10).spawn(work).expect("a thread can be started");
+}
+
+/// Where this process is dialled, for all its gangs.
+#[derive(Debug)]
+pub(crate) struct Endpoint {
+    address: SocketAddr,
+    timing: Timing,
+    meshes: Mutex<HashMap<(TaskId, Generation), Weak<Mesh>>>,
+    handshakes: AtomicUsize,
+}
+
+impl Endpoint {
+    /// Handshakes under way at once; more are turned away and dial again.
+    const MAX_HANDSHAKES: usize = 64;
+
+    /// Listens and serves in the background, as long as the process lives.
+    pub(crate) fn open(address: SocketAddr, timing: Timing) -> io::Result<Arc<Self>> {
+        let listener = TcpListener::bind(address)?;
+        let address = listener.local_addr()?;
+        let endpoint = Arc::new(Self { address, timing, meshes: Mutex::default(), handshakes: AtomicUsize::new(0) });
+        let weak = Arc::downgrade(&endpoint);
+        spawn("gang-accept", move || accept(&weak, &listener));
+        Ok(endpoint)
+    }
+
+    /// Where it listens.
+    pub(crate) fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    fn announce(&self, mesh: &Arc<Mesh>) {
+        let mut meshes = lock(&self.meshes);
+        meshes.retain(|_, mesh| mesh.strong_count() > 0);
+        meshes.insert((mesh.terms.task.clone(), mesh.terms.generation), Arc::downgrade(mesh));
+    }
+
+    fn welcome(&self, mut stream: TcpStream) -> Result<(), HandshakeError> {
+        let dial = handshake::wanted(&mut stream)?;
+        let unknown = || HandshakeError::Unknown { task: dial.task.clone(), generation: dial.generation };
+        let key = (dial.task.clone(), dial.generation);
+        let mesh =
+            lock(&self.meshes).get(&key).and_then(Weak::upgrade).filter(|m| !m.is_closed()).ok_or_else(unknown)?;
+        if dial.to != mesh.terms.rank || dial.from <= dial.to || dial.from >= mesh.size() {
+            return Err(HandshakeError::Ranks { from: dial.from, to: dial.to });
+        }
+        handshake::accept(&mut stream, &dial, &mesh.terms.secret)?;
+        mesh.attach(dial.from, stream);
+        Ok(())
+    }
+}
+
+fn accept(endpoint: &Weak<Endpoint>, listener: &TcpListener) {
+    loop {
+        let stream = listener.accept();
+        let Some(endpoint) = endpoint.upgrade() else { return };
+        let stream = match stream {
+            Ok((stream, _)) => stream,
+            Err(error) => {
+                tracing::warn!("accepting a peer failed: {error}");
+                thread::sleep(Duration::from_millis(100));
+                continue;
+            }
+        };
+        if endpoint.handshakes.fetch_add(1, Ordering::SeqCst) >= Endpoint::MAX_HANDSHAKES {
+            endpoint.handshakes.fetch_sub(1, Ordering::SeqCst);
+            continue;
+        }
+        spawn("gang-welcome", move || {
+            match endpoint.welcome(stream) {
+                Ok(()) => {}
+                // The peer heard of the generation before we did, and will dial again.
+                Err(error @ HandshakeError::Unknown { .. }) => tracing::debug!("{error}"),
+                Err(error) => tracing::warn!("turned a peer away: {error}"),
+            }
+            endpoint.handshakes.fetch_sub(1, Ordering::SeqCst);
+        });
+    }
+}

@@ -1,0 +1,145 @@
+//! Sums along the fixed binary tree over a step's slices (design: determinism).
+//!
+//! A node is a range of slices; the root is `0..slices`. A node of more than one slice splits where its left part is the
+//! largest power of two smaller than it. Floating-point addition is not associative, so the tree and not the
+//! membership decides which two numbers meet: whoever holds the sums of any set of disjoint nodes that cover a node gets
+//! the same bits for it.
+
+use std::ops::Range;
+
+/// A range of slices that is a node of the tree.
+pub(crate) type Node = Range<usize>;
+
+/// Floats summed at once: all inputs' blocks and the scratch stay in the cache.
+const BLOCK: usize = 4096;
+
+/// Where a node splits, or `None` for a single slice.
+fn split(node: &Node) -> Option<usize> {
+    match node.len() {
+        0 | 1 => None,
+        n => Some(node.start + (n.next_power_of_two() >> 1)),
+    }
+}
+
+/// The largest nodes of the tree over `0..slices` that lie in `range`, in order; together they are `range`.
+pub(crate) fn cover(slices: usize, range: &Range<usize>) -> Vec<Node> {
+    fn visit(node: Node, range: &Range<usize>, out: &mut Vec<Node>) {
+        if node.start >= range.end || node.end <= range.start {
+            return;
+        }
+        if range.start <= node.start && node.end <= range.end {
+            out.push(node);
+            return;
+        }
+        let middle = split(&node).expect("a slice lies in a range or does not");
+        visit(node.start..middle, range, out);
+        visit(middle..node.end, range, out);
+    }
+    let mut out = Vec::new();
+    if !range.is_empty() {
+        visit(0..slices, range, &mut out);
+    }
+    out
+}
+
+/// The slices of rank `rank` of `members`: contiguous, balanced, by rank.
+pub(crate) fn share(slices: usize, rank: usize, members: usize) -> Range<usize> {
+    slices * rank / members..slices * (rank + 1) / members
+}
+
+/// Sums `known` (disjoint nodes in order, each with numbers as many as `out` has) into `out`, the sum of `node`.
+///
+/// # Panics
+/// If `known` does not cover `node`; callers build it from [`cover`].
+pub(crate) fn sum(node: &Node, known: &[(Node, &[f32])], out: &mut [f32]) {
+    let mut scratch = Vec::new();
+    for (i, block) in out.chunks_mut(BLOCK).enumerate() {
+        sum_block(node, known, i * BLOCK, block, &mut scratch);
+    }
+}
+
+fn sum_block(node: &Node, known: &[(Node, &[f32])], at: usize, out: &mut [f32], scratch: &mut Vec<Vec<f32>>) {
+    if let [(only, numbers)] = known
+        && only == node
+    {
+        out.copy_from_slice(&numbers[at..at + out.len()]);
+        return;
+    }
+    let middle = split(node).unwrap_or_else(|| panic!("slice {} is not among the sums at hand", node.start));
+    let (left, right) = known.split_at(known.partition_point(|(node, _)| node.start < middle));
+    sum_block(&(node.start..middle), left, at, out, scratch);
+    if let [(only, numbers)] = right
+        && *only == (middle..node.end)
+    {
+        add(out, &numbers[at..at + out.len()]);
+        return;
+    }
+    let mut other = scratch.pop().unwrap_or_else(|| vec![0.0; BLOCK]);
+    sum_block(&(middle..node.end), right, at, &mut other[..out.len()], scratch);
+    add(out, &other[..out.len()]);
+    scratch.push(other);
+}
+
+fn add(out: &mut [f32], other: &[f32]) {
+    for (a, b) in out.iter_mut().zip(other) {
+        *a += b;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// The definition, one number at a time.
+    fn plain(node: Node, slices: &[Vec<f32>], at: usize) -> f32 {
+        match split(&node) {
+            None => slices[node.start][at],
+            Some(m) => plain(node.start..m, slices, at) + plain(m..node.end, slices, at),
+        }
+    }
+
+    #[test]
+    fn nodes_are_the_largest_aligned_ones() {
+        assert_eq!(cover(8, &(0..8)), [0..8]);
+        assert_eq!(cover(8, &(3..8)), [3..4, 4..8]);
+        assert_eq!(cover(7, &(2..7)), [2..4, 4..7]);
+        assert_eq!(cover(5, &(5..5)), []);
+    }
+
+    proptest! {
+        #[test]
+        fn any_partition_gives_the_same_bits(
+            slices in 1usize..20, cuts in proptest::collection::vec(0usize..20, 0..4), length in 1usize..9000, seed in 0u32..1000,
+        ) {
+            let data: Vec<Vec<f32>> = (0..slices)
+                .map(|s| (0..length).map(|i| ((seed as usize + s * 7919 + i * 104_729) % 10_007) as f32 * 0.37 - 1e3).collect())
+                .collect();
+            let mut bounds: Vec<usize> = cuts.into_iter().map(|c| c % (slices + 1)).chain([0, slices]).collect();
+            bounds.sort_unstable();
+            // Each range sums its own nodes; the sums meet afterwards.
+            let mut partial: Vec<(Node, Vec<f32>)> = Vec::new();
+            for pair in bounds.windows(2) {
+                for node in cover(slices, &(pair[0]..pair[1])) {
+                    let leaves: Vec<(Node, &[f32])> = node.clone().map(|s| (s..s + 1, data[s].as_slice())).collect();
+                    let mut out = vec![0.0; length];
+                    sum(&node, &leaves, &mut out);
+                    partial.push((node, out));
+                }
+            }
+            let known: Vec<(Node, &[f32])> = partial.iter().map(|(n, v)| (n.clone(), v.as_slice())).collect();
+            let mut out = vec![0.0; length];
+            sum(&(0..slices), &known, &mut out);
+            for at in [0, length / 2, length - 1] {
+                prop_assert_eq!(out[at].to_bits(), plain(0..slices, &data, at).to_bits());
+            }
+        }
+
+        #[test]
+        fn shares_cover_without_overlap(slices in 0usize..50, members in 1usize..9) {
+            let all: Vec<usize> = (0..members).flat_map(|r| share(slices, r, members)).collect();
+            prop_assert_eq!(all, (0..slices).collect::<Vec<_>>());
+        }
+    }
+}

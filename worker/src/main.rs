@@ -1,0 +1,27 @@
+//! `worker join URL`, for machines that only compute.
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+/// Computes stages for a Stride coordinator.
+#[derive(Debug, Parser)]
+#[command(name = "worker", version)]
+enum Command {
+    /// Offer this machine to a coordinator
+    Join(worker::JoinArgs),
+}
+
+fn main() -> ExitCode {
+    // First of all: the allocator can be tuned only while there is one thread.
+    worker::process::tune_allocator();
+    let Command::Join(args) = Command::parse();
+    worker::init_logging();
+    match worker::join(args.into()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            tracing::error!("{error}");
+            ExitCode::from(error.exit_code())
+        }
+    }
+}

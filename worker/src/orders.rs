@@ -1,0 +1,225 @@
+//! What this worker should be doing, kept equal to what the coordinator last said.
+//!
+//! The poll is heartbeat, report and order book in one; each answer is the whole truth, so one that is lost, late or doubled
+//! changes nothing. A poll that fails changes nothing either: work goes on, and the next poll says it all again.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use protocol::Incarnation;
+use protocol::message::{Assignment, Join, Joined, Orders, Poll};
+use tokio::sync::Notify;
+use tokio::time::sleep;
+
+use crate::bell::{Bell, lock};
+use crate::client::{CallError, Client};
+use crate::gang::mesh::Endpoint;
+use crate::held::{Held, Reading};
+
+/// Longest pause between two polls of a coordinator that is away.
+const LONGEST: Duration = Duration::from_secs(1);
+/// Shortest time between two polls.
+const SHORTEST: Duration = Duration::from_millis(20);
+/// Refusals in a row before they are believed.
+const REFUSALS: u32 = 5;
+
+/// What the poll and the stage thread share.
+#[derive(Debug)]
+pub(crate) struct Shared {
+    held: Mutex<Vec<Arc<Held>>>,
+    /// Rung when there may be something to start, or nothing more ever.
+    pub(crate) work: Bell,
+    pub(crate) wake: Arc<Notify>,
+    leaving: Arc<AtomicBool>,
+    over: AtomicBool,
+    endpoint: Arc<Endpoint>,
+}
+
+impl Shared {
+    pub(crate) fn new(endpoint: Arc<Endpoint>) -> Arc<Self> {
+        Arc::new(Self {
+            held: Mutex::default(),
+            work: Bell::default(),
+            wake: Arc::default(),
+            leaving: Arc::default(),
+            over: AtomicBool::new(false),
+            endpoint,
+        })
+    }
+
+    /// The next assignment to run. Called by the stage thread between two of them.
+    pub(crate) fn next(&self) -> Option<Arc<Held>> {
+        if self.is_leaving() {
+            return None;
+        }
+        lock(&self.held).iter().find(|held| !held.is_done() && held.ended().is_none()).cloned()
+    }
+
+    /// Takes nothing new; what runs saves and yields.
+    pub(crate) fn leave(&self) {
+        self.leaving.store(true, Ordering::SeqCst);
+        for held in lock(&self.held).iter() {
+            held.bell().ring();
+        }
+        self.wake.notify_one();
+        self.work.ring();
+    }
+
+    pub(crate) fn is_leaving(&self) -> bool {
+        self.leaving.load(Ordering::SeqCst)
+    }
+
+    pub(crate) fn is_over(&self) -> bool {
+        self.over.load(Ordering::SeqCst)
+    }
+
+    /// Nothing will come any more; what runs is of no use.
+    pub(crate) fn end(&self, reason: &str) {
+        self.over.store(true, Ordering::SeqCst);
+        for held in lock(&self.held).drain(..) {
+            held.end(reason);
+        }
+        self.work.ring();
+    }
+
+    fn is_idle(&self, running: bool) -> bool {
+        lock(&self.held).iter().all(|held| held.is_done() || !running)
+    }
+
+    /// Makes it so.
+    pub(crate) fn apply(&self, orders: &Orders) {
+        let mut held = lock(&self.held);
+        held.retain(|old| {
+            let grant = old.grant();
+            let listed =
+                orders.assignments.iter().any(|new| new.grant.task == grant.task && new.grant.attempt == grant.attempt);
+            if !listed {
+                old.end("the coordinator has taken it back");
+            }
+            listed
+        });
+        for assignment in &orders.assignments {
+            let same = |old: &Arc<Held>| old.grant().task == assignment.grant.task;
+            let Some(at) = held.iter().position(same) else {
+                held.push(self.hold(assignment));
+                continue;
+            };
+            match held[at].read(assignment) {
+                Reading::Same | Reading::Regrouped => held[at].update(assignment.clone()),
+                Reading::Anew => {
+                    held[at].end("the coordinator has granted it anew");
+                    held[at] = self.hold(assignment);
+                }
+            }
+        }
+        drop(held);
+        self.work.ring();
+    }
+
+    fn hold(&self, assignment: &Assignment) -> Arc<Held> {
+        Held::new(assignment.clone(), self.endpoint.clone(), self.wake.clone(), self.leaving.clone())
+    }
+
+    fn poll(&self, incarnation: Incarnation, version: u64) -> Poll {
+        let doing = lock(&self.held).iter().map(|held| held.doing()).collect();
+        Poll { incarnation, doing, version }
+    }
+}
+
+/// Why polling ended.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum End {
+    /// In good order.
+    Left,
+    /// The coordinator does not want this worker.
+    Refused(String),
+}
+
+/// Offers this process until the coordinator takes it.
+async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Option<Joined>, String> {
+    let mut pause = Duration::from_millis(50);
+    let mut said = false;
+    loop {
+        match client.join(join).await {
+            Ok(joined) => {
+                tracing::info!(worker = %join.worker, incarnation = %joined.incarnation, peer_address = join.peer_address, "joined");
+                return Ok(Some(joined));
+            }
+            Err(CallError::Away(message) | CallError::Fault(message)) => {
+                if !std::mem::replace(&mut said, true) {
+                    tracing::warn!("the coordinator cannot be reached yet: {message}; trying again");
+                }
+            }
+            Err(error) => return Err(format!("the coordinator turned worker `{}` away: {error}", join.worker)),
+        }
+        // A worker that runs nothing and is to go need not wait for a coordinator first.
+        if shared.is_leaving() && shared.is_idle(false) {
+            return Ok(None);
+        }
+        sleep(pause).await;
+        pause = (pause * 2).min(LONGEST);
+    }
+}
+
+/// Joins and polls until the worker may go.
+pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> End {
+    let mut joined = match join(client, offer, shared).await {
+        Ok(Some(joined)) => joined,
+        Ok(None) => return End::Left,
+        Err(reason) => return End::Refused(reason),
+    };
+    let path = format!("/v1/workers/{}/poll", offer.worker);
+    let (mut version, mut pause, mut refusals, mut leave) = (0, SHORTEST, 0, false);
+    let mut away = false;
+    loop {
+        if (leave || shared.is_leaving()) && shared.is_idle(true) {
+            return End::Left;
+        }
+        let poll = shared.poll(joined.incarnation, version);
+        let answer = tokio::select! {
+            // News of ours do not wait for news of theirs. The poll that is dropped may have been answered; the next one
+            // carries the old version and is answered again.
+            () = shared.wake.notified() => {
+                sleep(SHORTEST).await;
+                continue;
+            }
+            answer = client.poll(&path, &poll, Duration::from_millis(joined.poll_ms)) => answer,
+        };
+        match answer {
+            Ok(orders) => {
+                if std::mem::take(&mut away) {
+                    tracing::info!("the coordinator is back");
+                }
+                (version, leave, refusals, pause) = (orders.version, orders.leave, 0, SHORTEST);
+                shared.apply(&orders);
+            }
+            Err(CallError::NotFound(message)) => {
+                tracing::warn!("the coordinator does not know this process: {message}; joining again");
+                joined = match self::join(client, offer, shared).await {
+                    Ok(Some(joined)) => joined,
+                    Ok(None) => return End::Left,
+                    Err(reason) => return End::Refused(reason),
+                };
+                version = 0;
+                // A coordinator that forgets again at once is not asked in a tight loop.
+                pause = (pause * 2).min(LONGEST);
+            }
+            Err(CallError::Away(message) | CallError::Fault(message)) => {
+                if !std::mem::replace(&mut away, true) {
+                    tracing::warn!("the coordinator is away, work goes on: {message}");
+                }
+                pause = (pause * 2).min(LONGEST);
+            }
+            Err(error) => {
+                refusals += 1;
+                if refusals == REFUSALS {
+                    return End::Refused(error.to_string());
+                }
+                tracing::warn!("the coordinator refused a poll: {error}");
+                pause = (pause * 2).min(LONGEST);
+            }
+        }
+        sleep(pause).await;
+    }
+}

@@ -1,0 +1,63 @@
+//! What is set once for the whole process, before it has threads: allocator, group, what happens when the parent dies.
+
+/// Keeps freed memory instead of handing it back to the kernel after every tensor: each operation allocates buffers of
+/// megabytes, and glibc would map, zero and unmap them every time (a fifth of a training step). One arena, so that what a
+/// thread frees another finds. Must be called before any thread is started; does nothing without glibc.
+pub fn tune_allocator() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    {
+        let settings = [
+            (libc::M_MMAP_THRESHOLD, libc::c_int::MAX),
+            (libc::M_TRIM_THRESHOLD, libc::c_int::MAX),
+            (libc::M_TOP_PAD, 256 << 20),
+            (libc::M_ARENA_MAX, 1),
+        ];
+        for (parameter, value) in settings {
+            #[expect(unsafe_code, reason = "FFI; mallopt takes two numbers and only changes the allocator's settings")]
+            let accepted = unsafe { libc::mallopt(parameter, value) };
+            if accepted != 1 {
+                tracing::debug!(parameter, "the allocator refused a setting");
+            }
+        }
+    }
+}
+
+/// Binds this process to the one that started it: it is killed when that dies, and is not reached by a Ctrl-C in the
+/// terminal, which the parent turns into an orderly end.
+pub(crate) fn belong_to_parent() {
+    #[cfg(target_os = "linux")]
+    {
+        use nix::sys::signal::Signal;
+
+        let parent = nix::unistd::getppid();
+        if let Err(error) = nix::sys::prctl::set_pdeathsig(Signal::SIGKILL) {
+            tracing::warn!("cannot ask to be killed with the parent: {error}");
+        }
+        if nix::unistd::getppid() != parent {
+            // It died in between.
+            std::process::exit(1);
+        }
+    }
+    #[cfg(unix)]
+    if let Err(error) = nix::unistd::setpgid(nix::unistd::Pid::from_raw(0), nix::unistd::Pid::from_raw(0)) {
+        tracing::warn!("cannot leave the terminal's process group: {error}");
+    }
+}
+
+/// A name for a worker that was given none: host and process.
+pub(crate) fn default_name() -> String {
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    let host: String = host.trim().chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').take(40).collect();
+    let host = if host.starts_with(|c: char| c.is_ascii_alphanumeric()) { host } else { "worker".to_owned() };
+    format!("{host}-{}", std::process::id())
+}
+
+/// Makes the calling thread the one that computes. Tensor kernels split their work over rayon's pool; with one thread, and
+/// that the caller, everything runs in place. `RAYON_NUM_THREADS` asks for more.
+pub(crate) fn compute_here() {
+    let threads = std::env::var("RAYON_NUM_THREADS").ok().and_then(|n| n.parse::<usize>().ok()).filter(|n| *n > 0);
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.unwrap_or(1)).use_current_thread().build_global();
+    if let Err(error) = pool {
+        tracing::warn!("the compute pool was started before the worker could size it: {error}");
+    }
+}

@@ -1,0 +1,66 @@
+//! Trying again, for as long as the grant holds: a coordinator that restarts is waited for, however long it takes.
+
+use std::time::{Duration, Instant};
+
+use protocol::message::Grant;
+
+use crate::client::CallError;
+use crate::held::Held;
+
+/// Why a call in the name of a grant was given up.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum GaveUp {
+    /// The grant has ended.
+    Ended(String),
+    /// The call's answer is final.
+    Answer(CallError),
+}
+
+/// Answers of "my fault" that are taken before they are believed.
+const FAULTS: u32 = 8;
+
+/// Longest pause between two tries.
+const LONGEST: Duration = Duration::from_secs(1);
+
+/// Calls until it succeeds, is refused for good, or the grant has ended. `call` is given the newest grant each time.
+pub(crate) fn until_ended<T>(
+    held: &Held,
+    what: &str,
+    mut call: impl FnMut(&Grant) -> Result<T, CallError>,
+) -> Result<T, GaveUp> {
+    let begun = Instant::now();
+    let mut warned = begun;
+    let mut pause = Duration::from_millis(50);
+    let mut faults = 0;
+    loop {
+        if let Some(reason) = held.ended() {
+            return Err(GaveUp::Ended(reason));
+        }
+        let grant = held.grant();
+        match call(&grant) {
+            Ok(done) => {
+                if warned != begun {
+                    tracing::info!("{what}: done after {:.0} s", begun.elapsed().as_secs_f64());
+                }
+                return Ok(done);
+            }
+            Err(CallError::Stale(message)) => {
+                tracing::debug!(task = %grant.task, "{what}: {message}");
+                held.after_stale(&grant).map_err(GaveUp::Ended)?;
+            }
+            Err(CallError::Fault(message)) if faults == FAULTS => {
+                return Err(GaveUp::Answer(CallError::Fault(message)));
+            }
+            Err(error @ (CallError::Away(_) | CallError::Fault(_))) => {
+                faults += u32::from(matches!(error, CallError::Fault(_)));
+                if warned == begun || warned.elapsed() > Duration::from_secs(10) {
+                    tracing::warn!("{what}: {error}; trying again");
+                    warned = Instant::now();
+                }
+                held.pause(pause).map_err(GaveUp::Ended)?;
+                pause = (pause * 2).min(LONGEST);
+            }
+            Err(error) => return Err(GaveUp::Answer(error)),
+        }
+    }
+}

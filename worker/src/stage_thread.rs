@@ -1,0 +1,164 @@
+//! The thread that computes: one assignment after the other, and how each ended.
+
+use std::any::Any;
+use std::backtrace::{Backtrace, BacktraceStatus};
+use std::cell::RefCell;
+use std::panic::{self, AssertUnwindSafe};
+use std::sync::Arc;
+use std::time::Duration;
+
+use burn::tensor::Device;
+use protocol::message::{FailureClass, ReportOutcome, Role, TaskOutcome};
+use stages::context::{AttemptContext, ContextError, GangContext, Outcome, Part, StageError};
+
+use crate::cache::Cache;
+use crate::client::Client;
+use crate::context::HttpContext;
+use crate::failpoints;
+use crate::held::Held;
+use crate::orders::Shared;
+use crate::retry::{self, GaveUp};
+
+/// The stage kinds, as far as a worker knows them. Tests bring their own.
+pub(crate) trait Kinds: Send + Sync {
+    fn alone(&self, context: &mut dyn AttemptContext) -> Result<Outcome, StageError>;
+    fn part(&self, context: &mut dyn AttemptContext, part: Part) -> Result<Outcome, StageError>;
+    fn gang(&self, context: &mut dyn GangContext) -> Result<Outcome, StageError>;
+}
+
+/// What the thread needs besides assignments.
+pub(crate) struct Bench {
+    pub(crate) kinds: Arc<dyn Kinds>,
+    pub(crate) client: Client,
+    pub(crate) cache: Arc<Cache>,
+    pub(crate) device: Device,
+}
+
+/// Runs assignments until the poll says that it is over.
+pub(crate) fn run(shared: &Shared, bench: &Bench) {
+    loop {
+        let ticket = shared.work.ticket();
+        if let Some(held) = shared.next() {
+            attempt(&held, bench);
+            held.finish();
+        } else if shared.is_over() {
+            return;
+        } else {
+            shared.work.wait(ticket, Duration::from_secs(1));
+        }
+    }
+}
+
+fn attempt(held: &Arc<Held>, bench: &Bench) {
+    let assignment = held.assignment();
+    let grant = &assignment.grant;
+    tracing::info!(task = %grant.task, attempt = %grant.attempt, fence = %grant.fence, kind = assignment.stage.settings.kind(), "begin");
+    let mut context = HttpContext::new(held.clone(), bench.client.clone(), bench.cache.clone(), bench.device.clone());
+    let stage = AssertUnwindSafe(|| match assignment.role {
+        Role::Alone => bench.kinds.alone(&mut context),
+        Role::Shard { index, of } => {
+            bench.kinds.part(&mut context, Part::Shard { index: index as usize, of: of as usize })
+        }
+        Role::Merge { shards } => bench.kinds.part(&mut context, Part::Merge { shards }),
+        Role::Member { .. } => bench.kinds.gang(&mut context),
+    });
+    let result = panic::catch_unwind(stage).unwrap_or_else(|payload| Err(StageError::Fault(panic_message(&*payload))));
+    let Some(outcome) = outcome(result, held, &context) else { return };
+
+    failpoints::hit("outcome::before_report");
+    let reported = retry::until_ended(held, "reporting the outcome", |grant| {
+        let report = ReportOutcome { grant: grant.clone(), outcome: outcome.clone() };
+        bench.client.wait(bench.client.tell("/v1/outcomes", &report))
+    });
+    failpoints::hit("outcome::after_report");
+    match reported {
+        Ok(()) => tracing::info!(task = %grant.task, attempt = %grant.attempt, "end: {}", summary(&outcome)),
+        Err(GaveUp::Ended(reason)) => tracing::info!(task = %grant.task, "the outcome came too late: {reason}"),
+        Err(GaveUp::Answer(error)) => tracing::error!(task = %grant.task, "the outcome was refused: {error}"),
+    }
+}
+
+/// What to report; nothing if the grant has ended, or if it is for rank 0 to say.
+fn outcome(result: Result<Outcome, StageError>, held: &Held, context: &HttpContext) -> Option<TaskOutcome> {
+    let task = held.grant().task;
+    let result = match result {
+        // What was recorded belongs to the outcome; without it the outcome is not reported.
+        Ok(outcome) => context.flush().map(|()| outcome).map_err(StageError::from),
+        Err(error) => Err(error),
+    };
+    if let Some(reason) = held.ended() {
+        tracing::info!(%task, "dropped: {reason}");
+        return None;
+    }
+    match result {
+        Ok(_) if !held.leads() => {
+            tracing::info!(%task, "end; rank 0 reports");
+            None
+        }
+        Ok(Outcome::Finished { output, metrics }) => {
+            let metrics = metrics.into_iter().filter(|(_, value)| value.is_finite()).collect();
+            Some(TaskOutcome::Finished { output, metrics })
+        }
+        Ok(Outcome::Yielded { at }) => Some(TaskOutcome::Yielded { at }),
+        Err(StageError::Context(ContextError::GrantEnded(reason))) => {
+            tracing::info!(%task, "dropped: {reason}");
+            None
+        }
+        Err(error) => {
+            let message = error.to_string();
+            tracing::error!(%task, "{message}");
+            // So that the lines before the failure are there to be read. If they cannot be stored, the failure still is.
+            if let Err(error) = context.flush() {
+                tracing::warn!(%task, "the last lines of a failed attempt are lost: {error}");
+            }
+            let class = match error.class() {
+                FailureClass::Fault if is_out_of_memory(&message) => FailureClass::OutOfMemory,
+                class => class,
+            };
+            Some(TaskOutcome::Failed { class, message })
+        }
+    }
+}
+
+/// Device back ends panic when an allocation fails; there is no type to match.
+fn is_out_of_memory(message: &str) -> bool {
+    let message = message.to_ascii_lowercase();
+    message.contains("out of memory") || message.contains("outofmemory")
+}
+
+fn summary(outcome: &TaskOutcome) -> String {
+    match outcome {
+        TaskOutcome::Finished { output, .. } => format!("finished, {}", output.short()),
+        TaskOutcome::Yielded { at } => format!("yielded at {at}"),
+        TaskOutcome::Failed { class, .. } => format!("failed, {class:?}"),
+    }
+}
+
+thread_local! {
+    static WHERE: RefCell<Option<String>> = const { RefCell::new(None) };
+}
+
+/// Has panics logged with their place, and remembers it for the report.
+pub(crate) fn log_panics() {
+    panic::set_hook(Box::new(|info| {
+        let place = info.location().map_or_else(|| "an unknown place".to_owned(), ToString::to_string);
+        tracing::error!("panic at {place}: {}", text(info.payload()));
+        let trace = Backtrace::capture();
+        if trace.status() == BacktraceStatus::Captured {
+            tracing::error!("{trace}");
+        }
+        WHERE.with(|last| *last.borrow_mut() = Some(place));
+    }));
+}
+
+fn text(payload: &(dyn Any + Send)) -> &str {
+    let text = payload.downcast_ref::<&str>().copied().or_else(|| payload.downcast_ref::<String>().map(String::as_str));
+    text.unwrap_or("a panic without a message")
+}
+
+fn panic_message(payload: &(dyn Any + Send)) -> String {
+    match WHERE.with(|last| last.borrow_mut().take()) {
+        Some(place) => format!("panic at {place}: {}", text(payload)),
+        None => format!("panic: {}", text(payload)),
+    }
+}
