@@ -57,7 +57,12 @@ pub struct BlobStore {
 impl BlobStore {
     /// Over `backend`.
     pub fn new(backend: impl Backend + 'static) -> Self {
-        Self { backend: Arc::new(backend), removal: Arc::default() }
+        Self::over(Arc::new(backend))
+    }
+
+    /// Over a backend that is chosen at run time.
+    pub fn over(backend: Arc<dyn Backend>) -> Self {
+        Self { backend, removal: Arc::default() }
     }
 
     /// In memory, for tests.

@@ -1,0 +1,49 @@
+//! What the tests of this crate share.
+#![allow(dead_code, unreachable_pub, reason = "not every test file uses all of it")]
+
+use std::collections::BTreeMap;
+
+use protocol::message::Grant;
+use protocol::{ArtifactKind, Attempt, Digest, Fence, FileEntry, Incarnation, Manifest, TaskId};
+use registry::{BlobStore, Holder, Store, Write};
+use serde_json::json;
+
+pub async fn open(dir: &std::path::Path) -> Store {
+    Store::open(dir, Holder::this_process("test")).await.unwrap()
+}
+
+/// Uploads an artifact of one file.
+pub fn artifact(blobs: &BlobStore, kind: ArtifactKind, content: &str) -> Digest {
+    let bytes = content.as_bytes();
+    let mut manifest = Manifest::new(kind, json!({}));
+    let digest = blobs.put(bytes).unwrap();
+    manifest.files.insert("content".into(), FileEntry { digest, bytes: bytes.len() as u64 });
+    blobs.put(&manifest.to_bytes()).unwrap()
+}
+
+pub fn grant(task: &str, fence: u64) -> Grant {
+    Grant {
+        task: TaskId::new(task),
+        attempt: Attempt(fence),
+        fence: Fence(fence),
+        worker: "w".into(),
+        incarnation: Incarnation(1),
+    }
+}
+
+pub fn fence(task: &str, fence: u64) -> Write {
+    Write::Fence { task: TaskId::new(task), fence: Fence(fence) }
+}
+
+pub fn metrics(pairs: &[(&str, f64)]) -> BTreeMap<String, f64> {
+    pairs.iter().map(|(key, value)| ((*key).to_owned(), *value)).collect()
+}
+
+pub fn version(model: &str, artifact: Digest, fid: f64) -> Write {
+    Write::Version {
+        model: model.into(),
+        artifact,
+        metrics: metrics(&[("latent_fid", fid)]),
+        source: json!({"run": "r", "stage": "release", "metric": "latent_fid", "mode": "min"}),
+    }
+}
