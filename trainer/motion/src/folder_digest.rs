@@ -21,10 +21,7 @@ pub fn folder_digest(path: &Path, format: DataFormat) -> Result<Digest, OpenErro
     if !path.is_dir() {
         let what = if path.exists() { "is not a folder" } else { "no such folder" };
         let todo = "set dataset.path to the folder that holds new_joint_vecs/ and texts/";
-        problems.push(Problem {
-            kind: ProblemKind::Missing,
-            what: format!("{}: {what}; {todo}", path.display()),
-        });
+        problems.push(Problem { kind: ProblemKind::Missing, what: format!("{}: {what}; {todo}", path.display()) });
         return Err(OpenError { folder: path.into(), problems });
     }
     let mut listing = format!("stride/folder/1\0{format:?}\n");
@@ -50,13 +47,7 @@ pub fn folder_digest(path: &Path, format: DataFormat) -> Result<Digest, OpenErro
 }
 
 /// Adds one file's line to `listing` and gives its bytes. A missing file is a problem only if it is `needed`.
-fn hash(
-    root: &Path,
-    name: &str,
-    needed: bool,
-    listing: &mut String,
-    problems: &mut Vec<Problem>,
-) -> Option<Vec<u8>> {
+fn hash(root: &Path, name: &str, needed: bool, listing: &mut String, problems: &mut Vec<Problem>) -> Option<Vec<u8>> {
     let file = root.join(name);
     let bytes = match std::fs::read(&file) {
         Ok(bytes) => Some(bytes),

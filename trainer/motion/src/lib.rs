@@ -7,12 +7,14 @@
 //! row-major and frame-major.
 
 pub mod dataset;
-pub mod folder_digest;
+pub mod draw;
 pub mod features;
+pub mod folder_digest;
 pub mod npy;
 pub mod quaternion;
 pub mod random;
 pub mod skeleton;
+pub mod synthetic;
 pub mod text;
 
 pub use dataset::Dataset;

@@ -1,0 +1,229 @@
+//! Pictures of motion: an animated stick figure, and a sheet of poses over time.
+//!
+//! A small rasteriser of our own: orthographic projection from a 3/4 view, anti-aliased thick lines, a built-in 5x7 font.
+//! Joints are `[T, J, 3]` in the skeleton's units with y up.
+
+mod font;
+mod raster;
+
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+
+use raster::{Canvas, Colour};
+
+use crate::skeleton::Skeleton;
+
+const PAPER: Colour = [250, 250, 248];
+const INK: Colour = [40, 42, 48];
+const GRID: Colour = [222, 223, 224];
+const TRAIL: Colour = [150, 170, 150];
+const SHADOW: Colour = [205, 206, 208];
+const BODY: Colour = [70, 74, 84];
+const LEFT: Colour = [36, 110, 200];
+const RIGHT: Colour = [214, 84, 48];
+
+/// Where the picture is seen from: turned about the vertical and tipped down, radians.
+const TURN: f64 = -0.65;
+const TIP: f64 = 0.26;
+
+/// A view of the world: pixels a metre and the point that lies at `centre`.
+struct View {
+    scale: f64,
+    centre: [f64; 2],
+    looking_at: [f64; 3],
+}
+
+impl View {
+    /// Pixel position, and depth (larger is nearer).
+    fn project(&self, p: [f64; 3]) -> ([f64; 2], f64) {
+        let [x, y, z] = [0, 1, 2].map(|k| p[k] - self.looking_at[k]);
+        let (sin, cos) = TURN.sin_cos();
+        let (right, near) = (x * cos - z * sin, x * sin + z * cos);
+        let (tip_sin, tip_cos) = TIP.sin_cos();
+        let up = y * tip_cos - near * tip_sin;
+        ([self.centre[0] + self.scale * right, self.centre[1] - self.scale * up], near * tip_cos + y * tip_sin)
+    }
+}
+
+/// Joints of frame `t` in metres.
+fn frame(joints: &[f32], skeleton: &Skeleton, t: usize) -> Vec<[f64; 3]> {
+    let width = 3 * skeleton.joints;
+    let metres = |v: f32| f64::from(v) * skeleton.metres_per_unit;
+    joints[t * width..(t + 1) * width].chunks_exact(3).map(|p| [metres(p[0]), metres(p[1]), metres(p[2])]).collect()
+}
+
+fn colour_of(skeleton: &Skeleton, joint: usize) -> Colour {
+    if skeleton.left.contains(&joint) {
+        LEFT
+    } else if skeleton.right.contains(&joint) {
+        RIGHT
+    } else {
+        BODY
+    }
+}
+
+/// Size of the head above the last joint of the spine, metres.
+const HEAD: f64 = 0.115;
+
+fn figure(canvas: &mut Canvas, view: &View, skeleton: &Skeleton, pose: &[[f64; 3]], strength: f64) {
+    let fade = |colour: Colour| raster::blend(PAPER, colour, strength);
+    for chain in skeleton.chains {
+        for bone in chain.windows(2) {
+            let flat = |j: usize| view.project([pose[j][0], 0.0, pose[j][2]]).0;
+            canvas.line(flat(bone[0]), flat(bone[1]), 0.030 * view.scale, fade(SHADOW));
+        }
+    }
+    let mut bones: Vec<(f64, [usize; 2])> = skeleton
+        .chains
+        .iter()
+        .flat_map(|chain| chain.windows(2))
+        .map(|bone| (0.5 * (view.project(pose[bone[0]]).1 + view.project(pose[bone[1]]).1), [bone[0], bone[1]]))
+        .collect();
+    bones.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let skull = skeleton.chains.iter().map(|c| c[c.len() - 1]).find(|j| colour_of(skeleton, *j) == BODY);
+    for (_, [a, b]) in bones {
+        let colour = fade(colour_of(skeleton, b));
+        let width = if colour_of(skeleton, b) == BODY { 0.055 } else { 0.048 };
+        canvas.line(view.project(pose[a]).0, view.project(pose[b]).0, width * view.scale, colour);
+        if Some(b) == skull {
+            let lift = [0, 1, 2].map(|k| pose[b][k] + 0.35 * (pose[b][k] - pose[a][k]));
+            canvas.disc(view.project(lift).0, HEAD * view.scale, colour);
+        }
+    }
+}
+
+fn ground(canvas: &mut Canvas, view: &View, reach: f64) {
+    let step = 0.5;
+    let [x, _, z] = view.looking_at;
+    let cells = (reach / step).ceil() as i64;
+    let (x0, z0) = ((x / step).round() * step, (z / step).round() * step);
+    for i in -cells..=cells {
+        let (d, r) = (i as f64 * step, cells as f64 * step);
+        let mut line = |a: [f64; 3], b: [f64; 3]| canvas.line(view.project(a).0, view.project(b).0, 1.0, GRID);
+        line([x0 + d, 0.0, z0 - r], [x0 + d, 0.0, z0 + r]);
+        line([x0 - r, 0.0, z0 + d], [x0 + r, 0.0, z0 + d]);
+    }
+}
+
+/// Writes an animated GIF: the motion at its own speed, the camera following the root, `title` above.
+///
+/// # Errors
+/// When `out` refuses, or the joints are not a whole number of frames.
+pub fn gif_to(joints: &[f32], skeleton: &Skeleton, title: &str, out: impl Write) -> io::Result<()> {
+    const WIDTH: usize = 400;
+    const HEIGHT: usize = 400;
+    let frames = frames_of(joints, skeleton)?;
+    let palette = raster::palette(&[PAPER, INK, GRID, TRAIL, SHADOW, BODY, LEFT, RIGHT]);
+    let failed = |e: gif::EncodingError| io::Error::other(e.to_string());
+    let mut encoder = gif::Encoder::new(out, WIDTH as u16, HEIGHT as u16, &palette.bytes).map_err(failed)?;
+    encoder.set_repeat(gif::Repeat::Infinite).map_err(failed)?;
+    let lines = font::wrap(title, WIDTH / 12 - 2);
+    let path: Vec<[f64; 3]> = (0..frames).map(|t| frame(joints, skeleton, t)[0]).collect();
+    for t in 0..frames {
+        let pose = frame(joints, skeleton, t);
+        let view = View {
+            scale: 145.0,
+            centre: [WIDTH as f64 / 2.0, HEIGHT as f64 * 0.60],
+            looking_at: [follow(&path, t, 0), 0.80, follow(&path, t, 2)],
+        };
+        let mut canvas = Canvas::new(WIDTH, HEIGHT, PAPER);
+        ground(&mut canvas, &view, 3.5);
+        for pair in path[..=t].windows(2) {
+            let flat = |p: [f64; 3]| view.project([p[0], 0.0, p[2]]).0;
+            canvas.line(flat(pair[0]), flat(pair[1]), 2.5, TRAIL);
+        }
+        figure(&mut canvas, &view, skeleton, &pose, 1.0);
+        for (i, line) in lines.iter().enumerate() {
+            font::draw(&mut canvas, line, [12.0, 12.0 + 20.0 * i as f64], 2, INK);
+        }
+        let clock = format!("{:.1} s", t as f64 / skeleton.fps);
+        font::draw(&mut canvas, &clock, [WIDTH as f64 - 60.0, HEIGHT as f64 - 20.0], 1, INK);
+        let mut image = gif::Frame::from_indexed_pixels(WIDTH as u16, HEIGHT as u16, palette.indices(&canvas), None);
+        // Hundredths of a second; rounded over the whole clip, so that its length is right.
+        let ends = |t: usize| (t as f64 * 100.0 / skeleton.fps).round() as u16;
+        image.delay = if t + 1 == frames { 60 } else { ends(t + 1).wrapping_sub(ends(t)) };
+        encoder.write_frame(&image).map_err(failed)?;
+    }
+    Ok(())
+}
+
+/// [`gif_to`] a file.
+///
+/// # Errors
+/// When the file cannot be written, or the joints are not a whole number of frames.
+pub fn gif(joints: &[f32], skeleton: &Skeleton, title: &str, path: &Path) -> io::Result<()> {
+    let mut file = BufWriter::new(File::create(path)?);
+    gif_to(joints, skeleton, title, &mut file)?;
+    file.flush()
+}
+
+/// The camera's course: the root's, averaged over a second.
+fn follow(path: &[[f64; 3]], t: usize, axis: usize) -> f64 {
+    let near = &path[t.saturating_sub(10)..(t + 11).min(path.len())];
+    near.iter().map(|p| p[axis]).sum::<f64>() / near.len() as f64
+}
+
+fn frames_of(joints: &[f32], skeleton: &Skeleton) -> io::Result<usize> {
+    let width = 3 * skeleton.joints;
+    if joints.is_empty() || !joints.len().is_multiple_of(width) {
+        let what = format!("{} coordinates are not frames of {} joints x 3", joints.len(), skeleton.joints);
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, what));
+    }
+    Ok(joints.len() / width)
+}
+
+/// Writes a PNG with one row a motion: its name, and `poses` poses spread over its time, side by side.
+///
+/// # Errors
+/// When `out` refuses, or a motion is not a whole number of frames.
+pub fn strip_png_to(
+    motions: &[(String, Vec<f32>)],
+    poses: usize,
+    skeleton: &Skeleton,
+    out: impl Write,
+) -> io::Result<()> {
+    const CELL: usize = 110;
+    const ROW: usize = 196;
+    let (width, height) = (CELL * poses + 24, ROW * motions.len());
+    let mut canvas = Canvas::new(width, height, PAPER);
+    for (row, (name, joints)) in motions.iter().enumerate() {
+        let frames = frames_of(joints, skeleton)?;
+        let top = (row * ROW) as f64;
+        font::draw(&mut canvas, name, [12.0, top + 8.0], 2, INK);
+        for column in 0..poses {
+            let t = column * (frames - 1) / poses.saturating_sub(1).max(1);
+            let pose = frame(joints, skeleton, t);
+            let view = View {
+                scale: 78.0,
+                centre: [12.0 + CELL as f64 * (column as f64 + 0.5), top + 112.0],
+                looking_at: [pose[0][0], 0.85, pose[0][2]],
+            };
+            let floor = |dx: f64, dz: f64| view.project([pose[0][0] + dx, 0.0, pose[0][2] + dz]).0;
+            for (a, b) in [
+                ((-0.5, -0.5), (0.5, -0.5)),
+                ((0.5, -0.5), (0.5, 0.5)),
+                ((0.5, 0.5), (-0.5, 0.5)),
+                ((-0.5, 0.5), (-0.5, -0.5)),
+            ] {
+                canvas.line(floor(a.0, a.1), floor(b.0, b.1), 1.0, GRID);
+            }
+            figure(&mut canvas, &view, skeleton, &pose, 1.0);
+        }
+    }
+    let mut encoder = png::Encoder::new(out, width as u32, height as u32);
+    encoder.set_color(png::ColorType::Rgb);
+    encoder.set_depth(png::BitDepth::Eight);
+    let failed = |e: png::EncodingError| io::Error::other(e.to_string());
+    encoder.write_header().and_then(|mut w| w.write_image_data(canvas.bytes())).map_err(failed)
+}
+
+/// [`strip_png_to`] a file.
+///
+/// # Errors
+/// When the file cannot be written, or a motion is not a whole number of frames.
+pub fn strip_png(motions: &[(String, Vec<f32>)], poses: usize, skeleton: &Skeleton, path: &Path) -> io::Result<()> {
+    let mut file = BufWriter::new(File::create(path)?);
+    strip_png_to(motions, poses, skeleton, &mut file)?;
+    file.flush()
+}

@@ -1,0 +1,52 @@
+//! Finds the reference material and prints how far a result is from it.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use motion::npy::{self, Array};
+
+/// The folder of reference data, or `None` (said loudly) on a machine without it.
+pub(crate) fn data(part: &str) -> Option<PathBuf> {
+    let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+    let shared = std::env::var_os("STRIDE_SHARED").map_or_else(|| workspace.join("../shared"), PathBuf::from);
+    let folder = shared.join("data").join(part);
+    if folder.is_dir() {
+        return Some(folder);
+    }
+    eprintln!("SKIPPED: {} is missing; set STRIDE_SHARED to the folder of reference data", folder.display());
+    None
+}
+
+/// Reads f32 or f64.
+#[allow(dead_code, reason = "each test binary uses its own part of this module")]
+pub(crate) fn load(file: &Path) -> Array {
+    npy::read_any_float(file).unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// Folders in `folder`, sorted by name.
+#[allow(dead_code, reason = "each test binary uses its own part of this module")]
+pub(crate) fn folders(folder: &Path) -> Vec<PathBuf> {
+    let mut found: Vec<PathBuf> = fs::read_dir(folder)
+        .unwrap_or_else(|e| panic!("{}: {e}", folder.display()))
+        .map(|entry| entry.expect("a folder entry").path())
+        .filter(|path| path.is_dir())
+        .collect();
+    found.sort();
+    found
+}
+
+/// The largest absolute difference; infinite if one side is NaN or the lengths differ.
+pub(crate) fn worst(found: impl IntoIterator<Item = f64>, expected: impl IntoIterator<Item = f64>) -> f64 {
+    let (found, expected): (Vec<f64>, Vec<f64>) = (found.into_iter().collect(), expected.into_iter().collect());
+    if found.len() != expected.len() {
+        return f64::INFINITY;
+    }
+    let differences = found.iter().zip(&expected).map(|(a, b)| (a - b).abs());
+    differences.fold(0.0, |worst, d| if d.is_nan() { f64::INFINITY } else { worst.max(d) })
+}
+
+/// f32 values as f64.
+#[allow(dead_code, reason = "each test binary uses its own part of this module")]
+pub(crate) fn wide(values: &[f32]) -> impl Iterator<Item = f64> + '_ {
+    values.iter().map(|v| f64::from(*v))
+}
