@@ -84,11 +84,19 @@ impl std::error::Error for Diagnostics {}
 /// The candidate that `text` was probably meant to be: at most a third of its letters differ.
 pub(super) fn nearest<'a>(text: &str, candidates: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     let text = text.to_lowercase();
+    // What other programs call it.
+    let text = match text.as_str() {
+        "learning_rate" => "lr".to_owned(),
+        "iterations" | "epochs" | "max_steps" => "steps".to_owned(),
+        "batch_size" => "batch".to_owned(),
+        "d_model" | "hidden_size" => "width".to_owned(),
+        _ => text,
+    };
     let limit = (text.chars().count().max(3) / 3).clamp(1, 4);
     let distance = |candidate: &str| {
         let candidate = candidate.to_lowercase();
         // `steps_total` for `steps`, or `learning_rate` for `rate`: a whole word shared counts as near.
-        if text.len() >= 3 && candidate.len() >= 3 && text.split(['_', '-', '.']).any(|word| word == candidate) {
+        if text.split(['_', '-', '.']).any(|word| word == candidate) {
             return 1;
         }
         levenshtein(&text, &candidate)

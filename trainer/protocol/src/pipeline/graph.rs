@@ -27,7 +27,8 @@ pub(super) fn noun(kind: ArtifactKind) -> &'static str {
 
 /// The edges of `settings`, references only.
 pub(super) fn references(settings: &StageSettings) -> Vec<StageInput> {
-    let input = |(field, stage, kind): (String, String, ArtifactKind)| StageInput { field, stage: StageName::new(stage), kind };
+    let input =
+        |(field, stage, kind): (String, String, ArtifactKind)| StageInput { field, stage: StageName::new(stage), kind };
     settings.inputs().into_iter().map(input).collect()
 }
 
@@ -66,7 +67,8 @@ pub(super) fn sort(stages: Vec<PipelineStage>) -> Result<Vec<PipelineStage>, Vec
     let mut placed: BTreeSet<&StageName> = BTreeSet::new();
     while order.len() < stages.len() {
         let ready = stages.iter().position(|stage| {
-            !placed.contains(&stage.name) && stage.inputs.iter().filter(known).all(|input| placed.contains(&input.stage))
+            !placed.contains(&stage.name)
+                && stage.inputs.iter().filter(known).all(|input| placed.contains(&input.stage))
         });
         let Some(ready) = ready else {
             return Err(cycle(&stages, &placed));
@@ -112,12 +114,17 @@ pub(super) fn check_references(stages: &[PipelineStage], found: &mut ByStage) {
             };
             match stages.iter().find(|other| other.name == input.stage) {
                 None if input.stage.as_str().is_empty() => {
-                    problems.add(&input.field, format!("`{}` is empty; expected a stage that gives {what}", input.field), &help);
+                    problems.add(
+                        &input.field,
+                        format!("`{}` is empty; expected a stage that gives {what}", input.field),
+                        &help,
+                    );
                 }
                 None => {
                     let near = super::diagnostic::nearest(input.stage.as_str(), giving.iter().copied());
                     let question = near.map(|near| format!("; did you mean `{near}`?")).unwrap_or_default();
-                    let message = format!("`{}` names the stage `{}`, which does not exist{question}", input.field, input.stage);
+                    let message =
+                        format!("`{}` names the stage `{}`, which does not exist{question}", input.field, input.stage);
                     problems.add(&input.field, message, &help);
                 }
                 Some(other) if other.settings.output().1 != input.kind => {
@@ -154,10 +161,10 @@ impl<'a> Lookup<'a> {
         }
     }
 
-    /// Which VAE a denoiser was trained with.
+    /// Which VAE made the latents that a denoiser was trained on.
     fn vae_of_denoiser(&self, denoiser: &str) -> Option<&'a str> {
         match self.0.get(denoiser)? {
-            StageSettings::TrainMld(s) => Some(&s.vae),
+            StageSettings::TrainMld(s) => self.vae_of_latents(&s.latents),
             StageSettings::DistillLcm(s) => self.vae_of_latents(&s.distillation.latents),
             StageSettings::DistillPcm(s) => self.vae_of_latents(&s.distillation.latents),
             _ => None,
@@ -223,13 +230,18 @@ pub(super) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
                         );
                         p.add("sampler.steps", message, &format!("write `steps: {}`", pcm.phases));
                     }
-                    Some(StageSettings::DistillPcm(_) | StageSettings::TrainMld(_)) if !s.sampler.timesteps.is_empty() => {
+                    Some(StageSettings::DistillPcm(_) | StageSettings::TrainMld(_))
+                        if !s.sampler.timesteps.is_empty() =>
+                    {
                         let message = format!("`sampler.timesteps` are for LCM students, and `{}` is none", s.model);
                         p.add("sampler.timesteps", message, "leave them out");
                     }
                     Some(StageSettings::DistillLcm(lcm)) if s.sampler.steps > 1000 / lcm.distillation.skip.max(1) => {
                         let points = 1000 / lcm.distillation.skip.max(1);
-                        let message = format!("`sampler.steps` is {}, but the grid of `{}` has {points} points", s.sampler.steps, s.model);
+                        let message = format!(
+                            "`sampler.steps` is {}, but the grid of `{}` has {points} points",
+                            s.sampler.steps, s.model
+                        );
                         p.add("sampler.steps", message, "");
                     }
                     _ => {}
@@ -241,7 +253,8 @@ pub(super) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
                         |other| matches!(&other.settings, StageSettings::EvaluateLatentFid(e) if &e.model == from),
                     );
                     if !judged && (s.from.len() > 1 || !s.promote.to.is_empty()) {
-                        let message = format!("no `evaluate.*` stage looks at `{from}`, so `{}` cannot judge it", s.metric);
+                        let message =
+                            format!("no `evaluate.*` stage looks at `{from}`, so `{}` cannot judge it", s.metric);
                         let help = format!("add a stage such as `{{kind: evaluate.latent_fid, model: {from}}}`");
                         p.add(&format!("from[{i}]"), message, &help);
                     }
@@ -259,7 +272,8 @@ fn distillation(p: &mut Problems, lookup: &Lookup<'_>, s: &crate::stage::Distill
 
 fn is_teacher(p: &mut Problems, lookup: &Lookup<'_>, teacher: &str) {
     if let Some(settings @ (StageSettings::DistillLcm(_) | StageSettings::DistillPcm(_))) = lookup.0.get(teacher) {
-        let message = format!("`{teacher}` is a student ({}), but `teacher` needs a `train.mld` stage", settings.kind());
+        let message =
+            format!("`{teacher}` is a student ({}), but `teacher` needs a `train.mld` stage", settings.kind());
         p.add("teacher", message, "a student has guidance built in, and cannot be asked without it");
     }
 }
@@ -272,7 +286,9 @@ fn same_vae(p: &mut Problems, lookup: &Lookup<'_>, (field, vae): (&str, Option<&
         let message = if field == "vae" {
             format!("`vae` is `{vae}`{shape}, but `{latents}` was encoded with `{other}`{other_shape}")
         } else {
-            format!("`{field}` works on latents of `{vae}`{shape}, but `{latents}` was encoded with `{other}`{other_shape}")
+            format!(
+                "`{field}` works on latents of `{vae}`{shape}, but `{latents}` was encoded with `{other}`{other_shape}"
+            )
         };
         p.add(field, message, "latents of another VAE mean other motions; name the same VAE in both places");
     }

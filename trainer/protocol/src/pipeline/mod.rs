@@ -22,6 +22,9 @@ use crate::{ArtifactKind, Digest, Seed, StageName};
 pub use diagnostic::{Diagnostic, Diagnostics};
 pub use read::read;
 
+#[cfg(test)]
+mod tests;
+
 /// An immutable DAG of stages, in an order in which each stage comes after those it reads.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Pipeline {

@@ -32,7 +32,10 @@ pub(super) fn apply(root: &mut Node, text: &str, source: usize) -> Result<(), St
             let near = nearest(keys[0], TOP_KEYS.into_iter().chain(stages.iter().copied()));
             let question = near.map(|near| format!("; did you mean `{near}`?")).unwrap_or_default();
             let known = list_keys(TOP_KEYS.into_iter().chain(stages.iter().copied()));
-            return Err(format!("`{}` is neither a key of the pipeline nor a stage{question} (known: {known})", keys[0]));
+            return Err(format!(
+                "`{}` is neither a key of the pipeline nor a stage{question} (known: {known})",
+                keys[0]
+            ));
         }
     }
     let value = if value.trim().is_empty() {
@@ -71,6 +74,8 @@ fn put(node: &mut Node, keys: &[&str], value: Node, at: Position, path: &str) ->
             *node = Node { at, value: Content::Map(Vec::new()) };
             put(node, keys, value, at, path)
         }
-        Content::Scalar { text, .. } => Err(format!("`{key}` in `{path}` leads into the value `{text}`, which has no keys")),
+        Content::Scalar { text, .. } => {
+            Err(format!("`{key}` in `{path}` leads into the value `{text}`, which has no keys"))
+        }
     }
 }

@@ -122,13 +122,16 @@ impl Reader {
     fn stages(&mut self, root: &Node) -> (Vec<Written>, Vec<PipelineStage>) {
         let mut written = Vec::new();
         let mut stages = Vec::new();
-        let declared = |name: &str| {
-            root.entry("stages").and_then(|e| e.value.entry(name)).map(|e| e.key_at)
-        };
+        let declared = |name: &str| root.entry("stages").and_then(|e| e.value.entry(name)).map(|e| e.key_at);
 
         if let Some(entry) = root.entry("dataset") {
             if let Some(at) = declared("dataset") {
-                self.mistake(at, "stages.dataset", "the top-level key `dataset` already makes a stage of this name", None);
+                self.mistake(
+                    at,
+                    "stages.dataset",
+                    "the top-level key `dataset` already makes a stage of this name",
+                    None,
+                );
             }
             written.push(Written::implicit("dataset", entry));
             if let Some(settings) = self.dataset(entry) {
@@ -137,12 +140,19 @@ impl Reader {
         } else if declared("dataset").is_none() {
             let help = "such as `dataset: {format: synthetic}` or `dataset: {format: humanml3d, path: data/HumanML3D}`";
             self.mistake(root.at, "dataset", "the pipeline has no `dataset`", Some(help.into()));
+            // Those who read it have nothing to add.
+            written.push(Written { name: "dataset".into(), key_at: root.at, node: None, path: "dataset".into() });
         }
 
         match root.entry("text") {
             Some(entry) => {
                 if let Some(at) = declared("text") {
-                    self.mistake(at, "stages.text", "the top-level key `text` already makes a stage of this name", None);
+                    self.mistake(
+                        at,
+                        "stages.text",
+                        "the top-level key `text` already makes a stage of this name",
+                        None,
+                    );
                 }
                 written.push(Written::implicit("text", entry));
                 if let Some(settings) = self.typed::<TextEmbed>(&entry.value, "`text`", "text", &[]) {
@@ -164,7 +174,9 @@ impl Reader {
                 Some("such as `stages: {vae: {kind: train.vae}}`".into()),
             ),
             Some(entry) => match entry.value.map() {
-                Some([]) => self.mistake(entry.key_at, "stages", "`stages` is empty; expected at least one stage", None),
+                Some([]) => {
+                    self.mistake(entry.key_at, "stages", "`stages` is empty; expected at least one stage", None)
+                }
                 Some(entries) => {
                     for entry in entries {
                         written.push(Written {
@@ -193,7 +205,12 @@ impl Reader {
         let node = &entry.value;
         if node.map().is_none() {
             let message = format!("`dataset` is {}; expected a mapping with `format`", node.describe());
-            self.mistake(node.at, "dataset", message, Some("such as `{format: humanml3d, path: data/HumanML3D}`".into()));
+            self.mistake(
+                node.at,
+                "dataset",
+                message,
+                Some("such as `{format: humanml3d, path: data/HumanML3D}`".into()),
+            );
             return None;
         }
         let Some(format) = node.entry("format") else {
@@ -202,15 +219,19 @@ impl Reader {
             return None;
         };
         match format.value.as_text() {
-            Some("synthetic") => self
-                .typed::<DataSynthetic>(node, "`dataset`", "dataset", &["format"])
-                .map(StageSettings::DataSynthetic),
+            Some("synthetic") => {
+                self.typed::<DataSynthetic>(node, "`dataset`", "dataset", &["format"]).map(StageSettings::DataSynthetic)
+            }
             Some("humanml3d" | "kit") => {
                 self.typed::<DataOpen>(node, "`dataset`", "dataset", &[]).map(StageSettings::DataOpen)
             }
             other => {
                 let near = other.and_then(|text| nearest(text, formats)).map(|near| format!("did you mean `{near}`?"));
-                let message = format!("`format` of `dataset` is {}; expected one of {}", format.value.describe(), list_keys(formats));
+                let message = format!(
+                    "`format` of `dataset` is {}; expected one of {}",
+                    format.value.describe(),
+                    list_keys(formats)
+                );
                 self.mistake(format.value.at, "dataset.format", message, near);
                 None
             }
@@ -255,7 +276,9 @@ impl Reader {
         let path = format!("stages.{name}");
         let owner = format!("stage `{name}`");
         if !is_stage_name(name) {
-            let message = format!("`{name}` is not a stage name; expected a small letter, then small letters, digits, `_`, `-`, at most 64");
+            let message = format!(
+                "`{name}` is not a stage name; expected a small letter, then small letters, digits, `_`, `-`, at most 64"
+            );
             self.mistake(entry.key_at, &path, message, None);
         }
         if node.map().is_none() {
@@ -284,16 +307,27 @@ impl Reader {
         let placed = Node {
             at: node.at,
             value: Content::Map(
-                node.map().unwrap_or(&[]).iter().filter(|e| matches!(&*e.key, "workers" | "checkpoint")).cloned().collect(),
+                node.map()
+                    .unwrap_or(&[])
+                    .iter()
+                    .filter(|e| matches!(&*e.key, "workers" | "checkpoint"))
+                    .cloned()
+                    .collect(),
             ),
         };
         let placement = self.typed::<Placement>(&placed, &owner, &path, &[]);
-        let settings = self.overlaid(serde_json::to_value(default).ok()?, node, &owner, &path, &["workers", "checkpoint"]);
+        let settings =
+            self.overlaid(serde_json::to_value(default).ok()?, node, &owner, &path, &["workers", "checkpoint"]);
         Some((settings?, placement?))
     }
 
     /// Adds edges, applies rules, sorts. Rules between stages wait until every stage could be read.
-    fn connect(&mut self, root: &Node, written: &[Written], mut stages: Vec<PipelineStage>) -> Option<Vec<PipelineStage>> {
+    fn connect(
+        &mut self,
+        root: &Node,
+        written: &[Written],
+        mut stages: Vec<PipelineStage>,
+    ) -> Option<Vec<PipelineStage>> {
         for stage in &stages {
             for problem in rules::stage(&stage.settings, &stage.placement) {
                 self.problem(written, &stage.name, problem);
@@ -363,8 +397,10 @@ impl Reader {
             at = next.at;
             node = Some(next);
         }
-        let path = if problem.field.is_empty() { written.path.clone() } else { format!("{}.{}", written.path, problem.field) };
-        let owner = if written.path.starts_with("stages.") { format!("stage `{stage}`: ") } else { format!("`{stage}`: ") };
+        let path =
+            if problem.field.is_empty() { written.path.clone() } else { format!("{}.{}", written.path, problem.field) };
+        let owner =
+            if written.path.starts_with("stages.") { format!("stage `{stage}`: ") } else { format!("`{stage}`: ") };
         self.mistake(at, &path, format!("{owner}{}", problem.message), problem.help);
     }
 }

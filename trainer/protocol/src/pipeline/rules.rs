@@ -2,10 +2,11 @@
 //!
 //! One stage at a time; what concerns several stages is in `graph`.
 
-use crate::stage::{
-    Batch, Distance, Distillation, LatentShape, Network, Optimizer, Placement, Register, Sampler, StageSettings, Training,
-};
 use crate::id::is_name;
+use crate::stage::{
+    Batch, Distance, Distillation, LatentShape, Network, Optimizer, Placement, Register, Sampler, StageSettings,
+    Training,
+};
 
 /// A rule that does not hold.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -126,7 +127,10 @@ pub(super) fn stage(settings: &StageSettings, placement: &Placement) -> Vec<Prob
             if let Some(grid) = grid(&s.distillation)
                 && s.phases > grid
             {
-                let message = format!("`phases` is {}, but the grid of `skip` {} has only {grid} points", s.phases, s.distillation.skip);
+                let message = format!(
+                    "`phases` is {}, but the grid of `skip` {} has only {grid} points",
+                    s.phases, s.distillation.skip
+                );
                 p.add("phases", message, "take fewer phases or a smaller `skip`");
             }
             p.not_negative("adversarial", s.adversarial);
@@ -247,7 +251,8 @@ fn sampler(p: &mut Problems, s: &Sampler) {
         p.add("sampler.timesteps", "`sampler.timesteps` rise; expected the noisiest first", "");
     }
     if !s.timesteps.is_empty() && s.timesteps.len() != s.steps {
-        let message = format!("`sampler.timesteps` has {} entries, but `sampler.steps` is {}", s.timesteps.len(), s.steps);
+        let message =
+            format!("`sampler.timesteps` has {} entries, but `sampler.steps` is {}", s.timesteps.len(), s.steps);
         p.add("sampler.timesteps", message, "");
     }
 }
@@ -276,7 +281,11 @@ fn register(p: &mut Problems, s: &Register) {
         p.add("model", message, "");
     }
     if s.from.is_empty() {
-        p.add("from", "`from` is missing: the training stages whose denoisers become versions", "such as `from: [lcm, pcm]`");
+        p.add(
+            "from",
+            "`from` is missing: the training stages whose denoisers become versions",
+            "such as `from: [lcm, pcm]`",
+        );
     }
     for (i, stage) in s.from.iter().enumerate() {
         if s.from[..i].contains(stage) {
@@ -287,7 +296,8 @@ fn register(p: &mut Problems, s: &Register) {
         p.add("metric", "`metric` is empty; expected the metric that decides which version is best", "");
     }
     if !s.promote.to.is_empty() && !is_name(&s.promote.to) {
-        let message = format!("`{}` is not an alias; expected letters, digits, `.`, `_`, `-`, at most 64", s.promote.to);
+        let message =
+            format!("`{}` is not an alias; expected letters, digits, `.`, `_`, `-`, at most 64", s.promote.to);
         p.add("promote.to", message, "");
     }
     if s.promote.to.is_empty() && !s.promote.require.is_empty() {
@@ -295,32 +305,31 @@ fn register(p: &mut Problems, s: &Register) {
     }
     for gate in &s.promote.require {
         if !is_gate(gate) {
-            let message = format!("`{gate}` is not a gate; expected a metric, one of <= >= < > ==, and a number");
+            let message =
+                format!("`{gate}` is not a gate; expected a metric, one of <= >= < >, and a number or an alias");
             p.add("promote.require", message, "such as \"latent_fid <= 0.3\"");
         }
     }
 }
 
-/// `metric <= number`, or the same with `alias`, `alias + number`, `alias - number` on the right.
+/// `metric <= number`, or with `alias`, `alias + number`, `alias - number` on the right.
 fn is_gate(gate: &str) -> bool {
-    let Some(at) = gate.find(['<', '>', '=']) else { return false };
+    let Some(at) = gate.find(['<', '>']) else { return false };
     let (metric, rest) = gate.split_at(at);
     let metric = metric.trim();
-    let Some(right) = ["<=", ">=", "==", "<", ">"].iter().find_map(|operator| rest.strip_prefix(operator)) else {
+    let Some(right) = ["<=", ">=", "<", ">"].iter().find_map(|operator| rest.strip_prefix(operator)) else {
         return false;
     };
-    let number = |text: &str| text.trim().parse::<f64>().is_ok_and(f64::is_finite);
     let metric_fits = !metric.is_empty()
         && metric.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-' | b'@' | b'/'));
-    let right = right.trim();
-    let relative = right.split_once([' ', '+']).map_or_else(
-        || is_name(right),
-        |(alias, rest)| {
-            let rest = rest.trim().trim_start_matches(['+', '-']);
-            is_name(alias.trim()) && number(rest)
-        },
-    );
-    metric_fits && (number(right) || relative)
+    let number = |text: &str| text.parse::<f64>().is_ok_and(f64::is_finite);
+    let words: Vec<&str> = right.split_whitespace().collect();
+    let right_fits = match words[..] {
+        [bound] => number(bound) || (is_name(bound) && bound.parse::<f64>().is_err()),
+        [alias, "+" | "-", offset] => is_name(alias) && number(offset),
+        _ => false,
+    };
+    metric_fits && right_fits
 }
 
 #[cfg(test)]
@@ -329,10 +338,11 @@ mod tests {
 
     #[test]
     fn gates_are_comparisons() {
-        for good in ["latent_fid <= 0.3", "fid<=0.05", "eval.r_precision_top1 >= staging - 0.005", "a == 1", "a < prod"] {
+        for good in ["latent_fid <= 0.3", "fid<=0.05", "eval.r_precision_top1 >= staging - 0.005", "a > 1", "a < prod"]
+        {
             assert!(is_gate(good), "{good}");
         }
-        for bad in ["", "latent_fid", "<= 1", "a <= ", "a => 1", "a <= b c", "a b <= 1", "a <= nan"] {
+        for bad in ["", "latent_fid", "<= 1", "a <= ", "a => 1", "a == 1", "a <= b c", "a b <= 1", "a <= nan"] {
             assert!(!is_gate(bad), "{bad}");
         }
     }

@@ -118,7 +118,8 @@ impl Walk<'_> {
 
 /// What a leaf wants, in words, from its example and serde's reason.
 fn expectation(example: &Value, node: &Node, reason: &str) -> (String, Option<String>) {
-    if let Some((_, variants)) = reason.split_once("unknown variant ").and_then(|(_, rest)| rest.split_once(", expected "))
+    if let Some((_, variants)) =
+        reason.split_once("unknown variant ").and_then(|(_, rest)| rest.split_once(", expected "))
     {
         let names: Vec<&str> = variants.split('`').skip(1).step_by(2).collect();
         let listed = names.iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
@@ -143,7 +144,9 @@ fn expectation(example: &Value, node: &Node, reason: &str) -> (String, Option<St
         (Content::Scalar { value: Value::Number(_) | Value::Bool(_), text, .. }, Value::String(_)) => {
             Some(format!("if the text is meant, quote it: \"{text}\""))
         }
-        (Content::Scalar { value: Value::String(text), plain: false, .. }, Value::Number(_)) if text.parse::<f64>().is_ok() => {
+        (Content::Scalar { value: Value::String(text), plain: false, .. }, Value::Number(_))
+            if text.parse::<f64>().is_ok() =>
+        {
             Some("leave out the quotes".into())
         }
         (Content::Scalar { value: Value::String(_), .. }, Value::Number(number)) if number.is_f64() => {

@@ -79,9 +79,9 @@ impl Node {
                 value.clone()
             }
             Content::List(items) => Value::Array(items.iter().map(Self::to_json).collect::<Option<_>>()?),
-            Content::Map(entries) => Value::Object(
-                entries.iter().map(|e| Some((e.key.clone(), e.value.to_json()?))).collect::<Option<_>>()?,
-            ),
+            Content::Map(entries) => {
+                Value::Object(entries.iter().map(|e| Some((e.key.clone(), e.value.to_json()?))).collect::<Option<_>>()?)
+            }
         })
     }
 
@@ -300,7 +300,8 @@ impl Builder {
                 continue;
             };
             if let Some(first) = entries.iter().find(|entry| entry.key == text) {
-                let message = format!("the key `{text}` stands here a second time; the first is in line {}", first.key_at.line);
+                let message =
+                    format!("the key `{text}` stands here a second time; the first is in line {}", first.key_at.line);
                 let help = Some("keep one of the two".to_owned());
                 self.mistakes.push(YamlError { at: key.at, message, help });
                 continue;
