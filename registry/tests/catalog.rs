@@ -1,4 +1,5 @@
 //! Versions, aliases, gates, history.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;
 

@@ -1,4 +1,5 @@
 //! The binary: what it prints, how it exits, and how it asks the holder of a store.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;
 

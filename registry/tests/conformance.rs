@@ -1,4 +1,5 @@
 //! What every blob backend must do, as plain functions, and the backends that do it.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;
 

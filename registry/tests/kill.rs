@@ -2,6 +2,7 @@
 //! done again gives the same digests.
 //!
 //! The test runs itself as a child process that saves checkpoints, and tells by a file what was acknowledged.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;
 

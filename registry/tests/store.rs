@@ -1,4 +1,5 @@
 //! Fences, exactly-once, group commit, opening.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;
 

@@ -160,11 +160,7 @@ pub(crate) fn sync_dir(dir: &Path) -> io::Result<()> {
 /// Bytes that this user may still write where `path` lies.
 pub(crate) fn free_bytes(path: &Path) -> io::Result<u64> {
     let stat = nix::sys::statvfs::statvfs(path)?;
-    #[expect(
-        clippy::useless_conversion,
-        clippy::allow_attributes,
-        reason = "the fields' width differs between targets"
-    )]
+    #[expect(clippy::useless_conversion, reason = "the fields' width differs between targets")]
     Ok(u64::from(stat.blocks_available()).saturating_mul(u64::from(stat.fragment_size())))
 }
 

@@ -191,6 +191,7 @@ pub(crate) fn metric(metrics: &BTreeMap<String, f64>, name: &str) -> Option<f64>
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a test may panic")]
 mod tests {
     use super::*;
 

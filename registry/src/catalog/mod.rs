@@ -201,6 +201,7 @@ impl fmt::Display for ModelRef {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a test may panic")]
 mod tests {
     use super::*;
 

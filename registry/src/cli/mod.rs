@@ -96,7 +96,7 @@ pub enum Command {
 /// What a command gives.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
-#[expect(missing_docs, clippy::allow_attributes, reason = "each field is the type it holds")]
+#[expect(missing_docs, reason = "each field is the type it holds")]
 pub enum Data {
     /// Of `list`.
     Models { models: Vec<Model> },
@@ -194,16 +194,31 @@ impl From<&OpenError> for Answer {
     }
 }
 
-fn invalid(message: impl ToString) -> Answer {
-    Answer::refused(error("invalid", message, Some("`registry help` shows how commands are written")))
+fn invalid(message: impl ToString) -> Refused {
+    Refused::from(error("invalid", message, Some("`registry help` shows how commands are written")))
+}
+
+/// A refusal on its way out of a function.
+struct Refused(Box<Answer>);
+
+impl<E: Into<Answer>> From<E> for Refused {
+    fn from(e: E) -> Self {
+        Self(Box::new(e.into()))
+    }
+}
+
+impl From<ApiError> for Answer {
+    fn from(error: ApiError) -> Self {
+        Self::refused(error)
+    }
 }
 
 /// Runs a command on a store that this process holds.
 pub async fn run(command: Command, store: &Store) -> Answer {
-    answer(command, store).await.unwrap_or_else(|refused| refused)
+    answer(command, store).await.unwrap_or_else(|refused| *refused.0)
 }
 
-async fn answer(command: Command, store: &Store) -> Result<Answer, Answer> {
+async fn answer(command: Command, store: &Store) -> Result<Answer, Refused> {
     let data = match command {
         Command::List => Data::Models { models: store.models().await? },
         Command::Show { reference } => show(store, &reference).await?,
@@ -240,7 +255,7 @@ async fn answer(command: Command, store: &Store) -> Result<Answer, Answer> {
             };
             let nodes = store.lineage(digest).await?;
             if nodes.iter().all(|node| node.kind.is_none() && node.inputs.is_empty()) && !exists(store, digest)? {
-                return Err(Answer::from(QueryError::NotFound(format!("no artifact {digest}"))));
+                return Err(Refused::from(QueryError::NotFound(format!("no artifact {digest}"))));
             }
             Data::Lineage { nodes }
         }
@@ -252,7 +267,7 @@ async fn answer(command: Command, store: &Store) -> Result<Answer, Answer> {
                             that made them again";
                 let mut answer = Answer::refused(error("damaged", message, Some(hint)));
                 answer.data = Some(Data::Fsck { report });
-                return Err(answer);
+                return Err(answer.into());
             }
             Data::Fsck { report }
         }
@@ -263,14 +278,14 @@ async fn answer(command: Command, store: &Store) -> Result<Answer, Answer> {
         }
         Command::Export { reference, dir } => {
             let version = store.resolve(&reference).await?;
-            let files = export::export(store.blobs(), version.artifact, &dir).map_err(Answer::refused)?;
+            let files = export::export(store.blobs(), version.artifact, &dir)?;
             Data::Exported { version, dir, files }
         }
     };
     Ok(Answer::done(data))
 }
 
-async fn known(store: &Store, name: &str) -> Result<Model, Answer> {
+async fn known(store: &Store, name: &str) -> Result<Model, Refused> {
     let name: ModelName = name.parse().map_err(invalid)?;
     match store.model(&name).await? {
         Some(model) => Ok(model),
@@ -278,15 +293,15 @@ async fn known(store: &Store, name: &str) -> Result<Model, Answer> {
         None => Err(store
             .resolve(&format!("{name}@latest"))
             .await
-            .map_or_else(Answer::from, |_| invalid("the model was made just now"))),
+            .map_or_else(Refused::from, |_| invalid("the model was made just now"))),
     }
 }
 
-fn exists(store: &Store, digest: Digest) -> Result<bool, Answer> {
-    store.blobs().exists(digest).map_err(|e| Answer::from(QueryError::Blob(e.to_string())))
+fn exists(store: &Store, digest: Digest) -> Result<bool, Refused> {
+    store.blobs().exists(digest).map_err(|e| Refused::from(QueryError::Blob(e.to_string())))
 }
 
-async fn show(store: &Store, text: &str) -> Result<Data, Answer> {
+async fn show(store: &Store, text: &str) -> Result<Data, Refused> {
     let reference: ModelRef = text.parse().map_err(invalid)?;
     if reference.pick.is_none() {
         let model = known(store, reference.model.as_str()).await?;
