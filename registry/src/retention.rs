@@ -5,17 +5,20 @@
 //! manifest's own words (`meta`), and the lineage. A blob that was put within the grace period is never collected: the row
 //! that will name it may be on its way.
 //!
-//! Collection runs in the writer's thread and transaction, so that no row can come to name a blob while it goes.
+//! Collection runs in the writer's thread, between two transactions: no row can come to name a blob while it goes, and
+//! what rows no longer name is committed before a blob goes. A root whose manifest does not read stops the collection, for
+//! nobody can say what it needs.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
+use checkpoint::BlobError;
 use protocol::stage::Keep;
 use protocol::{Digest, TaskId};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use sqlx::{Row, SqliteConnection};
 
-use crate::blob::BlobStore;
+use crate::blob::{BlobStore, ManifestError};
 use crate::db::apply::{int, run};
 use crate::query::{self, QueryError};
 use crate::{Store, WriteError, clock};
@@ -86,9 +89,8 @@ pub(crate) async fn pin(
 pub(crate) async fn collect(conn: &mut SqliteConnection, blobs: &BlobStore, grace_ms: i64) -> Result<Plan, WriteError> {
     let before_ms = clock::now_ms().saturating_sub(grace_ms);
     let mut plan = plan(conn, blobs, grace_ms).await?;
-    for task in &plan.forget_shards {
-        run(conn, sqlx::query("DELETE FROM shards WHERE task = ?").bind(task.as_str())).await?;
-    }
+    // Outside of a transaction: on disk when it returns.
+    run(conn, sqlx::query(FORGET_SHARDS)).await?;
     let mut removed = Vec::with_capacity(plan.remove.len());
     for digest in std::mem::take(&mut plan.remove) {
         match blobs.remove_older(digest, before_ms) {
@@ -101,6 +103,9 @@ pub(crate) async fn collect(conn: &mut SqliteConnection, blobs: &BlobStore, grac
     plan.remove = removed;
     Ok(plan)
 }
+
+/// The stage's artifact stands for the shards of a run that is finished.
+const FORGET_SHARDS: &str = "DELETE FROM shards WHERE run IN (SELECT run FROM runs WHERE state = 'finished')";
 
 /// Every digest that a row names and that must therefore be whole, with the row in words.
 pub(crate) async fn roots(conn: &mut SqliteConnection) -> Result<Vec<(Digest, String)>, QueryError> {
@@ -137,26 +142,33 @@ async fn plan(conn: &mut SqliteConnection, blobs: &BlobStore, grace_ms: i64) -> 
         rows.iter().map(|row| row.try_get::<String, _>(0).map(TaskId::new)).collect::<Result<_, _>>()?;
     let forgotten: BTreeSet<_> = forget_shards.iter().map(|task| format!("shard `{task}`")).collect();
 
-    let roots = roots(conn).await?;
-    let mut queue: Vec<Digest> =
-        roots.into_iter().filter(|(_, why)| !forgotten.contains(why)).map(|(root, _)| root).collect();
+    let roots: BTreeMap<Digest, String> =
+        roots(conn).await?.into_iter().filter(|(_, why)| !forgotten.contains(why)).collect();
     let all = blobs.list().map_err(|e| QueryError::Blob(e.to_string()))?;
+    let mut queue: Vec<Digest> = roots.keys().copied().collect();
     let mut marked = BTreeSet::new();
     while let Some(digest) = queue.pop() {
-        if !marked.insert(digest) || !all.contains_key(&digest) {
+        if !marked.insert(digest) || !(all.contains_key(&digest) || roots.contains_key(&digest)) {
             continue;
         }
-        for row in sqlx::query("SELECT parent FROM edges WHERE child = ?")
-            .bind(digest.to_string())
-            .fetch_all(&mut *conn)
-            .await?
-        {
+        let parents = sqlx::query("SELECT parent FROM edges WHERE child = ?").bind(digest.to_string());
+        for row in parents.fetch_all(&mut *conn).await? {
             queue.push(query::digest(&row, "parent")?);
         }
-        // What is no manifest, or does not read, names nothing; `fsck` is the one to complain.
-        let Ok(manifest) = blobs.manifest(digest) else { continue };
-        marked.extend(manifest.files.values().map(|file| file.digest));
-        named(&manifest.meta, &mut queue);
+        match (blobs.manifest(digest), roots.get(&digest)) {
+            (Ok(manifest), _) => {
+                marked.extend(manifest.files.values().map(|file| file.digest));
+                named(&manifest.meta, &mut queue);
+            }
+            // Mentioned, but as a blob by itself; or gone since the listing.
+            (Err(ManifestError::NotAManifest { .. } | ManifestError::Blob(BlobError::NotFound(_))), None) => {}
+            (Err(e), why) => {
+                let why = why.map_or_else(|| format!("artifact {digest}"), Clone::clone);
+                return Err(QueryError::Blob(format!(
+                    "nothing was collected, for what {why} needs cannot be read: {e}"
+                )));
+            }
+        }
     }
 
     let before_ms = clock::now_ms().saturating_sub(grace_ms);

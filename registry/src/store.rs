@@ -102,9 +102,11 @@ impl OpenError {
     pub fn hint(&self) -> String {
         match self {
             Self::Busy { holder: Holder { address: Some(address), .. }, .. } => {
-                format!("send work to it with `trainer submit --server {address}`, wait for it, or choose another folder with `--store`")
+                format!("send work to {address}, wait for it to end, or choose another folder with `--store`")
             }
-            Self::Busy { holder, .. } => format!("wait for process {} to end, or choose another folder with `--store`", holder.pid),
+            Self::Busy { holder, .. } => {
+                format!("wait for process {} to end, or choose another folder with `--store`", holder.pid)
+            }
             Self::NotAStore(_) => "`trainer run PIPELINE` makes one; name its folder with `--store`".into(),
             Self::ReadOnly { .. } => "make the folder writable for this user, or choose another with `--store`".into(),
             Self::Full { .. } => "free some space, or choose a folder on another disk with `--store`".into(),
@@ -170,7 +172,7 @@ impl Store {
 
     /// Opens a store that is there.
     pub async fn open_existing(dir: &Path, holder: Holder) -> Result<Self, OpenError> {
-        if !dir.join("lock").exists() {
+        if !db::is_there(dir) {
             return Err(OpenError::NotAStore(dir.to_owned()));
         }
         Self::open(dir, holder).await

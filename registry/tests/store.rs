@@ -228,6 +228,48 @@ async fn checkpoints_are_pruned_by_policy_and_only_the_unneeded_is_collected() {
 }
 
 #[tokio::test]
+async fn shards_go_once_their_run_is_finished_and_pins_stay() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = open(dir.path()).await;
+    let run = |state: &str| Write::Run {
+        run: "r".into(),
+        pipeline: json!({}),
+        source: String::new(),
+        state: state.into(),
+        idempotency_key: None,
+    };
+    let shard = |content| artifact(store.blobs(), ArtifactKind::Shard, content);
+    let (first, second) = (shard("first"), shard("second"));
+    store.write(vec![run("failed"), fence("r/s/0", 1), fence("r/s/1", 1)]).await.unwrap();
+    for (task, output) in [("r/s/0", first), ("r/s/1", second)] {
+        store.write(vec![Write::Shard { grant: grant(task, 1), output }]).await.unwrap();
+    }
+    store.pin(second, "to look at").await.unwrap();
+    assert!(store.gc(-1000).await.unwrap().remove.is_empty(), "a failed run may be resumed");
+    store.write(vec![run("finished")]).await.unwrap();
+    assert_eq!(store.gc(-1000).await.unwrap().remove.len(), 2);
+    assert!(store.shards(&"r".into()).await.unwrap().is_empty());
+    assert!(store.blobs().exists(second).unwrap());
+    assert!(store.fsck().await.unwrap().problems.is_empty());
+    store.unpin(second).await.unwrap();
+    assert_eq!(store.gc(-1000).await.unwrap().remove.len(), 2);
+}
+
+#[tokio::test]
+async fn a_root_that_does_not_read_stops_the_collection() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = open(dir.path()).await;
+    let output = artifact(store.blobs(), ArtifactKind::Vae, "weights");
+    store.write(vec![result("k", output)]).await.unwrap();
+    store.blobs().put(b"nobody needs this").unwrap();
+    let hex = output.hex();
+    std::fs::write(dir.path().join("blobs/sha256").join(&hex[..2]).join(&hex[2..]), b"rot").unwrap();
+    let error = store.gc(-1000).await.unwrap_err();
+    assert!(error.to_string().contains("output `vae` of `r/s`"), "{error}");
+    assert_eq!(store.blobs().list().unwrap().len(), 3, "nothing went");
+}
+
+#[tokio::test]
 async fn a_check_finds_rot_and_loss() {
     let dir = tempfile::tempdir().unwrap();
     let store = open(dir.path()).await;

@@ -21,7 +21,8 @@ pub async fn execute(verb: Verb, dir: &Path, output: Output) -> u8 {
     answer.exit
 }
 
-async fn ask(command: Command, dir: &Path) -> Answer {
+/// Runs a command on the store in `dir`: here if nobody holds it, else at its holder.
+pub async fn ask(command: Command, dir: &Path) -> Answer {
     let until = Instant::now() + PATIENCE;
     loop {
         let busy = match Store::open_existing(dir, Holder::this_process("registry")).await {

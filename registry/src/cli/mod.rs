@@ -15,7 +15,7 @@ use protocol::{Alias, Digest, Manifest, ModelName};
 use serde::{Deserialize, Serialize};
 
 pub use args::{Output, Verb};
-pub use client::execute;
+pub use client::{ask, execute};
 pub use print::{render, show_error};
 
 use crate::catalog::{Expect, Gate, Model, ModelRef, Promotion, Version};

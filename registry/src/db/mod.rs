@@ -20,6 +20,11 @@ pub(crate) static MIGRATOR: Migrator = sqlx::migrate!("../migrations");
 
 const FILE: &str = "stride.db";
 
+/// Whether a folder holds a database.
+pub(crate) fn is_there(dir: &Path) -> bool {
+    dir.join(FILE).exists()
+}
+
 fn options(dir: &Path) -> SqliteConnectOptions {
     SqliteConnectOptions::new()
         .filename(dir.join(FILE))
@@ -117,5 +122,44 @@ pub(crate) fn write_error(e: sqlx::Error) -> WriteError {
         }
         Some(SQLITE_IOERR) => WriteError::Storage(format!("the disk refused a write of the database ({e}); check it and run the same command again")),
         _ => WriteError::Internal(format!("database: {e}")),
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a test may panic")]
+mod tests {
+    use super::*;
+
+    async fn schema(conn: &mut SqliteConnection) -> Vec<(String, Option<String>)> {
+        let all = "SELECT name, sql FROM sqlite_master WHERE name NOT LIKE 'sqlite_%' ORDER BY name";
+        let rows = sqlx::query(all).fetch_all(conn).await.unwrap();
+        rows.iter().map(|row| (row.get(0), row.get(1))).collect()
+    }
+
+    #[tokio::test]
+    async fn every_old_schema_becomes_the_newest_with_a_copy_kept_before() {
+        let fresh = tempfile::tempdir().unwrap();
+        let newest_schema = schema(&mut open_writer(fresh.path()).await.unwrap()).await;
+        let all: Vec<_> = MIGRATOR.iter().cloned().collect();
+        for count in 1..all.len() {
+            let dir = tempfile::tempdir().unwrap();
+            let mut conn = SqliteConnection::connect_with(&options(dir.path()).create_if_missing(true)).await.unwrap();
+            Migrator::with_migrations(all[..count].to_vec()).run(&mut conn).await.unwrap();
+            conn.close().await.unwrap();
+            let mut conn = open_writer(dir.path()).await.unwrap();
+            assert_eq!(schema(&mut conn).await, newest_schema, "from {count} migrations");
+            assert!(dir.path().join(format!("{FILE}.before-{:04}", newest())).exists());
+        }
+    }
+
+    #[tokio::test]
+    async fn each_migration_may_run_again() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut conn = open_writer(dir.path()).await.unwrap();
+        let before = schema(&mut conn).await;
+        for migration in MIGRATOR.iter() {
+            sqlx::raw_sql(migration.sql.clone()).execute(&mut conn).await.unwrap();
+        }
+        assert_eq!(schema(&mut conn).await, before);
     }
 }

@@ -32,10 +32,26 @@ const QUEUE: usize = 4096;
 pub(crate) enum Order {
     Write(Vec<Write>),
     Promote(catalog::PromoteOrder),
-    Rollback { model: ModelName, alias: Alias, to: Option<u64>, expect: Option<Expect>, reason: String, actor: String },
-    PruneCheckpoints { task: TaskId, keep: Keep },
-    Pin { digest: Digest, reason: Option<String> },
-    Collect { grace_ms: i64 },
+    Rollback {
+        model: ModelName,
+        alias: Alias,
+        to: Option<u64>,
+        expect: Option<Expect>,
+        reason: String,
+        actor: String,
+    },
+    PruneCheckpoints {
+        task: TaskId,
+        keep: Keep,
+    },
+    Pin {
+        digest: Digest,
+        reason: Option<String>,
+    },
+    /// Never part of a group: a blob must not go before the row that named it is gone for good.
+    Collect {
+        grace_ms: i64,
+    },
 }
 
 /// What an order gives.
@@ -116,7 +132,14 @@ impl Drop for Writer {
 async fn serve(mut conn: SqliteConnection, mut orders: mpsc::Receiver<(Order, Answer)>, blobs: &BlobStore) {
     let mut group = Vec::with_capacity(GROUP);
     while orders.recv_many(&mut group, GROUP).await > 0 {
-        commit(&mut conn, blobs, &mut group).await;
+        let collections: Vec<_> = group.extract_if(.., |(order, _)| matches!(order, Order::Collect { .. })).collect();
+        if !group.is_empty() {
+            commit(&mut conn, blobs, &mut group).await;
+        }
+        for (order, answer) in collections {
+            let Order::Collect { grace_ms } = order else { continue };
+            let _ = answer.send(retention::collect(&mut conn, blobs, grace_ms).await.map(Done::Collected));
+        }
     }
     if let Err(e) = conn.close().await {
         tracing::warn!("closing the database: {e}");
@@ -183,7 +206,7 @@ async fn run(conn: &mut SqliteConnection, blobs: &BlobStore, order: &Order) -> R
         Order::Pin { digest, reason } => {
             retention::pin(conn, blobs, *digest, reason.as_deref()).await.map(|()| Done::Nothing)
         }
-        Order::Collect { grace_ms } => retention::collect(conn, blobs, *grace_ms).await.map(Done::Collected),
+        Order::Collect { .. } => Err(WriteError::Internal("a collection cannot be part of a transaction".into())),
     }
 }
 
