@@ -179,8 +179,11 @@ async fn run_all(
     for (order, _) in group {
         exec(conn, "SAVEPOINT o").await?;
         let result = run(conn, blobs, order).await;
-        if result.is_err() {
-            exec(conn, "ROLLBACK TO o").await?;
+        if let Err(e) = &result
+            && exec(conn, "ROLLBACK TO o").await.is_err()
+        {
+            // The database ended the whole transaction, as it does on a full disk; that is every order's error.
+            return Err(copy_of(e));
         }
         exec(conn, "RELEASE o").await?;
         results.push(result);
