@@ -198,7 +198,7 @@ impl Deciding<'_> {
         let id = run.id.clone();
         for i in 0..self.state.runs.len() {
             let old = &self.state.runs[i];
-            if old.parked && old.state == RunState::Paused && *old.pipeline == *run.pipeline {
+            if old.parked && old.state == RunState::Paused && old.pipeline.digest() == run.pipeline.digest() {
                 Arc::make_mut(&mut self.state.runs[i]).skip_rest(&format!("taken over by run `{id}`"));
                 self.set_run_state(i, RunState::Cancelled);
             }

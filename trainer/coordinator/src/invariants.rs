@@ -106,8 +106,12 @@ fn check_task(state: &State, work: &Work, task: &Task, broken: &mut Vec<String>)
     let names: BTreeSet<_> = holders.iter().map(|member| &member.worker).collect();
     let range = work.placement.workers;
     let fits = match task.part {
-        // The bounds may have changed since, with the run that asks.
-        Part::Gang => !holders.is_empty() && (range.max == 0 || holders.len() <= range.max.max(range.min)),
+        // Who winds down keeps its members, even if the run that asks has changed, and with it the bounds.
+        Part::Gang => {
+            let winding = matches!(task.hold, Hold::Held { winding: Some(_), .. });
+            let fits = range.max == 0 || holders.len() <= range.max.max(range.min);
+            !holders.is_empty() && (fits || winding || state.draining)
+        }
         Part::Alone | Part::Shard { .. } | Part::Merge => holders.len() == 1,
     };
     if !fits || names.len() != holders.len() {

@@ -1,6 +1,7 @@
 //! Who gets what. Deterministic in state and moment.
 //!
-//! Works are served in the order of [`State::wanted`](crate::state::State::wanted). First, plain tasks, shards and merges
+//! Works are served in the order of [`State::wanted`](crate::state::State::wanted). Gangs that have become
+//! too large give up members. Then plain tasks, shards and merges
 //! that are ready, one worker each: they are short, and much waits for them. Then gangs that are under way take in whoever
 //! is left, up to their `max`; then gangs that wait start with everybody who is left. A gang does not start while a map
 //! stage that its workers could merge is almost done (its last shards are out), or the merge would wait for the whole
@@ -14,6 +15,7 @@ use crate::decide::Deciding;
 use crate::state::State;
 use crate::state::gang::{self, Change};
 use crate::state::task::{Hold, Part};
+use crate::state::work::WorkState;
 use crate::state::worker::Presence;
 
 /// Gives idle workers what is ready.
@@ -21,12 +23,16 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
     if cx.state.draining {
         return;
     }
-    let wanted = cx.state.wanted();
+    let is_open = |key: &Digest| cx.state.works[key].state == WorkState::Open;
+    let wanted: Vec<Digest> = cx.state.wanted().into_iter().filter(is_open).collect();
+    for key in &wanted {
+        change_gangs(cx, *key, |_, _| Vec::new());
+    }
     for key in &wanted {
         small_tasks(cx, *key);
     }
     for key in &wanted {
-        grow_gangs(cx, *key);
+        change_gangs(cx, *key, idle);
     }
     for key in &wanted {
         start_gangs(cx, *key);
@@ -63,13 +69,13 @@ fn small_tasks(cx: &mut Deciding<'_>, key: Digest) {
     }
 }
 
-fn grow_gangs(cx: &mut Deciding<'_>, key: Digest) {
+fn change_gangs(cx: &mut Deciding<'_>, key: Digest, joiners: impl Fn(&State, Backend) -> Vec<Member>) {
     for i in 0..cx.state.works[&key].tasks.len() {
         let work = &cx.state.works[&key];
         let task = &work.tasks[i];
         let under_way = matches!(task.hold, Hold::Held { winding: None, .. });
         if task.part == Part::Gang && under_way {
-            match gang::with(task.holders(), &idle(cx.state, work.backend), work.placement.workers) {
+            match gang::with(task.holders(), &joiners(cx.state, work.backend), work.placement.workers) {
                 Change::Keep | Change::Disband => {}
                 Change::Regroup(members) => cx.regroup(key, i, members),
             }

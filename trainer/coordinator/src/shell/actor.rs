@@ -70,6 +70,7 @@ impl Desk {
         let pipeline: Pipeline = serde_json::from_value(submit.pipeline).map_err(|e| {
             Rejected::Invalid(format!("the pipeline does not parse: {e}; was it made by another build?"))
         })?;
+        pipeline.check().map_err(Rejected::Invalid)?;
         let event = Event::Submit {
             pipeline: Box::new(pipeline),
             source: submit.source,

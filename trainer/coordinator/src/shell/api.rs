@@ -41,6 +41,7 @@ pub(crate) fn router(desk: Arc<Desk>, token: Option<&str>) -> Router {
         .route("/v1/runs/{run}/logs", get(queries::logs))
         .route("/v1/runs/{run}/metrics", get(queries::metrics))
         .route("/v1/runs/{run}/{action}", post(queries::control))
+        .route("/v1/registry", post(queries::registry))
         .layer(DefaultBodyLimit::max(MESSAGE_BYTES))
         .merge(blobs)
         .layer(middleware::from_fn_with_state(token, auth::require_token))

@@ -143,3 +143,11 @@ pub(crate) async fn metrics(
     }
     Ok(Json(stages))
 }
+
+/// The registry's commands, on behalf of a client: this process holds the store.
+pub(crate) async fn registry(
+    State(desk): State<Arc<Desk>>,
+    Json(command): Json<registry::cli::Command>,
+) -> Json<registry::cli::Answer> {
+    Json(registry::cli::run(command, &desk.store).await)
+}

@@ -1,8 +1,8 @@
 //! Who is in a gang. Membership is a list by rank; rank 0 leads: it saves, records and reports.
 //!
-//! | members \ change | some lost, `min` left | lost below `min` | joiners, room | joiners, full |
-//! |---|---|---|---|---|
-//! | n | Regroup, survivors keep their order | Disband | Regroup, joiners behind | Keep |
+//! | change | some lost, `min` left | lost below `min` | joiners, room | joiners, full | `max` lowered |
+//! |---|---|---|---|---|---|
+//! | becomes | Regroup, survivors keep their order | Disband | Regroup, joiners behind | Keep | Regroup, the first stay |
 //!
 //! Survivors keep their order, so rank 0 stays rank 0 for as long as it lives. A regrouped gang is a new generation of the
 //! same attempt; a disbanded one starts its next attempt from the newest checkpoint.
@@ -34,8 +34,13 @@ pub fn without(members: &[Member], lost: &[WorkerId], range: WorkerRange) -> Cha
     }
 }
 
-/// The gang with as many of `idle` as there is room for.
+/// The gang with as many of `idle` as there is room for; without its last members if there are too many, which is so when
+/// another run that wants the same stage asks for fewer.
 pub fn with(members: &[Member], idle: &[Member], range: WorkerRange) -> Change {
+    let most = room(0, range);
+    if members.len() > most {
+        return Change::Regroup(members[..most].to_vec());
+    }
     let room = room(members.len(), range).min(idle.len());
     if room == 0 { Change::Keep } else { Change::Regroup(members.iter().chain(&idle[..room]).cloned().collect()) }
 }
@@ -74,6 +79,8 @@ mod tests {
             with(&members(&["c", "a"]), &members(&["b", "d"]), two_to_three),
             Change::Regroup(members(&["c", "a", "b"]))
         );
+        let one = WorkerRange { min: 1, max: 1 };
+        assert_eq!(with(&abc, &[], one), Change::Regroup(members(&["a"])));
         assert_eq!(start(&members(&["a"]), two_to_three), None);
         assert_eq!(start(&members(&["a", "b", "c", "d"]), two_to_three), Some(abc));
         assert_eq!(start(&members(&["a", "b"]), WorkerRange::default()), Some(members(&["a", "b"])));

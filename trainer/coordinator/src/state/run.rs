@@ -16,7 +16,7 @@ use std::sync::Arc;
 
 use protocol::message::{RunState, StageState};
 use protocol::pipeline::Pipeline;
-use protocol::{Attempt, Digest, RunId, StageName, canonical};
+use protocol::{Attempt, Digest, RunId, StageName};
 
 use crate::event::{Control, Known};
 
@@ -110,7 +110,7 @@ impl Run {
         key: Option<String>,
         until: Option<StageName>,
     ) -> Self {
-        let digest = canonical::digest(&*pipeline);
+        let digest = pipeline.digest();
         let id = RunId::new(format!("{}-{}-{number}", pipeline.name, &digest.hex()[..8]));
         let wanted = wanted(&pipeline, until.as_ref());
         let stages = (0..pipeline.stages.len())

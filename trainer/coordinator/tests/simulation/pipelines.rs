@@ -1,0 +1,52 @@
+//! Pipelines of the quickstart's shape.
+
+use std::collections::BTreeMap;
+
+use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
+use protocol::stage::{
+    Backend, CheckpointPolicy, DataSynthetic, DistillLcm, DistillPcm, EncodeLatents, EvaluateLatentFid, Keep,
+    Placement, Promote, Register, StageSettings, TextEmbed, TrainMld, TrainVae, WorkerRange,
+};
+use protocol::{ArtifactKind, Seed, Steps};
+
+/// The whole way from clips to a promoted student.
+pub(crate) fn quickstart(seed: u64, workers: WorkerRange, require: &[&str]) -> Pipeline {
+    let evaluate = |model: &str| {
+        StageSettings::EvaluateLatentFid(EvaluateLatentFid { model: model.into(), shards: 3, ..Default::default() })
+    };
+    let register = StageSettings::Register(Register {
+        model: "quickstart".into(),
+        from: vec!["lcm".into(), "pcm".into()],
+        promote: Promote { to: "staging".into(), require: require.iter().map(|gate| (*gate).to_owned()).collect() },
+        ..Default::default()
+    });
+    let stages = [
+        ("dataset", StageSettings::DataSynthetic(DataSynthetic::default())),
+        ("text", StageSettings::TextEmbed(TextEmbed::default())),
+        ("vae", StageSettings::TrainVae(TrainVae::default())),
+        ("latents", StageSettings::EncodeLatents(EncodeLatents { shards: 4, ..Default::default() })),
+        ("mld", StageSettings::TrainMld(TrainMld::default())),
+        ("lcm", StageSettings::DistillLcm(DistillLcm::default())),
+        ("pcm", StageSettings::DistillPcm(DistillPcm::default())),
+        ("fid-lcm", evaluate("lcm")),
+        ("fid-pcm", evaluate("pcm")),
+        ("release", register),
+    ];
+    let placement =
+        Placement { workers, checkpoint: CheckpointPolicy { every: Steps(3), keep: Keep { latest: 2, best: 1 } } };
+    let stages = stages.map(|(name, settings)| {
+        let mut inputs: Vec<StageInput> = settings
+            .inputs()
+            .into_iter()
+            .map(|(field, stage, kind)| StageInput { field, stage: stage.as_str().into(), kind })
+            .collect();
+        if name == "release" {
+            for stage in ["fid-lcm", "fid-pcm"] {
+                let field = format!("evaluations.{stage}");
+                inputs.push(StageInput { field, stage: stage.into(), kind: ArtifactKind::Report });
+            }
+        }
+        PipelineStage { name: name.into(), settings, placement: placement.clone(), inputs, external: BTreeMap::new() }
+    });
+    Pipeline { name: "quickstart".into(), seed: Seed(seed), backend: Backend::Flex, stages: stages.to_vec() }
+}

@@ -1,0 +1,241 @@
+//! A worker that does not compute: it joins, polls, steps, saves and reports, over a network that delays, loses and
+//! doubles what it says.
+
+use std::collections::BTreeMap;
+
+use coordinator::Millis;
+use protocol::message::{
+    Assignment, CommitCheckpoint, Doing, FailureClass, Grant, Join, Orders, PROTOCOL_VERSION, Poll, Progress,
+    ReportOutcome, Role, TaskOutcome,
+};
+use protocol::stage::Backend;
+use protocol::{Attempt, Digest, Incarnation, TaskId, WorkerId};
+
+use crate::random::Random;
+
+/// Steps of a training stage.
+pub(crate) const STEPS: u64 = 10;
+
+/// What travels to the coordinator.
+#[derive(Debug, Clone)]
+pub(crate) enum Call {
+    Join(Join),
+    Poll(Poll),
+    Commit(CommitCheckpoint),
+    Report(ReportOutcome),
+}
+
+/// What travels back.
+#[derive(Debug, Clone)]
+pub(crate) enum Answer {
+    Joined(Incarnation),
+    Orders(Orders),
+    /// To this commit or report: stored.
+    Done(Saving),
+    /// To this commit or report: never.
+    Refused(Saving),
+    /// Of any call: later.
+    Later,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Saving {
+    No,
+    /// Until the answer comes, nothing goes on.
+    Commit(CommitCheckpoint),
+    Report(ReportOutcome),
+    Over,
+}
+
+#[derive(Debug, Clone)]
+pub(crate) struct FakeWorker {
+    pub(crate) name: WorkerId,
+    /// The process is there.
+    pub(crate) alive: bool,
+    /// Stopped by a signal until then.
+    pub(crate) hung_until: Millis,
+    pub(crate) process: u32,
+    incarnation: Option<Incarnation>,
+    orders: Option<Orders>,
+    /// Steps of the state in memory, and of which try.
+    live: Option<(TaskId, Attempt, u64)>,
+    saved_at: u64,
+    saving: Saving,
+    next_call: Millis,
+    silent_peers_since: Option<Millis>,
+}
+
+impl FakeWorker {
+    pub(crate) fn new(name: &str) -> Self {
+        Self {
+            name: name.into(),
+            alive: false,
+            hung_until: Millis(0),
+            process: 0,
+            incarnation: None,
+            orders: None,
+            live: None,
+            saved_at: 0,
+            saving: Saving::No,
+            next_call: Millis(0),
+            silent_peers_since: None,
+        }
+    }
+
+    /// A new process.
+    pub(crate) fn launch(&mut self) {
+        *self = Self { process: self.process + 1, alive: true, ..Self::new(self.name.as_str()) };
+    }
+
+    pub(crate) fn runs(&self, now: Millis) -> bool {
+        self.alive && self.hung_until <= now
+    }
+
+    fn assignment(&self) -> Option<&Assignment> {
+        self.orders.as_ref()?.assignments.first()
+    }
+
+    pub(crate) fn grant(&self) -> Option<&Grant> {
+        self.assignment().map(|assignment| &assignment.grant)
+    }
+
+    /// Steps in memory, if they are of this try.
+    pub(crate) fn live(&self, grant: &Grant) -> Option<u64> {
+        self.live.as_ref().filter(|(task, attempt, _)| (task, attempt) == (&grant.task, &grant.attempt)).map(|l| l.2)
+    }
+
+    pub(crate) fn hear(&mut self, process: u32, answer: Answer) {
+        if !self.alive || process != self.process {
+            return;
+        }
+        match answer {
+            Answer::Joined(incarnation) => {
+                self.incarnation.get_or_insert(incarnation);
+            }
+            Answer::Orders(orders) => {
+                let held = self.grant().cloned();
+                self.orders = Some(orders);
+                if self.grant() != held.as_ref() {
+                    self.saving = Saving::No;
+                    self.silent_peers_since = None;
+                }
+            }
+            Answer::Done(what) if what == self.saving => match what {
+                Saving::Commit(commit) => {
+                    self.saved_at = commit.step;
+                    self.saving = Saving::No;
+                }
+                Saving::Report(_) | Saving::Over | Saving::No => self.saving = Saving::Over,
+            },
+            // Whatever we hold is not ours any more.
+            Answer::Refused(what) if what == self.saving => self.saving = Saving::Over,
+            // An answer to what was said long ago.
+            Answer::Done(_) | Answer::Refused(_) | Answer::Later => {}
+        }
+    }
+
+    /// The process was replaced or is unknown: join again.
+    pub(crate) fn forget(&mut self) {
+        self.incarnation = None;
+        self.orders = None;
+        self.live = None;
+        self.saving = Saving::No;
+    }
+
+    /// What it sends now, if anything.
+    pub(crate) fn speak(&mut self, now: Millis, unreachable: &[WorkerId]) -> Vec<Call> {
+        if !self.runs(now) || now < self.next_call {
+            return Vec::new();
+        }
+        self.next_call = now.after(800);
+        let Some(incarnation) = self.incarnation else {
+            return vec![Call::Join(Join {
+                protocol: PROTOCOL_VERSION,
+                worker: self.name.clone(),
+                pid: self.process,
+                backend: Backend::Flex,
+                peer_address: format!("{}:{}", self.name, self.process),
+            })];
+        };
+        let doing = self.assignment().map(|assignment| Doing {
+            grant: assignment.grant.clone(),
+            progress: Progress { done: self.live.as_ref().map_or(0, |l| l.2), total: STEPS, ..Default::default() },
+            lost: match (&assignment.role, self.silent_peers_since) {
+                (Role::Member { members, .. }, Some(since)) if now.since(since) > 2500 => {
+                    members.iter().map(|m| &m.worker).filter(|w| unreachable.contains(w)).cloned().collect()
+                }
+                _ => Vec::new(),
+            },
+        });
+        let version = self.orders.as_ref().map_or(0, |orders| orders.version);
+        let mut calls = vec![Call::Poll(Poll { incarnation, doing: doing.into_iter().collect(), version })];
+        match &self.saving {
+            Saving::Commit(commit) => calls.push(Call::Commit(commit.clone())),
+            Saving::Report(report) => calls.push(Call::Report(report.clone())),
+            Saving::No | Saving::Over => {}
+        }
+        calls
+    }
+
+    fn report(&mut self, grant: Grant, outcome: TaskOutcome) {
+        self.saving = Saving::Report(ReportOutcome { grant, outcome });
+    }
+
+    /// One unit of work. `peers` says for a gang how far the furthest member is, or `None` if not all are there.
+    pub(crate) fn work(&mut self, now: Millis, peers: Option<Option<u64>>, saved: u64, random: &mut Random, chaos: bool) {
+        if !self.runs(now) || self.saving != Saving::No {
+            return;
+        }
+        let Some(assignment) = self.assignment().cloned() else { return };
+        let grant = assignment.grant.clone();
+        if chaos && random.chance(1) {
+            let class = if random.chance(50) { FailureClass::Fault } else { FailureClass::Infrastructure };
+            return self.report(grant, TaskOutcome::Failed { class, message: "made up".into() });
+        }
+        let rank = match &assignment.role {
+            Role::Member { members, .. } => members.iter().position(|member| member.worker == self.name),
+            Role::Alone | Role::Shard { .. } | Role::Merge { .. } => {
+                if random.chance(40) {
+                    self.report(grant.clone(), finished(&grant.task));
+                }
+                return;
+            }
+        };
+        let Some(furthest) = peers else {
+            self.silent_peers_since.get_or_insert(now);
+            return;
+        };
+        self.silent_peers_since = None;
+        let before = furthest.or(self.live(&grant)).unwrap_or(saved);
+        let leads = rank == Some(0);
+        if assignment.wind_down && leads {
+            if self.saved_at != before {
+                return self.commit(grant, before);
+            }
+            return self.report(grant, TaskOutcome::Yielded { at: before });
+        }
+        if before >= STEPS {
+            if leads {
+                self.report(grant.clone(), finished(&grant.task));
+            }
+            return;
+        }
+        self.live = Some((grant.task.clone(), grant.attempt, before + u64::from(leads)));
+        if leads && (before + 1) % 3 == 0 {
+            self.commit(grant, before + 1);
+        }
+    }
+
+    fn commit(&mut self, grant: Grant, step: u64) {
+        let manifest = Digest::of(format!("{} {step}", grant.task).as_bytes());
+        let metrics = BTreeMap::from([("loss".to_owned(), 1.0 / (1.0 + step as f64))]);
+        self.saving = Saving::Commit(CommitCheckpoint { grant, step, manifest, metrics });
+    }
+}
+
+/// A stage is a function: whoever computes it gets this.
+fn finished(task: &TaskId) -> TaskOutcome {
+    let parts: Vec<&str> = task.as_str().split('/').skip(1).collect();
+    let metrics = BTreeMap::from([("latent_fid".to_owned(), 0.1)]);
+    TaskOutcome::Finished { output: Digest::of(parts.join("/").as_bytes()), metrics }
+}
