@@ -7,6 +7,7 @@
 mod pipelines;
 mod random;
 mod store;
+mod wild;
 mod worker;
 
 use std::collections::BTreeMap;
@@ -43,6 +44,8 @@ struct World {
     checkpoint_steps: BTreeMap<Digest, u64>,
     events: u64,
     cancelled: Vec<RunId>,
+    /// Try every event now and then.
+    wild: bool,
 }
 
 fn policy() -> Policy {
@@ -82,6 +85,7 @@ impl World {
             checkpoint_steps: BTreeMap::new(),
             events: 0,
             cancelled: Vec::new(),
+            wild: false,
         }
     }
 
@@ -210,7 +214,10 @@ impl World {
                 let known = self.state.check_write(&report.grant);
                 let stored = self.happen(Event::Outcome { report });
                 if let Err(Rejected::StaleFence { .. }) = known {
-                    assert!(stored.is_err() || stored.is_ok_and(|effects| effects.is_empty()), "a stale report counted");
+                    assert!(
+                        stored.is_err() || stored.is_ok_and(|effects| effects.is_empty()),
+                        "a stale report counted"
+                    );
                     (false, Err(Refused::Rejected(Rejected::Conflict("stale".into()))))
                 } else {
                     (false, stored.map(|_| done))
@@ -312,6 +319,9 @@ impl World {
             self.workers[i].hear(process, answer);
         }
         self.workers_step();
+        if self.wild && self.now.0 % 7000 == 0 {
+            self.try_everything();
+        }
     }
 
     fn coordinator_step(&mut self) {
@@ -334,6 +344,20 @@ impl World {
         }
         if now.0 % 1000 == 0 && self.hear(Observation::Tick).is_err() {
             // Stored at the next tick.
+        }
+    }
+
+    /// Whatever could happen now, on copies: nothing panics, and the invariants hold.
+    fn try_everything(&mut self) {
+        for event in wild::events(&self.state) {
+            let moment = Moment { now: self.now, entropy: Digest::of(b"wild") };
+            let mut next = self.state.clone();
+            let result = decide(&mut next, moment, event.clone());
+            let broken = invariants::check_change(&self.state, &next);
+            assert!(broken.is_empty(), "after {event:?}: {broken:#?}");
+            if !matches!(result.as_ref().map(|effects| effects.first()), Ok(Some(Effect::Store(_)))) {
+                assert_eq!(durable(&next), durable(&self.state), "{event:?} gave {result:?} and changed the state");
+            }
         }
     }
 
@@ -373,7 +397,8 @@ impl World {
         while self.now.0 < LIMIT_MS && (self.chaos() || !self.is_over()) {
             self.step();
         }
-        let held: Vec<_> = self.state.works.values().flat_map(|work| &work.tasks).filter(|task| task.is_held()).collect();
+        let held: Vec<_> =
+            self.state.works.values().flat_map(|work| &work.tasks).filter(|task| task.is_held()).collect();
         assert!(self.is_over(), "not over after {LIMIT_MS} ms: {held:#?} {:#?}", self.workers);
         for run in &self.state.runs {
             let never = format!("{:?}", run.pipeline).contains("never");
@@ -437,6 +462,15 @@ fn whatever_happens_every_run_ends_and_every_task_is_done_once() {
         restarts += world.store.journal.iter().filter(|entry| entry["event"] == "started").count();
     }
     eprintln!("{} seeds: {events} events, {runs} runs, {restarts} restarts", seeds.len());
+}
+
+#[test]
+fn every_event_in_every_state_is_taken_or_refused() {
+    for seed in 0..6 {
+        let mut world = World::new(seed);
+        world.wild = true;
+        world.run();
+    }
 }
 
 #[test]

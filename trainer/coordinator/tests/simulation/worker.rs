@@ -182,7 +182,14 @@ impl FakeWorker {
     }
 
     /// One unit of work. `peers` says for a gang how far the furthest member is, or `None` if not all are there.
-    pub(crate) fn work(&mut self, now: Millis, peers: Option<Option<u64>>, saved: u64, random: &mut Random, chaos: bool) {
+    pub(crate) fn work(
+        &mut self,
+        now: Millis,
+        peers: Option<Option<u64>>,
+        saved: u64,
+        random: &mut Random,
+        chaos: bool,
+    ) {
         if !self.runs(now) || self.saving != Saving::No {
             return;
         }

@@ -1,0 +1,275 @@
+//! The server over a real socket and a real store, with a worker that does not compute.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use axum::body::Body;
+use axum::http::{Request, StatusCode};
+use coordinator::{Config, Control, Coordinator, Handle, Policy, StartError};
+use protocol::message::{
+    ApiError, CommitCheckpoint, Grant, Join, Joined, LogBatch, MetricBatch, MetricRow, Orders, PROTOCOL_VERSION, Poll,
+    ReportOutcome, RunState, StageState, Submit, TaskOutcome,
+};
+use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
+use protocol::stage::{Backend, DataSynthetic, Placement, StageSettings, TrainVae};
+use protocol::{ArtifactKind, Digest, Manifest, RunId, Seed};
+use registry::{Holder, Store};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+
+type TestResult<T = ()> = Result<T, Box<dyn std::error::Error>>;
+
+/// The smallest HTTP client that will do: one request, one connection.
+struct Client {
+    address: std::net::SocketAddr,
+    token: Option<String>,
+}
+
+impl Client {
+    async fn send(&self, request: Request<Body>) -> TestResult<(StatusCode, Vec<u8>)> {
+        let (parts, body) = request.into_parts();
+        let body = axum::body::to_bytes(body, usize::MAX).await?;
+        let mut stream = TcpStream::connect(self.address).await?;
+        let mut head = format!("{} {} HTTP/1.1\r\nhost: x\r\nconnection: close\r\n", parts.method, parts.uri);
+        if let Some(token) = &self.token {
+            head += &format!("authorization: Bearer {token}\r\n");
+        }
+        for (name, value) in &parts.headers {
+            head += &format!("{name}: {}\r\n", value.to_str()?);
+        }
+        head += &format!("content-length: {}\r\n\r\n", body.len());
+        stream.write_all(head.as_bytes()).await?;
+        stream.write_all(&body).await?;
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer).await?;
+        let end = answer.windows(4).position(|w| w == b"\r\n\r\n").ok_or("no head")? + 4;
+        let status = std::str::from_utf8(&answer[9..12])?.parse()?;
+        Ok((status, answer[end..].to_vec()))
+    }
+
+    async fn call<T: DeserializeOwned>(&self, method: &str, path: &str, body: impl Serialize) -> TestResult<T> {
+        let (status, bytes) = self.try_call(method, path, body).await?;
+        assert!(status.is_success(), "{method} {path}: {status} {}", String::from_utf8_lossy(&bytes));
+        Ok(serde_json::from_slice(&bytes)?)
+    }
+
+    async fn try_call(&self, method: &str, path: &str, body: impl Serialize) -> TestResult<(StatusCode, Vec<u8>)> {
+        let body = Body::from(serde_json::to_vec(&body)?);
+        self.send(Request::builder().method(method).uri(path).header("content-type", "application/json").body(body)?)
+            .await
+    }
+
+    async fn refused(&self, path: &str, body: impl Serialize) -> TestResult<(u16, ApiError)> {
+        let (status, bytes) = self.try_call("POST", path, body).await?;
+        Ok((status.as_u16(), serde_json::from_slice(&bytes)?))
+    }
+
+    async fn put_blob(&self, grant: &Grant, bytes: &[u8]) -> TestResult<Digest> {
+        let request = Request::builder().method("PUT").uri("/v1/blobs");
+        let request = request.header("x-stride-grant", serde_json::to_string(grant)?);
+        let (status, answer) = self.send(request.body(Body::from(bytes.to_vec()))?).await?;
+        assert!(status.is_success(), "{status} {}", String::from_utf8_lossy(&answer));
+        let stored: coordinator::shell::BlobStored = serde_json::from_slice(&answer)?;
+        Ok(stored.digest)
+    }
+
+    async fn put_manifest(&self, grant: &Grant, kind: ArtifactKind, name: &str) -> TestResult<Digest> {
+        self.put_blob(grant, &Manifest::new(kind, serde_json::json!({"name": name})).to_bytes()).await
+    }
+}
+
+fn pipeline() -> Pipeline {
+    let stage = |name: &str, settings: StageSettings| {
+        let inputs = settings.inputs().into_iter();
+        let inputs =
+            inputs.map(|(field, stage, kind)| StageInput { field, stage: stage.as_str().into(), kind }).collect();
+        PipelineStage {
+            name: name.into(),
+            settings,
+            placement: Placement::default(),
+            inputs,
+            external: BTreeMap::new(),
+        }
+    };
+    Pipeline {
+        name: "small".into(),
+        seed: Seed(1),
+        backend: Backend::Flex,
+        stages: vec![
+            stage("dataset", StageSettings::DataSynthetic(DataSynthetic::default())),
+            stage("vae", StageSettings::TrainVae(TrainVae::default())),
+        ],
+    }
+}
+
+fn submission(key: Option<&str>) -> TestResult<Submit> {
+    Ok(Submit {
+        pipeline: serde_json::to_value(pipeline())?,
+        source: "name: small".into(),
+        idempotency_key: key.map(str::to_owned),
+        until: None,
+    })
+}
+
+async fn start(dir: &std::path::Path) -> TestResult<(Handle, Client)> {
+    let store = Store::open(dir, Holder::this_process("a test")).await?;
+    let policy = Policy { poll_ms: 300, tick_ms: 50, lease_ms: 1000, ..Policy::default() };
+    let config = Config { policy, alone: false, park: false, ..Config::embedded() };
+    let handle = Coordinator::start(store, config).await?;
+    let client = Client { address: handle.address(), token: None };
+    Ok((handle, client))
+}
+
+async fn join(client: &Client, name: &str) -> TestResult<Joined> {
+    let join = Join {
+        protocol: PROTOCOL_VERSION,
+        worker: name.into(),
+        pid: 7,
+        backend: Backend::Flex,
+        peer_address: "127.0.0.1:1".into(),
+    };
+    client.call("POST", "/v1/workers", join).await
+}
+
+/// Polls until there is an assignment of `stage`.
+async fn assignment(
+    client: &Client,
+    name: &str,
+    joined: &Joined,
+    stage: &str,
+) -> TestResult<protocol::message::Assignment> {
+    let mut version = 0;
+    loop {
+        let poll = Poll { incarnation: joined.incarnation, doing: vec![], version };
+        let orders: Orders = client.call("POST", &format!("/v1/workers/{name}/poll"), poll).await?;
+        version = orders.version;
+        if let Some(assignment) = orders.assignments.into_iter().find(|a| a.stage.name.as_str() == stage) {
+            return Ok(assignment);
+        }
+    }
+}
+
+async fn until_over(handle: &Handle, run: &RunId) -> TestResult<protocol::message::RunView> {
+    let mut changes = handle.changes();
+    loop {
+        changes.mark_unchanged();
+        let view = handle.run_view(run).ok_or("no such run")?;
+        if view.state.is_final() {
+            return Ok(view);
+        }
+        tokio::time::timeout(Duration::from_secs(20), changes.changed()).await??;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_run_goes_through_over_http_and_survives_a_restart() -> TestResult {
+    let dir = tempfile::tempdir()?;
+    let (handle, client) = start(dir.path()).await?;
+    let run = handle.submit(submission(Some("once"))?).await?;
+    let again: coordinator::shell::Submitted = client.call("POST", "/v1/runs", submission(Some("once"))?).await?;
+    assert_eq!(again.run, run);
+
+    let joined = join(&client, "w").await?;
+    let data = assignment(&client, "w", &joined, "dataset").await?.grant;
+    let output = client.put_manifest(&data, ArtifactKind::Dataset, "clips").await?;
+    let rows = vec![MetricRow { step: 1, key: "clips".into(), value: 400.0 }];
+    client.call::<()>("POST", "/v1/metrics", MetricBatch { grant: data.clone(), rows }).await?;
+    let logs = LogBatch { grant: data.clone(), first: 0, lines: vec!["hello".into()] };
+    client.call::<()>("POST", "/v1/logs", logs.clone()).await?;
+    client.call::<()>("POST", "/v1/logs", logs).await?;
+    let finished = TaskOutcome::Finished { output, metrics: BTreeMap::from([("clips".into(), 400.0)]) };
+    let report = ReportOutcome { grant: data.clone(), outcome: finished };
+    client.call::<()>("POST", "/v1/outcomes", report.clone()).await?;
+    // The answer may have been lost.
+    client.call::<()>("POST", "/v1/outcomes", report).await?;
+
+    let vae = assignment(&client, "w", &joined, "vae").await?;
+    assert_eq!(vae.stage.inputs["dataset"], output);
+    let checkpoint = client.put_manifest(&vae.grant, ArtifactKind::Checkpoint, "step 5").await?;
+    let commit = CommitCheckpoint { grant: vae.grant.clone(), step: 5, manifest: checkpoint, metrics: BTreeMap::new() };
+    let missing = CommitCheckpoint { manifest: Digest::of(b"nothing"), ..commit.clone() };
+    assert_eq!(client.refused("/v1/checkpoints", missing).await?.0, 404, "a manifest that was not uploaded");
+    client.call::<()>("POST", "/v1/checkpoints", commit).await?;
+
+    let stale = Grant { fence: protocol::Fence(0), ..vae.grant.clone() };
+    let metrics = MetricBatch { grant: stale, rows: vec![] };
+    let (status, error) = client.refused("/v1/metrics", metrics).await?;
+    assert_eq!((status, error.code.as_str()), (409, "stale-fence"));
+
+    // As by `kill -9`: the worker goes on and re-attaches with the same incarnation and grant.
+    handle.shutdown().await;
+    let (handle, client) = start(dir.path()).await?;
+    let same = assignment(&client, "w", &joined, "vae").await?;
+    assert_eq!((&same.grant, same.resume), (&vae.grant, Some(checkpoint)));
+    let output = client.put_manifest(&vae.grant, ArtifactKind::Vae, "vae").await?;
+    let finished = TaskOutcome::Finished { output, metrics: BTreeMap::from([("mpjpe".into(), 40.0)]) };
+    let report = ReportOutcome { grant: vae.grant.clone(), outcome: finished };
+    client.call::<()>("POST", "/v1/outcomes", report).await?;
+    let view = until_over(&handle, &run).await?;
+    assert_eq!(view.state, RunState::Finished);
+    assert_eq!(view.stages[1].metrics["mpjpe"], 40.0);
+    let lines: Vec<registry::LogRow> = client.call("GET", &format!("/v1/runs/{run}/logs?stage=dataset"), ()).await?;
+    assert_eq!(lines.iter().map(|line| line.text.as_str()).collect::<Vec<_>>(), ["hello"]);
+    let curves: coordinator::shell::StageMetrics = client.call("GET", &format!("/v1/runs/{run}/metrics"), ()).await?;
+    assert_eq!(curves[&"dataset".into()]["clips"].points[0].value, 400.0);
+
+    // Nothing is computed twice.
+    let second = handle.submit(submission(None)?).await?;
+    let view = until_over(&handle, &second).await?;
+    assert!(view.stages.iter().all(|stage| stage.state == StageState::Cached), "{view:#?}");
+    assert!(handle.control(&second, Control::Pause).await.is_err());
+    handle.shutdown().await;
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestResult {
+    let dir = tempfile::tempdir()?;
+    let (handle, client) = start(dir.path()).await?;
+    handle.submit(submission(None)?).await?;
+    let first = join(&client, "a").await?;
+    let lost = assignment(&client, "a", &first, "dataset").await?.grant;
+    let begun = std::time::Instant::now();
+    let second = join(&client, "b").await?;
+    let taken = assignment(&client, "b", &second, "dataset").await?.grant;
+    let waited = begun.elapsed();
+    assert!(waited > Duration::from_millis(500) && waited < Duration::from_secs(10), "{waited:?}");
+    assert!(taken.fence > lost.fence && taken.attempt > lost.attempt);
+    let report = ReportOutcome { grant: lost.clone(), outcome: TaskOutcome::Yielded { at: 0 } };
+    let (status, error) = client.refused("/v1/outcomes", report).await?;
+    assert_eq!((status, error.code.as_str()), (409, "stale-fence"));
+    let request = Request::builder().method("PUT").uri("/v1/blobs");
+    let request = request.header("x-stride-grant", serde_json::to_string(&lost)?).body(Body::from("late"))?;
+    assert_eq!(client.send(request).await?.0, StatusCode::CONFLICT);
+
+    // A process that joins under the name replaces the old one, whose polls are refused.
+    join(&client, "b").await?;
+    let poll = Poll { incarnation: second.incarnation, doing: vec![], version: 0 };
+    assert_eq!(client.refused("/v1/workers/b/poll", poll.clone()).await?.0, 409);
+    assert_eq!(client.refused("/v1/workers/c/poll", poll).await?.0, 404);
+    handle.shutdown().await;
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_token_is_wanted_where_one_is_set_and_required_beyond_this_machine() -> TestResult {
+    let dir = tempfile::tempdir()?;
+    let store = Store::open(dir.path(), Holder::this_process("a test")).await?;
+    let open = Config::server(([0, 0, 0, 0], 0).into(), None);
+    assert!(matches!(Coordinator::start(store.clone(), open).await, Err(StartError::NoToken(_))));
+    let config = Config { token: Some("secret".into()), ..Config::embedded() };
+    let handle = Coordinator::start(store, config).await?;
+    let mut client = Client { address: handle.address(), token: None };
+    assert_eq!(client.try_call("GET", "/v1/runs", ()).await?.0, StatusCode::UNAUTHORIZED);
+    assert_eq!(client.try_call("GET", "/v1/health", ()).await?.0, StatusCode::OK);
+    client.token = Some("guess".into());
+    assert_eq!(client.try_call("GET", "/v1/runs", ()).await?.0, StatusCode::UNAUTHORIZED);
+    client.token = Some("secret".into());
+    assert_eq!(client.try_call("GET", "/v1/runs", ()).await?.0, StatusCode::OK);
+    let answer: registry::cli::Answer = client.call("POST", "/v1/registry", registry::cli::Command::List).await?;
+    assert_eq!(answer.exit, 0);
+    handle.shutdown().await;
+    Ok(())
+}

@@ -1,0 +1,99 @@
+//! Every kind of event, for everything that a state knows and for some things that it does not.
+
+use std::collections::BTreeMap;
+
+use coordinator::event::Known;
+use coordinator::{Control, Event, State};
+use protocol::message::{CommitCheckpoint, FailureClass, Grant, Join, PROTOCOL_VERSION, ReportOutcome, TaskOutcome};
+use protocol::stage::Backend;
+use protocol::{Digest, Fence, Incarnation, RunId, TaskId, WorkerId};
+
+pub(crate) fn events(state: &State) -> Vec<Event> {
+    let mut events = vec![
+        Event::Started { alone: false, park: false },
+        Event::Started { alone: true, park: true },
+        Event::Drain,
+        Event::Submit {
+            pipeline: Box::new(crate::pipelines::quickstart(0, Default::default(), &[])),
+            source: String::new(),
+            idempotency_key: None,
+            until: Some("nowhere".into()),
+        },
+    ];
+    let nobody: WorkerId = "nobody".into();
+    for worker in state.workers.keys().chain([&nobody]) {
+        let incarnation = state.workers.get(worker).map_or(Incarnation(9), |worker| worker.incarnation);
+        for protocol in [PROTOCOL_VERSION, 0] {
+            let join =
+                Join { protocol, worker: worker.clone(), pid: 1, backend: Backend::Flex, peer_address: "x:1".into() };
+            events.push(Event::Join { join });
+        }
+        events.push(Event::WorkerBack { worker: worker.clone() });
+        events.push(Event::LeaseExpired { worker: worker.clone(), incarnation });
+        events.push(Event::LeaseExpired { worker: worker.clone(), incarnation: Incarnation(0) });
+        events.push(Event::WorkerGone { worker: worker.clone() });
+    }
+    let no_run: RunId = "no-run".into();
+    for run in state.runs.iter().map(|run| &run.id).chain([&no_run]) {
+        for action in [Control::Pause, Control::Resume, Control::Cancel] {
+            events.push(Event::Control { run: run.clone(), action });
+        }
+    }
+    let known = Known { outputs: BTreeMap::from([("x".into(), Digest::of(b"x"))]), metrics: BTreeMap::new() };
+    for key in state.works.keys().copied().chain([Digest::of(b"no key")]) {
+        events.push(Event::LookedUp { key, known: Some(known.clone()) });
+        events.push(Event::LookedUp { key, known: None });
+        events.push(Event::Bundled { key, bundles: vec![Digest::of(b"1"), Digest::of(b"2")] });
+        events.push(Event::Bundled { key, bundles: vec![] });
+        events.push(Event::RegisterRefused { key, message: "no".into() });
+    }
+    let no_task: TaskId = "no/task".into();
+    for task in state.tasks.keys().chain([&no_task]) {
+        events.push(Event::BackoffOver { task: task.clone() });
+        for grant in grants(state, task, &nobody) {
+            events.push(Event::GraceOver { task: task.clone(), fence: grant.fence });
+            events.push(Event::PeersLost { grant: grant.clone(), lost: state.workers.keys().cloned().collect() });
+            let commit = CommitCheckpoint {
+                grant: grant.clone(),
+                step: 2,
+                manifest: Digest::of(b"m"),
+                metrics: BTreeMap::new(),
+            };
+            events.push(Event::Checkpoint { commit });
+            let failed = |class| TaskOutcome::Failed { class, message: "made up".into() };
+            for outcome in [
+                TaskOutcome::Finished { output: Digest::of(b"o"), metrics: BTreeMap::new() },
+                TaskOutcome::Yielded { at: 2 },
+                failed(FailureClass::Input),
+                failed(FailureClass::Diverged),
+                failed(FailureClass::OutOfMemory),
+                failed(FailureClass::Storage),
+                failed(FailureClass::Fault),
+                failed(FailureClass::Infrastructure),
+            ] {
+                events.push(Event::Outcome { report: ReportOutcome { grant: grant.clone(), outcome } });
+            }
+        }
+    }
+    events
+}
+
+/// Those of the holders, an old one, one from the future, and a stranger's.
+fn grants(state: &State, task: &TaskId, nobody: &WorkerId) -> Vec<Grant> {
+    let stranger = Grant {
+        task: task.clone(),
+        attempt: Default::default(),
+        fence: Fence(0),
+        worker: nobody.clone(),
+        incarnation: Incarnation(1),
+    };
+    let Ok((_, task)) = state.task(task) else { return vec![stranger] };
+    let mut grants: Vec<Grant> =
+        task.holders().iter().map(|member| task.grant_of(&member.worker, member.incarnation)).collect();
+    let current = task.grant_of(nobody, Incarnation(1));
+    grants.push(Grant { fence: Fence(task.fence.0.saturating_sub(1)), ..current.clone() });
+    grants.push(Grant { fence: task.fence.next(), ..current.clone() });
+    grants.push(current);
+    grants.push(stranger);
+    grants
+}
