@@ -8,17 +8,15 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use protocol::message::{Join, PROTOCOL_VERSION, RunState, StageState};
+use protocol::message::{Join, PROTOCOL_VERSION, RunState};
 use protocol::pipeline::Pipeline;
-use protocol::stage::{Shape, StageSettings};
 use protocol::{Digest, Fence, RunId, StageName, TaskId, WorkerId};
 use registry::Write;
 
 use crate::event::{Control, Effect, Event, Known, Millis, Moment, Rejected};
-use crate::register::Registration;
 use crate::state::State;
 use crate::state::gang::{self, Change};
-use crate::state::run::{Run, Status};
+use crate::state::run::Run;
 use crate::state::task::{Hold, Part, Task};
 use crate::state::work::{Work, WorkState};
 use crate::state::worker::{Sign, Worker};
@@ -401,11 +399,11 @@ impl Deciding<'_> {
         Ok((work.key, work.position(task).expect("it was just found")))
     }
 
-    fn keys(&self) -> Vec<Digest> {
+    pub(crate) fn keys(&self) -> Vec<Digest> {
         self.state.works.keys().copied().collect()
     }
 
-    fn set_run_state(&mut self, i: usize, state: RunState) {
+    pub(crate) fn set_run_state(&mut self, i: usize, state: RunState) {
         Arc::make_mut(&mut self.state.runs[i]).state = state;
         self.write_run(i);
     }
@@ -420,146 +418,6 @@ impl Deciding<'_> {
             state: state.as_str().unwrap_or_default().to_owned(),
             idempotency_key: run.idempotency_key.clone(),
         });
-    }
-
-    /// Brings every run up to date with its works, until nothing moves.
-    fn settle(&mut self) {
-        for i in 0..self.state.runs.len() {
-            loop {
-                let over = self.take_over_results(i);
-                let settled = self.state.runs[i].settled();
-                if settled != self.state.runs[i].state {
-                    if settled == RunState::Failed {
-                        let run = Arc::make_mut(&mut self.state.runs[i]);
-                        let failed = run.stages.iter().position(|s| matches!(s, Status::Failed { .. }));
-                        let name = failed.map(|j| run.pipeline.stages[j].name.to_string()).unwrap_or_default();
-                        run.skip_rest(&format!("stage `{name}` failed"));
-                    }
-                    self.set_run_state(i, settled);
-                }
-                if !self.attach_ready(i) && !over {
-                    break;
-                }
-            }
-        }
-    }
-
-    fn take_over_results(&mut self, i: usize) -> bool {
-        let now = self.now();
-        let mut moved = false;
-        for j in 0..self.state.runs[i].stages.len() {
-            let Status::Active { key } = self.state.runs[i].stages[j] else { continue };
-            self.state.work_mut(key).count_time(now);
-            let work = &self.state.works[&key];
-            let status = match &work.state {
-                WorkState::Looking | WorkState::Open | WorkState::Bundling => continue,
-                WorkState::Failed { message } => Status::Failed { key, message: message.clone() },
-                WorkState::Done { known, cached } => {
-                    let how = match (cached, work.resumed) {
-                        (true, _) => StageState::Cached,
-                        (false, true) => StageState::Resumed,
-                        (false, false) => StageState::Ran,
-                    };
-                    let wall_s = if *cached { 0.0 } else { work.wall_s(now) };
-                    Status::Done { key, how, known: known.clone(), wall_s, attempt: work.attempt() }
-                }
-            };
-            Arc::make_mut(&mut self.state.runs[i]).stages[j] = status;
-            moved = true;
-        }
-        moved
-    }
-
-    /// Starts the stages of a running run whose inputs are there.
-    fn attach_ready(&mut self, i: usize) -> bool {
-        if self.state.runs[i].state != RunState::Running {
-            return false;
-        }
-        let mut moved = false;
-        for j in 0..self.state.runs[i].stages.len() {
-            if self.state.runs[i].stages[j] == Status::Waiting
-                && let Some(inputs) = self.state.runs[i].inputs(j)
-            {
-                let status = self.attach(i, j, inputs);
-                Arc::make_mut(&mut self.state.runs[i]).stages[j] = status;
-                moved = true;
-            }
-        }
-        moved
-    }
-
-    fn attach(&mut self, i: usize, j: usize, inputs: std::collections::BTreeMap<String, Digest>) -> Status {
-        let run = Arc::clone(&self.state.runs[i]);
-        let stage = &run.pipeline.stages[j];
-        let key = run.pipeline.identity(stage, &inputs).key();
-        let registration = match &stage.settings {
-            StageSettings::Register(settings) => match Registration::gather(&run, &stage.name, settings) {
-                Ok(registration) => Some(registration),
-                Err(message) => return Status::Failed { key, message },
-            },
-            other => {
-                assert!(other.shape() != Shape::Registry, "only `register` changes the registry");
-                None
-            }
-        };
-        match self.state.works.contains_key(&key).then(|| self.state.work_mut(key)) {
-            Some(work) => {
-                work.placement = stage.placement.clone();
-                match work.state {
-                    WorkState::Looking | WorkState::Open | WorkState::Bundling => return Status::Active { key },
-                    WorkState::Done { .. } => work.want_again(true),
-                    WorkState::Failed { .. } => {
-                        work.resumed |= work.has_something();
-                        work.want_again(false);
-                    }
-                }
-            }
-            None => {
-                let work = Work {
-                    key,
-                    run: run.id.clone(),
-                    stage: stage.name.clone(),
-                    settings: stage.settings.clone(),
-                    inputs,
-                    seed: run.pipeline.seed,
-                    backend: run.pipeline.backend,
-                    placement: stage.placement.clone(),
-                    registration,
-                    state: WorkState::Looking,
-                    tasks: Vec::new(),
-                    wall_ms: 0,
-                    busy_since: None,
-                    resumed: false,
-                };
-                self.state.works.insert(key, Arc::new(work));
-            }
-        }
-        self.effects.push(Effect::Lookup { key });
-        Status::Active { key }
-    }
-
-    /// Work that no running run waits for is asked to wind down; work that one waits for again carries on.
-    fn wind(&mut self) {
-        let deadline = self.now().after(self.state.policy.grace_ms);
-        let wanted: BTreeSet<Digest> = self.state.wanted().into_iter().collect();
-        for key in self.keys() {
-            let carry_on = wanted.contains(&key) && !self.state.draining;
-            if self.state.works[&key].tasks.iter().any(Task::is_held) {
-                for task in &mut self.state.work_mut(key).tasks {
-                    task.wind((!carry_on).then_some(deadline));
-                }
-            }
-        }
-    }
-
-    fn count_time(&mut self) {
-        let now = self.now();
-        for key in self.keys() {
-            let work = &self.state.works[&key];
-            if work.is_busy() != work.busy_since.is_some() {
-                self.state.work_mut(key).count_time(now);
-            }
-        }
     }
 }
 

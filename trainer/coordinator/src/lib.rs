@@ -16,6 +16,7 @@ mod outcome;
 pub mod policy;
 pub mod register;
 mod schedule;
+mod settle;
 pub mod shell;
 pub mod state;
 mod view;

@@ -88,10 +88,12 @@ fn start_gangs(cx: &mut Deciding<'_>, key: Digest) {
     for i in 0..cx.state.works[&key].tasks.len() {
         let work = &cx.state.works[&key];
         let task = &work.tasks[i];
-        if task.part == Part::Gang && task.is_free(now) && !merge_is_near(cx.state, work.backend) {
-            if let Some(members) = gang::start(&idle(cx.state, work.backend), work.placement.workers) {
-                grant(cx, key, i, members);
-            }
+        if task.part == Part::Gang
+            && task.is_free(now)
+            && !merge_is_near(cx.state, work.backend)
+            && let Some(members) = gang::start(&idle(cx.state, work.backend), work.placement.workers)
+        {
+            grant(cx, key, i, members);
         }
     }
 }

@@ -175,8 +175,7 @@ impl Handle {
     /// A run as clients see it.
     pub fn run_view(&self, run: &RunId) -> Option<RunView> {
         let state = self.desk.state();
-        let view = state.run(run).ok().map(|run| state.view(run, self.desk.now()));
-        view
+        state.run(run).ok().map(|run| state.view(run, self.desk.now()))
     }
 
     /// All runs, oldest first.

@@ -234,3 +234,49 @@ fn wanted(pipeline: &Pipeline, until: Option<&StageName>) -> BTreeSet<usize> {
     }
     wanted
 }
+
+#[cfg(test)]
+mod tests {
+    use protocol::Seed;
+    use protocol::pipeline::PipelineStage;
+    use protocol::stage::{Backend, StageSettings};
+
+    use super::*;
+
+    fn run() -> Run {
+        let settings = StageSettings::all().remove(0);
+        let stage = PipelineStage {
+            name: "only".into(),
+            settings,
+            placement: Default::default(),
+            inputs: Vec::new(),
+            external: BTreeMap::new(),
+        };
+        let pipeline = Pipeline { name: "p".into(), seed: Seed(1), backend: Backend::Flex, stages: vec![stage] };
+        Run::new(1, Arc::new(pipeline), String::new(), None, None)
+    }
+
+    #[test]
+    fn the_table_in_the_header_is_what_the_code_does() {
+        let key = Digest::of(b"");
+        let failed = Status::Failed { key, message: String::new() };
+        let known = Known { outputs: BTreeMap::new(), metrics: BTreeMap::new() };
+        let done = Status::Done { key, how: StageState::Ran, known, wall_s: 0.0, attempt: Attempt(1) };
+        for state in [RunState::Running, RunState::Paused, RunState::Finished, RunState::Failed, RunState::Cancelled] {
+            let asked = |action| Run { state, ..run() }.after(action).map_or("-".to_owned(), |s| format!("{s:?}"));
+            let becomes = |status: &Status| {
+                let after = Run { state, stages: vec![status.clone()], ..run() }.settled();
+                if after == state { "-".to_owned() } else { format!("{after:?}") }
+            };
+            let row = format!(
+                "//! | {state:?} | {} | {} | {} | {} | {} |",
+                asked(Control::Pause),
+                asked(Control::Resume),
+                asked(Control::Cancel),
+                becomes(&failed),
+                becomes(&done)
+            );
+            assert!(include_str!("run.rs").lines().any(|line| line == row), "{row}");
+        }
+    }
+}

@@ -132,7 +132,8 @@ impl World {
         let events = observe(&mut self.state, self.now, observation).map_err(Refused::Rejected)?;
         for event in events {
             match self.happen(event) {
-                Ok(_) | Err(Refused::Rejected(_)) => {}
+                Ok(_) => {}
+                Err(Refused::Rejected(rejected)) => drop(rejected.to_string()),
                 Err(refused) => return Err(refused),
             }
         }
@@ -319,7 +320,7 @@ impl World {
             self.workers[i].hear(process, answer);
         }
         self.workers_step();
-        if self.wild && self.now.0 % 7000 == 0 {
+        if self.wild && self.now.0.is_multiple_of(7000) {
             self.try_everything();
         }
     }
@@ -342,7 +343,7 @@ impl World {
         for (_, i, process, call) in extract(&mut self.calls, now) {
             self.deliver(i, process, call);
         }
-        if now.0 % 1000 == 0 && self.hear(Observation::Tick).is_err() {
+        if now.0.is_multiple_of(1000) && self.hear(Observation::Tick).is_err() {
             // Stored at the next tick.
         }
     }
