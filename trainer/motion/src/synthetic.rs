@@ -28,6 +28,7 @@ use crate::skeleton::Skeleton;
 
 /// A movement.
 struct Kind {
+    #[cfg_attr(not(test), expect(dead_code, reason = "names the row for readers and tests"))]
     name: &'static str,
     /// Shortest and longest clip, seconds.
     seconds: (f64, f64),

@@ -117,7 +117,7 @@ impl Pose {
     pub(super) fn standing() -> Self {
         let leg = |side: f64| Leg::Foot { toe: [side * 0.11, TOE, 0.10], yaw: side * 0.12, pitch: 0.0 };
         Self {
-            pelvis: [0.0, 0.955, 0.0],
+            pelvis: [0.0, 0.970, 0.0],
             yaw: 0.0,
             pitch: 0.0,
             roll: 0.0,

@@ -51,7 +51,7 @@ impl Gait {
             duty: 0.62,
             width: 0.085,
             lift: 0.07,
-            height: 0.945,
+            height: 0.955,
             bounce: 0.018,
             lean: 0.04 + 0.03 * speed.max(0.0),
             arm_swing: 0.18 + 0.25 * speed.abs(),
@@ -235,7 +235,7 @@ impl Walk {
         let middle = TAU * (body.phase - 0.5 * g.duty);
         let sway = 0.018 * pace * middle.cos();
         let aside = quat::rotate(turn_y(body.yaw), [sway, 0.0, 0.0]);
-        let height = g.height + g.bounce * pace * (2.0 * middle).cos() + (0.955 - g.height) * (1.0 - pace) * 0.5;
+        let height = g.height + g.bounce * pace * (2.0 * middle).cos() + (0.970 - g.height) * (1.0 - pace) * 0.5;
         pose.pelvis = [body.at[0] + aside[0], height, body.at[1] + aside[2]];
         let swing = (TAU * body.phase).cos() * pace * toward;
         let counter = 0.10 * swing * (g.forward.abs() / 1.2).min(1.3);

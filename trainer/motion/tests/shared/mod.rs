@@ -1,5 +1,7 @@
 //! Finds the reference material and prints how far a result is from it.
 
+#![allow(dead_code, reason = "each test binary uses its own part of this module")]
+
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -18,13 +20,11 @@ pub(crate) fn data(part: &str) -> Option<PathBuf> {
 }
 
 /// Reads f32 or f64.
-#[allow(dead_code, reason = "each test binary uses its own part of this module")]
 pub(crate) fn load(file: &Path) -> Array {
     npy::read_any_float(file).unwrap_or_else(|e| panic!("{e}"))
 }
 
 /// Folders in `folder`, sorted by name.
-#[allow(dead_code, reason = "each test binary uses its own part of this module")]
 pub(crate) fn folders(folder: &Path) -> Vec<PathBuf> {
     let mut found: Vec<PathBuf> = fs::read_dir(folder)
         .unwrap_or_else(|e| panic!("{}: {e}", folder.display()))
@@ -46,7 +46,6 @@ pub(crate) fn worst(found: impl IntoIterator<Item = f64>, expected: impl IntoIte
 }
 
 /// f32 values as f64.
-#[allow(dead_code, reason = "each test binary uses its own part of this module")]
 pub(crate) fn wide(values: &[f32]) -> impl Iterator<Item = f64> + '_ {
     values.iter().map(|v| f64::from(*v))
 }
