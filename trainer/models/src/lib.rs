@@ -1,1 +1,5 @@
+//! The published networks, their samplers, and the CPU kernels under them.
+//!
+//! Not its job: stages, stores, workers, where data comes from.
 
+pub mod kernels;
