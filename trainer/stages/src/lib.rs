@@ -5,3 +5,5 @@
 pub mod artifacts;
 pub mod context;
 pub mod evaluation;
+pub mod kinds;
+pub mod testing;

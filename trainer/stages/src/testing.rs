@@ -250,7 +250,7 @@ impl Bench {
             }
             Shape::Gang => {
                 let saved = self.checkpoints.entry(name.to_owned()).or_default();
-                gang::run(attempt, self.members, &self.script, saved)
+                gang::run(attempt, self.members, &self.script, saved, &kinds::run_gang)
             }
             Shape::Registry => Err(StageError::Fault(format!("`{}` runs in the coordinator", settings.kind()))),
         }

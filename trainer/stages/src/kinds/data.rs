@@ -36,17 +36,15 @@ fn log_report(cx: &mut dyn AttemptContext, report: &OpenReport) {
 
 /// Makes clips from nothing but the seed.
 pub(super) fn synthetic(cx: &mut dyn AttemptContext, settings: &DataSynthetic) -> Result<Outcome, StageError> {
-    let dataset = motion::synthetic::generate(settings, cx.task().seed).map_err(|e| StageError::Input(e.to_string()))?;
+    if settings.clips == 0 {
+        return Err(StageError::Input(format!("stage `{}`: `clips` is 0, expected at least 1", cx.task().name)));
+    }
+    let dataset = motion::synthetic::generate(settings, cx.task().seed);
     let text = format!("made by the program: {} clips, {} captions\n", dataset.clips.len(), dataset.captions.len());
     pack(cx, &dataset, 0, text)
 }
 
-fn pack(
-    cx: &mut dyn AttemptContext,
-    dataset: &Dataset,
-    skipped: usize,
-    report: String,
-) -> Result<Outcome, StageError> {
+fn pack(cx: &mut dyn AttemptContext, dataset: &Dataset, skipped: usize, report: String) -> Result<Outcome, StageError> {
     let meta = DatasetMeta {
         format: dataset.format,
         clips: dataset.clips.len(),

@@ -14,7 +14,6 @@ use protocol::{Digest, Manifest};
 
 use super::{MemoryAttempt, Ran, Told, lock};
 use crate::context::{AttemptContext, ContextError, Exchange, GangContext, Outcome, Rendezvous, StageError};
-use crate::kinds;
 
 /// Who leaves or joins a gang, and when. Members are numbered from 0; the lowest alive leads.
 #[derive(Debug, Clone, Default)]
@@ -92,12 +91,16 @@ impl Member {
     }
 }
 
-/// Runs a gang stage with `count` members; `saved` are its checkpoints, old and new.
+/// What a member runs.
+type Body<'a> = dyn Fn(&mut dyn GangContext) -> Result<Outcome, StageError> + Sync + 'a;
+
+/// Runs `body` with `count` members; `saved` are its checkpoints, old and new.
 pub(super) fn run(
     attempt: impl Fn() -> MemoryAttempt,
     count: usize,
     script: &Script,
     saved: &mut Vec<(u64, Manifest)>,
+    body: &Body<'_>,
 ) -> Result<Ran, StageError> {
     let gang = Arc::new(Gang::default());
     {
@@ -125,7 +128,7 @@ pub(super) fn run(
                 scope.spawn(move || {
                     let started = join_after.is_none_or(|step| join(&mut member, step));
                     // A panic must not leave the others waiting for this member.
-                    let run = || started.then(|| kinds::run_gang(&mut member));
+                    let run = || started.then(|| body(&mut member));
                     let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run));
                     let mut state = lock(&member.gang.state);
                     if !matches!(result, Ok(Some(Ok(_)) | None)) && state.members.contains(&member.me) {
@@ -149,7 +152,7 @@ pub(super) fn run(
     });
 
     *saved = std::mem::take(&mut lock(&gang.state).checkpoints);
-    let lost = |me: usize| script.lost.iter().any(|(who, _)| *who == me);
+    let may_end = |me: usize| script.lost.iter().chain(&script.joins).any(|(who, _)| *who == me);
     let mut ran: Option<Ran> = None;
     for (me, result, told) in results {
         match result {
@@ -162,7 +165,7 @@ pub(super) fn run(
                     ran = Some(Ran { outcome, told });
                 }
             }
-            Some(Err(StageError::Context(ContextError::GrantEnded(_)))) if lost(me) => {}
+            Some(Err(StageError::Context(ContextError::GrantEnded(_)))) if may_end(me) => {}
             Some(Err(error)) => return Err(error),
             None => {}
         }
@@ -228,17 +231,18 @@ impl GangContext for Member {
         let gang = Arc::clone(&self.gang);
         let mut state = lock(&gang.state);
         loop {
-            if !state.members.contains(&self.me) {
+            // Only one that joined after the last step can find it so.
+            if state.over || !state.members.contains(&self.me) {
                 return Err(ContextError::GrantEnded("the gang went on without this member".into()));
             }
             self.generation = state.generation;
             self.members.clone_from(&state.members);
             state.arrived.insert(self.me, applied);
             gang.changed.notify_all();
-            while state.generation == self.generation && state.arrived.len() < state.members.len() {
+            while !state.over && state.generation == self.generation && state.arrived.len() < state.members.len() {
                 state = gang.changed.wait(state).unwrap_or_else(std::sync::PoisonError::into_inner);
             }
-            if state.generation != self.generation {
+            if state.over || state.generation != self.generation {
                 continue;
             }
             let newest = *state.arrived.values().max().expect("this member has arrived");
@@ -253,7 +257,7 @@ impl GangContext for Member {
             if applied == newest {
                 return Ok(Rendezvous::Keep);
             }
-            while state.generation == self.generation && state.donated.is_none() {
+            while !state.over && state.generation == self.generation && state.donated.is_none() {
                 state = gang.changed.wait(state).unwrap_or_else(std::sync::PoisonError::into_inner);
             }
             if let (true, Some(donated)) = (state.generation == self.generation, &state.donated) {
@@ -288,7 +292,10 @@ impl GangContext for Member {
             state.step = step;
             state.slices.clear();
         }
-        assert!(parts.iter().map(|(slice, _)| *slice).eq(self.share(slices)), "a member gives its own slices, in order");
+        assert!(
+            parts.iter().map(|(slice, _)| *slice).eq(self.share(slices)),
+            "a member gives its own slices, in order"
+        );
         state.slices.extend(parts.iter().cloned());
         if state.slices.len() == slices {
             let parts: Vec<_> = std::mem::take(&mut state.slices).into_values().collect();
@@ -325,7 +332,13 @@ impl GangContext for Member {
 
 #[cfg(test)]
 mod tests {
+    use protocol::stage::{CheckpointPolicy, StageSettings, TextEmbed};
+    use protocol::{ArtifactKind, RunId, Seed, StageName};
+
     use super::*;
+
+    const SLICES: usize = 6;
+    const STEPS: u64 = 12;
 
     #[test]
     fn the_tree_does_not_depend_on_who_computed_its_leaves() {
@@ -334,5 +347,87 @@ mod tests {
         let expected = ((by_hand(0) + by_hand(1)) + (by_hand(2) + by_hand(3))) + (by_hand(4) + by_hand(5));
         assert_eq!(tree_sum(&parts), [expected, 18.0]);
         assert_eq!(tree_sum(&parts[..1]), parts[0]);
+    }
+
+    /// A loop without a network: its state is a number that each step maps to another, and the steps done.
+    fn body(cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
+        let fault = |e: serde_json::Error| StageError::Fault(e.to_string());
+        let saved = cx.latest_checkpoint()?;
+        let (mut step, mut value): (u64, f32) = match &saved {
+            Some(manifest) => serde_json::from_value(manifest.meta.clone()).map_err(fault)?,
+            None => (0, 1.0),
+        };
+        let mut applied = saved.is_some().then_some(step);
+        let meet = |cx: &mut dyn GangContext, applied: Option<u64>, state: (u64, f32)| {
+            let mut bytes = || serde_json::to_vec(&state).expect("numbers");
+            match cx.rendezvous(applied, &mut bytes)? {
+                Rendezvous::Keep => Ok(state),
+                Rendezvous::Adopt(bytes) => serde_json::from_slice(&bytes).map_err(fault),
+            }
+        };
+        (step, value) = meet(cx, applied, (step, value))?;
+        while step < STEPS {
+            let parts: Vec<_> = cx
+                .share(SLICES)
+                .map(|slice| (slice, vec![(value + slice as f32 * 0.1 + step as f32 * 1e3).sin()]))
+                .collect();
+            match cx.exchange(step, SLICES, &parts)? {
+                Exchange::Regroup => (step, value) = meet(cx, applied, (step, value))?,
+                Exchange::Sum { sum, wind_down } => {
+                    (step, value) = (step + 1, value + sum[0]);
+                    if cx.leads() {
+                        cx.record(step, &[("value", f64::from(value))]);
+                    }
+                    if wind_down {
+                        if cx.leads() {
+                            let meta = serde_json::json!([step, value]);
+                            let manifest = Manifest::new(ArtifactKind::Checkpoint, meta);
+                            cx.commit_checkpoint(step, &manifest, &BTreeMap::new())?;
+                        }
+                        return Ok(Outcome::Yielded { at: step });
+                    }
+                }
+            }
+            applied = Some(step);
+        }
+        let output = Digest::of(&value.to_le_bytes());
+        Ok(Outcome::Finished { output, metrics: BTreeMap::from([("value".to_owned(), f64::from(value))]) })
+    }
+
+    fn ran(count: usize, script: &Script, saved: &mut Vec<(u64, Manifest)>) -> Ran {
+        let task = StageTask {
+            run: RunId::new("test-1"),
+            name: StageName::new("toy"),
+            settings: StageSettings::TextEmbed(TextEmbed::default()),
+            inputs: BTreeMap::new(),
+            seed: Seed(0),
+            checkpoint: CheckpointPolicy::default(),
+        };
+        let device = models::device::open(protocol::stage::Backend::Flex, 0).unwrap();
+        let attempt = || MemoryAttempt::new(task.clone(), device.clone(), Arc::default());
+        run(attempt, count, script, saved, &body).unwrap()
+    }
+
+    #[test]
+    fn a_gang_gives_one_value_whoever_leaves_or_joins() {
+        let alone = ran(1, &Script::default(), &mut vec![]);
+        assert_eq!(alone.told.records.len(), STEPS as usize);
+        for count in [2, 3, 5] {
+            assert_eq!(ran(count, &Script::default(), &mut vec![]).output(), alone.output());
+        }
+        for _ in 0..20 {
+            let script = Script { lost: vec![(0, 3), (2, 5)], joins: vec![(7, 1), (8, 6)], wind_down: None };
+            assert_eq!(ran(3, &script, &mut vec![]).output(), alone.output());
+        }
+    }
+
+    #[test]
+    fn a_gang_that_yields_goes_on_from_its_checkpoint() {
+        let alone = ran(1, &Script::default(), &mut vec![]);
+        let mut saved = vec![];
+        let script = Script { wind_down: Some(4), ..Script::default() };
+        assert_eq!(ran(2, &script, &mut saved).outcome, Outcome::Yielded { at: 5 });
+        assert_eq!(saved.len(), 1);
+        assert_eq!(ran(3, &Script::default(), &mut saved).output(), alone.output());
     }
 }
