@@ -52,7 +52,7 @@ impl Caption {
 
     /// The frames `from..to` that it describes at `fps`; both truncated, `None` for the whole clip.
     pub fn frames(&self, fps: f64) -> Option<(usize, usize)> {
-        (!self.is_whole()).then(|| ((self.from_s * fps) as usize, (self.to_s * fps) as usize))
+        (!self.is_whole()).then_some(((self.from_s * fps) as usize, (self.to_s * fps) as usize))
     }
 
     /// Reads one line. The error says what is wrong, without file and line.

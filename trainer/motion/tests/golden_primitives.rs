@@ -13,14 +13,20 @@ impl Tensors<'_> {
     fn values(&self, name: &str) -> Vec<f64> {
         let view = self.0.tensor(name).unwrap_or_else(|e| panic!("{name}: {e}"));
         match view.dtype() {
-            Dtype::F32 => view.data().chunks(4).map(|b| f64::from(f32::from_le_bytes(b.try_into().unwrap()))).collect(),
-            Dtype::F64 => view.data().chunks(8).map(|b| f64::from_le_bytes(b.try_into().unwrap())).collect(),
+            Dtype::F32 => view
+                .data()
+                .chunks(4)
+                .map(|b| f64::from(f32::from_le_bytes(b.try_into().expect("whole numbers"))))
+                .collect(),
+            Dtype::F64 => {
+                view.data().chunks(8).map(|b| f64::from_le_bytes(b.try_into().expect("whole numbers"))).collect()
+            }
             other => panic!("{name}: {other:?}"),
         }
     }
 
     fn rows<const N: usize>(&self, name: &str) -> Vec<[f64; N]> {
-        self.values(name).chunks(N).map(|row| row.try_into().unwrap()).collect()
+        self.values(name).chunks(N).map(|row| row.try_into().expect("whole rows")).collect()
     }
 }
 

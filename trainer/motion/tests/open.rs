@@ -47,9 +47,9 @@ fn the_mini_sets_open_with_their_known_counts() {
 fn folder() -> (tempfile::TempDir, Vec<String>) {
     let settings = DataSynthetic { clips: 10, val: 0.1, test: 0.1, mirror: false };
     let dataset = synthetic::generate(&settings, Seed(1));
-    let folder = tempfile::tempdir().unwrap();
-    synthetic::write_folder(&dataset, folder.path()).unwrap();
-    let list = fs::read_to_string(folder.path().join("train.txt")).unwrap();
+    let folder = tempfile::tempdir().expect("a folder");
+    synthetic::write_folder(&dataset, folder.path()).expect("a written folder");
+    let list = fs::read_to_string(folder.path().join("train.txt")).expect("a list");
     (folder, list.lines().map(str::to_owned).collect())
 }
 
