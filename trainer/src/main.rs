@@ -1,1 +1,25 @@
-fn main(){}
+//! The `trainer` command: composition root of control plane and data plane.
+//!
+//! No logic of its own: it reads arguments and files, starts a coordinator and worker processes, and shows what they say.
+
+mod cli;
+mod client;
+mod fleet;
+mod pipeline_file;
+mod plan;
+mod print;
+mod problem;
+mod progress;
+mod run;
+mod summary;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+fn main() -> ExitCode {
+    // First of all: the allocator can be tuned only while there is one thread.
+    worker::process::tune_allocator();
+    registry::failpoints::arm_from_env();
+    cli::main(cli::Cli::parse())
+}

@@ -1,0 +1,67 @@
+//! `trainer config show` and `trainer devices`.
+
+use clap::Subcommand;
+use serde_json::Value;
+
+use super::PipelineArgs;
+use crate::pipeline_file;
+use crate::print::{self, Output};
+use crate::problem::{Problem, Result, exit};
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum ConfigVerb {
+    /// Checks a pipeline and shows it with every default filled in
+    Show {
+        #[command(flatten)]
+        pipeline: PipelineArgs,
+        /// YAML, or JSON
+        #[arg(short, long, value_enum, default_value_t)]
+        output: Output,
+    },
+}
+
+pub(crate) fn config(verb: &ConfigVerb) -> Result<u8> {
+    let ConfigVerb::Show { pipeline: args, output } = verb;
+    let pipeline = pipeline_file::read(&args.pipeline, &args.set)?.pipeline;
+    if *output == Output::Json {
+        print::json(&pipeline);
+        return Ok(0);
+    }
+    let fault = |error: serde_json::Error| Problem::new(exit::FAULT, error);
+    let mut text =
+        format!("name: {}\nseed: {}\nbackend: {}\nstages:\n", pipeline.name, pipeline.seed, pipeline.backend.name());
+    for stage in &pipeline.stages {
+        text.push_str(&format!("  {}:\n    kind: {}\n", stage.name, stage.settings.kind()));
+        let mut settings = serde_json::to_value(&stage.settings).map_err(fault)?;
+        if let Some(map) = settings.as_object_mut() {
+            map.remove("kind");
+        }
+        yaml(&settings, 4, &mut text);
+        yaml(&serde_json::to_value(&stage.placement).map_err(fault)?, 4, &mut text);
+    }
+    print::out(text.trim_end());
+    Ok(0)
+}
+
+/// Block mappings, flow lists; every text quoted that could be read as something else.
+fn yaml(value: &Value, indent: usize, text: &mut String) {
+    let Some(map) = value.as_object() else { return };
+    for (key, value) in map {
+        let pad = " ".repeat(indent);
+        if value.is_object() {
+            text.push_str(&format!("{pad}{key}:\n"));
+            yaml(value, indent + 2, text);
+        } else {
+            let plain = |s: &str| {
+                s.starts_with(|c: char| c.is_ascii_lowercase())
+                    && s.bytes().all(|b| b.is_ascii_alphanumeric() || b"_-./".contains(&b))
+                    && !matches!(s, "true" | "false" | "null")
+            };
+            let shown = match value.as_str() {
+                Some(word) if plain(word) => word.to_owned(),
+                _ => value.to_string(),
+            };
+            text.push_str(&format!("{pad}{key}: {shown}\n"));
+        }
+    }
+}

@@ -1,0 +1,251 @@
+//! Arguments, one type and one function per verb.
+
+mod config;
+mod remote;
+mod serve;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::{Args, Parser, Subcommand};
+use protocol::StageName;
+use registry::{Holder, OpenError, Store};
+
+use crate::client::Target;
+use crate::print::{self, Output};
+use crate::problem::{Problem, Result, exit};
+use crate::{pipeline_file, plan, run};
+
+/// Trains text-to-motion models across workers and keeps what came out of it
+#[derive(Debug, Parser)]
+#[command(name = "trainer", version, propagate_version = true)]
+pub(crate) struct Cli {
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+#[derive(Debug, Subcommand)]
+enum Verb {
+    /// Runs a pipeline on this machine; run it again to go on where it stopped
+    Run(RunArgs),
+    /// Shows what `run` would do, and why
+    Plan(PlanArgs),
+    /// Sends a pipeline to a server
+    Submit(remote::SubmitArgs),
+    /// Coordinates runs for clients and workers elsewhere
+    Serve(serve::ServeArgs),
+    /// Shows a run, or all runs
+    Status(remote::StatusArgs),
+    /// Shows what workers said
+    Logs(remote::LogsArgs),
+    /// Ends a run
+    Cancel(remote::ControlArgs),
+    /// Holds a run back: its workers save and stop
+    Pause(remote::ControlArgs),
+    /// Takes a paused, failed or cancelled run up again
+    Resume(ResumeArgs),
+    /// Pipeline files
+    #[command(subcommand)]
+    Config(config::ConfigVerb),
+    /// Workers
+    #[command(subcommand)]
+    Worker(WorkerVerb),
+    /// Models, their versions, and the aliases that point at them
+    Registry(RegistryArgs),
+}
+
+#[derive(Debug, Subcommand)]
+enum WorkerVerb {
+    /// Offers this machine to a coordinator
+    Join(worker::JoinArgs),
+    /// Lists the workers of a coordinator
+    List(remote::WorkersArgs),
+}
+
+/// A pipeline on the command line.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct PipelineArgs {
+    /// The pipeline, a YAML file
+    pipeline: PathBuf,
+    /// Overrides a key, such as `stages.vae.lr=1e-4`; may be repeated
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    set: Vec<String>,
+}
+
+#[derive(Debug, Args)]
+struct RunArgs {
+    #[command(flatten)]
+    pipeline: PipelineArgs,
+    /// Worker processes [default: one a core on CPU, one on a GPU]
+    #[arg(long, value_name = "N")]
+    workers: Option<usize>,
+    /// The store's folder
+    #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR")]
+    store: PathBuf,
+    /// Stop after this stage
+    #[arg(long, value_name = "STAGE")]
+    until: Option<String>,
+    /// How the result is printed
+    #[arg(short, long, value_enum, default_value_t)]
+    output: Output,
+}
+
+#[derive(Debug, Args)]
+struct PlanArgs {
+    #[command(flatten)]
+    pipeline: PipelineArgs,
+    /// The store's folder
+    #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR")]
+    store: PathBuf,
+    /// How the plan is printed
+    #[arg(short, long, value_enum, default_value_t)]
+    output: Output,
+}
+
+#[derive(Debug, Args)]
+struct ResumeArgs {
+    /// The run, a unique beginning of its name, or `@last`
+    #[arg(default_value = "@last")]
+    run: String,
+    #[command(flatten)]
+    target: Target,
+    /// Worker processes, when no server is running
+    #[arg(long, value_name = "N")]
+    workers: Option<usize>,
+    /// How the result is printed
+    #[arg(short, long, value_enum, default_value_t)]
+    output: Output,
+}
+
+#[derive(Debug, Args)]
+struct RegistryArgs {
+    /// The store's folder
+    #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR", global = true)]
+    store: PathBuf,
+    /// How the answer is printed
+    #[arg(short, long, value_enum, default_value_t, global = true)]
+    output: registry::cli::Output,
+    #[command(subcommand)]
+    verb: registry::cli::Verb,
+}
+
+/// Does what was asked.
+pub(crate) fn main(cli: Cli) -> ExitCode {
+    if let Verb::Worker(WorkerVerb::Join(args)) = cli.verb {
+        // Its own threads, its own logging: a worker is synchronous at heart.
+        worker::init_logging();
+        return match worker::join(args.into()) {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(error) => {
+                tracing::error!("{error}");
+                ExitCode::from(error.exit_code())
+            }
+        };
+    }
+    init_logging();
+    let output = cli.verb.output();
+    let runtime = match tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build() {
+        Ok(runtime) => runtime,
+        Err(error) => {
+            print::problem(&Problem::new(exit::FAULT, error), output);
+            return ExitCode::from(exit::FAULT);
+        }
+    };
+    let code = match runtime.block_on(perform(cli.verb)) {
+        Ok(code) => code,
+        Err(problem) => {
+            print::problem(&problem, output);
+            problem.exit
+        }
+    };
+    // Whatever still blocks, such as a read of a blob, is of no use to anybody.
+    runtime.shutdown_background();
+    ExitCode::from(code)
+}
+
+/// Warnings on stderr, more by `RUST_LOG`.
+fn init_logging() {
+    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+}
+
+impl Verb {
+    fn output(&self) -> Output {
+        match self {
+            Self::Run(args) => args.output,
+            Self::Plan(args) => args.output,
+            Self::Submit(args) => args.output,
+            Self::Status(args) => args.output,
+            Self::Logs(args) => args.output,
+            Self::Cancel(args) | Self::Pause(args) => args.output,
+            Self::Resume(args) => args.output,
+            Self::Worker(WorkerVerb::List(args)) => args.output,
+            Self::Serve(_) | Self::Config(_) | Self::Worker(WorkerVerb::Join(_)) | Self::Registry(_) => Output::Table,
+        }
+    }
+}
+
+async fn perform(verb: Verb) -> Result<u8> {
+    match verb {
+        Verb::Run(args) => run_pipeline(args).await,
+        Verb::Plan(args) => show_plan(args).await,
+        Verb::Submit(args) => remote::submit(args).await,
+        Verb::Serve(args) => serve::serve(args).await,
+        Verb::Status(args) => remote::status(args).await,
+        Verb::Logs(args) => remote::logs(args).await,
+        Verb::Cancel(args) => remote::control(args, "cancel").await,
+        Verb::Pause(args) => remote::control(args, "pause").await,
+        Verb::Resume(args) => resume(args).await,
+        Verb::Config(verb) => config::config(&verb),
+        Verb::Worker(WorkerVerb::List(args)) => remote::workers(args).await,
+        Verb::Worker(WorkerVerb::Join(_)) => Ok(0),
+        Verb::Registry(args) => Ok(registry::cli::execute(args.verb, &args.store, args.output).await),
+    }
+}
+
+/// The command as typed, for messages that say how to go on.
+fn command_line() -> String {
+    let quoted = std::env::args().skip(1).map(|argument| {
+        let plain = |c: char| c.is_ascii_alphanumeric() || "-_./=@:,+".contains(c);
+        if argument.chars().all(plain) { argument } else { format!("'{}'", argument.replace('\'', "'\\''")) }
+    });
+    std::iter::once("trainer".to_owned()).chain(quoted).collect::<Vec<_>>().join(" ")
+}
+
+async fn run_pipeline(args: RunArgs) -> Result<u8> {
+    let file = pipeline_file::read_with_data(&args.pipeline.pipeline, &args.pipeline.set)?;
+    let until = args.until.map(StageName::new);
+    let options =
+        run::Options { store: args.store, workers: args.workers, output: args.output, command: command_line() };
+    run::run(run::Work::Pipeline { file: Box::new(file), until }, options).await
+}
+
+async fn show_plan(args: PlanArgs) -> Result<u8> {
+    let file = pipeline_file::read_with_data(&args.pipeline.pipeline, &args.pipeline.set)?;
+    let store = match Store::open_existing(&args.store, Holder::this_process("trainer plan")).await {
+        Ok(store) => Some(store),
+        Err(OpenError::NotAStore(_)) => None,
+        Err(error) => return Err(error.into()),
+    };
+    let plan = plan::plan(&file.pipeline, store.as_ref()).await?;
+    match args.output {
+        Output::Json => print::json(&plan),
+        Output::Table => print::out(&plan.table()),
+    }
+    Ok(0)
+}
+
+async fn resume(args: ResumeArgs) -> Result<u8> {
+    let client = crate::client::Client::connect(&args.target).await?;
+    let found = client.find(&args.run).await?;
+    if !client.is_own() {
+        let view = client.control(&found.run, "resume").await?;
+        remote::show(&view, args.output);
+        return Ok(0);
+    }
+    client.close().await;
+    let options =
+        run::Options { store: args.target.store, workers: args.workers, output: args.output, command: command_line() };
+    run::run(run::Work::Run(found.run.to_string()), options).await
+}

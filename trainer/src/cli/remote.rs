@@ -1,0 +1,238 @@
+//! Verbs that ask a coordinator: submit, status, logs, pause, cancel.
+
+use std::path::Path;
+use std::time::Duration;
+
+use clap::Args;
+use protocol::StageName;
+use protocol::message::{RunState, RunView, Submit};
+
+use super::PipelineArgs;
+use crate::client::{Client, Target};
+use crate::pipeline_file;
+use crate::print::{self, Output};
+use crate::problem::{Problem, Result, exit};
+use crate::progress::Progress;
+use crate::summary::{self, Summary};
+
+#[derive(Debug, Args)]
+pub(crate) struct SubmitArgs {
+    #[command(flatten)]
+    pipeline: PipelineArgs,
+    #[command(flatten)]
+    target: Target,
+    /// Stop after this stage
+    #[arg(long, value_name = "STAGE")]
+    until: Option<String>,
+    /// Submitting twice with one key gives one run
+    #[arg(long, value_name = "KEY")]
+    idempotency_key: Option<String>,
+    /// Watch the run to its end
+    #[arg(short, long)]
+    follow: bool,
+    /// How the answer is printed
+    #[arg(short, long, value_enum, default_value_t)]
+    pub(super) output: Output,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct StatusArgs {
+    /// The run, a unique beginning of its name, or `@last`
+    #[arg(default_value = "@last")]
+    run: String,
+    /// All runs, one a line
+    #[arg(long)]
+    all: bool,
+    #[command(flatten)]
+    target: Target,
+    /// How the answer is printed
+    #[arg(short, long, value_enum, default_value_t)]
+    pub(super) output: Output,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct LogsArgs {
+    /// The run, a unique beginning of its name, or `@last`
+    #[arg(default_value = "@last")]
+    run: String,
+    /// Only this stage
+    #[arg(long)]
+    stage: Option<String>,
+    /// Go on until the run ends
+    #[arg(short, long)]
+    follow: bool,
+    #[command(flatten)]
+    target: Target,
+    /// Lines, or one JSON object a line
+    #[arg(short, long, value_enum, default_value_t)]
+    pub(super) output: Output,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ControlArgs {
+    /// The run, a unique beginning of its name, or `@last`
+    run: String,
+    #[command(flatten)]
+    target: Target,
+    /// How the answer is printed
+    #[arg(short, long, value_enum, default_value_t)]
+    pub(super) output: Output,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct WorkersArgs {
+    #[command(flatten)]
+    target: Target,
+    /// How the answer is printed
+    #[arg(short, long, value_enum, default_value_t)]
+    pub(super) output: Output,
+}
+
+/// A run as a table or an object.
+pub(crate) fn show(view: &RunView, output: Output) {
+    match output {
+        Output::Json => print::json(&Summary::of(view, false)),
+        Output::Table => {
+            print::out(&format!("run {}: {}\n", view.run, summary::run_state(view.state)));
+            print::out(&summary::table(view));
+        }
+    }
+}
+
+pub(crate) async fn submit(args: SubmitArgs) -> Result<u8> {
+    let file = pipeline_file::read_with_data(&args.pipeline.pipeline, &args.pipeline.set)?;
+    let until = args.until.map(StageName::new);
+    pipeline_file::check_stage(&file.pipeline, until.as_ref())?;
+    let client = Client::connect(&args.target).await?;
+    if client.is_own() {
+        client.close().await;
+        let problem = Problem::usage("no server is running on this store, so nobody would do the work");
+        return Err(problem.hint("`trainer serve` starts one, `trainer run` needs none; or name one with --server"));
+    }
+    let pipeline = serde_json::to_value(&file.pipeline).map_err(|error| Problem::new(exit::FAULT, error))?;
+    let submit = Submit { pipeline, source: file.source, idempotency_key: args.idempotency_key, until };
+    let run = client.submit(&submit).await?;
+    if !args.follow {
+        match args.output {
+            Output::Json => print::json(&serde_json::json!({"schema_version": 1, "run": run})),
+            Output::Table => print::out(run.as_str()),
+        }
+        return Ok(0);
+    }
+    let mut progress = Progress::new(args.output == Output::Table && print::on_terminal());
+    let view = loop {
+        let view = client.run(&run).await?;
+        progress.update(&view);
+        if view.state.is_final() {
+            break view;
+        }
+        tokio::time::sleep(Duration::from_millis(500)).await;
+    };
+    progress.finish();
+    show(&view, args.output);
+    Ok(exit_code(view.state))
+}
+
+fn exit_code(state: RunState) -> u8 {
+    match state {
+        RunState::Finished | RunState::Running | RunState::Paused => 0,
+        RunState::Failed => exit::FAILED,
+        RunState::Cancelled => exit::CANCELLED,
+    }
+}
+
+pub(crate) async fn status(args: StatusArgs) -> Result<u8> {
+    let client = Client::connect(&args.target).await?;
+    if args.all {
+        let runs = client.runs().await?;
+        match args.output {
+            Output::Json => {
+                let runs: Vec<Summary> = runs.iter().map(|run| Summary::of(run, false)).collect();
+                print::json(&serde_json::json!({"schema_version": 1, "runs": runs}));
+            }
+            Output::Table => {
+                let row = |run: &RunView| {
+                    let done = run.stages.iter().filter(|stage| !stage.outputs.is_empty()).count();
+                    let state = summary::run_state(run.state).to_owned();
+                    vec![run.run.to_string(), run.pipeline.clone(), state, format!("{done}/{}", run.stages.len())]
+                };
+                print::out(&print::table(&["RUN", "PIPELINE", "STATE", "STAGES"], runs.iter().map(row).collect()));
+            }
+        }
+    } else {
+        show(&client.find(&args.run).await?, args.output);
+    }
+    client.close().await;
+    Ok(0)
+}
+
+pub(crate) async fn logs(args: LogsArgs) -> Result<u8> {
+    let client = Client::connect(&args.target).await?;
+    let run = client.find(&args.run).await?.run;
+    let mut after = 0;
+    loop {
+        // Asked first: what is logged before the end is then read after it.
+        let state = client.run(&run).await?.state;
+        loop {
+            let rows = client.logs(&run, args.stage.as_deref(), after).await?;
+            let Some(last) = rows.last() else { break };
+            after = last.id;
+            for row in &rows {
+                match args.output {
+                    Output::Json => print::line(&serde_json::to_string(row).unwrap_or_default()),
+                    Output::Table => {
+                        let task = row.task.as_str();
+                        let stage = task.strip_prefix(&format!("{run}/")).unwrap_or(task);
+                        print::line(&format!("{stage} {} {}", row.worker, row.text));
+                    }
+                }
+            }
+        }
+        if !args.follow || state.is_final() || client.is_own() {
+            client.close().await;
+            return Ok(0);
+        }
+        tokio::time::sleep(Duration::from_millis(500)).await;
+    }
+}
+
+pub(crate) async fn control(args: ControlArgs, action: &str) -> Result<u8> {
+    let client = Client::connect(&args.target).await?;
+    let run = client.find(&args.run).await?.run;
+    let view = client.control(&run, action).await?;
+    show(&view, args.output);
+    client.close().await;
+    Ok(0)
+}
+
+pub(crate) async fn workers(args: WorkersArgs) -> Result<u8> {
+    let client = Client::connect(&args.target).await?;
+    let workers = client.workers().await?;
+    match args.output {
+        Output::Json => print::json(&workers),
+        Output::Table => {
+            let row = |worker: &coordinator::WorkerView| {
+                let task = worker.task.as_ref().map(ToString::to_string).unwrap_or_default();
+                let backend = worker.backend.name().to_owned();
+                vec![worker.worker.to_string(), worker.pid.to_string(), backend, worker.state.clone(), task]
+            };
+            print::out(&print::table(
+                &["WORKER", "PID", "BACKEND", "STATE", "TASK"],
+                workers.iter().map(row).collect(),
+            ));
+        }
+    }
+    client.close().await;
+    Ok(0)
+}
+
+/// Where a file is to go must exist before anything is computed.
+pub(crate) fn check_parent(path: &Path) -> Result<()> {
+    let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
+    match parent {
+        Some(parent) if !parent.is_dir() => {
+            Err(Problem::usage(format!("cannot write `{}`: there is no folder `{}`", path.display(), parent.display())))
+        }
+        _ => Ok(()),
+    }
+}

@@ -1,0 +1,202 @@
+//! The HTTP client of a coordinator: the one given by `--server`, the one that holds the store, or one started for the
+//! length of a command.
+
+use std::path::Path;
+use std::time::Duration;
+
+use coordinator::{Config, Coordinator, Handle, WorkerView};
+use protocol::message::{ApiError, RunView, Submit};
+use protocol::{Digest, RunId};
+use registry::cli::{Answer, Command};
+use registry::{Holder, LogRow, OpenError, Store};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use crate::problem::{Problem, Result, exit};
+
+/// Where a command is sent.
+#[derive(Debug, Clone, clap::Args)]
+pub(crate) struct Target {
+    /// The store's folder
+    #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR")]
+    pub(crate) store: std::path::PathBuf,
+    /// A server to ask instead of the store's folder
+    #[arg(long, env = "STRIDE_SERVER", value_name = "URL")]
+    pub(crate) server: Option<String>,
+    /// Bearer token of the server
+    #[arg(long, env = "STRIDE_TOKEN", hide_env_values = true)]
+    pub(crate) token: Option<String>,
+}
+
+/// A coordinator that can be asked.
+#[derive(Debug)]
+pub(crate) struct Client {
+    http: reqwest::Client,
+    url: String,
+    token: Option<String>,
+    /// Kept alive: a coordinator of our own, if nobody else's was running.
+    own: Option<Handle>,
+}
+
+impl Client {
+    /// Finds the coordinator of `target`.
+    pub(crate) async fn connect(target: &Target) -> Result<Self> {
+        if let Some(url) = &target.server {
+            return Self::new(url, target.token.clone());
+        }
+        match Store::open_existing(&target.store, Holder::this_process("trainer")).await {
+            Ok(store) => {
+                let handle = Coordinator::start(store, Config::embedded()).await?;
+                let client = Self::new(&handle.url(), None)?;
+                Ok(Self { own: Some(handle), ..client })
+            }
+            Err(OpenError::Busy { holder: Holder { address: Some(address), .. }, .. }) => {
+                Self::new(&address, target.token.clone())
+            }
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    /// A client of the server at `url`.
+    pub(crate) fn new(url: &str, token: Option<String>) -> Result<Self> {
+        let http = reqwest::Client::builder().connect_timeout(Duration::from_secs(5)).build();
+        let http = http.map_err(|error| Problem::failed(format!("no HTTP client: {error}")))?;
+        let url = url.trim_end_matches('/').to_owned();
+        let url = if url.contains("://") { url } else { format!("http://{url}") };
+        Ok(Self { http, url, token, own: None })
+    }
+
+    /// Whether the coordinator lives only as long as this command.
+    pub(crate) fn is_own(&self) -> bool {
+        self.own.is_some()
+    }
+
+    /// Ends a coordinator of our own, and lets go of its store.
+    pub(crate) async fn close(self) {
+        if let Some(handle) = self.own {
+            handle.shutdown().await;
+        }
+    }
+
+    async fn send(&self, request: reqwest::RequestBuilder) -> Result<reqwest::Response> {
+        let request = match &self.token {
+            Some(token) => request.bearer_auth(token),
+            None => request,
+        };
+        let answer = request.send().await.map_err(|error| {
+            let problem =
+                Problem::new(exit::UNREACHABLE, anyhow::anyhow!("cannot reach `{}`: {}", self.url, innermost(&error)));
+            problem.hint("start it with `trainer serve`, or give its address with --server")
+        })?;
+        if answer.status().is_success() {
+            return Ok(answer);
+        }
+        let status = answer.status();
+        let body = answer.bytes().await.unwrap_or_default();
+        let error = serde_json::from_slice::<ApiError>(&body).unwrap_or_else(|_| ApiError {
+            code: "internal".into(),
+            message: format!("`{}` answered {status}: {}", self.url, String::from_utf8_lossy(&body)),
+            hint: None,
+        });
+        let code = match (status.as_u16(), error.code.as_str()) {
+            (401 | 403, _) => exit::UNAUTHORISED,
+            (_, "not-found") => exit::NOT_FOUND,
+            (_, "invalid") => exit::USAGE,
+            (_, "conflict" | "stale-fence") => exit::CONFLICT,
+            _ => exit::FAILED,
+        };
+        let mut problem = Problem::new(code, anyhow::anyhow!("{}", error.message));
+        problem.hint = error.hint.or_else(|| {
+            (code == exit::UNAUTHORISED).then(|| "give the server's token with --token or STRIDE_TOKEN".to_owned())
+        });
+        Err(problem)
+    }
+
+    async fn read<T: DeserializeOwned>(&self, request: reqwest::RequestBuilder) -> Result<T> {
+        let answer = self.send(request).await?;
+        answer.json().await.map_err(|error| {
+            let problem = Problem::failed(format!("the answer of `{}` does not read: {}", self.url, innermost(&error)));
+            problem.hint("use one build for client and server")
+        })
+    }
+
+    async fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T> {
+        self.read(self.http.get(format!("{}{path}", self.url))).await
+    }
+
+    async fn post<T: DeserializeOwned>(&self, path: &str, body: &impl Serialize) -> Result<T> {
+        self.read(self.http.post(format!("{}{path}", self.url)).json(body)).await
+    }
+
+    pub(crate) async fn submit(&self, submit: &Submit) -> Result<RunId> {
+        Ok(self.post::<coordinator::shell::Submitted>("/v1/runs", submit).await?.run)
+    }
+
+    pub(crate) async fn runs(&self) -> Result<Vec<RunView>> {
+        self.get("/v1/runs").await
+    }
+
+    pub(crate) async fn run(&self, run: &RunId) -> Result<RunView> {
+        self.get(&format!("/v1/runs/{run}")).await
+    }
+
+    /// `pause`, `resume` or `cancel`.
+    pub(crate) async fn control(&self, run: &RunId, action: &str) -> Result<RunView> {
+        self.post(&format!("/v1/runs/{run}/{action}"), &()).await
+    }
+
+    pub(crate) async fn logs(&self, run: &RunId, stage: Option<&str>, after: i64) -> Result<Vec<LogRow>> {
+        let stage = stage.map(|stage| format!("&stage={stage}")).unwrap_or_default();
+        self.get(&format!("/v1/runs/{run}/logs?after={after}&limit=1000{stage}")).await
+    }
+
+    pub(crate) async fn workers(&self) -> Result<Vec<WorkerView>> {
+        self.get("/v1/workers").await
+    }
+
+    pub(crate) async fn registry(&self, command: &Command) -> Result<Answer> {
+        self.post("/v1/registry", command).await
+    }
+
+    pub(crate) async fn blob(&self, digest: Digest) -> Result<Vec<u8>> {
+        let answer = self.send(self.http.get(format!("{}/v1/blobs/{digest}", self.url))).await?;
+        let bytes = answer.bytes().await.map_err(|error| Problem::failed(innermost(&error)))?;
+        Ok(bytes.into())
+    }
+
+    /// The run that `text` means: its name, a unique beginning of it, or `@last`.
+    pub(crate) async fn find(&self, text: &str) -> Result<RunView> {
+        let runs = self.runs().await?;
+        let not_found = |message: String| Problem::new(exit::NOT_FOUND, anyhow::anyhow!("{message}"));
+        if text == "@last" {
+            return runs.into_iter().next_back().ok_or_else(|| {
+                not_found("there are no runs yet".into()).hint("`trainer run configs/quickstart.yaml` makes one")
+            });
+        }
+        if let Some(exact) = runs.iter().find(|run| run.run.as_str() == text) {
+            return Ok(exact.clone());
+        }
+        let begins: Vec<&RunView> = runs.iter().filter(|run| run.run.as_str().starts_with(text)).collect();
+        match begins.as_slice() {
+            [run] => Ok((*run).clone()),
+            [] => Err(not_found(format!("there is no run `{text}`")).hint("`trainer status --all` lists runs")),
+            several => {
+                let names: Vec<&str> = several.iter().map(|run| run.run.as_str()).collect();
+                Err(Problem::usage(format!("`{text}` could be {}", names.join(", "))).hint("give more of the name"))
+            }
+        }
+    }
+}
+
+/// A store's folder as messages show it.
+pub(crate) fn shown(store: &Path) -> String {
+    store.display().to_string()
+}
+
+fn innermost(error: &dyn std::error::Error) -> String {
+    let mut inner = error;
+    while let Some(source) = inner.source() {
+        inner = source;
+    }
+    inner.to_string()
+}

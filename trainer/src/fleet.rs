@@ -1,0 +1,153 @@
+//! The worker processes of `trainer run`: started, watched, started again when they die, and ended.
+
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::{Duration, Instant};
+
+use protocol::WorkerId;
+use protocol::stage::Backend;
+use tokio::process::{Child, Command};
+
+use crate::problem::{Problem, Result};
+
+/// A worker that lives shorter than this has died at its start.
+const SHORT_LIFE: Duration = Duration::from_secs(5);
+/// So many early deaths in a row and the worker is given up.
+const EARLY_DEATHS: u32 = 5;
+
+/// A worker's process, if it lives.
+#[derive(Debug)]
+struct Member {
+    name: WorkerId,
+    device: usize,
+    child: Option<Child>,
+    since: Instant,
+    early_deaths: u32,
+    next_start: Instant,
+}
+
+/// All worker processes of a run.
+#[derive(Debug)]
+pub(crate) struct Fleet {
+    members: Vec<Member>,
+    url: String,
+    backend: Backend,
+    logs: PathBuf,
+}
+
+impl Fleet {
+    /// Starts `count` workers for the coordinator at `url`. What they say goes to files in `logs`.
+    pub(crate) fn start(count: usize, url: String, backend: Backend, logs: &Path) -> Result<Self> {
+        // Their place is a comfort: without the folder they are silent.
+        let _ = std::fs::create_dir_all(logs);
+        let devices = match backend {
+            Backend::Flex | Backend::Ndarray => 1,
+            Backend::Wgpu | Backend::Cuda => count,
+        };
+        let now = Instant::now();
+        let member = |i: usize| Member {
+            name: WorkerId::new(format!("w{}", i + 1)),
+            device: i % devices.max(1),
+            child: None,
+            since: now,
+            early_deaths: 0,
+            next_start: now,
+        };
+        let mut fleet = Self { members: (0..count).map(member).collect(), url, backend, logs: logs.to_owned() };
+        for i in 0..count {
+            fleet.spawn(i)?;
+        }
+        Ok(fleet)
+    }
+
+    fn spawn(&mut self, i: usize) -> Result<()> {
+        let program = std::env::current_exe()
+            .map_err(|error| Problem::failed(format!("cannot find this program to start workers: {error}")))?;
+        let log = self.log(&self.members[i].name);
+        let stderr =
+            std::fs::OpenOptions::new().create(true).append(true).open(&log).map_or(Stdio::null(), Stdio::from);
+        let member = &mut self.members[i];
+        let child = Command::new(program)
+            .args(["worker", "join", &self.url, "--name", member.name.as_str(), "--die-with-parent"])
+            .args(["--backend", self.backend.name(), "--device", &member.device.to_string()])
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(stderr)
+            // Ctrl-C in the terminal is for us; we tell them.
+            .process_group(0)
+            .kill_on_drop(true)
+            .spawn()
+            .map_err(|error| Problem::failed(format!("cannot start worker `{}`: {error}", member.name)))?;
+        member.child = Some(child);
+        member.since = Instant::now();
+        Ok(())
+    }
+
+    fn log(&self, worker: &WorkerId) -> PathBuf {
+        self.logs.join(format!("{worker}.log"))
+    }
+
+    /// Collects workers that have died, and starts them again once their time has come. Gives the names of the dead.
+    pub(crate) fn tend(&mut self, restart: bool) -> Result<Vec<WorkerId>> {
+        let mut dead = Vec::new();
+        let now = Instant::now();
+        for i in 0..self.members.len() {
+            let member = &mut self.members[i];
+            match &mut member.child {
+                Some(child) => {
+                    let Ok(Some(status)) = child.try_wait() else { continue };
+                    member.child = None;
+                    dead.push(member.name.clone());
+                    let early = now - member.since < SHORT_LIFE;
+                    member.early_deaths = if early { member.early_deaths + 1 } else { 0 };
+                    member.next_start = now + if early { Duration::from_millis(500) } else { Duration::ZERO };
+                    tracing::info!(worker = %member.name, %status, "worker ended");
+                    if restart && member.early_deaths >= EARLY_DEATHS {
+                        let (name, log) = (member.name.clone(), self.log(&self.members[i].name));
+                        let said = last_lines(&log, 5);
+                        return Err(Problem::failed(format!(
+                            "worker `{name}` died {EARLY_DEATHS} times right after its start ({status})\n{said}"
+                        ))
+                        .hint(format!("all it said is in `{}`", log.display())));
+                    }
+                }
+                None if restart && member.next_start <= now => self.spawn(i)?,
+                None => {}
+            }
+        }
+        Ok(dead)
+    }
+
+    /// Whether any worker lives.
+    pub(crate) fn is_alive(&self) -> bool {
+        self.members.iter().any(|member| member.child.is_some())
+    }
+
+    /// Ends all workers at once. Only for when nothing of theirs is needed any more.
+    pub(crate) async fn kill(&mut self) {
+        for child in self.members.iter_mut().filter_map(|member| member.child.as_mut()) {
+            // It may have ended by itself.
+            let _ = child.start_kill();
+        }
+        for member in &mut self.members {
+            if let Some(mut child) = member.child.take() {
+                let _ = child.wait().await;
+            }
+        }
+    }
+}
+
+fn last_lines(path: &Path, count: usize) -> String {
+    let bytes = std::fs::read(path).unwrap_or_default();
+    let text = String::from_utf8_lossy(&bytes[bytes.len().saturating_sub(8192)..]).into_owned();
+    let lines: Vec<&str> = text.lines().collect();
+    lines[lines.len().saturating_sub(count)..].join("\n")
+}
+
+/// How many workers a backend gets when nobody says: one a core on CPU, one on a GPU.
+pub(crate) fn default_size(backend: Backend) -> usize {
+    match backend {
+        Backend::Flex | Backend::Ndarray => std::thread::available_parallelism().map_or(1, usize::from),
+        Backend::Wgpu | Backend::Cuda => 1,
+    }
+}

@@ -1,0 +1,86 @@
+//! A pipeline file on disk: read, checked, and its dataset folders looked at, all before a store is opened.
+
+use std::path::Path;
+
+use motion::Dataset;
+use motion::folder_digest::folder_digest;
+use protocol::StageName;
+use protocol::pipeline::{self, Pipeline};
+use protocol::stage::StageSettings;
+
+use crate::problem::{Problem, Result};
+
+/// A pipeline as read.
+#[derive(Debug)]
+pub(crate) struct PipelineFile {
+    pub(crate) pipeline: Pipeline,
+    pub(crate) source: String,
+}
+
+/// Reads and validates the file alone.
+pub(crate) fn read(path: &Path, sets: &[String]) -> Result<PipelineFile> {
+    let name = path.display().to_string();
+    let source = std::fs::read_to_string(path).map_err(|error| {
+        let problem = Problem::usage(format!("cannot read the pipeline `{name}`: {error}"));
+        if error.kind() == std::io::ErrorKind::NotFound {
+            problem.hint("shipped pipelines are in `configs/`; `trainer run configs/quickstart.yaml` needs no data")
+        } else {
+            problem
+        }
+    })?;
+    let pipeline = pipeline::read(&name, &source, sets).map_err(|mistakes| {
+        let count = mistakes.0.len();
+        let problem = Problem::usage(format!("{count} mistake(s) in the pipeline\n\n{mistakes}"));
+        problem.hint("nothing was run and nothing was stored")
+    })?;
+    Ok(PipelineFile { pipeline, source })
+}
+
+/// Reads the file and digests the dataset folders it names.
+pub(crate) fn read_with_data(path: &Path, sets: &[String]) -> Result<PipelineFile> {
+    let mut file = read(path, sets)?;
+    file.pipeline
+        .fill_external(|_, settings| folder_digest(Path::new(&settings.path), settings.format).map_err(bad_folder))?;
+    Ok(file)
+}
+
+/// Whether the stage of `--until` exists.
+pub(crate) fn check_stage(pipeline: &Pipeline, until: Option<&StageName>) -> Result<()> {
+    match until {
+        Some(until) if pipeline.stage(until).is_none() => {
+            let names: Vec<&str> = pipeline.stages.iter().map(|stage| stage.name.as_str()).collect();
+            Err(Problem::usage(format!(
+                "`--until {until}`: there is no such stage; expected one of {}",
+                names.join(", ")
+            )))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Opens the dataset folders whose content this store has not seen yet, so that what is wrong with them is said before
+/// anything is stored.
+pub(crate) fn check_data(pipeline: &Pipeline, store: &Path) -> Result<()> {
+    for stage in &pipeline.stages {
+        if let StageSettings::DataOpen(settings) = &stage.settings
+            && stage.external.get("folder").is_none_or(|digest| !store.join("seen").join(digest.hex()).exists())
+        {
+            Dataset::open(Path::new(&settings.path), settings.format).map_err(bad_folder)?;
+        }
+    }
+    Ok(())
+}
+
+/// Remembers which folders were good, so that they are not opened twice. A hint only: `data.open` checks again.
+pub(crate) fn remember_data(pipeline: &Pipeline, store: &Path) {
+    for digest in pipeline.stages.iter().filter_map(|stage| stage.external.get("folder")) {
+        let seen = store.join("seen");
+        // Losing the note costs one more look at the folder.
+        let _ = std::fs::create_dir_all(&seen).and_then(|()| std::fs::write(seen.join(digest.hex()), b""));
+    }
+}
+
+fn bad_folder(error: motion::dataset::OpenError) -> Problem {
+    Problem::usage(error)
+        .hint("set the folder with `--set dataset.path=FOLDER`; `dataset: {format: synthetic}` needs none")
+}

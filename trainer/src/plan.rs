@@ -1,0 +1,173 @@
+//! `trainer plan`: what a run would do and why, from keys, checkpoints and the newest run of the same name. Runs nothing.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use protocol::pipeline::{Pipeline, PipelineStage};
+use protocol::{Digest, StageName, TaskId};
+use registry::{RunRow, Store};
+use serde::Serialize;
+use serde_json::Value;
+
+use crate::print;
+use crate::problem::Result;
+
+/// What would happen to a stage.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct Step {
+    pub(crate) stage: StageName,
+    pub(crate) kind: &'static str,
+    /// `cached`, `resume` or `run`.
+    pub(crate) action: &'static str,
+    pub(crate) why: String,
+    pub(crate) key: Option<Digest>,
+}
+
+/// The whole plan.
+#[derive(Debug, Serialize)]
+pub(crate) struct Plan {
+    schema_version: u32,
+    pipeline: String,
+    pub(crate) stages: Vec<Step>,
+}
+
+impl Plan {
+    /// As people read it.
+    pub(crate) fn table(&self) -> String {
+        let rows =
+            self.stages.iter().map(|step| vec![step.stage.to_string(), step.action.to_owned(), step.why.clone()]);
+        print::table(&["STAGE", "ACTION", "WHY"], rows.collect())
+    }
+}
+
+/// Keys that are decided already, and the outputs of stages that are known.
+struct Known {
+    keys: BTreeMap<StageName, Digest>,
+    outputs: BTreeMap<StageName, Digest>,
+    made_by: BTreeMap<StageName, String>,
+}
+
+async fn known(pipeline: &Pipeline, store: Option<&Store>) -> Result<Known> {
+    let mut known = Known { keys: BTreeMap::new(), outputs: BTreeMap::new(), made_by: BTreeMap::new() };
+    for stage in &pipeline.stages {
+        let inputs: Option<BTreeMap<String, Digest>> =
+            stage.inputs.iter().map(|input| Some((input.field.clone(), *known.outputs.get(&input.stage)?))).collect();
+        let Some(inputs) = inputs else { continue };
+        let key = pipeline.identity(stage, &inputs).key();
+        known.keys.insert(stage.name.clone(), key);
+        if let Some(store) = store
+            && let Some(row) = store.stage_result(key).await?
+        {
+            known.made_by.insert(stage.name.clone(), row.run.to_string());
+            known.outputs.extend(row.outputs.into_values().next().map(|output| (stage.name.clone(), output)));
+        }
+    }
+    Ok(known)
+}
+
+/// Says what a run of `pipeline` on `store` would do; `None` is a store that does not exist yet.
+pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&Store>) -> Result<Plan> {
+    let now = known(pipeline, store).await?;
+    let mut earlier: Vec<(RunRow, Pipeline)> = Vec::new();
+    if let Some(store) = store {
+        let mut rows = store.runs().await?;
+        rows.sort_by_key(|row| std::cmp::Reverse(row.created_ms));
+        // A run of another build may not read; it has nothing to say then.
+        earlier.extend(rows.into_iter().filter_map(|row| {
+            let pipeline = serde_json::from_value(row.pipeline.clone()).ok()?;
+            Some((row, pipeline))
+        }));
+    }
+    let mut running: BTreeSet<&StageName> = BTreeSet::new();
+    let mut stages = Vec::new();
+    for stage in &pipeline.stages {
+        let key = now.keys.get(&stage.name).copied();
+        let (action, why) = if let Some(run) = now.made_by.get(&stage.name) {
+            ("cached", format!("key {} from run {run}", key.map(|key| key.short()).unwrap_or_default()))
+        } else {
+            let upstream = stage.inputs.iter().find(|input| running.contains(&input.stage));
+            let resume = match (key, store) {
+                (Some(key), Some(store)) => checkpoint(stage, key, store, &earlier).await?,
+                _ => None,
+            };
+            match (resume, upstream) {
+                (Some(why), _) => ("resume", why),
+                (None, Some(input)) => ("run", format!("upstream `{}` runs", input.stage)),
+                (None, None) => ("run", difference(pipeline, stage, &earlier)),
+            }
+        };
+        if action != "cached" {
+            running.insert(&stage.name);
+        }
+        stages.push(Step { stage: stage.name.clone(), kind: stage.settings.kind(), action, why, key });
+    }
+    Ok(Plan { schema_version: 1, pipeline: pipeline.name.clone(), stages })
+}
+
+/// The newest checkpoint of a stage with this key.
+async fn checkpoint(
+    stage: &PipelineStage,
+    key: Digest,
+    store: &Store,
+    earlier: &[(RunRow, Pipeline)],
+) -> Result<Option<String>> {
+    for (row, pipeline) in earlier {
+        let Some(steps) = stage.settings.steps() else { return Ok(None) };
+        if known(pipeline, Some(store)).await?.keys.get(&stage.name) != Some(&key) {
+            continue;
+        }
+        if let Some(found) = store.latest_checkpoint(&TaskId::of(&row.run, &stage.name, None)).await? {
+            return Ok(Some(format!(
+                "run {} stopped at step {} of {} (checkpoint {})",
+                row.run,
+                found.step,
+                steps,
+                found.manifest.short()
+            )));
+        }
+    }
+    Ok(None)
+}
+
+/// What tells a stage from the same one of the newest run of that name.
+fn difference(pipeline: &Pipeline, stage: &PipelineStage, earlier: &[(RunRow, Pipeline)]) -> String {
+    let before = earlier
+        .iter()
+        .filter(|(_, other)| other.name == pipeline.name)
+        .find_map(|(_, other)| Some((other, other.stage(&stage.name)?)));
+    let Some((other, before)) = before else { return "never run".into() };
+    if before.settings.kind() != stage.settings.kind() {
+        return format!("kind changed: {} -> {}", before.settings.kind(), stage.settings.kind());
+    }
+    let mut changes = Vec::new();
+    if other.seed != pipeline.seed {
+        changes.push(format!("seed {} -> {}", other.seed, pipeline.seed));
+    }
+    if other.backend != pipeline.backend {
+        changes.push(format!("backend {} -> {}", other.backend.name(), pipeline.backend.name()));
+    }
+    if before.external != stage.external {
+        changes.push("the dataset folder's content".into());
+    }
+    let json = |stage: &PipelineStage| serde_json::to_value(stage.settings.without_references()).unwrap_or_default();
+    compare(&json(before), &json(stage), "", &mut changes);
+    match changes.len() {
+        0 => "not finished before".into(),
+        1..=3 => format!("changed: {}", changes.join(", ")),
+        more => format!("changed: {}, and {} more", changes[..3].join(", "), more - 3),
+    }
+}
+
+fn compare(before: &Value, after: &Value, path: &str, changes: &mut Vec<String>) {
+    match (before, after) {
+        (Value::Object(before), Value::Object(after)) => {
+            let keys: BTreeSet<&String> = before.keys().chain(after.keys()).collect();
+            for key in keys {
+                let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
+                let get = |map: &serde_json::Map<String, Value>| map.get(key).cloned().unwrap_or_default();
+                compare(&get(before), &get(after), &path, changes);
+            }
+        }
+        _ if before != after => changes.push(format!("{path} {before} -> {after}")),
+        _ => {}
+    }
+}

@@ -1,0 +1,98 @@
+//! What went wrong, as the user sees it: the chain of causes, a blank line, `hint:`, and an exit code.
+
+use std::fmt::Display;
+
+/// Exit codes. 1 is a run or a request that failed.
+pub(crate) mod exit {
+    pub(crate) const FAILED: u8 = 1;
+    pub(crate) const USAGE: u8 = 2;
+    pub(crate) const FAULT: u8 = 3;
+    pub(crate) const NOT_FOUND: u8 = 3;
+    pub(crate) const CONFLICT: u8 = 4;
+    pub(crate) const UNAUTHORISED: u8 = 5;
+    pub(crate) const UNREACHABLE: u8 = 6;
+    pub(crate) const CANCELLED: u8 = 8;
+    pub(crate) const INTERRUPTED: u8 = 130;
+}
+
+/// An error with what to do about it.
+#[derive(Debug)]
+pub(crate) struct Problem {
+    pub(crate) error: anyhow::Error,
+    pub(crate) hint: Option<String>,
+    pub(crate) exit: u8,
+}
+
+/// What most of the command returns.
+pub(crate) type Result<T, E = Problem> = std::result::Result<T, E>;
+
+impl Problem {
+    pub(crate) fn new(exit: u8, error: impl Into<anyhow::Error>) -> Self {
+        Self { error: error.into(), hint: None, exit }
+    }
+
+    /// A wrong argument or a wrong file.
+    pub(crate) fn usage(message: impl Display) -> Self {
+        Self::new(exit::USAGE, anyhow::anyhow!("{message}"))
+    }
+
+    pub(crate) fn failed(message: impl Display) -> Self {
+        Self::new(exit::FAILED, anyhow::anyhow!("{message}"))
+    }
+
+    pub(crate) fn hint(mut self, hint: impl Into<String>) -> Self {
+        self.hint = Some(hint.into());
+        self
+    }
+}
+
+impl From<anyhow::Error> for Problem {
+    fn from(error: anyhow::Error) -> Self {
+        Self::new(exit::FAILED, error)
+    }
+}
+
+impl From<registry::OpenError> for Problem {
+    fn from(error: registry::OpenError) -> Self {
+        let hint = error.hint();
+        Self::new(exit::USAGE, error).hint(hint)
+    }
+}
+
+impl From<registry::QueryError> for Problem {
+    fn from(error: registry::QueryError) -> Self {
+        let exit = match &error {
+            registry::QueryError::NotFound(_) => exit::NOT_FOUND,
+            registry::QueryError::Invalid(_) => exit::USAGE,
+            _ => exit::FAILED,
+        };
+        Self::new(exit, error)
+    }
+}
+
+impl From<coordinator::StartError> for Problem {
+    fn from(error: coordinator::StartError) -> Self {
+        match &error {
+            coordinator::StartError::NoToken(_) => {
+                Self::new(exit::USAGE, error).hint("set a token with --token or STRIDE_TOKEN, or listen on 127.0.0.1")
+            }
+            coordinator::StartError::Listen { .. } => {
+                Self::new(exit::USAGE, error).hint("choose another address with --bind; port 0 takes a free one")
+            }
+            _ => Self::new(exit::FAILED, error),
+        }
+    }
+}
+
+impl From<coordinator::Refused> for Problem {
+    fn from(error: coordinator::Refused) -> Self {
+        let exit = match &error {
+            coordinator::Refused::Rejected(coordinator::Rejected::Invalid(_)) => exit::USAGE,
+            coordinator::Refused::Rejected(coordinator::Rejected::NotFound(_)) => exit::NOT_FOUND,
+            coordinator::Refused::Rejected(coordinator::Rejected::Conflict(_)) => exit::CONFLICT,
+            coordinator::Refused::Write(registry::WriteError::Storage(_)) => exit::USAGE,
+            _ => exit::FAILED,
+        };
+        Self::new(exit, error)
+    }
+}

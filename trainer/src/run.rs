@@ -1,0 +1,288 @@
+//! `trainer run`: a coordinator, its workers and a pipeline, from start to end or to Ctrl-C.
+
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use coordinator::{Config, Control, Coordinator, Handle};
+use protocol::message::{RunState, RunView, StageState, Submit};
+use protocol::pipeline::Pipeline;
+use protocol::{RunId, StageName};
+use registry::{Holder, Store};
+use tokio::signal::unix::{Signal, SignalKind, signal};
+
+use crate::fleet::{self, Fleet};
+use crate::pipeline_file::PipelineFile;
+use crate::print::{self, Output};
+use crate::problem::{Problem, Result, exit};
+use crate::progress::Progress;
+use crate::summary::{self, Summary};
+use crate::{client, pipeline_file};
+
+/// How often workers and progress are looked at.
+const BEAT: Duration = Duration::from_millis(200);
+/// How long winding down may take before workers are ended.
+const PATIENCE: Duration = Duration::from_secs(45);
+
+/// What to run, and how.
+#[derive(Debug)]
+pub(crate) struct Options {
+    pub(crate) store: PathBuf,
+    pub(crate) workers: Option<usize>,
+    pub(crate) output: Output,
+    /// The command as typed, to show how to go on.
+    pub(crate) command: String,
+}
+
+/// A pipeline, or a run of the store to take up again.
+#[derive(Debug)]
+pub(crate) enum Work {
+    Pipeline { file: Box<PipelineFile>, until: Option<StageName> },
+    Run(String),
+}
+
+/// Ctrl-C and SIGTERM.
+struct Stop {
+    interrupt: Signal,
+    terminate: Signal,
+}
+
+impl Stop {
+    fn new() -> Result<Self> {
+        let listen =
+            |kind| signal(kind).map_err(|error| Problem::failed(format!("cannot listen for signals: {error}")));
+        Ok(Self { interrupt: listen(SignalKind::interrupt())?, terminate: listen(SignalKind::terminate())? })
+    }
+
+    async fn asked(&mut self) {
+        tokio::select! {
+            _ = self.interrupt.recv() => {}
+            _ = self.terminate.recv() => {}
+        }
+    }
+}
+
+/// How the watching ended.
+enum End {
+    Final,
+    Interrupted { killed: bool },
+    Trouble(String),
+}
+
+/// Runs to the end and gives the exit code.
+pub(crate) async fn run(work: Work, options: Options) -> Result<u8> {
+    let mut stop = Stop::new()?;
+    if options.workers == Some(0) {
+        return Err(Problem::usage("`--workers` is 0; expected at least 1").hint("leave it out for one a core"));
+    }
+    if let Work::Pipeline { file, until } = &work {
+        pipeline_file::check_stage(&file.pipeline, until.as_ref())?;
+        pipeline_file::check_data(&file.pipeline, &options.store)?;
+    }
+    let holder = Holder::this_process(&*options.command);
+    let store = match &work {
+        Work::Pipeline { .. } => Store::open(&options.store, holder).await?,
+        Work::Run(_) => Store::open_existing(&options.store, holder).await?,
+    };
+    let dir = store.dir().to_owned();
+    let handle = Coordinator::start(store.clone(), Config::embedded()).await?;
+    store
+        .set_address(handle.url())
+        .map_err(|error| Problem::usage(format!("cannot write to the store `{}`: {error}", dir.display())))?;
+
+    let (run, pipeline) = begin(&handle, &store, work).await?;
+    pipeline_file::remember_data(&pipeline, &dir);
+    let bars = options.output == Output::Table && print::on_terminal();
+    let mut progress = Progress::new(bars);
+    progress.note(&format!("run {run} in {}", client::shown(&options.store)));
+
+    let mut fleet = None;
+    let watched = watch(&handle, &run, &pipeline, &options, &mut progress, &mut fleet, &mut stop).await;
+    progress.finish();
+    let view = handle.run_view(&run);
+    if let Some(fleet) = &mut fleet {
+        fleet.kill().await;
+    }
+    handle.shutdown().await;
+    let end = watched?;
+    let view =
+        view.ok_or_else(|| Problem::new(exit::FAULT, anyhow::anyhow!("run `{run}` is gone from its coordinator")))?;
+    Ok(report(&view, &pipeline, &end, &options))
+}
+
+async fn begin(handle: &Handle, store: &Store, work: Work) -> Result<(RunId, Pipeline)> {
+    match work {
+        Work::Pipeline { file, until } => {
+            let PipelineFile { pipeline, source } = *file;
+            let json = serde_json::to_value(&pipeline).map_err(|error| Problem::new(exit::FAULT, error))?;
+            let run = handle.submit(Submit { pipeline: json, source, idempotency_key: None, until }).await?;
+            Ok((run, pipeline))
+        }
+        Work::Run(name) => {
+            let rows = store.runs().await?;
+            let row = match name.as_str() {
+                "@last" => rows.iter().max_by_key(|row| row.created_ms),
+                name => rows.iter().find(|row| row.run.as_str() == name),
+            };
+            let row = row.ok_or_else(|| {
+                Problem::new(exit::NOT_FOUND, anyhow::anyhow!("there is no run `{name}` in this store"))
+                    .hint("`trainer status --all` lists runs")
+            })?;
+            let pipeline = serde_json::from_value(row.pipeline.clone()).map_err(|error| {
+                Problem::failed(format!("the pipeline of run `{}` does not read: {error}", row.run))
+            })?;
+            handle.control(&row.run, Control::Resume).await?;
+            Ok((row.run.clone(), pipeline))
+        }
+    }
+}
+
+async fn watch(
+    handle: &Handle,
+    run: &RunId,
+    pipeline: &Pipeline,
+    options: &Options,
+    progress: &mut Progress,
+    fleet: &mut Option<Fleet>,
+    stop: &mut Stop,
+) -> Result<End> {
+    let mut changes = handle.changes();
+    loop {
+        let Some(view) = handle.run_view(run) else { return Ok(End::Final) };
+        progress.update(&view);
+        if view.state.is_final() {
+            return Ok(End::Final);
+        }
+        if let Some(trouble) = handle.trouble() {
+            return Ok(End::Trouble(trouble));
+        }
+        if fleet.is_none() && wants_workers(&view) {
+            let count = options.workers.unwrap_or_else(|| fleet::default_size(pipeline.backend));
+            let logs = options.store.join("workers");
+            *fleet = Some(Fleet::start(count, handle.url(), pipeline.backend, &logs)?);
+        }
+        if let Some(fleet) = fleet {
+            for dead in fleet.tend(true)? {
+                progress.note(&format!("worker {dead} has died; starting it again"));
+                // A worker that never joined is not known; then there is nothing to take from it.
+                let _ = handle.worker_gone(&dead).await;
+            }
+        }
+        tokio::select! {
+            _ = changes.changed() => {}
+            () = tokio::time::sleep(BEAT) => {}
+            () = stop.asked() => return wind_down(handle, run, progress, fleet, stop).await,
+        }
+        // A training step may change something ten times a second; nobody reads so fast.
+        if fleet.is_some() {
+            tokio::time::sleep(BEAT / 4).await;
+        }
+    }
+}
+
+/// Whether a stage waits for somebody to do it. A run whose stages are all known needs no workers.
+fn wants_workers(view: &RunView) -> bool {
+    let waits = |stage: &protocol::message::StageView| stage.state == StageState::Ready && stage.message.is_some();
+    view.state == RunState::Running && view.stages.iter().any(waits)
+}
+
+async fn wind_down(
+    handle: &Handle,
+    run: &RunId,
+    progress: &mut Progress,
+    fleet: &mut Option<Fleet>,
+    stop: &mut Stop,
+) -> Result<End> {
+    progress.note("stopping: workers finish their step and save; Ctrl-C again ends them at once");
+    handle.drain().await?;
+    let deadline = Instant::now() + PATIENCE;
+    let mut changes = handle.changes();
+    loop {
+        if let Some(view) = handle.run_view(run) {
+            progress.update(&view);
+        }
+        let alive = match fleet {
+            Some(fleet) => {
+                for dead in fleet.tend(false)? {
+                    // As above: it may be unknown.
+                    let _ = handle.worker_gone(&dead).await;
+                }
+                fleet.is_alive()
+            }
+            None => false,
+        };
+        if !alive || !handle.is_busy() {
+            return Ok(End::Interrupted { killed: false });
+        }
+        if let Some(trouble) = handle.trouble() {
+            return Ok(End::Trouble(trouble));
+        }
+        if Instant::now() > deadline {
+            progress.note("the workers do not stop; ending them");
+            return Ok(End::Interrupted { killed: true });
+        }
+        tokio::select! {
+            _ = changes.changed() => {}
+            () = tokio::time::sleep(BEAT) => {}
+            () = stop.asked() => return Ok(End::Interrupted { killed: true }),
+        }
+    }
+}
+
+fn report(view: &RunView, pipeline: &Pipeline, end: &End, options: &Options) -> u8 {
+    let interrupted = matches!(end, End::Interrupted { .. });
+    match options.output {
+        Output::Json => print::json(&Summary::of(view, interrupted)),
+        Output::Table => print::out(&summary::table(view)),
+    }
+    match end {
+        End::Trouble(trouble) => {
+            let problem = Problem::usage(format!("the store takes no writes: {trouble}"))
+                .hint(format!("free some space or make the store writable, then `{}` goes on", options.command));
+            print::problem(&problem, options.output);
+            return problem.exit;
+        }
+        End::Interrupted { .. } if !view.state.is_final() => {
+            let killed = matches!(end, End::Interrupted { killed: true });
+            let saved = if killed { "Ended; the last checkpoints are kept." } else { "Stopped; all work is saved." };
+            print::note(&format!("\n{saved} To go on:\n  {}", options.command));
+            return exit::INTERRUPTED;
+        }
+        End::Interrupted { .. } | End::Final => {}
+    }
+    match view.state {
+        RunState::Finished => {
+            if let (Some((model, steps)), Output::Table) = (summary::promoted(pipeline, view), options.output) {
+                let store = if options.store.as_os_str() == ".stride" {
+                    String::new()
+                } else {
+                    format!(" --store {}", client::shown(&options.store))
+                };
+                print::out(&format!(
+                    "\n{model} is ready. Try:\n  trainer generate \"a person walks in a circle\" --model {model} --steps {steps} -o walk.gif{store}"
+                ));
+            }
+            0
+        }
+        RunState::Cancelled => {
+            print::problem(
+                &Problem::new(exit::CANCELLED, anyhow::anyhow!("run `{}` was cancelled", view.run)),
+                options.output,
+            );
+            exit::CANCELLED
+        }
+        RunState::Running | RunState::Paused | RunState::Failed => {
+            let failed = view.stages.iter().filter(|stage| stage.state == StageState::Failed);
+            let reasons: Vec<String> = failed
+                .map(|stage| {
+                    format!("stage `{}` failed: {}", stage.name, stage.message.as_deref().unwrap_or("no reason given"))
+                })
+                .collect();
+            let message =
+                if reasons.is_empty() { format!("run `{}` ended early", view.run) } else { reasons.join("\n") };
+            let problem = Problem::failed(message)
+                .hint(format!("`trainer logs {}` shows what its workers said; what is done stays done", view.run));
+            print::problem(&problem, options.output);
+            problem.exit
+        }
+    }
+}

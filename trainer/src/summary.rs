@@ -1,0 +1,133 @@
+//! What a run came to: a table for people, one object for programs.
+
+use std::collections::BTreeMap;
+
+use protocol::message::{RunState, RunView, StageState, StageView};
+use protocol::pipeline::Pipeline;
+use protocol::stage::StageSettings;
+use protocol::{Digest, StageName};
+use serde::Serialize;
+
+use crate::print;
+
+/// The one object of `run -o json` and `status -o json`. It only grows.
+#[derive(Debug, Serialize)]
+pub(crate) struct Summary {
+    schema_version: u32,
+    run: String,
+    pipeline: String,
+    state: String,
+    stages: Vec<StageSummary>,
+}
+
+#[derive(Debug, Serialize)]
+struct StageSummary {
+    name: String,
+    kind: String,
+    state: &'static str,
+    key: Option<Digest>,
+    outputs: BTreeMap<String, Digest>,
+    metrics: BTreeMap<String, f64>,
+    wall_s: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    message: Option<String>,
+}
+
+impl Summary {
+    /// `interrupted` tells a run that was wound down from one that is running.
+    pub(crate) fn of(run: &RunView, interrupted: bool) -> Self {
+        let stage = |stage: &StageView| StageSummary {
+            name: stage.name.to_string(),
+            kind: stage.kind.clone(),
+            state: state(stage.state),
+            key: stage.key,
+            outputs: stage.outputs.clone(),
+            metrics: stage.metrics.clone(),
+            wall_s: stage.wall_s,
+            message: stage.message.clone(),
+        };
+        let interrupted = interrupted && !run.state.is_final();
+        Self {
+            schema_version: 1,
+            run: run.run.to_string(),
+            pipeline: run.pipeline.clone(),
+            state: if interrupted { "interrupted".to_owned() } else { run_state(run.state).to_owned() },
+            stages: run.stages.iter().map(stage).collect(),
+        }
+    }
+}
+
+/// A stage's state in one word.
+pub(crate) fn state(state: StageState) -> &'static str {
+    match state {
+        StageState::Waiting => "waiting",
+        StageState::Ready => "ready",
+        StageState::Running => "running",
+        StageState::Ran => "ran",
+        StageState::Cached => "cached",
+        StageState::Resumed => "resumed",
+        StageState::Failed => "failed",
+        StageState::Skipped => "skipped",
+    }
+}
+
+/// A run's state in one word.
+pub(crate) fn run_state(state: RunState) -> &'static str {
+    match state {
+        RunState::Running => "running",
+        RunState::Paused => "paused",
+        RunState::Finished => "finished",
+        RunState::Failed => "failed",
+        RunState::Cancelled => "cancelled",
+    }
+}
+
+/// The stages of a run, one a line.
+pub(crate) fn table(run: &RunView) -> String {
+    let rows = run.stages.iter().map(|stage| {
+        let progress = &stage.progress;
+        let steps = if progress.total > 0 { format!("{}/{}", progress.done, progress.total) } else { String::new() };
+        vec![
+            stage.name.to_string(),
+            stage.kind.clone(),
+            state(stage.state).to_owned(),
+            steps,
+            if stage.wall_s > 0.0 { print::duration(stage.wall_s) } else { String::new() },
+            stage.key.map(|key| key.short()).unwrap_or_default(),
+            headline(stage),
+        ]
+    });
+    print::table(&["STAGE", "KIND", "STATE", "DONE", "TIME", "KEY", "RESULT"], rows.collect())
+}
+
+/// The metric that says most, or why there is none.
+fn headline(stage: &StageView) -> String {
+    if matches!(stage.state, StageState::Failed | StageState::Skipped) {
+        return stage.message.clone().unwrap_or_default().lines().next().unwrap_or_default().chars().take(90).collect();
+    }
+    let first = ["latent_fid", "mpjpe", "mpjpe_mm", "loss"]
+        .into_iter()
+        .find_map(|key| stage.metrics.get_key_value(key))
+        .or_else(|| stage.metrics.first_key_value());
+    first.map(|(key, value)| format!("{key} {}", print::number(*value))).unwrap_or_default()
+}
+
+/// The model that the run promoted, as `generate` takes it, and how many steps it samples in.
+pub(crate) fn promoted(pipeline: &Pipeline, run: &RunView) -> Option<(String, usize)> {
+    let done = |name: &StageName| {
+        let stage = run.stages.iter().find(|stage| &stage.name == name)?;
+        matches!(stage.state, StageState::Ran | StageState::Cached | StageState::Resumed).then_some(())
+    };
+    pipeline.stages.iter().rev().find_map(|stage| {
+        let StageSettings::Register(settings) = &stage.settings else { return None };
+        done(&stage.name)?;
+        let pick = if settings.promote.to.is_empty() { "best" } else { &settings.promote.to };
+        let steps = pipeline.stages.iter().find_map(|other| match &other.settings {
+            StageSettings::EvaluateLatentFid(evaluation) if settings.from.contains(&evaluation.model) => {
+                Some(evaluation.sampler.steps)
+            }
+            _ => None,
+        });
+        Some((format!("{}@{pick}", settings.model), steps.unwrap_or(1)))
+    })
+}
