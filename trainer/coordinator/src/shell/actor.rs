@@ -251,11 +251,9 @@ impl Actor {
             let broken = invariants::check_change(&self.state, &next);
             assert!(broken.is_empty(), "broken invariants: {broken:#?}");
         }
-        fail::fail_point!("coordinator::before_commit");
         let written = self.desk.store.write(writes).await;
         self.desk.wrote(&written);
         written?;
-        fail::fail_point!("coordinator::after_commit");
         self.state = next;
         self.desk.publish(&self.state, true);
         for effect in &effects {
