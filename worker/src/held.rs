@@ -15,7 +15,8 @@ use protocol::{Digest, Generation};
 use tokio::sync::Notify;
 
 use crate::bell::{Bell, lock};
-use crate::gang::mesh::{Endpoint, Halt, Mesh, Terms};
+use crate::gang::endpoint::Endpoint;
+use crate::gang::mesh::{Halt, Mesh, Terms};
 
 /// After a refused write, how long to wait for orders that explain it.
 const STALE_PATIENCE: Duration = Duration::from_secs(30);
@@ -139,6 +140,14 @@ impl Held {
     /// The connections of the newest generation, if the stage does not have them yet.
     pub(crate) fn take_mesh(&self) -> Option<Arc<Mesh>> {
         lock(&self.state).offered.take()
+    }
+
+    /// Ends all connections as the death of the process would.
+    #[cfg(test)]
+    pub(crate) fn sever(&self) {
+        if let Some(mesh) = &lock(&self.state).newest {
+            mesh.sever();
+        }
     }
 
     /// Ends the grant: whatever is asked in its name from now on is refused.

@@ -4,6 +4,7 @@ use std::net::{IpAddr, SocketAddr, ToSocketAddrs, UdpSocket};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::thread;
+use std::time::Duration;
 
 use burn::tensor::Device;
 use protocol::WorkerId;
@@ -14,10 +15,14 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use crate::cache::{Bounds, Cache};
 use crate::client::Client;
-use crate::gang::mesh::{Endpoint, Timing};
+use crate::gang::endpoint::Endpoint;
+use crate::gang::mesh::Timing;
 use crate::orders::{self, End, Shared};
 use crate::stage_thread::{self, Bench, Kinds};
 use crate::{failpoints, kinds, process};
+
+/// How long the coordinator may take to hear that we leave.
+const FAREWELL: Duration = Duration::from_secs(2);
 
 /// How a worker takes part.
 #[derive(Debug, Clone)]
@@ -138,7 +143,15 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
     shared.end("this worker leaves");
     stage.join().map_err(|_| JoinError::Fault)?;
     match end {
-        End::Left => Ok(()),
+        End::Left => {
+            // Spares the coordinator the wait for our lease to run out; if it does not hear it, that is what happens.
+            let path = format!("/v1/workers/{}/gone", offer.worker);
+            let told = runtime.block_on(async { tokio::time::timeout(FAREWELL, client.tell(&path, &())).await });
+            if !matches!(told, Ok(Ok(()))) {
+                tracing::debug!("the coordinator did not hear that this worker leaves");
+            }
+            Ok(())
+        }
         End::Refused(reason) => Err(JoinError::Refused(reason)),
     }
 }

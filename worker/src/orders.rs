@@ -14,7 +14,7 @@ use tokio::time::sleep;
 
 use crate::bell::{Bell, lock};
 use crate::client::{CallError, Client};
-use crate::gang::mesh::Endpoint;
+use crate::gang::endpoint::Endpoint;
 use crate::held::{Held, Reading};
 
 /// Longest pause between two polls of a coordinator that is away.

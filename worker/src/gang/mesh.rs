@@ -7,10 +7,10 @@
 //!
 //! Not its job: what the frames mean (`exchange`), and what follows from a loss (the coordinator's decision).
 
-use std::collections::{BTreeSet, HashMap, VecDeque};
-use std::io::{self, Write};
-use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream, ToSocketAddrs};
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::collections::{BTreeSet, VecDeque};
+use std::io;
+use std::net::{Shutdown, TcpStream, ToSocketAddrs};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, Weak};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -19,8 +19,10 @@ use protocol::message::Member;
 use protocol::{Generation, TaskId, WorkerId};
 use tokio::sync::Notify;
 
+use super::endpoint::Endpoint;
 use super::frame::{self, Frame, FrameError, Head, Kind, MAX_PAYLOAD};
 use super::handshake::{self, HandshakeError};
+use super::link::{BLINK, Link, send};
 use crate::bell::{Bell, lock};
 
 /// How patient members are with each other.
@@ -78,52 +80,6 @@ struct Peer {
     inbox: VecDeque<Frame>,
     heard: Instant,
     fate: Fate,
-}
-
-#[derive(Debug)]
-struct Link {
-    writer: Mutex<TcpStream>,
-}
-
-impl Link {
-    /// Writes a frame. `abort` is asked while the socket takes nothing, for up to `patience`.
-    fn send(&self, head: Head, payload: &[u8], patience: Duration, abort: &dyn Fn() -> bool) -> io::Result<()> {
-        let mut stream = lock(&self.writer);
-        send(&mut stream, head, payload, patience, abort)
-    }
-}
-
-fn send(
-    out: &mut TcpStream,
-    head: Head,
-    payload: &[u8],
-    patience: Duration,
-    abort: &dyn Fn() -> bool,
-) -> io::Result<()> {
-    let header = frame::header(head, payload);
-    for mut rest in [header.as_slice(), payload] {
-        let mut moved = Instant::now();
-        while !rest.is_empty() {
-            match out.write(rest) {
-                Ok(0) => return Err(io::ErrorKind::WriteZero.into()),
-                Ok(n) => {
-                    rest = &rest[n..];
-                    moved = Instant::now();
-                }
-                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                Err(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {
-                    if abort() {
-                        return Err(io::ErrorKind::Interrupted.into());
-                    }
-                    if moved.elapsed() > patience {
-                        return Err(io::ErrorKind::TimedOut.into());
-                    }
-                }
-                Err(error) => return Err(error),
-            }
-        }
-    }
-    Ok(())
 }
 
 /// All that a mesh needs to know.
@@ -203,8 +159,21 @@ impl Mesh {
         }
     }
 
-    fn is_closed(&self) -> bool {
+    pub(super) fn is_closed(&self) -> bool {
         self.closed.load(Ordering::SeqCst)
+    }
+
+    /// Ends every connection without a word, as the death of the process would.
+    #[cfg(test)]
+    pub(crate) fn sever(&self) {
+        self.closed.store(true, Ordering::SeqCst);
+        for peer in lock(&self.peers).iter_mut() {
+            if let Some(link) = peer.link.take() {
+                // The writer may be held by whoever is blocked on it; a clone of the socket ends that too.
+                let _ = link.socket.shutdown(Shutdown::Both);
+            }
+        }
+        self.bell.ring();
     }
 
     fn name(&self, rank: usize) -> &WorkerId {
@@ -222,10 +191,8 @@ impl Mesh {
                 return;
             }
             peer.fate = Fate::Lost(reason.clone());
-            if let Some(link) = peer.link.take()
-                && let Ok(stream) = link.writer.try_lock()
-            {
-                let _ = stream.shutdown(Shutdown::Write);
+            if let Some(link) = peer.link.take() {
+                let _ = link.socket.shutdown(Shutdown::Write);
             }
         }
         let (task, generation) = (&self.terms.task, self.terms.generation);
@@ -280,15 +247,15 @@ impl Mesh {
     }
 
     /// Takes a connection whose other side has proved to be `rank`.
-    fn attach(self: &Arc<Self>, rank: usize, stream: TcpStream) {
-        let reader = stream.try_clone().and_then(|reader| {
+    pub(super) fn attach(self: &Arc<Self>, rank: usize, stream: TcpStream) {
+        let both = stream.try_clone().and_then(|reader| {
             // Signs of life come far more often than this; it only keeps a reader from outliving everything.
             reader.set_read_timeout(Some(self.timing.patience * 3))?;
-            stream.set_write_timeout(Some(Duration::from_millis(200)))?;
-            Ok(reader)
+            stream.set_write_timeout(Some(BLINK))?;
+            Ok((reader, Link { socket: stream.try_clone()?, writer: Mutex::new(stream) }))
         });
-        let reader = match reader {
-            Ok(reader) => reader,
+        let (reader, link) = match both {
+            Ok(both) => both,
             Err(error) => return self.lose(rank, error.to_string()),
         };
         {
@@ -297,7 +264,7 @@ impl Mesh {
                 return;
             }
             let peer = &mut peers[rank];
-            peer.link = Some(Arc::new(Link { writer: Mutex::new(stream) }));
+            peer.link = Some(Arc::new(link));
             peer.heard = Instant::now();
             peer.fate = Fate::Up;
         }
@@ -453,84 +420,7 @@ fn keep_alive(mesh: &Weak<Mesh>, timing: Timing) {
     }
 }
 
-fn spawn(name: &str, work: impl FnOnce() + Send + 'static) {
+pub(super) fn spawn(name: &str, work: impl FnOnce() + Send + 'static) {
     // Without threads there is no worker either.
     thread::Builder::new().name(name.to_owned()).stack_size(512 << 10).spawn(work).expect("a thread can be started");
-}
-
-/// Where this process is dialled, for all its gangs.
-#[derive(Debug)]
-pub(crate) struct Endpoint {
-    address: SocketAddr,
-    timing: Timing,
-    meshes: Mutex<HashMap<(TaskId, Generation), Weak<Mesh>>>,
-    handshakes: AtomicUsize,
-}
-
-impl Endpoint {
-    /// Handshakes under way at once; more are turned away and dial again.
-    const MAX_HANDSHAKES: usize = 64;
-
-    /// Listens and serves in the background, as long as the process lives.
-    pub(crate) fn open(address: SocketAddr, timing: Timing) -> io::Result<Arc<Self>> {
-        let listener = TcpListener::bind(address)?;
-        let address = listener.local_addr()?;
-        let endpoint = Arc::new(Self { address, timing, meshes: Mutex::default(), handshakes: AtomicUsize::new(0) });
-        let weak = Arc::downgrade(&endpoint);
-        spawn("gang-accept", move || accept(&weak, &listener));
-        Ok(endpoint)
-    }
-
-    /// Where it listens.
-    pub(crate) fn address(&self) -> SocketAddr {
-        self.address
-    }
-
-    fn announce(&self, mesh: &Arc<Mesh>) {
-        let mut meshes = lock(&self.meshes);
-        meshes.retain(|_, mesh| mesh.strong_count() > 0);
-        meshes.insert((mesh.terms.task.clone(), mesh.terms.generation), Arc::downgrade(mesh));
-    }
-
-    fn welcome(&self, mut stream: TcpStream) -> Result<(), HandshakeError> {
-        let dial = handshake::wanted(&mut stream)?;
-        let unknown = || HandshakeError::Unknown { task: dial.task.clone(), generation: dial.generation };
-        let key = (dial.task.clone(), dial.generation);
-        let mesh =
-            lock(&self.meshes).get(&key).and_then(Weak::upgrade).filter(|m| !m.is_closed()).ok_or_else(unknown)?;
-        if dial.to != mesh.terms.rank || dial.from <= dial.to || dial.from >= mesh.size() {
-            return Err(HandshakeError::Ranks { from: dial.from, to: dial.to });
-        }
-        handshake::accept(&mut stream, &dial, &mesh.terms.secret)?;
-        mesh.attach(dial.from, stream);
-        Ok(())
-    }
-}
-
-fn accept(endpoint: &Weak<Endpoint>, listener: &TcpListener) {
-    loop {
-        let stream = listener.accept();
-        let Some(endpoint) = endpoint.upgrade() else { return };
-        let stream = match stream {
-            Ok((stream, _)) => stream,
-            Err(error) => {
-                tracing::warn!("accepting a peer failed: {error}");
-                thread::sleep(Duration::from_millis(100));
-                continue;
-            }
-        };
-        if endpoint.handshakes.fetch_add(1, Ordering::SeqCst) >= Endpoint::MAX_HANDSHAKES {
-            endpoint.handshakes.fetch_sub(1, Ordering::SeqCst);
-            continue;
-        }
-        spawn("gang-welcome", move || {
-            match endpoint.welcome(stream) {
-                Ok(()) => {}
-                // The peer heard of the generation before we did, and will dial again.
-                Err(error @ HandshakeError::Unknown { .. }) => tracing::debug!("{error}"),
-                Err(error) => tracing::warn!("turned a peer away: {error}"),
-            }
-            endpoint.handshakes.fetch_sub(1, Ordering::SeqCst);
-        });
-    }
 }

@@ -1,7 +1,12 @@
 //! Gangs: connections between members, what they agree on, and how they sum.
 
+pub(crate) mod endpoint;
 pub(crate) mod exchange;
-pub(crate) mod frame;
-pub(crate) mod handshake;
+mod frame;
+mod handshake;
+mod link;
 pub(crate) mod mesh;
 pub(crate) mod tree;
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,70 @@
+//! Writing to a peer without waiting for it forever.
+//!
+//! A socket's write times out after [`BLINK`]; between two tries the writer asks whether the write is still wanted.
+
+use std::io::{self, Write};
+use std::net::TcpStream;
+use std::sync::Mutex;
+use std::time::{Duration, Instant};
+
+use super::frame::{self, Head};
+use crate::bell::lock;
+
+/// The write timeout of a link's socket.
+pub(super) const BLINK: Duration = Duration::from_millis(200);
+
+/// Our direction of a connection. Frames of the stage and signs of life take turns.
+#[derive(Debug)]
+pub(super) struct Link {
+    /// To end the connection while somebody writes.
+    pub(super) socket: TcpStream,
+    pub(super) writer: Mutex<TcpStream>,
+}
+
+impl Link {
+    /// Writes a frame. `abort` is asked while the socket takes nothing, for up to `patience`.
+    pub(super) fn send(
+        &self,
+        head: Head,
+        payload: &[u8],
+        patience: Duration,
+        abort: &dyn Fn() -> bool,
+    ) -> io::Result<()> {
+        let mut stream = lock(&self.writer);
+        send(&mut stream, head, payload, patience, abort)
+    }
+}
+
+/// Writes a whole frame, or an error.
+pub(super) fn send(
+    out: &mut TcpStream,
+    head: Head,
+    payload: &[u8],
+    patience: Duration,
+    abort: &dyn Fn() -> bool,
+) -> io::Result<()> {
+    let header = frame::header(head, payload);
+    for mut rest in [header.as_slice(), payload] {
+        let mut moved = Instant::now();
+        while !rest.is_empty() {
+            match out.write(rest) {
+                Ok(0) => return Err(io::ErrorKind::WriteZero.into()),
+                Ok(n) => {
+                    rest = &rest[n..];
+                    moved = Instant::now();
+                }
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {
+                    if abort() {
+                        return Err(io::ErrorKind::Interrupted.into());
+                    }
+                    if moved.elapsed() > patience {
+                        return Err(io::ErrorKind::TimedOut.into());
+                    }
+                }
+                Err(error) => return Err(error),
+            }
+        }
+    }
+    Ok(())
+}

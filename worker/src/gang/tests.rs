@@ -1,0 +1,527 @@
+//! Gangs of threads over loopback, with a coordinator of a few lines that does what the real one does about losses.
+
+use std::collections::BTreeMap;
+use std::io::Write as _;
+use std::net::TcpStream;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use burn::tensor::Device;
+use proptest::prelude::*;
+use protocol::message::{Assignment, Grant, Member, Role, StageTask};
+use protocol::stage::{CheckpointPolicy, StageSettings, TrainVae};
+use protocol::{Attempt, Fence, Generation, Incarnation, RunId, Seed, StageName, TaskId, WorkerId};
+use stages::context::{ContextError, Exchange, GangContext, Rendezvous};
+use tokio::runtime::Runtime;
+
+use super::endpoint::Endpoint;
+use super::frame::{self, Head, Kind};
+use super::handshake;
+use super::mesh::{Mesh, Terms, Timing};
+use super::tree;
+use crate::bell::{Bell, lock};
+use crate::cache::{Bounds, Cache};
+use crate::client::Client;
+use crate::context::HttpContext;
+use crate::held::Held;
+
+/// Short, so that losses by silence are found within a test.
+const QUICK: Timing = Timing {
+    patience: Duration::from_secs(2),
+    keep_alive: Duration::from_millis(200),
+    stall: Duration::from_secs(60),
+    refused: Duration::from_millis(500),
+};
+
+fn task() -> TaskId {
+    TaskId::from("run/vae")
+}
+
+pub(crate) fn assignment(worker: &WorkerId, generation: u64, members: &[Member], secret: &str) -> Assignment {
+    let grant = Grant {
+        task: task(),
+        attempt: Attempt(1),
+        fence: Fence(generation),
+        worker: worker.clone(),
+        incarnation: Incarnation(1),
+    };
+    let stage = StageTask {
+        run: RunId::from("run"),
+        name: StageName::from("vae"),
+        settings: StageSettings::TrainVae(TrainVae::default()),
+        inputs: BTreeMap::new(),
+        seed: Seed(1),
+        checkpoint: CheckpointPolicy::default(),
+    };
+    let role =
+        Role::Member { generation: Generation(generation), members: members.to_vec(), secret: secret.to_owned() };
+    Assignment { grant, stage, role, resume: None, wind_down: false }
+}
+
+/// One worker: where it is dialled, and what it holds once it is a member.
+#[derive(Debug)]
+struct Seat {
+    member: Member,
+    endpoint: Arc<Endpoint>,
+    held: Mutex<Option<Arc<Held>>>,
+    dead: AtomicBool,
+}
+
+#[derive(Debug)]
+struct Gang {
+    seats: Vec<Seat>,
+    generation: AtomicU64,
+    runtime: Runtime,
+}
+
+impl Gang {
+    fn new(seats: usize, timing: Timing) -> Arc<Self> {
+        let seat = |i: usize| {
+            let endpoint = Endpoint::open(([127, 0, 0, 1], 0).into(), timing).expect("loopback");
+            let member = Member {
+                worker: WorkerId::new(format!("w{i}")),
+                incarnation: Incarnation(1),
+                peer_address: endpoint.address().to_string(),
+            };
+            Seat { member, endpoint, held: Mutex::default(), dead: AtomicBool::new(false) }
+        };
+        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
+        let runtime = runtime.expect("a runtime");
+        Arc::new(Self { seats: (0..seats).map(seat).collect(), generation: AtomicU64::new(0), runtime })
+    }
+
+    /// Starts a generation of these seats; others that were members are told that it is over.
+    fn regroup(&self, seats: &[usize], wind_down: bool) {
+        let generation = self.generation.fetch_add(1, Ordering::SeqCst) + 1;
+        let members: Vec<Member> = seats.iter().map(|&i| self.seats[i].member.clone()).collect();
+        for (i, seat) in self.seats.iter().enumerate() {
+            let mut held = lock(&seat.held);
+            if !seats.contains(&i) {
+                if let Some(held) = held.take() {
+                    held.end("dropped from the gang");
+                }
+                continue;
+            }
+            let mut orders = assignment(&seat.member.worker, generation, &members, &format!("secret {generation}"));
+            orders.wind_down = wind_down;
+            match &*held {
+                Some(held) => held.update(orders),
+                None => {
+                    *held = Some(Held::new(orders, seat.endpoint.clone(), Arc::default(), Arc::default()));
+                }
+            }
+        }
+    }
+
+    fn held(&self, seat: usize) -> Option<Arc<Held>> {
+        lock(&self.seats[seat].held).clone()
+    }
+
+    fn context(&self, seat: usize) -> HttpContext {
+        let held = self.held(seat).expect("a member");
+        // Nobody is there; nothing in these tests is recorded or uploaded.
+        let client = Client::new("http://127.0.0.1:9", None, self.runtime.handle().clone()).expect("a client");
+        let cache = Arc::new(Cache::new(None, Bounds::default()).expect("memory"));
+        HttpContext::new(held, client, cache, Device::default())
+    }
+
+    /// What the coordinator does: members that somebody cannot reach are dropped. Suspects that are not dead come back.
+    fn supervise(self: Arc<Self>, mut members: Vec<usize>, over: &AtomicBool) {
+        while !over.load(Ordering::SeqCst) {
+            let mut lost: Vec<WorkerId> = Vec::new();
+            for &i in &members {
+                if let (false, Some(held)) = (self.seats[i].dead.load(Ordering::SeqCst), self.held(i)) {
+                    lost.extend(held.doing().lost);
+                }
+            }
+            let before = members.clone();
+            members.retain(|&i| !lost.contains(&self.seats[i].member.worker));
+            if members != before {
+                if members.is_empty() {
+                    return;
+                }
+                self.regroup(&members, false);
+            }
+            thread::sleep(Duration::from_millis(2));
+        }
+    }
+}
+
+/// A gradient that depends on step and slice.
+fn gradient(step: u64, slice: usize, length: usize) -> Vec<f32> {
+    let mut x = step.wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ (slice as u64 + 1).wrapping_mul(0xD1B5_4A32_D192_ED03);
+    (0..length)
+        .map(|_| {
+            x ^= x << 13;
+            x ^= x >> 7;
+            x ^= x << 17;
+            (x >> 40) as f32 / 1e4 - 800.0
+        })
+        .collect()
+}
+
+/// What a lone member computes.
+fn reference(steps: u64, slices: usize, length: usize) -> Vec<f32> {
+    let mut state = vec![0.0f32; length];
+    for step in 0..steps {
+        let parts: Vec<Vec<f32>> = (0..slices).map(|s| gradient(step, s, length)).collect();
+        let known: Vec<_> = parts.iter().enumerate().map(|(s, p)| (s..s + 1, p.as_slice())).collect();
+        let mut sum = vec![0.0; length];
+        tree::sum(&(0..slices), &known, &mut sum);
+        apply(&mut state, &sum);
+    }
+    state
+}
+
+fn apply(state: &mut [f32], sum: &[f32]) {
+    for (s, g) in state.iter_mut().zip(sum) {
+        *s = *s * 0.99 + *g;
+    }
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Plan {
+    steps: u64,
+    slices: usize,
+    length: usize,
+}
+
+/// The training loop, as `stages` has it.
+fn train(context: &mut HttpContext, plan: Plan, mut before: impl FnMut(u64)) -> Result<Vec<f32>, ContextError> {
+    let mut state = vec![0.0f32; plan.length];
+    let mut applied = None;
+    let mut parts: BTreeMap<usize, Vec<f32>> = BTreeMap::new();
+    let mut met = false;
+    while applied.unwrap_or(0) < plan.steps {
+        if !met {
+            let bytes = |state: &[f32], at: u64| {
+                let mut bytes = at.to_le_bytes().to_vec();
+                bytes.extend_from_slice(bytemuck::cast_slice(state));
+                bytes
+            };
+            if let Rendezvous::Adopt(adopted) =
+                context.rendezvous(applied, &mut || bytes(&state, applied.unwrap_or(0)))?
+            {
+                let at = u64::from_le_bytes(adopted[..8].try_into().expect("8 bytes"));
+                state = adopted[8..].chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().expect("4"))).collect();
+                applied = Some(at);
+                parts.clear();
+            }
+            met = true;
+            continue;
+        }
+        let step = applied.unwrap_or(0);
+        before(step);
+        for slice in context.share(plan.slices) {
+            parts.entry(slice).or_insert_with(|| gradient(step, slice, plan.length));
+        }
+        let brought: Vec<(usize, Vec<f32>)> = parts.iter().map(|(s, p)| (*s, p.clone())).collect();
+        match context.exchange(step, plan.slices, &brought)? {
+            Exchange::Regroup => met = false,
+            Exchange::Sum { sum, .. } => {
+                apply(&mut state, &sum);
+                applied = Some(step + 1);
+                parts.clear();
+            }
+        }
+    }
+    Ok(state)
+}
+
+fn bits(state: &[f32]) -> Vec<u32> {
+    state.iter().map(|x| x.to_bits()).collect()
+}
+
+/// Runs `members` seats to the end of `plan` without incident.
+fn run_whole(members: usize, plan: Plan) -> Vec<Vec<f32>> {
+    let gang = Gang::new(members, Timing::default());
+    gang.regroup(&(0..members).collect::<Vec<_>>(), false);
+    thread::scope(|scope| {
+        let threads: Vec<_> = (0..members)
+            .map(|i| {
+                let gang = gang.clone();
+                scope.spawn(move || train(&mut gang.context(i), plan, |_| {}).expect("trained"))
+            })
+            .collect();
+        threads.into_iter().map(|t| t.join().expect("no panic")).collect()
+    })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(16))]
+    #[test]
+    fn any_membership_gives_the_same_bits(members in 1usize..=4, slices in 1usize..=9, length in 1usize..5000) {
+        let plan = Plan { steps: 3, slices, length };
+        let expected = bits(&reference(plan.steps, slices, length));
+        for state in run_whole(members, plan) {
+            prop_assert!(bits(&state) == expected, "{members} members differ from one");
+        }
+    }
+}
+
+#[test]
+fn buffers_of_many_pieces_are_summed_too() {
+    let plan = Plan { steps: 2, slices: 5, length: 3 * frame::PIECE + 17 };
+    let expected = bits(&reference(plan.steps, plan.slices, plan.length));
+    for members in [2, 3] {
+        for state in run_whole(members, plan) {
+            assert!(bits(&state) == expected, "{members} members differ from one");
+        }
+    }
+}
+
+/// Kills one of `members` after `delay`; the others must end with the bits of an undisturbed run.
+fn lose_one(members: usize, victim: usize, plan: Plan, at: u64, delay: Duration) {
+    let gang = Gang::new(members, QUICK);
+    let all: Vec<usize> = (0..members).collect();
+    gang.regroup(&all, false);
+    let over = AtomicBool::new(false);
+    let expected = bits(&reference(plan.steps, plan.slices, plan.length));
+    thread::scope(|scope| {
+        let supervisor = {
+            let (gang, all, over) = (gang.clone(), all.clone(), &over);
+            scope.spawn(move || gang.supervise(all, over))
+        };
+        let threads: Vec<_> = all
+            .iter()
+            .map(|&i| {
+                let gang = gang.clone();
+                scope.spawn(move || {
+                    let mut context = gang.context(i);
+                    train(&mut context, plan, |step| {
+                        if i == victim && step == at && !gang.seats[i].dead.load(Ordering::SeqCst) {
+                            let gang = gang.clone();
+                            // From another thread, so that it strikes at any point of the exchange.
+                            thread::spawn(move || {
+                                thread::sleep(delay);
+                                gang.seats[i].dead.store(true, Ordering::SeqCst);
+                                let held = gang.held(i);
+                                if let Some(held) = held {
+                                    held.sever();
+                                    held.end("killed");
+                                }
+                            });
+                        }
+                    })
+                })
+            })
+            .collect();
+        for (i, thread) in threads.into_iter().enumerate() {
+            let result = thread.join().expect("no panic");
+            if i == victim {
+                // It may have come through before it was struck.
+                assert!(matches!(result, Err(ContextError::GrantEnded(_)) | Ok(_)), "{result:?}");
+            } else {
+                let state = result.unwrap_or_else(|e| panic!("member {i}: {e}"));
+                assert!(bits(&state) == expected, "member {i} differs after a loss");
+            }
+        }
+        over.store(true, Ordering::SeqCst);
+        supervisor.join().expect("no panic");
+    });
+}
+
+#[test]
+fn a_loss_at_any_moment_changes_no_bits() {
+    let plan = Plan { steps: 12, slices: 6, length: 40_000 };
+    for (round, micros) in [0u64, 50, 150, 300, 500, 800, 1200, 2000, 3000, 5000].into_iter().enumerate() {
+        let members = 2 + round % 3;
+        lose_one(members, round % members, plan, 4, Duration::from_micros(micros));
+    }
+}
+
+#[test]
+fn a_joiner_takes_the_state_of_a_peer() {
+    let plan = Plan { steps: 40, slices: 4, length: 2000 };
+    let gang = Gang::new(3, QUICK);
+    gang.regroup(&[0], false);
+    let expected = bits(&reference(plan.steps, plan.slices, plan.length));
+    let adopted = AtomicU64::new(0);
+    thread::scope(|scope| {
+        let mut threads = Vec::new();
+        let first = gang.clone();
+        let (reached, reached_by_first) = std::sync::mpsc::channel();
+        threads.push(scope.spawn(move || {
+            train(&mut first.context(0), plan, |step| {
+                if step == 10 {
+                    let _ = reached.send(());
+                }
+                thread::sleep(Duration::from_millis(2));
+            })
+        }));
+        reached_by_first.recv().expect("the first member trains");
+        gang.regroup(&[0, 1, 2], false);
+        for i in [1, 2] {
+            let (gang, adopted) = (gang.clone(), &adopted);
+            threads.push(scope.spawn(move || {
+                let mut first = true;
+                train(&mut gang.context(i), plan, |step| {
+                    if std::mem::take(&mut first) {
+                        adopted.fetch_max(step, Ordering::SeqCst);
+                    }
+                })
+            }));
+        }
+        for thread in threads {
+            let state = thread.join().expect("no panic").expect("trained");
+            assert!(bits(&state) == expected);
+        }
+    });
+    assert!(adopted.load(Ordering::SeqCst) >= 10, "joiners began where the first member was");
+}
+
+#[test]
+fn one_wish_to_wind_down_is_heard_by_all_after_the_same_step() {
+    let gang = Gang::new(3, QUICK);
+    gang.regroup(&[0, 1, 2], false);
+    let contexts: Vec<HttpContext> = (0..3).map(|i| gang.context(i)).collect();
+    // Only the second is told.
+    let held = gang.held(1).expect("a member");
+    let stops: Vec<Vec<bool>> = thread::scope(|scope| {
+        let threads: Vec<_> = contexts
+            .into_iter()
+            .map(|mut context| {
+                let held = held.clone();
+                scope.spawn(move || {
+                    context.rendezvous(None, &mut Vec::new).expect("met");
+                    let mut stops = Vec::new();
+                    for step in 0..4 {
+                        let parts: Vec<_> = context.share(3).map(|s| (s, vec![1.0])).collect();
+                        if step == 2 {
+                            let mut orders = held.assignment();
+                            orders.wind_down = true;
+                            held.update(orders);
+                        }
+                        match context.exchange(step, 3, &parts).expect("summed") {
+                            Exchange::Sum { wind_down, sum } => {
+                                assert_eq!(sum, [3.0]);
+                                stops.push(wind_down);
+                            }
+                            Exchange::Regroup => panic!("nothing happened"),
+                        }
+                    }
+                    stops
+                })
+            })
+            .collect();
+        threads.into_iter().map(|t| t.join().expect("no panic")).collect()
+    });
+    assert!(stops.iter().all(|s| *s == stops[0]), "{stops:?}");
+    assert!(stops[0][3]);
+}
+
+fn mesh(gang: &Gang, seats: &[usize], own: usize, secret: &str) -> (Arc<Mesh>, Arc<Bell>) {
+    let members = seats.iter().map(|&i| gang.seats[i].member.clone()).collect();
+    let terms = Terms { task: task(), generation: Generation(7), rank: own, members, secret: secret.to_owned() };
+    let bell: Arc<Bell> = Arc::default();
+    (Mesh::open(terms, &gang.seats[seats[own]].endpoint, bell.clone(), Arc::default()), bell)
+}
+
+fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
+    let begun = Instant::now();
+    while !holds() {
+        assert!(begun.elapsed() < Duration::from_secs(20), "{what}");
+        thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn a_slow_peer_is_waited_for_and_a_silent_one_is_named() {
+    // The second member lets its threads answer for it, but is late; the third never sends a sign of life.
+    let quiet = Timing { keep_alive: Duration::from_secs(3600), ..QUICK };
+    let mut gang = Gang::new(3, QUICK);
+    let silent = Gang::new(1, quiet);
+    {
+        let gang = Arc::get_mut(&mut gang).expect("not shared yet");
+        gang.seats[2].member = silent.seats[0].member.clone();
+        gang.seats[2].member.worker = WorkerId::from("w2");
+        gang.seats[2].endpoint = silent.seats[0].endpoint.clone();
+    }
+    let (first, _) = mesh(&gang, &[0, 1, 2], 0, "s");
+    let (second, _) = mesh(&gang, &[0, 1, 2], 1, "s");
+    let (third, _) = mesh(&gang, &[0, 1, 2], 2, "s");
+    let late = thread::spawn(move || {
+        thread::sleep(QUICK.patience * 2);
+        second.send(0, "late", Head::new(Kind::Applied, 5, 1, 0), &[], &|| None).expect("sent");
+        second
+    });
+    let frame = first.next(1, "barrier `test`", &|| None).expect("late, but alive");
+    assert_eq!(frame.step, 5);
+    assert!(first.next(2, "barrier `test`", &|| None).is_err());
+    assert_eq!(first.lost().into_iter().collect::<Vec<_>>(), [WorkerId::from("w2")]);
+    let second = late.join().expect("no panic");
+    for mesh in [first, second, third] {
+        mesh.close(None);
+    }
+}
+
+#[test]
+fn a_peer_with_another_secret_never_gets_in() {
+    let gang = Gang::new(2, QUICK);
+    let (first, _) = mesh(&gang, &[0, 1], 0, "mine");
+    let (second, _) = mesh(&gang, &[0, 1], 1, "yours");
+    assert!(first.next(1, "barrier `test`", &|| None).is_err());
+    assert!(second.next(0, "barrier `test`", &|| None).is_err());
+    assert_eq!(first.lost().len(), 1);
+    first.close(None);
+    second.close(None);
+}
+
+/// Connects as rank 1 with the right secret, then sends `bytes`.
+fn misbehave(bytes: &[u8]) -> Arc<Mesh> {
+    let gang = Gang::new(2, QUICK);
+    let (mesh, _) = mesh(&gang, &[0, 1], 0, "s");
+    let mut stream = TcpStream::connect(gang.seats[0].endpoint.address()).expect("listening");
+    handshake::dial(&mut stream, &task(), Generation(7), 1, 0, "s").expect("welcome");
+    stream.write_all(bytes).expect("sent");
+    wait_until("the peer is given up", || !mesh.lost().is_empty());
+    mesh
+}
+
+#[test]
+fn a_corrupt_frame_ends_the_connection() {
+    let mut bytes = Vec::new();
+    frame::write(&mut bytes, Head::new(Kind::Applied, 3, 1, 0), b"payload").expect("memory");
+    *bytes.last_mut().expect("not empty") ^= 1;
+    misbehave(&bytes).close(None);
+}
+
+#[test]
+fn an_oversized_frame_ends_the_connection_without_being_read() {
+    let mut bytes = frame::header(Head::new(Kind::State, 0, 0, 0), &[]).to_vec();
+    bytes[24..28].copy_from_slice(&(frame::MAX_PAYLOAD as u32 + 1).to_le_bytes());
+    misbehave(&bytes).close(None);
+}
+
+#[test]
+#[ignore = "a measurement: cargo test --release -p worker throughput -- --ignored --nocapture"]
+fn throughput() {
+    for (members, length) in [(1, 20_000_000), (2, 2_000_000), (2, 20_000_000), (3, 20_000_000)] {
+        let gang = Gang::new(members, Timing::default());
+        gang.regroup(&(0..members).collect::<Vec<_>>(), false);
+        let begun = Mutex::new(None::<Instant>);
+        let barrier = std::sync::Barrier::new(members);
+        thread::scope(|scope| {
+            for i in 0..members {
+                let (gang, begun, barrier) = (gang.clone(), &begun, &barrier);
+                scope.spawn(move || {
+                    let mut context = gang.context(i);
+                    context.rendezvous(None, &mut Vec::new).expect("met");
+                    let parts: Vec<_> = context.share(8).map(|s| (s, vec![0.5f32; length])).collect();
+                    barrier.wait();
+                    lock(begun).get_or_insert_with(Instant::now);
+                    for step in 0..4 {
+                        context.exchange(step, 8, &parts).expect("summed");
+                    }
+                    barrier.wait();
+                    if i == 0 {
+                        let each = lock(begun).expect("set").elapsed() / 4;
+                        eprintln!("{members} members, {length} floats, 8 slices: {each:?} an exchange");
+                    }
+                });
+            }
+        });
+    }
+}
