@@ -184,7 +184,7 @@ pub fn strip_png_to(
     out: impl Write,
 ) -> io::Result<()> {
     const CELL: usize = 110;
-    const ROW: usize = 196;
+    const ROW: usize = 210;
     let (width, height) = (CELL * poses + 24, ROW * motions.len());
     let mut canvas = Canvas::new(width, height, PAPER);
     for (row, (name, joints)) in motions.iter().enumerate() {
@@ -196,7 +196,7 @@ pub fn strip_png_to(
             let pose = frame(joints, skeleton, t);
             let view = View {
                 scale: 78.0,
-                centre: [12.0 + CELL as f64 * (column as f64 + 0.5), top + 112.0],
+                centre: [12.0 + CELL as f64 * (column as f64 + 0.5), top + 126.0],
                 looking_at: [pose[0][0], 0.85, pose[0][2]],
             };
             let floor = |dx: f64, dz: f64| view.project([pose[0][0] + dx, 0.0, pose[0][2] + dz]).0;

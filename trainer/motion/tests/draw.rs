@@ -39,7 +39,7 @@ fn a_sheet_has_a_row_a_motion() {
     let mut bytes = vec![];
     draw::strip_png_to(&[motion(), motion()], 6, skeleton, &mut bytes).unwrap();
     let reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();
-    assert_eq!((reader.info().width, reader.info().height), (684, 392));
+    assert_eq!((reader.info().width, reader.info().height), (684, 420));
     let error = draw::gif_to(&[0.0; 65], skeleton, "", vec![]).unwrap_err().to_string();
     assert!(error.contains("65 coordinates"), "{error}");
 }
