@@ -121,10 +121,13 @@ async fn begin(handle: &Handle, store: &Store, work: Work) -> Result<(RunId, Pip
             let rows = store.runs().await?;
             let row = match name.as_str() {
                 "@last" => rows.iter().max_by_key(|row| row.created_ms),
-                name => rows.iter().find(|row| row.run.as_str() == name),
+                name => rows.iter().find(|row| row.run.as_str() == name).or_else(|| {
+                    let mut begins = rows.iter().filter(|row| row.run.as_str().starts_with(name));
+                    begins.next().filter(|_| begins.next().is_none())
+                }),
             };
             let row = row.ok_or_else(|| {
-                Problem::new(exit::NOT_FOUND, anyhow::anyhow!("there is no run `{name}` in this store"))
+                Problem::new(exit::NOT_FOUND, anyhow::anyhow!("there is no one run `{name}` in this store"))
                     .hint("`trainer status --all` lists runs")
             })?;
             let pipeline = serde_json::from_value(row.pipeline.clone()).map_err(|error| {

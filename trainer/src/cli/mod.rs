@@ -237,15 +237,26 @@ async fn show_plan(args: PlanArgs) -> Result<u8> {
 }
 
 async fn resume(args: ResumeArgs) -> Result<u8> {
+    if args.target.server.is_none() {
+        match Store::open_existing(&args.target.store, Holder::this_process("trainer resume")).await {
+            Ok(store) => {
+                // Nobody holds it, so nobody would do the work: this process does.
+                drop(store);
+                let options = run::Options {
+                    store: args.target.store,
+                    workers: args.workers,
+                    output: args.output,
+                    command: command_line(),
+                };
+                return run::run(run::Work::Run(args.run), options).await;
+            }
+            Err(OpenError::Busy { holder: Holder { address: Some(_), .. }, .. }) => {}
+            Err(error) => return Err(error.into()),
+        }
+    }
     let client = crate::client::Client::connect(&args.target).await?;
     let found = client.find(&args.run).await?;
-    if !client.is_own() {
-        let view = client.control(&found.run, "resume").await?;
-        remote::show(&view, args.output);
-        return Ok(0);
-    }
-    client.close().await;
-    let options =
-        run::Options { store: args.target.store, workers: args.workers, output: args.output, command: command_line() };
-    run::run(run::Work::Run(found.run.to_string()), options).await
+    let view = client.control(&found.run, "resume").await?;
+    remote::show(&view, args.output);
+    Ok(0)
 }
