@@ -113,7 +113,7 @@ mod tests {
 
     #[test]
     fn quantities_are_short() {
-        assert_eq!(duration(3.14159), "3.1 s");
+        assert_eq!(duration(3.25), "3.2 s");
         assert_eq!(duration(185.0), "3 min 05 s");
         assert_eq!(duration(7800.0), "2 h 10 min");
         assert_eq!(number(0.05312), "0.05312");

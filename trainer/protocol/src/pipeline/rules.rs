@@ -172,7 +172,7 @@ fn network(p: &mut Problems, n: &Network) {
             p.add(field, format!("`{field}` is {value}; expected at most 65536"), "");
         }
     }
-    if n.layers > 0 && n.layers % 2 == 0 {
+    if n.layers > 0 && n.layers.is_multiple_of(2) {
         let message = format!("`network.layers` is {}; expected an odd number", n.layers);
         p.add("network.layers", message, "the skip stack has as many blocks before its middle block as after it");
     }
@@ -213,18 +213,18 @@ fn optimizer(p: &mut Problems, field: &str, o: &Optimizer) {
 
 /// Points of the solver grid; `None` if `skip` is wrong.
 fn grid(d: &Distillation) -> Option<usize> {
-    (d.skip > 0 && 1000 % d.skip == 0).then(|| 1000 / d.skip)
+    (d.skip > 0 && 1000usize.is_multiple_of(d.skip)).then(|| 1000 / d.skip)
 }
 
 fn distillation(p: &mut Problems, d: &Distillation) {
     let (low, high) = d.guidance;
-    if !(low <= high) {
+    if low > high {
         p.add("guidance", format!("`guidance` is [{low}, {high}]; expected the smaller number first"), "");
     }
     if !(low >= 0.0 && high.is_finite()) {
         p.add("guidance", format!("`guidance` is [{low}, {high}]; expected numbers of 0 or more"), "");
     }
-    if d.guidance_dim < 4 || d.guidance_dim % 2 != 0 {
+    if d.guidance_dim < 4 || !d.guidance_dim.is_multiple_of(2) {
         let message = format!("`guidance_dim` is {}; expected an even number of at least 4", d.guidance_dim);
         p.add("guidance_dim", message, "half of it are sines, half cosines");
     }
