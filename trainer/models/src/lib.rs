@@ -2,4 +2,7 @@
 //!
 //! Not its job: stages, stores, workers, where data comes from.
 
+pub mod flat;
 pub mod kernels;
+pub mod names;
+pub mod networks;

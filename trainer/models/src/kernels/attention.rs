@@ -52,7 +52,7 @@ pub fn self_attention(qkv: Tensor<3>, heads: usize, mask: Option<&KeyMask>, drop
     let sizes = Sizes { batch, queries: len, keys: len, heads, width };
     let key = dropout.next_key();
     #[cfg(feature = "flex")]
-    match raw::place(&qkv) {
+    match raw::place(&qkv, false) {
         Place::Tracked => return fused::tracked_self(qkv, sizes, mask, key.map(|k| (k, dropout.clone()))),
         Place::Plain => {
             let x = contiguous(raw::plain(qkv));
@@ -79,7 +79,7 @@ pub fn cross_attention(
     let sizes = Sizes { batch, queries, keys, heads, width };
     let key = dropout.next_key();
     #[cfg(feature = "flex")]
-    match raw::place(&q) {
+    match raw::place(&q, raw::on_tape(&kv)) {
         Place::Tracked => return fused::tracked_cross(q, kv, sizes, mask, key.map(|k| (k, dropout.clone()))),
         Place::Plain => {
             let (q, kv) = (contiguous(raw::plain(q)), contiguous(raw::plain(kv)));

@@ -21,7 +21,7 @@ use burn::backend::flex::FlexTensor;
 /// GELU of every element.
 pub fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     #[cfg(feature = "flex")]
-    match raw::place(&x) {
+    match raw::place(&x, false) {
         Place::Tracked => return tracked(x),
         Place::Plain => {
             let shape = x.dims();

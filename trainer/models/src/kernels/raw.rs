@@ -31,9 +31,14 @@ mod flex {
         Other,
     }
 
-    /// Finds out where `x` lives.
-    pub(in crate::kernels) fn place<const D: usize>(x: &Tensor<D>) -> Place {
-        if x.clone().try_into_primitive::<Tracked>().is_ok() {
+    /// Whether `x` has a tape.
+    pub(in crate::kernels) fn on_tape<const D: usize>(x: &Tensor<D>) -> bool {
+        x.clone().try_into_primitive::<Tracked>().is_ok()
+    }
+
+    /// Where `x` lives, and with it the others of a call: on the tape if any of them is (`taped`).
+    pub(in crate::kernels) fn place<const D: usize>(x: &Tensor<D>, taped: bool) -> Place {
+        if taped || on_tape(x) {
             Place::Tracked
         } else if x.clone().try_into_primitive::<Flex>().is_ok() {
             Place::Plain

@@ -1,0 +1,113 @@
+//! Parameters and gradients as flat f32 buffers in declaration order: what is reduced, clipped, updated, saved and compared.
+
+use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
+use burn::tensor::{Gradients, Tensor, TensorData};
+
+/// One parameter tensor inside a flat buffer.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Entry {
+    /// Published name.
+    pub name: String,
+    /// Shape.
+    pub shape: Vec<usize>,
+}
+
+impl Entry {
+    /// Number of elements.
+    pub fn len(&self) -> usize {
+        self.shape.iter().product()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
+/// Names and shapes in declaration order. Paths are the published names, but for `emb_proj`, which upstream is the second entry of
+/// a sequence (`emb_proj.1`) whose first is an activation.
+pub fn layout<M: Module>(module: &M) -> Vec<Entry> {
+    struct Layout(Vec<String>, Vec<Entry>);
+    impl ModuleVisitor for Layout {
+        fn enter_module(&mut self, name: &str, _: &str) {
+            self.0.push(name.to_owned());
+        }
+        fn exit_module(&mut self, _: &str, _: &str) {
+            self.0.pop();
+        }
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            let name = self.0.join(".");
+            let name = match name.strip_prefix("emb_proj.") {
+                Some(rest) => format!("emb_proj.1.{rest}"),
+                None => name,
+            };
+            self.1.push(Entry { name, shape: param.dims().to_vec() });
+        }
+    }
+    let mut visitor = Layout(Vec::new(), Vec::new());
+    module.visit(&mut visitor);
+    visitor.1
+}
+
+/// All parameters, one after the other.
+pub fn read<M: Module>(module: &M) -> Vec<f32> {
+    struct Read(Vec<f32>);
+    impl ModuleVisitor for Read {
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            let data = param.val().into_data();
+            self.0.extend_from_slice(data.as_slice::<f32>().expect("parameters are f32"));
+        }
+    }
+    let mut visitor = Read(Vec::new());
+    module.visit(&mut visitor);
+    visitor.0
+}
+
+/// The module with its parameters replaced by `flat`; identities and gradient tracking stay.
+///
+/// # Panics
+/// If `flat` has another length than the module has parameters.
+pub fn write<M: Module>(module: M, flat: &[f32]) -> M {
+    struct Write<'a>(&'a [f32]);
+    impl ModuleMapper for Write<'_> {
+        fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+            let shape = param.dims();
+            let (head, tail) = self.0.split_at(shape.iter().product());
+            self.0 = tail;
+            let data = TensorData::new(head.to_vec(), shape);
+            param.map(|old| {
+                let tracked = old.is_require_grad();
+                Tensor::from_data(data, &old.device()).set_require_grad(tracked)
+            })
+        }
+    }
+    let mut mapper = Write(flat);
+    let module = module.map(&mut mapper);
+    assert!(mapper.0.is_empty(), "the buffer is longer than the module");
+    module
+}
+
+/// Adds the gradients of all parameters to `out`, in the order of [`read`]. A parameter that took no part adds nothing.
+///
+/// # Panics
+/// If `out` has another length than the module has parameters.
+pub fn add_gradients<M: Module>(module: &M, gradients: &mut Gradients, out: &mut [f32]) {
+    struct Add<'a>(&'a mut Gradients, &'a mut [f32], usize);
+    impl ModuleVisitor for Add<'_> {
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            let len = param.dims().iter().product::<usize>();
+            if let Some(gradient) = param.val().grad_remove(self.0) {
+                let data = gradient.into_data();
+                let from = data.as_slice::<f32>().expect("gradients are f32");
+                for (o, g) in self.1[self.2..self.2 + len].iter_mut().zip(from) {
+                    *o += g;
+                }
+            }
+            self.2 += len;
+        }
+    }
+    let mut visitor = Add(gradients, out, 0);
+    module.visit(&mut visitor);
+    let (seen, len) = (visitor.2, visitor.1.len());
+    assert_eq!(seen, len, "the buffer and the module have different lengths");
+}

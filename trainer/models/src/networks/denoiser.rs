@@ -1,0 +1,176 @@
+//! The latent denoiser: predicts the noise in a latent from the latent, a timestep and a caption embedding. Source: MLD (v1: ReLU on
+//! the text, d = H), MotionLCM v2 (no ReLU, projections), and LCM's guidance embedding (Luo et al., arXiv:2310.04378).
+//!
+//! One sequence: N latent tokens, one time token, the text tokens; learned positions; skip encoder; the first N outputs. The length of
+//! the motion is no input: it enters through the VAE's decoder alone.
+
+use burn::module::Module;
+use burn::tensor::Tensor;
+use burn::tensor::activation::{relu, silu};
+use serde::{Deserialize, Serialize};
+
+use super::vae::Positions;
+use super::{Init, Linear, SkipStack, StackConfig, time_sinusoid};
+use crate::kernels::Dropout;
+
+/// Size of a denoiser.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct DenoiserConfig {
+    /// N latent tokens.
+    pub tokens: usize,
+    /// Width d of a latent token.
+    pub dim: usize,
+    /// Width H of the transformer.
+    pub width: usize,
+    /// Blocks.
+    pub layers: usize,
+    /// Heads.
+    pub heads: usize,
+    /// Feed-forward width.
+    pub feed_forward: usize,
+    /// Width of a caption embedding.
+    pub text_dim: usize,
+    /// Width of the time sinusoid.
+    pub time_dim: usize,
+    /// ReLU on the text (v1).
+    pub text_relu: bool,
+    /// Linear layers d -> H and back (v2); without them d is H (v1).
+    pub projection: bool,
+    /// Width of the guidance embedding of a student.
+    pub guidance_dim: Option<usize>,
+    /// Added to variances in layer norms.
+    pub norm_eps: f64,
+}
+
+/// Two layers on the time sinusoid.
+#[derive(Module, Debug)]
+pub struct TimeEmbedding {
+    /// time_dim -> H.
+    pub linear_1: Linear,
+    /// guidance_dim -> time_dim, no bias, zero at first.
+    pub cond_proj: Option<Linear>,
+    /// H -> H.
+    pub linear_2: Linear,
+}
+
+/// The denoiser.
+#[derive(Module, Debug)]
+pub struct Denoiser {
+    /// d -> H (v2).
+    pub latent_pre: Option<Linear>,
+    /// H -> d (v2).
+    pub latent_post: Option<Linear>,
+    /// Time token.
+    pub time_embedding: TimeEmbedding,
+    /// text_dim -> H; published as `emb_proj.1`.
+    pub emb_proj: Linear,
+    /// Positions of all tokens.
+    pub query_pos: Positions,
+    /// The transformer.
+    pub encoder: SkipStack,
+    tokens: usize,
+    time_dim: usize,
+    text_relu: bool,
+}
+
+impl Denoiser {
+    /// A fresh denoiser.
+    pub fn new(config: &DenoiserConfig, init: &mut Init<'_>) -> Self {
+        let DenoiserConfig { tokens, dim, width, text_dim, time_dim, .. } = *config;
+        let stack = StackConfig {
+            width,
+            layers: config.layers,
+            heads: config.heads,
+            feed_forward: config.feed_forward,
+            norm_eps: config.norm_eps,
+            memory: false,
+        };
+        Self {
+            latent_pre: config.projection.then(|| Linear::new(init, dim, width)),
+            latent_post: config.projection.then(|| Linear::new(init, width, dim)),
+            time_embedding: TimeEmbedding {
+                linear_1: Linear::new(init, time_dim, width),
+                cond_proj: config.guidance_dim.map(|guidance| Linear::zero(init, guidance, time_dim)),
+                linear_2: Linear::new(init, width, width),
+            },
+            emb_proj: Linear::new(init, text_dim, width),
+            query_pos: Positions::new(init, width),
+            encoder: SkipStack::new(init, &stack),
+            tokens,
+            time_dim,
+            text_relu: config.text_relu,
+        }
+    }
+
+    /// The time token [B, H] before positions.
+    ///
+    /// # Panics
+    /// If a guidance embedding is given to a network without a place for it.
+    pub fn time_token(&self, timesteps: &[usize], guidance_bg: Option<Tensor<2>>, device: &burn::tensor::Device) -> Tensor<2> {
+        let mut sinusoid = time_sinusoid(timesteps, self.time_dim, device);
+        if let Some(guidance) = guidance_bg {
+            let project = self.time_embedding.cond_proj.as_ref().expect("a teacher takes no guidance embedding");
+            sinusoid = sinusoid + project.forward(guidance);
+        }
+        self.time_embedding.linear_2.forward(silu(self.time_embedding.linear_1.forward(sinusoid)))
+    }
+
+    /// Predicted noise [B, N, d]. `latent_bnd` [B, N, d]; one timestep a sample; `text_blc` [B, L, text_dim]; `guidance_bg`
+    /// [B, guidance_dim] for a student.
+    pub fn forward(
+        &self,
+        latent_bnd: Tensor<3>,
+        timesteps: &[usize],
+        text_blc: Tensor<3>,
+        guidance_bg: Option<Tensor<2>>,
+        dropout: &mut Dropout,
+    ) -> Tensor<3> {
+        let out = self.tokens_through(latent_bnd, timesteps, text_blc, guidance_bg, dropout, |_| ());
+        match &self.latent_post {
+            Some(project) => project.forward(out),
+            None => out,
+        }
+    }
+
+    /// The outputs of every block on the N latent tokens, [B, N, H] each: what a discriminator looks at.
+    pub fn features(
+        &self,
+        latent_bnd: Tensor<3>,
+        timesteps: &[usize],
+        text_blc: Tensor<3>,
+        dropout: &mut Dropout,
+    ) -> Vec<Tensor<3>> {
+        let mut seen = Vec::new();
+        let _unused_output = self.tokens_through(latent_bnd, timesteps, text_blc, None, dropout, |x_bth| {
+            let [batch, _, width] = x_bth.dims();
+            seen.push(x_bth.clone().slice([0..batch, 0..self.tokens, 0..width]));
+        });
+        seen
+    }
+
+    fn tokens_through(
+        &self,
+        latent_bnd: Tensor<3>,
+        timesteps: &[usize],
+        text_blc: Tensor<3>,
+        guidance_bg: Option<Tensor<2>>,
+        dropout: &mut Dropout,
+        see: impl FnMut(&Tensor<3>),
+    ) -> Tensor<3> {
+        let [batch, tokens, _] = latent_bnd.dims();
+        assert_eq!(timesteps.len(), batch, "one timestep a sample");
+        let device = self.emb_proj.weight.val().device();
+        let latent = match &self.latent_pre {
+            Some(project) => project.forward(latent_bnd),
+            None => latent_bnd,
+        };
+        let width = latent.dims()[2];
+        let time = self.time_token(timesteps, guidance_bg, &device).reshape([batch, 1, width]);
+        let text = if self.text_relu { relu(text_blc) } else { text_blc };
+        let text = self.emb_proj.forward(text);
+        let x = Tensor::cat(vec![latent, time, text], 1);
+        let len = x.dims()[1];
+        let x = x + self.query_pos.rows(len);
+        self.encoder.forward_blocks(x, None, None, dropout, see).slice([0..batch, 0..tokens, 0..width])
+    }
+}

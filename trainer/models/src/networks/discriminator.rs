@@ -1,0 +1,59 @@
+//! MotionPCM's discriminator: small heads on the block features of the frozen teacher. Source: MotionPCM (arXiv:2501.19083), which says
+//! "linear layers, layer norm, activation, residual" and gives no sizes, and the image repository it follows.
+//!
+//! A head is `h1 = a(LN(W1 f))`, `h2 = h1 + a(LN(W2 h1))`, `score = W3 h2` for each latent token, with `a` a leaky ReLU of slope 0.01. One head per
+//! block. Our choice: width of the blocks, LayerNorm (the image heads have GroupNorm), a score per token.
+
+use burn::module::Module;
+use burn::tensor::Tensor;
+use burn::tensor::activation::leaky_relu;
+
+use super::{Init, Linear, Norm};
+
+/// One head.
+#[derive(Module, Debug)]
+pub struct Head {
+    /// H -> H.
+    pub linear1: Linear,
+    /// After `linear1`.
+    pub norm1: Norm,
+    /// H -> H.
+    pub linear2: Linear,
+    /// After `linear2`.
+    pub norm2: Norm,
+    /// H -> 1.
+    pub score: Linear,
+}
+
+/// Heads, one per block of the teacher.
+#[derive(Module, Debug)]
+pub struct Discriminator {
+    /// In block order.
+    pub heads: Vec<Head>,
+}
+
+impl Discriminator {
+    /// Heads for a teacher of `layers` blocks of `width`.
+    pub fn new(layers: usize, width: usize, init: &mut Init<'_>) -> Self {
+        let head = |_| Head {
+            linear1: Linear::new(init, width, width),
+            norm1: Norm::new(init, width),
+            linear2: Linear::new(init, width, width),
+            norm2: Norm::new(init, width),
+            score: Linear::new(init, width, 1),
+        };
+        Self { heads: (0..layers).map(head).collect() }
+    }
+
+    /// Scores [B, N, 1] of each head on its features [B, N, H].
+    pub fn forward(&self, features: Vec<Tensor<3>>) -> Vec<Tensor<3>> {
+        const SLOPE: f64 = 0.01;
+        const EPS: f64 = 1e-5;
+        let one = |(head, f): (&Head, Tensor<3>)| {
+            let h1 = leaky_relu(head.norm1.forward(head.linear1.forward(f), EPS), SLOPE);
+            let h2 = leaky_relu(head.norm2.forward(head.linear2.forward(h1.clone()), EPS), SLOPE);
+            head.score.forward(h1 + h2)
+        };
+        self.heads.iter().zip(features).map(one).collect()
+    }
+}

@@ -1,0 +1,36 @@
+//! Sinusoids of timesteps and guidance scales. Source: diffusers' `Timesteps` (cosines first) as MLD configures it, and the LCM
+//! script's guidance embedding (sines first, other denominator, argument times 1000).
+//!
+//! Both run in f32 from the frequencies on, as the originals do: with arguments up to 15,000 the rounding is part of what a
+//! network was trained with.
+
+use burn::tensor::{Device, Tensor, TensorData};
+
+/// [B, width]: `[cos(t f) | sin(t f)]` with `f_i = 10000^(-i / (width / 2))`.
+pub fn time_sinusoid(timesteps: &[usize], width: usize, device: &Device) -> Tensor<2> {
+    let half = width / 2;
+    #[expect(clippy::cast_precision_loss, clippy::cast_possible_truncation, reason = "f32 by definition")]
+    let frequencies: Vec<f32> = (0..half).map(|i| ((-(10_000_f64.ln()) as f32) * i as f32 / half as f32).exp()).collect();
+    #[expect(clippy::cast_precision_loss, reason = "timesteps are below 1000")]
+    let rows = timesteps.iter().flat_map(|t| {
+        let angles = frequencies.iter().map(|f| *t as f32 * f).collect::<Vec<_>>();
+        let cosines: Vec<f32> = angles.iter().map(|a| a.cos()).collect();
+        cosines.into_iter().chain(angles.into_iter().map(f32::sin)).collect::<Vec<_>>()
+    });
+    Tensor::from_data(TensorData::new(rows.collect(), [timesteps.len(), 2 * half]), device)
+}
+
+/// [B, width]: `[sin(1000 w f) | cos(1000 w f)]` with `f_i = 10000^(-i / (width / 2 - 1))`.
+pub fn guidance_embedding(guidance: &[f32], width: usize, device: &Device) -> Tensor<2> {
+    let half = width / 2;
+    #[expect(clippy::cast_precision_loss, clippy::cast_possible_truncation, reason = "f32 by definition")]
+    let step = (10_000_f64.ln() / (half as f64 - 1.0)) as f32;
+    #[expect(clippy::cast_precision_loss, reason = "widths are small")]
+    let frequencies: Vec<f32> = (0..half).map(|i| (i as f32 * -step).exp()).collect();
+    let rows = guidance.iter().flat_map(|w| {
+        let angles: Vec<f32> = frequencies.iter().map(|f| w * 1000.0 * f).collect();
+        let sines: Vec<f32> = angles.iter().map(|a| a.sin()).collect();
+        sines.into_iter().chain(angles.into_iter().map(f32::cos)).collect::<Vec<_>>()
+    });
+    Tensor::from_data(TensorData::new(rows.collect(), [guidance.len(), 2 * half]), device)
+}

@@ -1,0 +1,83 @@
+//! First values of parameters, drawn on the host from a keyed stream in declaration order: never from a backend's global
+//! generator, whose state cannot be saved and differs between backends.
+
+use burn::module::Param;
+use burn::tensor::{Device, Tensor, TensorData};
+use motion::random::Stream;
+use protocol::Seed;
+use protocol::stage::Positions;
+
+/// Draws parameters.
+#[derive(Debug)]
+pub struct Init<'a> {
+    stream: Stream,
+    device: &'a Device,
+    positions: Positions,
+}
+
+impl<'a> Init<'a> {
+    /// All parameters of one network of one stage. `purpose` keeps two networks of one stage apart.
+    pub fn new(seed: Seed, purpose: &str, positions: Positions, device: &'a Device) -> Self {
+        Self { stream: Stream::new(seed, purpose, 0, 0), device, positions }
+    }
+
+    /// Where parameters are made.
+    pub fn device(&self) -> &Device {
+        self.device
+    }
+
+    fn param<const D: usize>(&self, values: Vec<f32>, shape: [usize; D]) -> Param<Tensor<D>> {
+        Param::from_tensor(Tensor::from_data(TensorData::new(values, shape), self.device))
+    }
+
+    fn draw<const D: usize>(&mut self, low: f64, high: f64, shape: [usize; D]) -> Param<Tensor<D>> {
+        let count = shape.iter().product();
+        #[expect(clippy::cast_possible_truncation, reason = "parameters are f32")]
+        let values = (0..count).map(|_| self.stream.range(low, high) as f32).collect();
+        self.param(values, shape)
+    }
+
+    /// Every element `value`.
+    pub fn constant<const D: usize>(&self, value: f32, shape: [usize; D]) -> Param<Tensor<D>> {
+        self.param(vec![value; shape.iter().product()], shape)
+    }
+
+    /// Uniform within `±sqrt(6 / (fan_in + fan_out))` of an [out, in] matrix (Glorot and Bengio, 2010).
+    #[expect(clippy::cast_precision_loss, reason = "widths are small")]
+    pub fn xavier(&mut self, out: usize, inner: usize) -> Param<Tensor<2>> {
+        let bound = (6.0 / (inner + out) as f64).sqrt();
+        self.draw(-bound, bound, [out, inner])
+    }
+
+    /// Uniform within `±1 / sqrt(fan_in)`: PyTorch's default for a Linear's weight and bias.
+    #[expect(clippy::cast_precision_loss, reason = "widths are small")]
+    pub fn fan_in<const D: usize>(&mut self, inner: usize, shape: [usize; D]) -> Param<Tensor<D>> {
+        let bound = 1.0 / (inner as f64).sqrt();
+        self.draw(-bound, bound, shape)
+    }
+
+    /// Standard normal.
+    pub fn normal<const D: usize>(&mut self, shape: [usize; D]) -> Param<Tensor<D>> {
+        let mut values = vec![0.0; shape.iter().product()];
+        self.stream.fill_normal(&mut values);
+        self.param(values, shape)
+    }
+
+    /// A position table [rows, 1, width]: uniform on [0, 1) as published, or sinusoids.
+    pub fn positions(&mut self, rows: usize, width: usize) -> Param<Tensor<3>> {
+        match self.positions {
+            Positions::Uniform => self.draw(0.0, 1.0, [rows, 1, width]),
+            Positions::Sinusoid => {
+                #[expect(clippy::cast_precision_loss, clippy::cast_possible_truncation, reason = "small tables of f32")]
+                let value = |row: usize, column: usize| {
+                    let half = width / 2;
+                    let frequency = 10_000_f64.powf(-((column % half.max(1)) as f64) / half.max(1) as f64);
+                    let angle = row as f64 * frequency;
+                    (if column < half { angle.sin() } else { angle.cos() }) as f32
+                };
+                let values = (0..rows).flat_map(|r| (0..width).map(move |c| value(r, c))).collect();
+                self.param(values, [rows, 1, width])
+            }
+        }
+    }
+}
