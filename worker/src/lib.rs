@@ -22,6 +22,8 @@ pub mod process;
 mod retry;
 mod spool;
 mod stage_thread;
+#[cfg(test)]
+mod tests;
 
 pub use cli::JoinArgs;
 pub use join::{JoinError, Options, init_logging, join};

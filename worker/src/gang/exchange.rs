@@ -161,7 +161,7 @@ pub(crate) fn exchange(mesh: &Mesh, bring: &Bring<'_>, interrupt: Interrupt<'_>)
     // Reduce-scatter, their half: our chunk of their nodes.
     let mut wind_down = bring.wind_down;
     let mut durable = if own == 0 { bring.durable } else { 0 };
-    let mut theirs: Vec<(usize, Vec<(Node, Vec<f32>)>)> = Vec::new();
+    let mut theirs: Vec<(Node, Vec<f32>)> = Vec::new();
     for peer in mesh.others() {
         let begin = expect(mesh.next(peer, &barrier, interrupt)?, Kind::Begin, mesh, peer)?;
         if begin.step != bring.step || begin.a != number(bring.slices) {
@@ -185,7 +185,6 @@ pub(crate) fn exchange(mesh: &Mesh, bring: &Bring<'_>, interrupt: Interrupt<'_>)
             return Err(disagree(peer, format!("has a buffer of {at} numbers, not {length}")));
         }
         let chunk = tree::share(length, own, size);
-        let mut sums = Vec::with_capacity(nodes.len());
         for (n, node) in nodes.into_iter().enumerate() {
             let mut numbers = Vec::with_capacity(chunk.len());
             for (p, range) in pieces(&chunk).enumerate() {
@@ -196,9 +195,8 @@ pub(crate) fn exchange(mesh: &Mesh, bring: &Bring<'_>, interrupt: Interrupt<'_>)
                 };
                 if numbers.is_empty() && range.len() == chunk.len() { numbers = part } else { numbers.extend(part) }
             }
-            sums.push((node, numbers));
+            theirs.push((node, numbers));
         }
-        theirs.push((peer, sums));
     }
     let length = length.ok_or_else(|| Halt::Disagree(format!("{barrier}: no member has a slice")))?;
 
@@ -206,7 +204,7 @@ pub(crate) fn exchange(mesh: &Mesh, bring: &Bring<'_>, interrupt: Interrupt<'_>)
     let chunk = tree::share(length, own, size);
     let mut known: Vec<(Node, &[f32])> =
         bring.parts.iter().map(|(slice, part)| (slice.clone(), &part[chunk.clone()])).collect();
-    known.extend(theirs.iter().flat_map(|(_, sums)| sums).map(|(node, sum)| (node.clone(), sum.as_slice())));
+    known.extend(theirs.iter().map(|(node, sum)| (node.clone(), sum.as_slice())));
     known.sort_by_key(|(node, _)| node.start);
     let mut sum = vec![0.0; length];
     tree::sum(&root, &known, &mut sum[chunk.clone()]);

@@ -102,7 +102,7 @@ mod tests {
 
     #[test]
     fn nodes_are_the_largest_aligned_ones() {
-        assert_eq!(cover(8, &(0..8)), [0..8]);
+        assert_eq!(cover(8, &(0..8)), vec![0..8; 1]);
         assert_eq!(cover(8, &(3..8)), [3..4, 4..8]);
         assert_eq!(cover(7, &(2..7)), [2..4, 4..7]);
         assert!(cover(5, &(5..5)).is_empty());

@@ -1,0 +1,509 @@
+//! A worker against a coordinator of a few lines that can be told to misbehave.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use axum::Router;
+use axum::body::Bytes;
+use axum::extract::{Json, Path, State};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use axum::routing::{get, post, put};
+use burn::tensor::Device;
+use checkpoint::BlobError;
+use protocol::message::{
+    ApiError, Assignment, CommitCheckpoint, FailureClass, Grant, Join, Joined, LogBatch, Member, MetricBatch, Orders,
+    PROTOCOL_VERSION, Poll, ReportOutcome, Role, StageTask, TaskOutcome,
+};
+use protocol::stage::{Backend, CheckpointPolicy, DataSynthetic, StageSettings};
+use protocol::{
+    ArtifactKind, Attempt, Digest, Fence, Generation, Incarnation, Manifest, RunId, Seed, StageName, TaskId, WorkerId,
+};
+use stages::context::{AttemptContext, ContextError, Exchange, GangContext, Outcome, Part, StageError};
+use tokio::runtime::Runtime;
+
+use crate::bell::lock;
+use crate::cache::{Bounds, Cache};
+use crate::client::Client;
+use crate::gang::endpoint::Endpoint;
+use crate::gang::mesh::Timing;
+use crate::orders::{self, End, Shared};
+use crate::stage_thread::{self, Bench, Kinds};
+
+type Metrics = BTreeMap<(u64, String), f64>;
+
+#[derive(Debug, Default)]
+struct Desk {
+    assignments: Vec<Assignment>,
+    version: u64,
+    leave: bool,
+    joins: u64,
+    forget: bool,
+    polls: u64,
+    last_poll: Option<Poll>,
+    blobs: HashMap<Digest, Vec<u8>>,
+    metrics: Metrics,
+    logs: BTreeMap<u64, String>,
+    checkpoints: Vec<CommitCheckpoint>,
+    outcomes: Vec<ReportOutcome>,
+    /// The fence that the store has; writes with another are refused.
+    fence: u64,
+    calls: u64,
+}
+
+/// The coordinator.
+#[derive(Debug, Default)]
+struct Fake {
+    desk: Mutex<Desk>,
+    /// Answers 503 to everything.
+    away: AtomicBool,
+    /// Every third write is done, and then its answer is lost.
+    lossy: AtomicBool,
+    /// The next so many downloads arrive with a flipped bit.
+    damage: AtomicU64,
+}
+
+fn refuse(status: StatusCode, code: &str) -> Response {
+    (status, Json(ApiError { code: code.to_owned(), message: format!("refused: {code}"), hint: None })).into_response()
+}
+
+impl Fake {
+    fn orders(&self, change: impl FnOnce(&mut Desk)) {
+        let mut desk = lock(&self.desk);
+        change(&mut desk);
+        desk.version += 1;
+    }
+
+    /// A write: checked, done, and answered unless the answer is to be lost.
+    fn write(&self, grant: &Grant, work: impl FnOnce(&mut Desk)) -> Response {
+        if self.away.load(Ordering::SeqCst) {
+            return refuse(StatusCode::SERVICE_UNAVAILABLE, "internal");
+        }
+        let mut desk = lock(&self.desk);
+        if grant.fence.0 != desk.fence {
+            return refuse(StatusCode::CONFLICT, "stale-fence");
+        }
+        work(&mut desk);
+        desk.calls += 1;
+        if self.lossy.load(Ordering::SeqCst) && desk.calls.is_multiple_of(3) {
+            return refuse(StatusCode::BAD_GATEWAY, "internal");
+        }
+        Json(()).into_response()
+    }
+}
+
+async fn join(State(fake): State<Arc<Fake>>, Json(join): Json<Join>) -> Response {
+    assert_eq!(join.protocol, PROTOCOL_VERSION);
+    let mut desk = lock(&fake.desk);
+    desk.joins += 1;
+    Json(Joined { incarnation: Incarnation(desk.joins), lease_ms: 1000, poll_ms: 100 }).into_response()
+}
+
+async fn poll(State(fake): State<Arc<Fake>>, Path(worker): Path<String>, Json(poll): Json<Poll>) -> Response {
+    assert_eq!(worker, "w0");
+    if fake.away.load(Ordering::SeqCst) {
+        return refuse(StatusCode::SERVICE_UNAVAILABLE, "internal");
+    }
+    let version = poll.version;
+    {
+        let mut desk = lock(&fake.desk);
+        if std::mem::take(&mut desk.forget) {
+            return refuse(StatusCode::NOT_FOUND, "not-found");
+        }
+        desk.polls += 1;
+        desk.last_poll = Some(poll);
+    }
+    for _ in 0..20 {
+        if lock(&fake.desk).version != version {
+            break;
+        }
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    let desk = lock(&fake.desk);
+    Json(Orders { version: desk.version, assignments: desk.assignments.clone(), leave: desk.leave }).into_response()
+}
+
+async fn metrics(State(fake): State<Arc<Fake>>, Json(batch): Json<MetricBatch>) -> Response {
+    fake.write(&batch.grant, |desk| {
+        for row in batch.rows {
+            let before = desk.metrics.insert((row.step, row.key.clone()), row.value);
+            assert!(before.is_none_or(|v| v == row.value), "a row changed its value");
+        }
+    })
+}
+
+async fn logs(State(fake): State<Arc<Fake>>, Json(batch): Json<LogBatch>) -> Response {
+    fake.write(&batch.grant, |desk| {
+        for (i, line) in batch.lines.into_iter().enumerate() {
+            desk.logs.insert(batch.first + i as u64, line);
+        }
+    })
+}
+
+async fn checkpoint(State(fake): State<Arc<Fake>>, Json(commit): Json<CommitCheckpoint>) -> Response {
+    fake.write(&commit.grant.clone(), |desk| {
+        assert!(desk.blobs.contains_key(&commit.manifest), "a manifest is uploaded before it is committed");
+        // What was recorded up to here must have arrived before.
+        assert!((1..=commit.step).all(|s| desk.metrics.contains_key(&(s, "loss".to_owned()))), "{:?}", desk.metrics);
+        desk.checkpoints.push(commit);
+    })
+}
+
+async fn outcome(State(fake): State<Arc<Fake>>, Json(report): Json<ReportOutcome>) -> Response {
+    fake.write(&report.grant.clone(), |desk| {
+        if !desk.outcomes.contains(&report) {
+            desk.assignments.retain(|a| a.grant.task != report.grant.task);
+            desk.version += 1;
+            desk.outcomes.push(report);
+        }
+    })
+}
+
+async fn put_blob(State(fake): State<Arc<Fake>>, headers: axum::http::HeaderMap, body: Bytes) -> Response {
+    let grant: Grant = serde_json::from_slice(headers["x-stride-grant"].as_bytes()).expect("a grant");
+    assert_eq!(headers["authorization"], "Bearer token");
+    let digest = Digest::of(&body);
+    let response = fake.write(&grant, |desk| drop(desk.blobs.insert(digest, body.to_vec())));
+    if response.status().is_success() {
+        Json(serde_json::json!({ "digest": digest })).into_response()
+    } else {
+        response
+    }
+}
+
+async fn get_blob(State(fake): State<Arc<Fake>>, Path(digest): Path<String>) -> Response {
+    if fake.away.load(Ordering::SeqCst) {
+        return refuse(StatusCode::SERVICE_UNAVAILABLE, "internal");
+    }
+    let digest: Digest = digest.parse().expect("a digest");
+    let Some(mut bytes) = lock(&fake.desk).blobs.get(&digest).cloned() else {
+        return refuse(StatusCode::NOT_FOUND, "not-found");
+    };
+    if fake.damage.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok() {
+        bytes[0] ^= 1;
+    }
+    bytes.into_response()
+}
+
+/// A stage of a test.
+type Script = Box<dyn Fn(&mut dyn GangContext) -> Result<Outcome, StageError> + Send + Sync>;
+
+struct Scripted(Script);
+
+impl Kinds for Scripted {
+    fn alone(&self, _context: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
+        panic!("these tests run gangs of one, which may ask for everything")
+    }
+
+    fn part(&self, _context: &mut dyn AttemptContext, _part: Part) -> Result<Outcome, StageError> {
+        panic!("these tests run gangs of one, which may ask for everything")
+    }
+
+    fn gang(&self, context: &mut dyn GangContext) -> Result<Outcome, StageError> {
+        (self.0)(context)
+    }
+}
+
+/// A worker on threads of this process.
+struct Worker {
+    fake: Arc<Fake>,
+    shared: Arc<Shared>,
+    member: Member,
+    stage: JoinHandle<()>,
+    poll: JoinHandle<End>,
+    _server: Runtime,
+}
+
+impl Worker {
+    fn start(script: Script) -> Self {
+        let fake: Arc<Fake> = Arc::default();
+        let server = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
+        let server = server.expect("a runtime");
+        let router = Router::new()
+            .route("/v1/workers", post(join))
+            .route("/v1/workers/{worker}/poll", post(poll))
+            .route("/v1/metrics", post(metrics))
+            .route("/v1/logs", post(logs))
+            .route("/v1/checkpoints", post(checkpoint))
+            .route("/v1/outcomes", post(outcome))
+            .route("/v1/blobs", put(put_blob))
+            .route("/v1/blobs/{digest}", get(get_blob))
+            .with_state(fake.clone());
+        let listener = server.block_on(tokio::net::TcpListener::bind("127.0.0.1:0")).expect("loopback");
+        let url = format!("http://{}", listener.local_addr().expect("bound"));
+        server.spawn(async move { axum::serve(listener, router).await });
+
+        let client = Client::new(&url, Some("token".to_owned()), server.handle().clone()).expect("a client");
+        let endpoint = Endpoint::open(([127, 0, 0, 1], 0).into(), Timing::default()).expect("loopback");
+        let peer_address = endpoint.address().to_string();
+        let member = Member { worker: "w0".into(), incarnation: Incarnation(1), peer_address: peer_address.clone() };
+        let shared = Shared::new(endpoint);
+        let cache = Arc::new(Cache::new(None, Bounds::default()).expect("memory"));
+        let bench =
+            Bench { kinds: Arc::new(Scripted(script)), client: client.clone(), cache, device: Device::default() };
+        let stage = {
+            let shared = shared.clone();
+            thread::spawn(move || stage_thread::run(&shared, &bench))
+        };
+        let offer =
+            Join { protocol: PROTOCOL_VERSION, worker: "w0".into(), pid: 1, backend: Backend::Flex, peer_address };
+        let poll = {
+            let (shared, handle) = (shared.clone(), server.handle().clone());
+            thread::spawn(move || {
+                let end = handle.block_on(orders::follow(&client, &offer, &shared));
+                shared.end("the worker leaves");
+                end
+            })
+        };
+        Self { fake, shared, member, stage, poll, _server: server }
+    }
+
+    /// Grants the task anew under the next fence.
+    fn grant(&self, attempt: u64) {
+        let member = self.member.clone();
+        self.fake.orders(|desk| {
+            desk.fence += 1;
+            desk.assignments = vec![assignment(&member, attempt, desk.fence)];
+        });
+    }
+
+    fn wait(&self, what: &str, mut holds: impl FnMut(&Desk) -> bool) {
+        let begun = Instant::now();
+        while !holds(&lock(&self.fake.desk)) {
+            assert!(begun.elapsed() < Duration::from_secs(30), "{what}: {:?}", lock(&self.fake.desk));
+            thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    /// Lets the worker go and returns all that the coordinator was told.
+    fn leave(self) -> Desk {
+        self.fake.orders(|desk| desk.leave = true);
+        assert_eq!(self.poll.join().expect("no panic"), End::Left);
+        self.stage.join().expect("no panic");
+        std::mem::take(&mut *lock(&self.fake.desk))
+    }
+}
+
+fn assignment(member: &Member, attempt: u64, fence: u64) -> Assignment {
+    Assignment {
+        grant: Grant {
+            task: TaskId::from("run/stage"),
+            attempt: Attempt(attempt),
+            fence: Fence(fence),
+            worker: WorkerId::from("w0"),
+            incarnation: Incarnation(1),
+        },
+        stage: StageTask {
+            run: RunId::from("run"),
+            name: StageName::from("stage"),
+            settings: StageSettings::DataSynthetic(DataSynthetic::default()),
+            inputs: BTreeMap::new(),
+            seed: Seed(1),
+            checkpoint: CheckpointPolicy::default(),
+        },
+        role: Role::Member {
+            generation: Generation(fence),
+            members: vec![member.clone()],
+            secret: "secret".to_owned(),
+        },
+        resume: None,
+        wind_down: false,
+    }
+}
+
+fn finished(context: &mut dyn GangContext) -> Result<Outcome, StageError> {
+    let output = context.put_manifest(&Manifest::new(ArtifactKind::Report, serde_json::json!({"done": true})))?;
+    Ok(Outcome::Finished { output, metrics: BTreeMap::from([("loss".to_owned(), 0.5)]) })
+}
+
+/// Trains `steps` steps as a gang of whoever there is; a checkpoint every tenth.
+fn train(context: &mut dyn GangContext, steps: u64, pause: Duration) -> Result<Outcome, StageError> {
+    context.rendezvous(None, &mut Vec::new)?;
+    let mut step = 0;
+    while step < steps {
+        let parts: Vec<_> = context.share(2).map(|slice| (slice, vec![1.0])).collect();
+        match context.exchange(step, 2, &parts)? {
+            Exchange::Regroup => {
+                context.rendezvous(Some(step), &mut Vec::new)?;
+            }
+            Exchange::Sum { wind_down, .. } => {
+                step += 1;
+                context.record(step, &[("loss", 1.0 / step as f64), ("bad", f64::NAN)]);
+                context.progress(step, steps, "steps", &[]);
+                if step.is_multiple_of(10) || wind_down {
+                    context.log(&format!("saving at {step}"));
+                    let blob = context.blobs().put(step.to_le_bytes().to_vec()).expect("stored");
+                    let manifest = Manifest::new(ArtifactKind::Checkpoint, serde_json::json!({"blob": blob}));
+                    context.put_manifest(&manifest)?;
+                    context.commit_checkpoint(step, &manifest, &BTreeMap::new())?;
+                }
+                if wind_down {
+                    return Ok(Outcome::Yielded { at: step });
+                }
+                thread::sleep(pause);
+            }
+        }
+    }
+    finished(context)
+}
+
+#[test]
+fn everything_arrives_once_though_answers_are_lost() {
+    let worker = Worker::start(Box::new(|context| train(context, 100, Duration::ZERO)));
+    worker.fake.lossy.store(true, Ordering::SeqCst);
+    worker.grant(1);
+    worker.wait("an outcome", |desk| !desk.outcomes.is_empty());
+    let desk = worker.leave();
+    let steps: Vec<u64> = desk.metrics.keys().filter(|(_, key)| key == "loss").map(|(step, _)| *step).collect();
+    assert_eq!(steps, (1..=100).collect::<Vec<_>>());
+    assert_eq!(desk.metrics.len(), 100, "what is not a number is left out");
+    assert_eq!(
+        desk.logs.values().cloned().collect::<Vec<_>>(),
+        (1..=10).map(|i| format!("saving at {}", i * 10)).collect::<Vec<_>>()
+    );
+    assert!(matches!(desk.outcomes[..], [ReportOutcome { outcome: TaskOutcome::Finished { .. }, .. }]));
+    assert_eq!(desk.joins, 1);
+}
+
+#[test]
+fn a_coordinator_that_goes_away_and_forgets_is_waited_for() {
+    let worker = Worker::start(Box::new(|context| train(context, 200, Duration::from_millis(5))));
+    worker.grant(1);
+    worker.wait("some steps", |desk| desk.metrics.len() > 10);
+    worker.fake.away.store(true, Ordering::SeqCst);
+    thread::sleep(Duration::from_millis(2500));
+    worker.fake.away.store(false, Ordering::SeqCst);
+    worker.wait("an outcome", |desk| !desk.outcomes.is_empty());
+    lock(&worker.fake.desk).forget = true;
+    worker.wait("a second join", |desk| desk.joins == 2);
+    let desk = worker.leave();
+    assert_eq!(desk.metrics.len(), 200);
+    assert!(matches!(desk.outcomes[..], [ReportOutcome { outcome: TaskOutcome::Finished { .. }, .. }]));
+}
+
+#[test]
+fn work_that_is_taken_back_is_dropped_without_a_word() {
+    let worker = Worker::start(Box::new(|context| train(context, u64::MAX, Duration::from_millis(1))));
+    worker.grant(1);
+    worker.wait("some steps", |desk| desk.metrics.len() > 3);
+    worker.fake.orders(|desk| desk.assignments.clear());
+    worker.wait("nothing is done", |desk| desk.last_poll.as_ref().is_some_and(|poll| poll.doing.is_empty()));
+    let desk = worker.leave();
+    assert_eq!(desk.outcomes, []);
+}
+
+#[test]
+fn a_newer_generation_is_taken_on_by_the_same_attempt() {
+    let starts = Arc::new(AtomicU64::new(0));
+    let counted = starts.clone();
+    let worker = Worker::start(Box::new(move |context| {
+        counted.fetch_add(1, Ordering::SeqCst);
+        train(context, 150, Duration::from_millis(5))
+    }));
+    worker.grant(1);
+    worker.wait("some steps", |desk| desk.metrics.len() > 3);
+    // The fence moves first: writes under the old one are refused until the next orders say why.
+    worker.grant(1);
+    worker.wait("an outcome", |desk| !desk.outcomes.is_empty());
+    let desk = worker.leave();
+    assert_eq!(starts.load(Ordering::SeqCst), 1);
+    assert_eq!(desk.outcomes[0].grant.fence, Fence(2));
+    assert_eq!(desk.metrics.len(), 150);
+}
+
+#[test]
+fn another_attempt_begins_anew() {
+    let starts = Arc::new(AtomicU64::new(0));
+    let counted = starts.clone();
+    let worker = Worker::start(Box::new(move |context| {
+        let first = counted.fetch_add(1, Ordering::SeqCst) == 0;
+        train(context, if first { u64::MAX } else { 5 }, Duration::from_millis(1))
+    }));
+    worker.grant(1);
+    worker.wait("some steps", |desk| desk.metrics.len() > 3);
+    worker.grant(2);
+    worker.wait("an outcome", |desk| !desk.outcomes.is_empty());
+    let desk = worker.leave();
+    assert_eq!(starts.load(Ordering::SeqCst), 2);
+    assert_eq!((desk.outcomes.len(), desk.outcomes[0].grant.attempt), (1, Attempt(2)));
+}
+
+#[test]
+fn a_write_under_an_old_fence_ends_the_attempt_once_orders_say_so() {
+    let worker = Worker::start(Box::new(|context| train(context, u64::MAX, Duration::from_millis(1))));
+    worker.grant(1);
+    worker.wait("some steps", |desk| desk.metrics.len() > 3);
+    // Somebody else holds the task now: the store knows, this worker does not yet.
+    lock(&worker.fake.desk).fence = 9;
+    thread::sleep(Duration::from_millis(700));
+    let stored = lock(&worker.fake.desk).metrics.len();
+    worker.fake.orders(|desk| desk.assignments.clear());
+    let desk = worker.leave();
+    assert_eq!(desk.metrics.len(), stored, "nothing is written under an old fence");
+    assert_eq!(desk.outcomes, []);
+}
+
+#[test]
+fn a_panic_is_a_fault_with_its_place() {
+    stage_thread::log_panics();
+    let worker = Worker::start(Box::new(|context| {
+        context.log("about to fail");
+        panic!("the tensor {} is upside down", 3)
+    }));
+    worker.grant(1);
+    worker.wait("an outcome", |desk| !desk.outcomes.is_empty());
+    let desk = worker.leave();
+    let TaskOutcome::Failed { class, message } = &desk.outcomes[0].outcome else { panic!("{:?}", desk.outcomes) };
+    assert_eq!(*class, FailureClass::Fault);
+    assert!(message.contains("tests.rs") && message.ends_with("the tensor 3 is upside down"), "{message}");
+    assert_eq!(desk.logs.values().collect::<Vec<_>>(), ["about to fail"]);
+}
+
+#[test]
+fn leaving_saves_and_yields() {
+    let worker = Worker::start(Box::new(|context| train(context, u64::MAX, Duration::from_millis(1))));
+    worker.grant(1);
+    worker.wait("some steps", |desk| desk.metrics.len() > 3);
+    worker.shared.leave();
+    let (poll, stage, fake) = (worker.poll, worker.stage, worker.fake);
+    assert_eq!(poll.join().expect("no panic"), End::Left);
+    stage.join().expect("no panic");
+    let desk = lock(&fake.desk);
+    let TaskOutcome::Yielded { at } = desk.outcomes[0].outcome else { panic!("{:?}", desk.outcomes) };
+    assert_eq!(desk.checkpoints.last().map(|c| c.step), Some(at));
+}
+
+#[test]
+fn blobs_are_verified() {
+    let (good, absent) = (Digest::of(b"good"), Digest::of(b"absent"));
+    let worker = Worker::start(Box::new(move |context| {
+        let blobs = context.blobs();
+        assert_eq!(&*blobs.get(good).expect("a damaged download is repeated"), b"good");
+        assert!(matches!(blobs.get(absent), Err(BlobError::NotFound(d)) if d == absent));
+        assert!(matches!(context.manifest(good), Err(ContextError::Corrupt(_))), "not a manifest");
+        finished(context)
+    }));
+    lock(&worker.fake.desk).blobs.insert(good, b"good".to_vec());
+    worker.fake.damage.store(2, Ordering::SeqCst);
+    worker.grant(1);
+    worker.wait("an outcome", |desk| !desk.outcomes.is_empty());
+    let desk = worker.leave();
+    assert!(matches!(desk.outcomes[0].outcome, TaskOutcome::Finished { .. }), "{:?}", desk.outcomes);
+}
+
+#[test]
+fn a_blob_that_stays_damaged_is_an_error() {
+    let good = Digest::of(b"good");
+    let worker = Worker::start(Box::new(move |context| {
+        assert!(matches!(context.blobs().get(good), Err(BlobError::Corrupt { expected, .. }) if expected == good));
+        finished(context)
+    }));
+    lock(&worker.fake.desk).blobs.insert(good, b"good".to_vec());
+    worker.fake.damage.store(100, Ordering::SeqCst);
+    worker.grant(1);
+    worker.wait("an outcome", |desk| !desk.outcomes.is_empty());
+    assert!(matches!(worker.leave().outcomes[0].outcome, TaskOutcome::Finished { .. }));
+}
