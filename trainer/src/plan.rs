@@ -171,3 +171,50 @@ fn compare(before: &Value, after: &Value, path: &str, changes: &mut Vec<String>)
         _ => {}
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TEXT: &str = "name: p\ndataset: {format: synthetic}\nstages:\n  vae: {kind: train.vae}\n";
+
+    fn pipeline(sets: &[&str]) -> Pipeline {
+        let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
+        protocol::pipeline::read("p.yaml", TEXT, &sets).unwrap_or_else(|mistakes| panic!("{mistakes}"))
+    }
+
+    fn row(pipeline: &Pipeline) -> RunRow {
+        RunRow {
+            run: "p-1".into(),
+            pipeline: serde_json::to_value(pipeline).unwrap(),
+            source: String::new(),
+            state: "finished".into(),
+            idempotency_key: None,
+            created_ms: 0,
+            updated_ms: 0,
+        }
+    }
+
+    #[test]
+    fn a_changed_setting_is_named() {
+        let before = pipeline(&["vae.lr=2e-4"]);
+        let earlier = [(row(&before), before)];
+        let why = |sets: &[&str]| {
+            let now = pipeline(sets);
+            difference(&now, now.stage(&"vae".into()).unwrap(), &earlier)
+        };
+        assert_eq!(why(&["vae.lr=1e-4"]), "changed: lr 0.0002 -> 0.0001");
+        assert_eq!(why(&["vae.network.width=64", "seed=3"]), "changed: seed 0 -> 3, network.width 256 -> 64");
+        assert_eq!(why(&[]), "not finished before");
+        let other = pipeline(&["name=q"]);
+        assert_eq!(difference(&other, other.stage(&"vae".into()).unwrap(), &earlier), "never run");
+    }
+
+    #[tokio::test]
+    async fn without_a_store_everything_runs() {
+        let plan = plan(&pipeline(&[]), None).await.unwrap_or_else(|problem| panic!("{problem:?}"));
+        let shown: Vec<(&str, &str)> = plan.stages.iter().map(|step| (step.stage.as_str(), &*step.why)).collect();
+        assert_eq!(shown, [("dataset", "never run"), ("vae", "upstream `dataset` runs")]);
+        assert!(plan.stages[0].key.is_some() && plan.stages[1].key.is_none());
+    }
+}

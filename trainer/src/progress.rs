@@ -181,3 +181,51 @@ pub(crate) fn values(stage: &StageView, count: usize) -> String {
     let shown = loss.chain(others).take(count).map(|(key, value)| format!("{key} {}", print::number(*value)));
     shown.collect::<Vec<_>>().join("  ")
 }
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use protocol::message::Progress as Done;
+
+    use super::*;
+
+    fn stage(state: StageState, done: u64) -> StageView {
+        StageView {
+            name: "vae".into(),
+            kind: "train.vae".into(),
+            state,
+            key: None,
+            outputs: BTreeMap::new(),
+            metrics: BTreeMap::from([("grad_norm".to_owned(), 0.5), ("loss".to_owned(), 0.25)]),
+            progress: Done { done, total: 100, unit: "steps".into(), metrics: BTreeMap::new() },
+            wall_s: 12.0,
+            attempt: protocol::Attempt(1),
+            workers: vec!["w1".into(), "w2".into()],
+            message: None,
+        }
+    }
+
+    fn shown(state: StageState) -> Shown {
+        Shown { state, message: None, bar: None, from: None, line_at: Instant::now(), done: 0 }
+    }
+
+    #[test]
+    fn changes_are_told_once() {
+        let waiting = shown(StageState::Waiting);
+        let line = |state, done| change(&stage(state, done), &waiting);
+        assert_eq!(line(StageState::Running, 0).unwrap(), "           vae  started on w1, w2");
+        assert_eq!(line(StageState::Running, 40).unwrap(), "           vae  goes on at 40 of 100 steps");
+        assert_eq!(line(StageState::Ran, 100).unwrap(), "           vae  done in 12 s  loss 0.2500  grad_norm 0.5000");
+        assert_eq!(line(StageState::Waiting, 0), None);
+        assert_eq!(change(&stage(StageState::Running, 50), &shown(StageState::Running)), None);
+    }
+
+    #[test]
+    fn the_rate_is_that_of_the_present_stretch() {
+        let now = Instant::now();
+        let since = now.checked_sub(Duration::from_secs(10)).unwrap();
+        let line = working(&stage(StageState::Running, 60), Some((40, since)), now);
+        assert_eq!(line, "           vae  60/100 steps  2.000 steps/s, 20 s left  loss 0.2500  grad_norm 0.5000");
+    }
+}

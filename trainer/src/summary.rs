@@ -131,3 +131,65 @@ pub(crate) fn promoted(pipeline: &Pipeline, run: &RunView) -> Option<(String, us
         Some((format!("{}@{pick}", settings.model), steps.unwrap_or(1)))
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use protocol::message::Progress;
+
+    use super::*;
+
+    fn view(states: &[(&str, &str, StageState)]) -> RunView {
+        let stage = |(name, kind, state): &(&str, &str, StageState)| StageView {
+            name: (*name).into(),
+            kind: (*kind).into(),
+            state: *state,
+            key: Some(Digest::of(b"key")),
+            outputs: BTreeMap::from([("x".to_owned(), Digest::of(b"x"))]),
+            metrics: BTreeMap::from([("latent_fid".to_owned(), 0.25), ("a".to_owned(), 1.0)]),
+            progress: Progress::default(),
+            wall_s: 2.0,
+            attempt: protocol::Attempt(1),
+            workers: vec![],
+            message: None,
+        };
+        RunView {
+            run: "p-1".into(),
+            pipeline: "p".into(),
+            state: RunState::Finished,
+            stages: states.iter().map(stage).collect(),
+        }
+    }
+
+    #[test]
+    fn programs_get_what_was_promised() {
+        let view = view(&[("vae", "train.vae", StageState::Ran), ("mld", "train.mld", StageState::Cached)]);
+        let json = serde_json::to_value(Summary::of(&view, false)).unwrap();
+        assert_eq!((&json["run"], &json["state"]), (&"p-1".into(), &"finished".into()));
+        let stage = &json["stages"][0];
+        assert_eq!(
+            (&stage["name"], &stage["kind"], &stage["state"]),
+            (&"vae".into(), &"train.vae".into(), &"ran".into())
+        );
+        assert_eq!(stage["outputs"]["x"], Digest::of(b"x").to_string());
+        assert_eq!(stage["metrics"]["latent_fid"], 0.25);
+        assert_eq!(json["stages"][1]["state"], "cached");
+    }
+
+    #[test]
+    fn people_get_a_line_a_stage() {
+        let table = table(&view(&[("fid", "evaluate.latent_fid", StageState::Resumed)]));
+        let lines: Vec<&str> = table.lines().collect();
+        assert!(lines[0].starts_with("STAGE") && lines[1].starts_with("fid"), "{table}");
+        assert!(lines[1].contains("resumed") && lines[1].contains("latent_fid 0.2500"), "{table}");
+    }
+
+    #[test]
+    fn the_promoted_model_is_offered_once_it_is_there() {
+        let text = "name: p\ndataset: {format: synthetic}\nstages:\n  vae: {kind: train.vae}\n  latents: {kind: encode.latents}\n  mld: {kind: train.mld}\n  pcm: {kind: distill.pcm, phases: 2}\n  fid: {kind: evaluate.latent_fid, model: pcm, sampler: {steps: 2}}\n  out: {kind: register, model: m, from: pcm, promote: {to: staging}}\n";
+        let pipeline = protocol::pipeline::read("p.yaml", text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"));
+        let ready = view(&[("out", "register", StageState::Ran)]);
+        assert_eq!(promoted(&pipeline, &ready), Some(("m@staging".to_owned(), 2)));
+        let failed = view(&[("out", "register", StageState::Failed)]);
+        assert_eq!(promoted(&pipeline, &failed), None);
+    }
+}
