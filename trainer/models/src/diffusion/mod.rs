@@ -1,0 +1,54 @@
+//! The noise schedule, what moves a latent along it, and the three samplers.
+//!
+//! Every rule here is affine in the latent and the predicted noise, so each module gives plain coefficients, one pair
+//! per sample, and [`affine`] applies them. Coefficients are computed in f64 from the f32 table that the published
+//! models were trained with (see [`Schedule`]).
+//!
+//! Notation: `ab_t` cumulative alpha, `alpha_t = sqrt(ab_t)`, `sigma_t = sqrt(1 - ab_t)`; timesteps are integers
+//! 0..=999. Latents are [B, N, d]. Nothing here draws random numbers: noise is an argument.
+//!
+//! Not its job: networks, losses, what the timestep and the guidance scale of a training example are.
+
+pub mod consistency;
+pub mod ddim;
+pub mod pcm;
+mod schedule;
+
+pub use consistency::{Grid, LcmTimesteps, boundary, consistency, lcm_sample, lcm_timesteps};
+pub use ddim::{ddim_sample, ddim_timesteps};
+pub use pcm::{Phases, pcm_sample};
+pub use schedule::{Schedule, TIMESTEPS};
+
+use burn::tensor::{Tensor, TensorData};
+
+/// A column [B, 1, 1] of per-sample factors, on the device of `like`.
+pub fn column(values: &[f32], like: &Tensor<3>) -> Tensor<3> {
+    Tensor::from_data(TensorData::new(values.to_vec(), [values.len(), 1, 1]), &like.device())
+}
+
+/// `a_b z_b + e_b eps_b` for every sample b; `z`, `eps` [B, N, d], `a`, `e` [B].
+pub fn affine(z: Tensor<3>, eps: Tensor<3>, a: &[f32], e: &[f32]) -> Tensor<3> {
+    let (a, e) = (column(a, &z), column(e, &z));
+    z * a + eps * e
+}
+
+/// The same with one pair for the whole batch.
+pub fn affine_one(z: Tensor<3>, eps: Tensor<3>, (a, e): (f64, f64)) -> Tensor<3> {
+    z * (a as f32) + eps * (e as f32)
+}
+
+/// Classifier-free guidance as samplers write it: `uncond + g (cond - uncond)`.
+pub fn guided(cond: Tensor<3>, uncond: Tensor<3>, g: f64) -> Tensor<3> {
+    uncond.clone() + (cond - uncond) * (g as f32)
+}
+
+/// Classifier-free guidance as distillation writes it, one scale per sample: `cond + w (cond - uncond)`, so `w = g - 1`.
+pub fn guided_by(cond: Tensor<3>, uncond: Tensor<3>, w: &[f32]) -> Tensor<3> {
+    let w = column(w, &cond);
+    cond.clone() + (cond - uncond) * w
+}
+
+/// Splits per-sample pairs into the two f32 lists that [`affine`] takes.
+pub fn unzip(pairs: impl IntoIterator<Item = (f64, f64)>) -> (Vec<f32>, Vec<f32>) {
+    pairs.into_iter().map(|(a, e)| (a as f32, e as f32)).unzip()
+}
