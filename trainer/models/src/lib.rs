@@ -5,5 +5,6 @@
 pub mod diffusion;
 pub mod flat;
 pub mod kernels;
+pub mod losses;
 pub mod names;
 pub mod networks;

@@ -116,7 +116,7 @@ fn numbers(dtype: Dtype, data: &[u8], name: &str) -> Vec<f64> {
 }
 
 pub fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.into_data().into_vec::<f32>().expect("f32")
+    tensor.into_data().as_slice::<f32>().expect("f32").to_vec()
 }
 
 /// Largest absolute difference over the largest absolute expected value.

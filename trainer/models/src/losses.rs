@@ -1,0 +1,342 @@
+//! The training losses, in a form that adds up over slices of a batch.
+//!
+//! Every function returns the *sum over the examples* of per-example means, shape [1]: whoever adds the slices divides
+//! by the global batch, and gets the mean over the batch however it was cut.
+//!
+//! Source: MLD and MotionLCM (VAE terms, noise loss), Luo et al. (pseudo-Huber), Lim and Ye, arXiv:1705.02894 (hinge).
+//! Departs: MotionLCM divides the joint term of KIT-ML like HumanML3D's although its unit is not the metre; here
+//! [`Body::metres_per_unit`] says what one unit is.
+//!
+//! Not its job: dividing by the batch, which network the arguments come from.
+
+use burn::tensor::activation::relu;
+use burn::tensor::{Device, Tensor, TensorData};
+use motion::skeleton::Skeleton;
+use protocol::stage::VaeLoss;
+
+use crate::networks::Posterior;
+
+/// Mean squared error of each example, summed. [B, N, d].
+pub fn mse(found: Tensor<3>, expected: Tensor<3>) -> Tensor<1> {
+    per_example((found - expected).square())
+}
+
+/// `sqrt((found - expected)^2 + c^2) - c`, mean of each example, summed. [B, N, d]. For differences well below `c` it
+/// is squared error over 2c, well above it absolute error.
+pub fn pseudo_huber(found: Tensor<3>, expected: Tensor<3>, c: f64) -> Tensor<1> {
+    let c = c as f32;
+    per_example(((found - expected).square() + c * c).sqrt() - c)
+}
+
+/// Divergence from the standard normal, mean of each example, summed.
+pub fn kl(posterior: &Posterior) -> Tensor<1> {
+    let (mu, logvar) = (posterior.mu_bnd.clone(), posterior.logvar_bnd.clone());
+    per_example((mu.square() + logvar.clone().exp() - 1.0 - logvar) * 0.5)
+}
+
+/// Hinge loss of a discriminator: scores of data above 1, of fakes below -1. One tensor [B, N, 1] per head; the mean of
+/// each example over heads and tokens, summed.
+pub fn hinge_discriminator(real: Vec<Tensor<3>>, fake: Vec<Tensor<3>>) -> Tensor<1> {
+    let heads = real.len() as f32;
+    let terms = real.into_iter().zip(fake).map(|(real, fake)| per_example(relu(1.0 - real) + relu(fake + 1.0)));
+    total(terms) / heads
+}
+
+/// Hinge loss of what the discriminator judges: scores of fakes above 1. As [`hinge_discriminator`].
+pub fn hinge_generator(fake: Vec<Tensor<3>>) -> Tensor<1> {
+    let heads = fake.len() as f32;
+    total(fake.into_iter().map(|fake| per_example(relu(1.0 - fake)))) / heads
+}
+
+/// # Panics
+/// If there are no terms: a discriminator has at least one head.
+fn total(terms: impl Iterator<Item = Tensor<1>>) -> Tensor<1> {
+    terms.reduce(|a, b| a + b).expect("a discriminator has heads")
+}
+
+fn per_example(elements: Tensor<3>) -> Tensor<1> {
+    let [_, tokens, width] = elements.dims();
+    elements.sum() / ((tokens * width) as f32)
+}
+
+/// How two numbers are compared.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Pointwise {
+    /// `d^2 / 2` up to 1, `|d| - 1/2` beyond.
+    SmoothL1,
+    /// `|d|`.
+    L1,
+    /// `d^2`.
+    L2,
+}
+
+impl Pointwise {
+    fn of(self, difference: Tensor<3>) -> Tensor<3> {
+        match self {
+            Self::SmoothL1 => {
+                let d = difference.abs();
+                let m = d.clone().clamp_max(1.0);
+                m.clone() * (d - m * 0.5)
+            }
+            Self::L1 => difference.abs(),
+            Self::L2 => difference.square(),
+        }
+    }
+}
+
+/// Which frames of a padded batch count, and for how much.
+#[derive(Debug, Clone)]
+pub struct FrameWeights {
+    /// [B, T, 1].
+    weights: Tensor<3>,
+}
+
+impl FrameWeights {
+    /// Of clip b the first `lengths[b]` frames, each with weight `1 / lengths[b]`.
+    pub fn masked(lengths: &[usize], frames: usize, device: &Device) -> Self {
+        Self::of(lengths, frames, device, |length, t| if t < length { 1.0 / length as f32 } else { 0.0 })
+    }
+
+    /// Every frame, padding too, with weight 1 / T (v1).
+    pub fn plain(lengths: &[usize], frames: usize, device: &Device) -> Self {
+        Self::of(lengths, frames, device, |_, _| 1.0 / frames as f32)
+    }
+
+    fn of(lengths: &[usize], frames: usize, device: &Device, weight: impl Fn(usize, usize) -> f32) -> Self {
+        let values = lengths.iter().flat_map(|l| (0..frames).map(|t| weight(*l, t)).collect::<Vec<_>>()).collect();
+        Self { weights: Tensor::from_data(TensorData::new(values, [lengths.len(), frames, 1]), device) }
+    }
+
+    /// Mean over the width, weighted mean over the frames, sum over the examples. [B, T, width].
+    pub fn compare(&self, distance: Pointwise, found: Tensor<3>, expected: Tensor<3>) -> Tensor<1> {
+        let width = found.dims()[2] as f32;
+        (distance.of(found - expected) * self.weights.clone()).sum() / width
+    }
+}
+
+/// What turns normalised features into joints.
+#[derive(Debug, Clone)]
+pub struct Body {
+    skeleton: &'static Skeleton,
+    /// What joints are multiplied by before they are compared; `Skeleton::metres_per_unit`, or 1 to keep the data's unit.
+    pub metres_per_unit: f64,
+    mean: Tensor<3>,
+    std: Tensor<3>,
+}
+
+impl Body {
+    /// `mean` and `std` [D] are the normalisation of the features.
+    ///
+    /// # Panics
+    /// If they are not as wide as the skeleton's feature rows.
+    pub fn new(skeleton: &'static Skeleton, mean: &[f32], std: &[f32], device: &Device) -> Self {
+        assert_eq!((mean.len(), std.len()), (skeleton.features, skeleton.features), "widths of mean and std");
+        let row = |v: &[f32]| Tensor::from_data(TensorData::new(v.to_vec(), [1, 1, v.len()]), device);
+        Self { skeleton, metres_per_unit: skeleton.metres_per_unit, mean: row(mean), std: row(std) }
+    }
+
+    /// Joints [B, T, J, 3] of normalised features [B, T, D], in the data's unit.
+    pub fn joints(&self, features: Tensor<3>) -> Tensor<4> {
+        joints(features * self.std.clone() + self.mean.clone(), self.skeleton)
+    }
+}
+
+/// Weights and distances of the VAE's loss.
+#[derive(Debug, Clone, PartialEq)]
+pub struct VaeRecipe {
+    /// The terms' weights, and whether padding is left out.
+    pub weights: VaeLoss,
+    /// Distance of the feature term.
+    pub feature: Pointwise,
+    /// Distance of the joint term.
+    pub joint: Pointwise,
+    /// Distance of the local position term.
+    pub velocity: Pointwise,
+}
+
+impl From<VaeLoss> for VaeRecipe {
+    /// Smooth L1 throughout, as published.
+    fn from(weights: VaeLoss) -> Self {
+        Self { weights, feature: Pointwise::SmoothL1, joint: Pointwise::SmoothL1, velocity: Pointwise::SmoothL1 }
+    }
+}
+
+/// The VAE's terms, each already multiplied by its weight; a term of weight 0 is absent.
+#[derive(Debug, Clone)]
+pub struct VaeTerms {
+    /// On normalised features.
+    pub feature: Option<Tensor<1>>,
+    /// On recovered joints.
+    pub joint: Option<Tensor<1>>,
+    /// On local positions, which upstream calls velocity.
+    pub velocity: Option<Tensor<1>>,
+    /// Divergence of the posterior.
+    pub kl: Option<Tensor<1>>,
+}
+
+impl VaeTerms {
+    /// The sum of the terms.
+    pub fn total(&self) -> Option<Tensor<1>> {
+        [&self.feature, &self.joint, &self.velocity, &self.kl].into_iter().flatten().cloned().reduce(|a, b| a + b)
+    }
+}
+
+/// The VAE's loss. `decoded` and `features` [B, T, D], normalised.
+pub fn vae(
+    recipe: &VaeRecipe,
+    body: &Body,
+    decoded: Tensor<3>,
+    features: Tensor<3>,
+    posterior: &Posterior,
+    lengths: &[usize],
+) -> VaeTerms {
+    let ([batch, frames, _], device) = (decoded.dims(), features.device());
+    let weights = &recipe.weights;
+    let frame_weights = if weights.masked {
+        FrameWeights::masked(lengths, frames, &device)
+    } else {
+        FrameWeights::plain(lengths, frames, &device)
+    };
+    let term = |weight: f64, value: &dyn Fn() -> Tensor<1>| (weight != 0.0).then(|| value() * (weight as f32));
+    let positions = body.skeleton.layout().positions;
+    let local = |x: &Tensor<3>| x.clone().slice([0..batch, 0..frames, positions.clone()]);
+    let flat = |x: &Tensor<3>| {
+        let joints = body.joints(x.clone()).reshape([batch, frames, 3 * body.skeleton.joints]);
+        joints * (body.metres_per_unit as f32)
+    };
+    VaeTerms {
+        feature: term(weights.feature, &|| frame_weights.compare(recipe.feature, decoded.clone(), features.clone())),
+        joint: term(weights.joint, &|| frame_weights.compare(recipe.joint, flat(&decoded), flat(&features))),
+        velocity: term(weights.velocity, &|| frame_weights.compare(recipe.velocity, local(&decoded), local(&features))),
+        kl: term(weights.kl, &|| kl(posterior)),
+    }
+}
+
+/// Global joints [B, T, J, 3] of features [B, T, D] that are not normalised; gradients flow through the running sums.
+///
+/// The differentiable twin of `motion::features::recover_joints`: the turn feature is half the yaw increment, so its
+/// running sum `a_t` (over rows before t) is the angle of the heading's quaternion and `2 a_t` the yaw; turn and velocity
+/// of the last row are not used.
+pub fn joints(features: Tensor<3>, skeleton: &Skeleton) -> Tensor<4> {
+    let [batch, frames, _] = features.dims();
+    let (device, others) = (features.device(), skeleton.joints - 1);
+    let columns = |range: std::ops::Range<usize>| features.clone().slice([0..batch, 0..frames, range]);
+    // Row t of what leads *to* frame t; nothing leads to the first.
+    let before = |x: Tensor<3>| {
+        let width = x.dims()[2];
+        let first = Tensor::zeros([batch, 1, width], &device);
+        if frames == 1 {
+            return first;
+        }
+        Tensor::cat(vec![first, x.slice([0..batch, 0..frames - 1, 0..width])], 1)
+    };
+    let yaw = before(columns(0..1)).cumsum(1) * 2.0;
+    let (sin, cos) = (yaw.clone().sin(), yaw.cos());
+
+    let (step_x, step_z) = (before(columns(1..2)), before(columns(2..3)));
+    let root_x = (cos.clone() * step_x.clone() - sin.clone() * step_z.clone()).cumsum(1);
+    let root_z = (sin.clone() * step_x + cos.clone() * step_z).cumsum(1);
+    let root = Tensor::cat(vec![root_x.clone(), columns(3..4), root_z.clone()], 2).reshape([batch, frames, 1, 3]);
+
+    let local = columns(skeleton.layout().positions).reshape([batch, frames, others, 3]);
+    let axis = |k: usize| local.clone().slice([0..batch, 0..frames, 0..others, k..k + 1]);
+    let wide = |x: Tensor<3>| x.reshape([batch, frames, 1, 1]);
+    let (x, z, sin, cos) = (axis(0), axis(2), wide(sin), wide(cos));
+    let turned_x = cos.clone() * x.clone() - sin.clone() * z.clone() + wide(root_x);
+    let turned_z = sin * x + cos * z + wide(root_z);
+    Tensor::cat(vec![root, Tensor::cat(vec![turned_x, axis(1), turned_z], 3)], 2)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use motion::features::recover_joints;
+    use protocol::stage::DataFormat;
+
+    /// Rows that turn, walk and wobble.
+    fn rows(skeleton: &Skeleton, frames: usize, seed: usize) -> Vec<f32> {
+        let value = |t: usize, k: usize| ((t * 7 + k * 13 + seed * 5) as f32 * 0.37).sin();
+        let scale = |k: usize| if k < 3 { 0.05 } else { 0.8 };
+        (0..frames).flat_map(|t| (0..skeleton.features).map(move |k| scale(k) * value(t, k))).collect()
+    }
+
+    #[test]
+    fn joints_are_those_of_the_data_code() {
+        for format in [DataFormat::Humanml3d, DataFormat::Kit] {
+            for frames in [1, 2, 60] {
+                let skeleton = Skeleton::of(format);
+                let clips: Vec<Vec<f32>> = (0..3).map(|seed| rows(skeleton, frames, seed)).collect();
+                let data = TensorData::new(clips.concat(), [3, frames, skeleton.features]);
+                let found = joints(Tensor::from_data(data, &Device::flex()), skeleton);
+                assert_eq!(found.dims(), [3, frames, skeleton.joints, 3]);
+                let expected: Vec<f32> = clips.iter().flat_map(|c| recover_joints(c, skeleton)).collect();
+                let data = found.into_data();
+                for (f, e) in data.as_slice::<f32>().unwrap().iter().zip(&expected) {
+                    assert!((f - e).abs() < 2e-5, "{format:?}, {frames} frames: {f} instead of {e}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn gradients_of_joints_agree_with_differences() {
+        let skeleton = Skeleton::of(DataFormat::Humanml3d);
+        let (frames, device) = (6, Device::flex());
+        let base = rows(skeleton, frames, 1);
+        let loss = |x: Tensor<3>| {
+            let found = joints(x, skeleton);
+            let n = found.shape().num_elements();
+            let weights: Vec<f32> = (0..n).map(|i| (i as f32 * 0.71).cos()).collect();
+            let weights = Tensor::<4>::from_data(TensorData::new(weights, found.dims()), &found.device());
+            (found * weights).sum()
+        };
+        let at = |values: &[f32], device: &Device| {
+            Tensor::<3>::from_data(TensorData::new(values.to_vec(), [1, frames, skeleton.features]), device)
+        };
+        let x = at(&base, &device.clone().autodiff()).require_grad();
+        let gradients = loss(x.clone()).backward();
+        let found = x.grad(&gradients).unwrap().into_data();
+        let found = found.as_slice::<f32>().unwrap();
+        let number = |x: Tensor<3>| loss(x).into_data().as_slice::<f32>().unwrap()[0];
+        for (t, k) in [(0, 0), (2, 0), (1, 1), (3, 2), (4, 3), (2, 10), (5, 40), (5, 0), (3, 200)] {
+            let (i, h) = (t * skeleton.features + k, 4e-3);
+            let mut moved = base.clone();
+            moved[i] += h;
+            let up = number(at(&moved, &device));
+            moved[i] -= 2.0 * h;
+            let slope = (up - number(at(&moved, &device))) / (2.0 * h);
+            assert!(
+                (slope - found[i]).abs() < 1e-2 * (1.0 + slope.abs()),
+                "row {t} feature {k}: {} and {slope}",
+                found[i]
+            );
+        }
+    }
+
+    #[test]
+    fn slices_add_up_to_the_batch() {
+        let device = Device::flex();
+        let make = |seed: usize| {
+            let values = (0..4 * 5 * 3).map(|i| ((i + seed) as f32 * 0.3).sin() * 2.0).collect::<Vec<_>>();
+            Tensor::<3>::from_data(TensorData::new(values, [4, 5, 3]), &device)
+        };
+        let part = |x: &Tensor<3>, r: std::ops::Range<usize>| x.clone().slice([r, 0..5, 0..3]);
+        let number = |x: Tensor<1>| x.into_data().as_slice::<f32>().unwrap()[0];
+        let (a, b, lengths) = (make(0), make(9), [5, 2, 3, 1]);
+        let masked = |r: std::ops::Range<usize>| {
+            let weights = FrameWeights::masked(&lengths[r.clone()], 5, &device);
+            number(weights.compare(Pointwise::SmoothL1, part(&a, r.clone()), part(&b, r)))
+        };
+        assert!((masked(0..4) - masked(0..1) - masked(1..4)).abs() < 1e-5);
+        let huber = |r: std::ops::Range<usize>| number(pseudo_huber(part(&a, r.clone()), part(&b, r), 0.5));
+        assert!((huber(0..4) - huber(0..3) - huber(3..4)).abs() < 1e-5);
+    }
+
+    #[test]
+    fn undecided_scores_cost_the_known_amounts() {
+        let zeros = || vec![Tensor::<3>::zeros([2, 3, 1], &Device::flex()); 4];
+        let number = |x: Tensor<1>| x.into_data().as_slice::<f32>().unwrap()[0] / 2.0;
+        assert_eq!(number(hinge_discriminator(zeros(), zeros())), 2.0);
+        assert_eq!(number(hinge_generator(zeros())), 1.0);
+    }
+}
