@@ -5,5 +5,7 @@
 pub mod artifacts;
 pub mod context;
 pub mod evaluation;
+pub mod generate;
 pub mod kinds;
+pub mod networks;
 pub mod testing;

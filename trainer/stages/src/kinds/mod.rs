@@ -1,10 +1,18 @@
 //! One file per stage kind, and the table that finds it.
 
 mod data;
+mod encode;
+mod latent_fid;
+mod reconstruction;
 pub mod text;
 
-use protocol::stage::StageSettings;
+use std::collections::BTreeMap;
 
+use protocol::ArtifactKind;
+use protocol::stage::StageSettings;
+use serde_json::{Value, json};
+
+use crate::artifacts;
 use crate::context::{AttemptContext, GangContext, Outcome, Part, StageError};
 
 /// Where a report's details are.
@@ -22,8 +30,21 @@ pub fn run_alone(cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
 
 /// Runs one shard of a map stage, or merges them.
 pub fn run_part(cx: &mut dyn AttemptContext, part: Part) -> Result<Outcome, StageError> {
-    let _ = part;
-    Err(misplaced(&cx.task().settings.clone(), "in shards"))
+    match (cx.task().settings.clone(), part) {
+        (StageSettings::EncodeLatents(settings), Part::Shard { index, of }) => encode::shard(cx, &settings, index, of),
+        (StageSettings::EncodeLatents(_), Part::Merge { shards }) => encode::merge(cx, &shards),
+        (StageSettings::EvaluateReconstruction(settings), Part::Shard { index, of }) => {
+            reconstruction::shard(cx, &settings, index, of)
+        }
+        (StageSettings::EvaluateReconstruction(_), Part::Merge { shards }) => reconstruction::merge(cx, &shards),
+        (StageSettings::EvaluateLatentFid(settings), Part::Shard { index, of }) => {
+            latent_fid::shard(cx, &settings, index, of)
+        }
+        (StageSettings::EvaluateLatentFid(settings), Part::Merge { shards }) => {
+            latent_fid::merge(cx, &settings, &shards)
+        }
+        (other, _) => Err(misplaced(&other, "in shards")),
+    }
 }
 
 /// Runs a training stage as a member of its gang.
@@ -33,4 +54,17 @@ pub fn run_gang(cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
 
 fn misplaced(settings: &StageSettings, how: &str) -> StageError {
     StageError::Fault(format!("stage kind `{}` does not run {how}", settings.kind()))
+}
+
+/// Uploads a report and ends the stage with its metrics.
+fn publish_report(
+    cx: &mut dyn AttemptContext,
+    metrics: BTreeMap<String, f64>,
+    details: Value,
+) -> Result<Outcome, StageError> {
+    let report = json!({"metrics": metrics, "details": details});
+    let meta = json!({"kind": cx.task().settings.kind(), "metrics": metrics});
+    let bytes = protocol::canonical::to_bytes(&report);
+    let output = artifacts::publish(cx, ArtifactKind::Report, meta, REPORT_FILE, bytes)?;
+    Ok(Outcome::Finished { output, metrics })
 }

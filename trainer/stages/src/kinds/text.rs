@@ -37,7 +37,8 @@ pub(super) fn run(cx: &mut dyn AttemptContext, settings: &TextEmbed) -> Result<O
     }
     let meta = EmbeddingsMeta { encoder: encoder.to_owned(), dim, captions: captions.len() };
     let tensors = Tensors::default().with("captions", [captions.len(), dim], rows).with("null", [dim], null);
-    let output = artifacts::publish(cx, ArtifactKind::Embeddings, to_meta(&meta), EMBEDDINGS_FILE, tensors.to_bytes()?)?;
+    let output =
+        artifacts::publish(cx, ArtifactKind::Embeddings, to_meta(&meta), EMBEDDINGS_FILE, tensors.to_bytes()?)?;
     let metrics = BTreeMap::from([("captions".to_owned(), captions.len() as f64)]);
     Ok(Outcome::Finished { output, metrics })
 }

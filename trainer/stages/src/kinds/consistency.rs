@@ -1,0 +1,220 @@
+//! What both distillations share: the student and its target, the frozen teacher, and one guided solver step between neighbouring
+//! grid points. Source: MotionLCM (arXiv:2404.19759), after Luo et al., arXiv:2310.04378.
+//!
+//! The student starts as the teacher plus a zero guidance projection; the target is the moving average of the student. Frozen networks
+//! run without dropout unless `upstream_dropout` asks for the original script's accident.
+
+use burn::tensor::{Device, Tensor};
+use models::diffusion::{Grid, Schedule, affine, guided_by, unzip};
+use models::flat::{self, Entry};
+use models::kernels::Dropout;
+use models::losses;
+use models::names;
+use models::networks::{Denoiser, Init, guidance_embedding};
+use protocol::stage::{Distance, Distillation, Positions};
+use protocol::{ArtifactKind, Seed};
+
+use super::latent_data::{LatentData, LatentSlice};
+use super::{optimizer, schedule};
+use crate::artifacts::{self, DenoiserMeta, Family, MODEL_FILE};
+use crate::context::{ContextError, GangContext, StageError};
+use crate::train::{GroupPlan, TrainState};
+
+/// Networks and data of a distillation.
+pub(super) struct Distiller {
+    pub(super) settings: Distillation,
+    pub(super) data: LatentData,
+    pub(super) teacher: Denoiser,
+    pub(super) teacher_meta: DenoiserMeta,
+    pub(super) student: Denoiser,
+    target: Denoiser,
+    pub(super) noise: Schedule,
+    pub(super) grid: Grid,
+    pub(super) device: Device,
+    seed: u64,
+}
+
+/// The teacher's move of one slice, and what it was made of.
+pub(super) struct SolverStep {
+    pub(super) batch: LatentSlice,
+    /// Grid index of each sample.
+    pub(super) index: Vec<usize>,
+    /// Timesteps that the student starts from.
+    pub(super) from: Vec<usize>,
+    /// Timesteps that the teacher's step lands on.
+    pub(super) to: Vec<usize>,
+    /// Noised latents [B, N, d].
+    pub(super) noisy_bnd: Tensor<3>,
+    /// The teacher's guided step from there [B, N, d].
+    pub(super) solved_bnd: Tensor<3>,
+    /// Guidance embeddings [B, g].
+    pub(super) guidance_bg: Tensor<2>,
+}
+
+impl Distiller {
+    /// Reads the inputs and builds the networks.
+    pub(super) fn read(cx: &dyn GangContext, settings: &Distillation) -> Result<Self, StageError> {
+        let data = LatentData::read(cx, &settings.training)?;
+        let blobs = cx.blobs();
+        let (_, manifest) = artifacts::input(cx, "teacher", ArtifactKind::Denoiser)?;
+        let teacher_meta: DenoiserMeta = artifacts::meta(&manifest, "the teacher")?;
+        let stage = &cx.task().name;
+        if teacher_meta.family != Family::Mld {
+            return Err(StageError::Input(format!("stage `{stage}`: `teacher` is a student; name a `train.mld` stage")));
+        }
+        if teacher_meta.vae != data.vae() {
+            return Err(StageError::Input(format!(
+                "stage `{stage}`: `latents` were made by another VAE than the teacher was trained on; name the teacher's latents"
+            )));
+        }
+        let device = cx.device();
+        let weights = artifacts::file(&*blobs, &manifest, MODEL_FILE)?;
+        let corrupt = |e: names::LoadError| StageError::Context(ContextError::Corrupt(format!("the teacher: {e}")));
+        let blank = |guidance: Option<usize>, device: &Device| {
+            let config = models::networks::DenoiserConfig { guidance_dim: guidance, ..teacher_meta.config() };
+            Denoiser::new(&config, &mut Init::new(Seed(0), "blank", Positions::Uniform, device))
+        };
+        let teacher = names::load(blank(None, &device), &weights, "").map_err(corrupt)?;
+        let tracked = device.clone().autodiff();
+        let student = start_from(blank(Some(settings.guidance_dim), &tracked), &teacher);
+        let target = start_from(blank(Some(settings.guidance_dim), &device), &teacher);
+        Ok(Self {
+            settings: settings.clone(),
+            data,
+            teacher,
+            teacher_meta,
+            student,
+            target,
+            noise: Schedule::published(),
+            grid: Grid::new(settings.skip),
+            device,
+            seed: super::dropout_seed(cx),
+        })
+    }
+
+    /// The student as a group of parameters.
+    pub(super) fn group(&self) -> GroupPlan {
+        GroupPlan {
+            name: "model",
+            entries: flat::layout(&self.student),
+            params: flat::read(&self.student),
+            optimizer: optimizer(&self.settings.training.optimizer),
+            lr: schedule(&self.settings.training, self.settings.training.lr),
+            ema: Some(self.settings.ema),
+        }
+    }
+
+    /// Takes over student and target.
+    pub(super) fn load(&mut self, state: &TrainState) {
+        let group = &state.groups[0];
+        self.student = flat::write(self.student.clone(), &group.params);
+        let average = group.average.as_ref().expect("the group was planned with an average");
+        self.target = flat::write(self.target.clone(), average);
+    }
+
+    /// Dropout of the student in one slice.
+    pub(super) fn dropout(&self, step: u64, slice: usize) -> Dropout {
+        Dropout::new(self.teacher_meta.network.dropout, self.seed, step, slice as u64)
+    }
+
+    /// Dropout of a frozen network in one slice; `which` keeps the networks apart.
+    fn frozen(&self, step: u64, slice: usize, which: u64) -> Dropout {
+        if self.settings.upstream_dropout {
+            Dropout::new(self.teacher_meta.network.dropout, self.seed ^ which, step, slice as u64)
+        } else {
+            Dropout::off()
+        }
+    }
+
+    /// Draws one slice and moves it one solver step with the teacher: points 2, 3 and 5 of MotionLCM's iteration.
+    pub(super) fn solve(&mut self, step: u64, slice: usize) -> SolverStep {
+        let batch = self.data.slice(step, slice, 0.0);
+        let (low, high) = self.settings.guidance;
+        let (mut index, mut w) = (Vec::new(), Vec::new());
+        for pick in &batch.picks {
+            let mut draw = self.data.stream("distillation", *pick);
+            index.push(draw.below(self.grid.steps));
+            #[expect(clippy::cast_possible_truncation, reason = "a scale")]
+            w.push(draw.range(low, high) as f32);
+        }
+        let from: Vec<usize> = index.iter().map(|i| self.grid.tau(*i)).collect();
+        let to: Vec<usize> = index.iter().map(|i| self.grid.prev(*i)).collect();
+        let noise = self.data.noise("noise", &batch.picks);
+        let (a, e) = unzip(from.iter().map(|t| self.noise.add_noise(*t)));
+        let noisy = affine(batch.clean_bnd.clone(), noise, &a, &e);
+
+        let twice = |x: &Tensor<3>, y: &Tensor<3>| Tensor::cat(vec![x.clone(), y.clone()], 0);
+        let both: Vec<usize> = from.iter().chain(&from).copied().collect();
+        let texts = twice(&batch.text_blc, &batch.null_blc);
+        let mut dropout = self.frozen(step, slice, 1);
+        let eps = self.teacher.forward(twice(&noisy, &noisy), &both, texts, None, &mut dropout);
+        let [count, tokens, dim] = noisy.dims();
+        let conditional = eps.clone().slice([0..count, 0..tokens, 0..dim]);
+        let unconditional = eps.slice([count..2 * count, 0..tokens, 0..dim]);
+        let eps = guided_by(conditional, unconditional, &w);
+        let (a, e) = unzip(from.iter().zip(&to).map(|(t, s)| self.noise.jump(*t, *s)));
+        let solved = affine(noisy.clone(), eps, &a, &e);
+        let guidance = guidance_embedding(&w, self.settings.guidance_dim, &self.device);
+        SolverStep { batch, index, from, to, noisy_bnd: noisy, solved_bnd: solved, guidance_bg: guidance }
+    }
+
+    /// The student's predicted noise at the start of the step, on the tape.
+    pub(super) fn student_eps(&self, solved: &SolverStep, step: u64, slice: usize) -> Tensor<3> {
+        let mut dropout = self.dropout(step, slice);
+        self.student.forward(
+            solved.noisy_bnd.clone(),
+            &solved.from,
+            solved.batch.text_blc.clone(),
+            Some(solved.guidance_bg.clone()),
+            &mut dropout,
+        )
+    }
+
+    /// The target's predicted noise at the end of the step.
+    pub(super) fn target_eps(&self, solved: &SolverStep, step: u64, slice: usize) -> Tensor<3> {
+        let mut dropout = self.frozen(step, slice, 2);
+        self.target.forward(
+            solved.solved_bnd.clone(),
+            &solved.to,
+            solved.batch.text_blc.clone(),
+            Some(solved.guidance_bg.clone()),
+            &mut dropout,
+        )
+    }
+
+    /// Sum over samples of the mean distance of `student` and `target`.
+    pub(super) fn distance(&self, student: Tensor<3>, target: Tensor<3>) -> Tensor<1> {
+        match self.settings.distance {
+            Distance::Huber => losses::pseudo_huber(student, target, self.settings.huber_c),
+            Distance::L2 => losses::mse(student, target),
+        }
+    }
+
+    /// The student's manifest.
+    pub(super) fn meta(&self, family: Family) -> DenoiserMeta {
+        DenoiserMeta { family, guidance_dim: self.settings.guidance_dim, ..self.teacher_meta.clone() }
+    }
+}
+
+/// `student` with the teacher's parameters where both have them; the guidance projection stays zero.
+fn start_from(student: Denoiser, teacher: &Denoiser) -> Denoiser {
+    let from: std::collections::HashMap<String, (usize, Entry)> = {
+        let mut at = 0;
+        let mut all = std::collections::HashMap::new();
+        for entry in flat::layout(teacher) {
+            let len = entry.len();
+            all.insert(entry.name.clone(), (at, entry));
+            at += len;
+        }
+        all
+    };
+    let values = flat::read(teacher);
+    let mut params = Vec::new();
+    for entry in flat::layout(&student) {
+        match from.get(&entry.name) {
+            Some((at, theirs)) => params.extend_from_slice(&values[*at..at + theirs.len()]),
+            None => params.extend(std::iter::repeat_n(0.0, entry.len())),
+        }
+    }
+    flat::write(student, &params)
+}

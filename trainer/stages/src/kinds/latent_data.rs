@@ -1,0 +1,125 @@
+//! Examples of the stages that train in the latent space: a latent drawn from its posterior, its caption, and keyed draws about it.
+
+use burn::tensor::{Device, Tensor, TensorData};
+use motion::Stream;
+use motion::dataset::Split;
+use protocol::stage::Training;
+use protocol::{ArtifactKind, Digest, Seed, StageName};
+
+use crate::artifacts::{self, Embeddings, Latents};
+use crate::context::{AttemptContext, StageError};
+use crate::train::{Order, Pick};
+
+/// Latents and captions of the training split, in the order of a stage.
+#[derive(Debug)]
+pub(super) struct LatentData {
+    latents: Latents,
+    embeddings: Embeddings,
+    train: Vec<usize>,
+    order: Order,
+    seed: Seed,
+    stage: StageName,
+    slices: usize,
+    device: Device,
+}
+
+/// One slice of a batch.
+#[derive(Debug)]
+pub(super) struct LatentSlice {
+    /// Keys of all draws.
+    pub(super) picks: Vec<Pick>,
+    /// Latents [B, N, d], drawn from their posteriors.
+    pub(super) clean_bnd: Tensor<3>,
+    /// Caption embeddings [B, 1, text].
+    pub(super) text_blc: Tensor<3>,
+    /// The empty caption's embedding as often [B, 1, text].
+    pub(super) null_blc: Tensor<3>,
+}
+
+impl LatentData {
+    /// Reads the inputs `latents` and `text`.
+    pub(super) fn read(cx: &dyn AttemptContext, training: &Training) -> Result<Self, StageError> {
+        let blobs = cx.blobs();
+        let (_, manifest) = artifacts::input(cx, "latents", ArtifactKind::Latents)?;
+        let latents = Latents::read(&*blobs, &manifest)?;
+        let (_, manifest) = artifacts::input(cx, "text", ArtifactKind::Embeddings)?;
+        let embeddings = Embeddings::read(&*blobs, &manifest)?;
+        let captions = latents.meta.captions.iter().flatten().max().map_or(0, |most| most + 1);
+        let stage = cx.task().name.clone();
+        if captions > embeddings.meta.captions {
+            return Err(StageError::Input(format!(
+                "stage `{stage}`: `latents` refers to {captions} captions, `text` embeds {}; both must come from one dataset",
+                embeddings.meta.captions
+            )));
+        }
+        let train: Vec<usize> = (0..latents.entries()).filter(|e| latents.meta.splits[*e] == Split::Train).collect();
+        if train.is_empty() {
+            return Err(StageError::Input(format!("stage `{stage}`: the training split has no clips")));
+        }
+        let seed = cx.task().seed;
+        let order = Order::new(seed, stage.as_str(), train.len(), training.batch.global, 1);
+        Ok(Self { latents, embeddings, train, order, seed, stage, slices: training.batch.slices, device: cx.device() })
+    }
+
+    /// The VAE whose latents these are.
+    pub(super) fn vae(&self) -> Digest {
+        self.latents.meta.vae
+    }
+
+    /// Latents' meta.
+    pub(super) fn meta(&self) -> &artifacts::LatentsMeta {
+        &self.latents.meta
+    }
+
+    /// Embeddings' meta.
+    pub(super) fn text_meta(&self) -> &artifacts::EmbeddingsMeta {
+        &self.embeddings.meta
+    }
+
+    /// The generator of one kind of draw about one example.
+    pub(super) fn stream(&self, what: &str, pick: Pick) -> Stream {
+        Stream::new(self.seed, &format!("{}/{what}", self.stage), pick.place, 0)
+    }
+
+    /// Standard normal noise [B, N, d] of a purpose.
+    pub(super) fn noise(&self, what: &str, picks: &[Pick]) -> Tensor<3> {
+        let latent = self.latents.meta.latent;
+        let size = latent.tokens * latent.dim;
+        let mut values = vec![0.0; picks.len() * size];
+        for (row, pick) in values.chunks_exact_mut(size).zip(picks) {
+            self.stream(what, *pick).fill_normal(row);
+        }
+        Tensor::from_data(TensorData::new(values, [picks.len(), latent.tokens, latent.dim]), &self.device)
+    }
+
+    /// Slice `slice` of the batch of `step`. With probability `drop` a caption is replaced by the empty one.
+    pub(super) fn slice(&mut self, step: u64, slice: usize, drop: f64) -> LatentSlice {
+        let range = self.order.slice(slice, self.slices);
+        let picks: Vec<Pick> = self.order.batch(step, |_| 0)[range].to_vec();
+        let latent = self.latents.meta.latent;
+        let (size, crops) = (latent.tokens * latent.dim, self.latents.meta.crops);
+        let (mut clean, mut text) = (Vec::new(), Vec::new());
+        for pick in &picks {
+            let entry = self.train[pick.example];
+            let mut draw = self.stream("example", *pick);
+            let row = entry * crops + draw.below(crops);
+            let captions = &self.latents.meta.captions[entry];
+            let caption = captions[draw.below(captions.len())];
+            let empty = draw.uniform() < drop;
+            let mut noise = vec![0.0; size];
+            draw.fill_normal(&mut noise);
+            let (mu, sigma) = (self.latents.mu.row(row), self.latents.sigma.row(row));
+            clean.extend(mu.iter().zip(sigma).zip(&noise).map(|((mu, sigma), noise)| mu + sigma * noise));
+            text.extend_from_slice(if empty { &self.embeddings.null } else { self.embeddings.captions.row(caption) });
+        }
+        let (batch, width) = (picks.len(), self.embeddings.null.len());
+        let tensor = |values, shape: [usize; 3]| Tensor::from_data(TensorData::new(values, shape), &self.device);
+        let null = self.embeddings.null.iter().copied().cycle().take(batch * width).collect();
+        LatentSlice {
+            picks,
+            clean_bnd: tensor(clean, [batch, latent.tokens, latent.dim]),
+            text_blc: tensor(text, [batch, 1, width]),
+            null_blc: tensor(null, [batch, 1, width]),
+        }
+    }
+}

@@ -1,0 +1,379 @@
+//! `evaluate.latent_fid`: how close a denoiser's samples come to real latents, to their captions, and to its teacher's.
+//!
+//! Sample `i` of a repeat is of entry `i mod n`; its caption and noise are keyed by (seed, repeat, i) and not by the stage's name, so
+//! that two models of a run are compared on the same noise. Samples are made in blocks that are cut from the sample's number alone, and
+//! blocks are dealt to shards in turn; what a sample is computed together with does not hang on the number of shards.
+//!
+//! `match` compares repeat 0 with the teacher's 50-step DDIM from the same noise and captions, at g = w + 1 for a student.
+//! `match_other_noise` is its yardstick: a teacher's sample against the teacher's next sample for the same entry.
+//! Definitions: [`evaluation::latent_fid`](crate::evaluation::latent_fid).
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use motion::Stream;
+use motion::dataset::Split;
+use protocol::stage::{EvaluateLatentFid, Sampler, Split as Wanted};
+use protocol::{ArtifactKind, Digest, Manifest, Seed};
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::publish_report;
+use crate::artifacts::{self, DenoiserMeta, Embeddings, Family, Latents, Tensors, to_meta};
+use crate::context::{AttemptContext, Outcome, StageError};
+use crate::evaluation::latent_fid::{
+    Real, Reference, mean_and_spread, relative_distance, same_captions, standard_deviation, top,
+};
+use crate::networks::{Conditions, Denoiser};
+
+/// Samples computed together.
+const BLOCK: usize = 64;
+/// Steps of the teacher that `match` compares with.
+const TEACHER_STEPS: usize = 50;
+/// Where a shard's samples are.
+const SAMPLES_FILE: &str = "samples.safetensors";
+
+/// Whose samples a block holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum Maker {
+    Model,
+    Teacher,
+}
+
+/// One block of samples.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+struct Unit {
+    maker: Maker,
+    repeat: usize,
+    block: usize,
+}
+
+/// What all shards and the merge agree on.
+struct Plan<'a> {
+    settings: &'a EvaluateLatentFid,
+    seed: Seed,
+    latents: Latents,
+    embeddings: Embeddings,
+    model: DenoiserMeta,
+    /// Entries that are sampled.
+    entries: Vec<usize>,
+    /// Whether a teacher's samples are needed besides the model's.
+    teacher: bool,
+    /// Whether `match` is measured.
+    matched: bool,
+}
+
+impl<'a> Plan<'a> {
+    fn read(cx: &dyn AttemptContext, settings: &'a EvaluateLatentFid) -> Result<(Self, Manifest), StageError> {
+        let blobs = cx.blobs();
+        let name = &cx.task().name;
+        let refuse = |text: String| Err(StageError::Input(format!("stage `{name}`: {text}")));
+        let (model_digest, manifest) = artifacts::input(cx, "model", ArtifactKind::Denoiser)?;
+        let model: DenoiserMeta = artifacts::meta(&manifest, "the denoiser")?;
+        let latents = Latents::read(&*blobs, &artifacts::input(cx, "latents", ArtifactKind::Latents)?.1)?;
+        let embeddings = Embeddings::read(&*blobs, &artifacts::input(cx, "text", ArtifactKind::Embeddings)?.1)?;
+        fits("model", &model, &latents, &embeddings)?;
+        let wanted = |split: Split| match settings.split {
+            Wanted::All => true,
+            Wanted::Train => split == Split::Train,
+            Wanted::Val => split == Split::Val,
+            Wanted::Test => split == Split::Test,
+        };
+        let entries: Vec<usize> = (0..latents.entries()).filter(|&e| wanted(latents.meta.splits[e])).collect();
+        if entries.len() * settings.samples < 2 || entries.len() * latents.meta.crops < 2 {
+            return refuse(format!("{} entries of the split are too few to compare with", entries.len()));
+        }
+        if settings.repeats == 0 || settings.components == 0 {
+            return refuse("`repeats` and `components` must be at least 1".into());
+        }
+        let captions = embeddings.meta.captions;
+        if let Some(c) = latents.meta.captions.iter().flatten().find(|c| **c >= captions) {
+            return refuse(format!(
+                "`latents` speaks of caption {c}, `text` has {captions}; they are of different datasets"
+            ));
+        }
+        let matched = cx.task().inputs.contains_key("teacher");
+        let teacher = if matched {
+            let (digest, manifest) = artifacts::input(cx, "teacher", ArtifactKind::Denoiser)?;
+            let meta: DenoiserMeta = artifacts::meta(&manifest, "the teacher")?;
+            if meta.family != Family::Mld {
+                return refuse("`teacher` is a student itself; expected the output of a train.mld stage".into());
+            }
+            fits("teacher", &meta, &latents, &embeddings)?;
+            // A teacher that is compared with itself is not sampled twice.
+            digest != model_digest || settings.sampler.steps != TEACHER_STEPS
+        } else {
+            false
+        };
+        let seed = cx.task().seed;
+        Ok((Self { settings, seed, latents, embeddings, model, entries, teacher, matched }, manifest))
+    }
+
+    /// Samples of one repeat.
+    fn samples(&self) -> usize {
+        self.entries.len() * self.settings.samples
+    }
+
+    fn width(&self) -> usize {
+        self.latents.mu.row_len()
+    }
+
+    fn block(&self, block: usize) -> std::ops::Range<usize> {
+        block * BLOCK..((block + 1) * BLOCK).min(self.samples())
+    }
+
+    fn entry(&self, sample: usize) -> usize {
+        self.entries[sample % self.entries.len()]
+    }
+
+    /// All blocks; shard `index` of `of` takes every `of`-th one of each maker, since a teacher's block costs a hundred of a student's.
+    fn units(&self) -> Vec<Unit> {
+        let blocks = self.samples().div_ceil(BLOCK);
+        let of = |maker, repeat| (0..blocks).map(move |block| Unit { maker, repeat, block });
+        let model = (0..self.settings.repeats).flat_map(|repeat| of(Maker::Model, repeat));
+        let teacher = self.teacher.then(|| of(Maker::Teacher, 0));
+        model.chain(teacher.into_iter().flatten()).collect()
+    }
+
+    /// The conditions and noise of a block.
+    fn conditions(&self, unit: Unit) -> Conditions {
+        let mut conditions = Conditions { text: Vec::new(), null: self.embeddings.null.clone(), noise: Vec::new() };
+        for sample in self.block(unit.block) {
+            let captions = &self.latents.meta.captions[self.entry(sample)];
+            let stream = |what: &str| {
+                Stream::new(self.seed, &format!("evaluate.latent_fid/{what}"), unit.repeat as u64, sample as u64)
+            };
+            let caption = captions[stream("caption").below(captions.len())];
+            conditions.text.extend_from_slice(self.embeddings.captions.row(caption));
+            let mut noise = vec![0.0; self.width()];
+            stream("noise").fill_normal(&mut noise);
+            conditions.noise.extend(noise);
+        }
+        conditions
+    }
+
+    /// Fresh noise of a block for the `step`-th jump of an LCM.
+    fn step_noise(&self, unit: Unit, step: usize) -> Vec<f32> {
+        let mut noise = vec![0.0; self.block(unit.block).len() * self.width()];
+        for (row, sample) in noise.chunks_exact_mut(self.width()).zip(self.block(unit.block)) {
+            let purpose = format!("evaluate.latent_fid/noise {step}");
+            Stream::new(self.seed, &purpose, unit.repeat as u64, sample as u64).fill_normal(row);
+        }
+        noise
+    }
+
+    /// The sampler of the teacher that `match` compares with.
+    fn teacher_sampler(&self) -> Sampler {
+        let shift = if self.model.family == Family::Mld { 0.0 } else { 1.0 };
+        Sampler { steps: TEACHER_STEPS, guidance: self.settings.sampler.guidance + shift, timesteps: Vec::new() }
+    }
+}
+
+/// Whether a denoiser makes these latents and reads these embeddings.
+fn fits(field: &str, model: &DenoiserMeta, latents: &Latents, embeddings: &Embeddings) -> Result<(), StageError> {
+    let refuse = |text: String| Err(StageError::Input(format!("`{field}` does not fit: {text}")));
+    if model.latent != latents.meta.latent {
+        let (a, b) = (model.latent, latents.meta.latent);
+        return refuse(format!("its latent is {}x{}, that of `latents` {}x{}", a.tokens, a.dim, b.tokens, b.dim));
+    }
+    if model.vae != latents.meta.vae {
+        return refuse("it was trained on latents of another VAE than `latents`".into());
+    }
+    if model.encoder != embeddings.meta.encoder || model.text_dim != embeddings.meta.dim {
+        return refuse(format!(
+            "it was trained on `{}` embeddings of width {}, `text` has `{}` of width {}",
+            model.encoder, model.text_dim, embeddings.meta.encoder, embeddings.meta.dim
+        ));
+    }
+    Ok(())
+}
+
+pub(super) fn shard(
+    cx: &mut dyn AttemptContext,
+    settings: &EvaluateLatentFid,
+    index: usize,
+    of: usize,
+) -> Result<Outcome, StageError> {
+    let blobs = cx.blobs();
+    let (plan, manifest) = Plan::read(cx, settings)?;
+    let mine = |maker: Maker| -> Vec<Unit> {
+        let all = plan.units().into_iter().filter(|u| u.maker == maker);
+        all.enumerate().filter(|(i, _)| i % of == index).map(|(_, unit)| unit).collect()
+    };
+    let units: Vec<Unit> = mine(Maker::Model).into_iter().chain(mine(Maker::Teacher)).collect();
+    let model = Denoiser::read(&*blobs, &manifest, &cx.device())?;
+    let teacher = match plan.teacher {
+        true => {
+            let (_, manifest) = artifacts::input(cx, "teacher", ArtifactKind::Denoiser)?;
+            Some((Denoiser::read(&*blobs, &manifest, &cx.device())?, plan.teacher_sampler()))
+        }
+        false => None,
+    };
+    model.check_sampler(&settings.sampler)?;
+
+    // Network evaluations, so that the progress is even.
+    let cost = |unit: &Unit| match unit.maker {
+        Maker::Model => settings.sampler.steps as u64,
+        Maker::Teacher => TEACHER_STEPS as u64,
+    };
+    let total = units.iter().map(cost).sum();
+    let (mut done, mut values) = (0, Vec::new());
+    for unit in &units {
+        if cx.interrupted() {
+            return Ok(Outcome::Yielded { at: 0 });
+        }
+        let conditions = plan.conditions(*unit);
+        let z = match (&teacher, unit.maker) {
+            (Some((teacher, sampler)), Maker::Teacher) => teacher.sample(&conditions, sampler, &mut |_| Vec::new())?,
+            _ => model.sample(&conditions, &settings.sampler, &mut |step| plan.step_noise(*unit, step))?,
+        };
+        values.extend(z);
+        done += cost(unit);
+        cx.progress(done, total, "evaluations", &[]);
+    }
+    let rows = values.len() / plan.width();
+    let bytes = Tensors::default().with("z", [rows, plan.width()], values).to_bytes()?;
+    let output = artifacts::publish(cx, ArtifactKind::Shard, json!({"units": units}), SAMPLES_FILE, bytes)?;
+    Ok(Outcome::Finished { output, metrics: BTreeMap::new() })
+}
+
+pub(super) fn merge(
+    cx: &mut dyn AttemptContext,
+    settings: &EvaluateLatentFid,
+    shards: &[Digest],
+) -> Result<Outcome, StageError> {
+    #[derive(Deserialize)]
+    struct ShardMeta {
+        units: Vec<Unit>,
+    }
+    let (plan, _) = Plan::read(cx, settings)?;
+    let blobs = cx.blobs();
+    let mut blocks: BTreeMap<Unit, Vec<f32>> = BTreeMap::new();
+    for digest in shards {
+        let manifest = cx.manifest(*digest)?;
+        let ShardMeta { units } = artifacts::meta(&manifest, "a shard of the samples")?;
+        let bytes = artifacts::file(&*blobs, &manifest, SAMPLES_FILE)?;
+        let rows = Tensors::from_bytes(&bytes, SAMPLES_FILE)?.take("z", 2, SAMPLES_FILE)?;
+        let mut at = 0;
+        for unit in units {
+            let end = at + plan.block(unit.block).len() * plan.width();
+            blocks.insert(unit, rows.values[at..end].to_vec());
+            at = end;
+        }
+    }
+    let expected: BTreeSet<Unit> = plan.units().into_iter().collect();
+    if !blocks.keys().eq(&expected) {
+        return Err(StageError::Fault(format!("{} blocks of samples, expected {}", blocks.len(), expected.len())));
+    }
+    if !blocks.values().flatten().all(|v| v.is_finite()) {
+        return Err(StageError::Input("samples are not finite; the denoiser has not been trained well".into()));
+    }
+    let of = |maker: Maker, repeat: usize| -> Vec<f32> {
+        let mine = blocks.iter().filter(|(u, _)| u.maker == maker && u.repeat == repeat);
+        mine.flat_map(|(_, values)| values.iter().copied()).collect()
+    };
+
+    let z = draw(&plan, 0);
+    let reference = reference(&plan, &z);
+    let sampled: Vec<usize> = (0..plan.samples()).map(|i| plan.entry(i)).collect();
+    let tested = |i: &usize| plan.latents.meta.splits[sampled[*i]] == Split::Test;
+    let mut values: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
+    for repeat in 0..settings.repeats {
+        let samples = of(Maker::Model, repeat);
+        let found = reference.measure(&samples, &sampled, plan.seed, repeat as u64);
+        let test: Vec<usize> = (0..plan.samples()).filter(tested).map(|i| found.ranks[i]).collect();
+        let mut put = |name, value| values.entry(name).or_default().push(value);
+        put("latent_fid", found.latent_fid);
+        put("latent_std", found.latent_std);
+        put("r_precision_top1", top(found.ranks.iter().copied(), 1));
+        put("r_precision_top3", top(found.ranks.iter().copied(), 3));
+        if !test.is_empty() {
+            put("r_precision_top3_test", top(test.iter().copied(), 3));
+        }
+        if repeat == 0 && plan.matched {
+            let teacher = if plan.teacher { of(Maker::Teacher, 0) } else { samples.clone() };
+            put("match", relative_distance(&samples, &teacher, plan.width()));
+            if settings.samples > 1 {
+                // One entry's samples are a whole number of entries apart.
+                let mut others = teacher.clone();
+                others.rotate_left(plan.entries.len() * plan.width());
+                put("match_other_noise", relative_distance(&others, &teacher, plan.width()));
+            }
+        }
+    }
+    let mut metrics = BTreeMap::new();
+    let mut spread = BTreeMap::new();
+    for (name, values) in &values {
+        let (mean, sd) = mean_and_spread(values);
+        metrics.insert((*name).to_owned(), mean);
+        spread.extend(sd.map(|sd| (*name, sd)));
+    }
+    if let Some(sd) = spread.get("latent_fid") {
+        metrics.insert("latent_fid_sd".into(), *sd);
+    }
+    metrics.insert("latent_fid_floor".into(), reference.distance(&fresh(&plan)));
+    metrics.insert("latent_std_real".into(), standard_deviation(&compared(&plan, &z)));
+    publish_report(cx, metrics, details(&plan, &reference, &values, &spread))
+}
+
+/// What a reader of the report may want besides the metrics.
+fn details(
+    plan: &Plan<'_>,
+    reference: &Reference,
+    values: &BTreeMap<&str, Vec<f64>>,
+    spread: &BTreeMap<&str, f64>,
+) -> Value {
+    json!({
+        "sampler": plan.settings.sampler,
+        "model": to_meta(&plan.model.family),
+        "samples_per_repeat": plan.samples(),
+        "explained_variance": reference.explained(),
+        "real_variance": reference.total_variance(),
+        "repeats": values,
+        "sd": spread,
+    })
+}
+
+/// A draw of z from the posterior of every crop, `[rows, width]`.
+fn draw(plan: &Plan<'_>, repeat: u64) -> Vec<f32> {
+    let mut z = plan.latents.sigma.values.clone();
+    for (row, (z, mu)) in
+        z.chunks_exact_mut(plan.width()).zip(plan.latents.mu.values.chunks_exact(plan.width())).enumerate()
+    {
+        let mut stream = Stream::new(plan.seed, "evaluate.latent_fid/real", repeat, row as u64);
+        for (z, mu) in z.iter_mut().zip(mu) {
+            *z = mu + *z * stream.normal();
+        }
+    }
+    z
+}
+
+fn reference(plan: &Plan<'_>, z: &[f32]) -> Reference {
+    let crops = plan.latents.meta.crops;
+    let train: Vec<usize> =
+        (0..plan.latents.entries()).filter(|&e| plan.latents.meta.splits[e] == Split::Train).collect();
+    let real = Real { z, mu: &plan.latents.mu.values, crops, width: plan.width() };
+    let numbers = same_captions(&plan.embeddings.captions.values, plan.embeddings.meta.dim);
+    let captions =
+        plan.latents.meta.captions.iter().map(|captions| captions.iter().map(|c| numbers[*c]).collect()).collect();
+    Reference::new(real, &train, &plan.entries, captions, plan.settings.components)
+}
+
+/// The rows of the entries that are compared with.
+fn compared(plan: &Plan<'_>, z: &[f32]) -> Vec<f32> {
+    let size = plan.latents.meta.crops * plan.width();
+    plan.entries.iter().flat_map(|e| z[e * size..(e + 1) * size].iter().copied()).collect()
+}
+
+/// Another draw of real latents, as many of each entry as there are samples: what a perfect sampler would score.
+fn fresh(plan: &Plan<'_>) -> Vec<f32> {
+    let z = draw(plan, 1);
+    let (crops, width) = (plan.latents.meta.crops, plan.width());
+    (0..plan.samples())
+        .flat_map(|i| {
+            let crop = Stream::new(plan.seed, "evaluate.latent_fid/floor", 0, i as u64).below(crops);
+            let row = plan.entry(i) * crops + crop;
+            z[row * width..(row + 1) * width].iter().copied()
+        })
+        .collect()
+}

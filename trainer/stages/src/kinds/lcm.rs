@@ -1,0 +1,59 @@
+//! `distill.lcm`: latent consistency distillation. Source: MotionLCM (arXiv:2404.19759).
+//!
+//! `y = c_skip(t) z_t + c_out(t) z_0(z_t, t)` by the student against the same at the teacher's solver step by the target.
+
+use models::diffusion::{affine, consistency, unzip};
+use models::names::to_bytes;
+use protocol::ArtifactKind;
+use protocol::stage::DistillLcm;
+
+use super::consistency::Distiller;
+use super::slice_gradient;
+use crate::artifacts::{self, Family, MODEL_FILE, to_meta};
+use crate::context::{GangContext, Outcome, StageError};
+use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, train};
+
+struct Lcm(Distiller);
+
+impl Objective for Lcm {
+    fn groups(&mut self) -> Vec<GroupPlan> {
+        vec![self.0.group()]
+    }
+
+    fn terms(&self) -> &'static [&'static str] {
+        &["loss"]
+    }
+
+    fn load(&mut self, state: &TrainState) {
+        self.0.load(state);
+    }
+
+    fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
+        let it = &mut self.0;
+        let solved = it.solve(step, slice);
+        let (a, e) = unzip(solved.to.iter().map(|t| consistency(&it.noise, *t)));
+        let target = affine(solved.solved_bnd.clone(), it.target_eps(&solved, step, slice), &a, &e);
+        let (a, e) = unzip(solved.from.iter().map(|t| consistency(&it.noise, *t)));
+        let student = affine(solved.noisy_bnd.clone(), it.student_eps(&solved, step, slice), &a, &e);
+        let loss = it.distance(student, target) / it.settings.training.batch.global as f32;
+        let (gradient, loss) = slice_gradient(&it.student, loss);
+        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss] })
+    }
+}
+
+/// Runs one member's attempt.
+pub(super) fn run(cx: &mut dyn GangContext, settings: &DistillLcm) -> Result<Outcome, StageError> {
+    let mut objective = Lcm(Distiller::read(cx, &settings.distillation)?);
+    match train(&mut objective, &settings.distillation.training, cx)? {
+        Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
+        Trained::Finished { state, metrics } => {
+            let family =
+                Family::Lcm { skip: settings.distillation.skip, guidance: settings.distillation.guidance };
+            // The online network is what is kept, as upstream; its average only was the target.
+            let bytes = to_bytes(&state.groups[0].entries, &state.groups[0].params);
+            let meta = to_meta(&objective.0.meta(family));
+            let output = artifacts::publish(cx, ArtifactKind::Denoiser, meta, MODEL_FILE, bytes)?;
+            Ok(Outcome::Finished { output, metrics })
+        }
+    }
+}

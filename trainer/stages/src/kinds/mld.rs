@@ -1,0 +1,103 @@
+//! `train.mld`: the latent-diffusion teacher. Source: MLD (arXiv:2212.04048), MotionLCM v2's recipe.
+//!
+//! `t ~ U{0..999}`, `z_t = alpha_t z_0 + sigma_t eps`, loss `mean (eps_hat(z_t, t, c) - eps)^2`, the caption replaced by the empty one with
+//! probability `guidance_dropout`. Latents are samples of their posteriors, unscaled.
+
+use models::diffusion::{Schedule, TIMESTEPS, affine, unzip};
+use models::flat;
+use models::kernels::Dropout;
+use models::losses;
+use models::names::to_bytes;
+use models::networks::{Denoiser, Init};
+use protocol::ArtifactKind;
+use protocol::stage::TrainMld;
+
+use super::latent_data::LatentData;
+use super::{optimizer, schedule, slice_gradient};
+use crate::artifacts::{self, DenoiserMeta, Family, MODEL_FILE, VaeMeta, to_meta};
+use crate::context::{GangContext, Outcome, StageError};
+use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, train};
+
+struct Mld {
+    settings: TrainMld,
+    data: LatentData,
+    network: Denoiser,
+    noise: Schedule,
+    seed: u64,
+}
+
+impl Objective for Mld {
+    fn groups(&mut self) -> Vec<GroupPlan> {
+        vec![GroupPlan {
+            name: "model",
+            entries: flat::layout(&self.network),
+            params: flat::read(&self.network),
+            optimizer: optimizer(&self.settings.training.optimizer),
+            lr: schedule(&self.settings.training, self.settings.training.lr),
+            ema: (self.settings.ema > 0.0).then_some(self.settings.ema),
+        }]
+    }
+
+    fn terms(&self) -> &'static [&'static str] {
+        &["loss"]
+    }
+
+    fn load(&mut self, state: &TrainState) {
+        self.network = flat::write(self.network.clone(), &state.groups[0].params);
+    }
+
+    fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
+        let batch = self.data.slice(step, slice, self.settings.guidance_dropout);
+        let timesteps: Vec<usize> =
+            batch.picks.iter().map(|pick| self.data.stream("timestep", *pick).below(TIMESTEPS)).collect();
+        let noise = self.data.noise("noise", &batch.picks);
+        let (a, e) = unzip(timesteps.iter().map(|t| self.noise.add_noise(*t)));
+        let noisy = affine(batch.clean_bnd, noise.clone(), &a, &e);
+        let mut dropout = Dropout::new(self.settings.network.dropout, self.seed, step, slice as u64);
+        let predicted = self.network.forward(noisy, &timesteps, batch.text_blc, None, &mut dropout);
+        let loss = losses::mse(predicted, noise) / self.settings.training.batch.global as f32;
+        let (gradient, loss) = slice_gradient(&self.network, loss);
+        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss] })
+    }
+}
+
+/// Runs one member's attempt.
+pub(super) fn run(cx: &mut dyn GangContext, settings: &TrainMld) -> Result<Outcome, StageError> {
+    let data = LatentData::read(cx, &settings.training)?;
+    let (vae_digest, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
+    let vae: VaeMeta = artifacts::meta(&vae, "the VAE")?;
+    if data.vae() != vae_digest || data.meta().latent != vae.latent {
+        return Err(StageError::Input(format!(
+            "stage `{}`: `latents` were made by another VAE ({} x {} latents) than `vae` ({} x {}); name the VAE that encoded them",
+            cx.task().name,
+            data.meta().latent.tokens,
+            data.meta().latent.dim,
+            vae.latent.tokens,
+            vae.latent.dim
+        )));
+    }
+    let meta = DenoiserMeta {
+        family: Family::Mld,
+        latent: vae.latent,
+        network: settings.network.clone(),
+        text_relu: settings.text_relu,
+        guidance_dim: 0,
+        encoder: data.text_meta().encoder.clone(),
+        text_dim: data.text_meta().dim,
+        vae: vae_digest,
+    };
+    let device = cx.device().autodiff();
+    let purpose = format!("{}/init", cx.task().name);
+    let mut init = Init::new(cx.task().seed, &purpose, settings.network.positions, &device);
+    let network = Denoiser::new(&meta.config(), &mut init);
+    let seed = super::dropout_seed(cx);
+    let mut objective = Mld { settings: settings.clone(), data, network, noise: Schedule::published(), seed };
+    match train(&mut objective, &settings.training, cx)? {
+        Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
+        Trained::Finished { state, metrics } => {
+            let bytes = to_bytes(&state.groups[0].entries, state.result(0));
+            let output = artifacts::publish(cx, ArtifactKind::Denoiser, to_meta(&meta), MODEL_FILE, bytes)?;
+            Ok(Outcome::Finished { output, metrics })
+        }
+    }
+}

@@ -1,0 +1,148 @@
+//! `distill.pcm`: phased consistency distillation with a discriminator. Source: MotionPCM (arXiv:2501.19083), Algorithm 1, and the image
+//! repository it follows.
+//!
+//! Student and target jump to the edge `s_m` of their phase, `F(z, t, s) = A z + E eps`. At grid points next to an edge the target is the teacher's
+//! step itself. The discriminator sees block features of the frozen teacher at a level `s` within the phase: fake is the student's jump
+//! noised on from `s_m`, real the data latent noised to `s`, with independent noise.
+//!
+//! Readings and departures: the student's input is the noised latent (the paper's line 10 is a slip); hinge signs as in Algorithm 1, not
+//! Eq. 13; levels end at the true next edge. Both networks are updated in every step from gradients of the same step, so one exchange carries
+//! both; the discriminator therefore sees the student before its update.
+
+use burn::tensor::Tensor;
+use models::diffusion::{Phases, affine, unzip};
+use models::flat;
+use models::kernels::Dropout;
+use models::losses;
+use models::names::to_bytes;
+use models::networks::{Discriminator, Init};
+use protocol::ArtifactKind;
+use protocol::stage::DistillPcm;
+
+use super::consistency::{Distiller, SolverStep};
+use super::{optimizer, schedule, slice_gradient};
+use crate::artifacts::{self, Family, MODEL_FILE, to_meta};
+use crate::context::{GangContext, Outcome, StageError};
+use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, train};
+use burn::module::Module;
+
+struct Pcm {
+    it: Distiller,
+    settings: DistillPcm,
+    phases: Phases,
+    heads: Option<Discriminator>,
+}
+
+impl Objective for Pcm {
+    fn groups(&mut self) -> Vec<GroupPlan> {
+        let mut groups = vec![self.it.group()];
+        if let Some(heads) = &self.heads {
+            let training = &self.settings.distillation.training;
+            let lr = if self.settings.discriminator_lr > 0.0 { self.settings.discriminator_lr } else { training.lr };
+            groups.push(GroupPlan {
+                name: "heads",
+                entries: flat::layout(heads),
+                params: flat::read(heads),
+                optimizer: optimizer(&self.settings.discriminator_optimizer),
+                lr: schedule(training, lr),
+                ema: None,
+            });
+        }
+        groups
+    }
+
+    fn terms(&self) -> &'static [&'static str] {
+        if self.heads.is_some() { &["loss", "consistency", "adversarial", "discriminator"] } else { &["loss"] }
+    }
+
+    fn load(&mut self, state: &TrainState) {
+        self.it.load(state);
+        if let Some(heads) = self.heads.take() {
+            self.heads = Some(flat::write(heads, &state.groups[1].params));
+        }
+    }
+
+    fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
+        let solved = self.it.solve(step, slice);
+        let phases: Vec<usize> = solved.index.iter().map(|i| self.phases.phase_of(*i)).collect();
+        let edges: Vec<usize> = phases.iter().map(|m| self.phases.edge_time(*m)).collect();
+
+        // The jump from a point to itself is the identity, which is what the target is next to an edge (t' = s_m).
+        let (a, e) = unzip(solved.to.iter().zip(&edges).map(|(t, s)| self.it.noise.jump(*t, *s)));
+        let target = affine(solved.solved_bnd.clone(), self.it.target_eps(&solved, step, slice), &a, &e);
+        let (a, e) = unzip(solved.from.iter().zip(&edges).map(|(t, s)| self.it.noise.jump(*t, *s)));
+        let student = affine(solved.noisy_bnd.clone(), self.it.student_eps(&solved, step, slice), &a, &e);
+
+        let global = self.settings.distillation.training.batch.global as f32;
+        let consistency = self.it.distance(student.clone(), target) / global;
+        let Some(heads) = &self.heads else {
+            let (gradient, loss) = slice_gradient(&self.it.student, consistency);
+            return Ok(SliceResult { gradients: vec![gradient], terms: vec![loss] });
+        };
+
+        let levels: Vec<usize> = solved.batch.picks.iter().zip(&phases).zip(&edges).map(|((pick, m), edge)| {
+            edge + self.it.data.stream("level", *pick).below(self.phases.next_edge_time(*m) - edge)
+        }).collect();
+        let (fake, real) = self.levels(&solved, student, &edges, &levels);
+        let text = &solved.batch.text_blc;
+        let features = |z: Tensor<3>| self.it.teacher.features(z, &levels, text.clone(), &mut Dropout::off());
+
+        let fake_features = features(fake);
+        let detached: Vec<Tensor<3>> = fake_features.iter().map(|f| f.clone().inner()).collect();
+        let adversarial = losses::hinge_generator(heads.valid().forward(fake_features)) / global;
+        let total = consistency.clone() + adversarial.clone() * self.settings.adversarial as f32;
+        let (gradient, loss) = slice_gradient(&self.it.student, total);
+
+        let critic = losses::hinge_discriminator(heads.forward(features(real)), heads.forward(detached)) / global;
+        let (head_gradient, discriminator) = slice_gradient(heads, critic);
+        let value = |x: Tensor<1>| x.inner().into_scalar::<f32>();
+        Ok(SliceResult {
+            gradients: vec![gradient, head_gradient],
+            terms: vec![loss, value(consistency), value(adversarial), discriminator],
+        })
+    }
+}
+
+impl Pcm {
+    /// The student's jump noised from `s_m` to the level (on the tape), and the data latent noised to it.
+    fn levels(
+        &self,
+        solved: &SolverStep,
+        student: Tensor<3>,
+        edges: &[usize],
+        levels: &[usize],
+    ) -> (Tensor<3>, Tensor<3>) {
+        let picks = &solved.batch.picks;
+        let (a, e) = unzip(edges.iter().zip(levels).map(|(m, s)| self.it.noise.transition(*m, *s)));
+        let fake = affine(student, self.it.data.noise("fake", picks), &a, &e);
+        let (a, e) = unzip(levels.iter().map(|s| self.it.noise.add_noise(*s)));
+        let real = affine(solved.batch.clean_bnd.clone(), self.it.data.noise("real", picks), &a, &e);
+        (fake, real)
+    }
+}
+
+/// Runs one member's attempt.
+pub(super) fn run(cx: &mut dyn GangContext, settings: &DistillPcm) -> Result<Outcome, StageError> {
+    let it = Distiller::read(cx, &settings.distillation)?;
+    let phases = Phases::new(&it.grid, settings.phases);
+    let heads = (settings.adversarial > 0.0).then(|| {
+        let device = cx.device().autodiff();
+        let purpose = format!("{}/heads", cx.task().name);
+        let network = &it.teacher_meta.network;
+        let mut init = Init::new(cx.task().seed, &purpose, network.positions, &device);
+        Discriminator::new(network.layers, network.width, &mut init)
+    });
+    let mut objective = Pcm { it, settings: settings.clone(), phases, heads };
+    match train(&mut objective, &settings.distillation.training, cx)? {
+        Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
+        Trained::Finished { state, metrics } => {
+            let distillation = &settings.distillation;
+            let family =
+                Family::Pcm { skip: distillation.skip, guidance: distillation.guidance, phases: settings.phases };
+            let bytes = to_bytes(&state.groups[0].entries, &state.groups[0].params);
+            let meta = to_meta(&objective.it.meta(family));
+            let output = artifacts::publish(cx, ArtifactKind::Denoiser, meta, MODEL_FILE, bytes)?;
+            Ok(Outcome::Finished { output, metrics })
+        }
+    }
+}

@@ -1,0 +1,186 @@
+//! `train.vae`: the motion VAE. Source: MLD (arXiv:2212.04048) and MotionLCM v2: smooth-L1 on normalised features and on joints in metres, KL
+//! as a mean over all elements.
+//!
+//! Ours: an optional first phase on short windows, a joint term that may join late, and batches of similar length. The unmasked loss of
+//! v1 counts padding up to the longest clip of a slice, not of the batch.
+
+use burn::tensor::{Device, Tensor, TensorData};
+use models::flat;
+use models::kernels::Dropout;
+use models::losses;
+use models::names::to_bytes;
+use models::networks::{Init, Vae};
+use motion::Stream;
+use motion::dataset::{Dataset, crop, window};
+use protocol::stage::{Split, TrainVae};
+use protocol::{ArtifactKind, Seed};
+
+use super::{optimizer, schedule, slice_gradient};
+use crate::artifacts::{self, MODEL_FILE, VaeMeta, to_meta};
+use crate::context::{GangContext, Outcome, StageError};
+use crate::train::{GroupPlan, Objective, Order, Pick, SliceResult, TrainState, Trained, train};
+
+/// Batches that are sorted by length together.
+const POOL: usize = 4;
+
+struct VaeObjective {
+    settings: TrainVae,
+    dataset: Dataset,
+    train: Vec<usize>,
+    network: Vae,
+    windows: Order,
+    clips: Order,
+    purpose: String,
+    seed: Seed,
+    dropout_seed: u64,
+    device: Device,
+}
+
+impl VaeObjective {
+    /// Steps that train on windows.
+    fn window_steps(&self) -> u64 {
+        self.share(self.settings.windows.until)
+    }
+
+    fn share(&self, part: f64) -> u64 {
+        (self.settings.training.steps.0 as f64 * part).round() as u64
+    }
+
+    /// Frames `start..start + len` of the clip at a place.
+    fn cut(&self, phase: u64, pick: Pick) -> (usize, usize) {
+        let entry = &self.dataset.entries[self.train[pick.example]];
+        let mut draw = Stream::new(self.seed, &format!("{}/crop", self.purpose), pick.place, phase);
+        let skeleton = self.dataset.skeleton();
+        if phase == 0 {
+            let windows = &self.settings.windows;
+            window(&mut draw, windows.min, windows.max, entry.len, skeleton)
+        } else {
+            crop(&mut draw, entry.len, skeleton)
+        }
+    }
+
+    /// The slice's places, cuts, and the examples of its whole batch.
+    fn pick(&mut self, step: u64, slice: usize) -> (u64, Vec<Pick>, usize) {
+        let (phase, local) = match step.checked_sub(self.window_steps()) {
+            None => (0, step),
+            Some(local) => (1, local),
+        };
+        let empty = || Order::new(Seed(0), "", 1, 1, 1);
+        let mut order = std::mem::replace(if phase == 0 { &mut self.windows } else { &mut self.clips }, empty());
+        let batch = order.batch(local, |pick| self.cut(phase, pick).1);
+        let range = order.slice(slice, self.settings.training.batch.slices);
+        *(if phase == 0 { &mut self.windows } else { &mut self.clips }) = order;
+        (phase, batch[range].to_vec(), batch.len())
+    }
+}
+
+impl Objective for VaeObjective {
+    fn groups(&mut self) -> Vec<GroupPlan> {
+        vec![GroupPlan {
+            name: "model",
+            entries: flat::layout(&self.network),
+            params: flat::read(&self.network),
+            optimizer: optimizer(&self.settings.training.optimizer),
+            lr: schedule(&self.settings.training, self.settings.training.lr),
+            ema: (self.settings.ema > 0.0).then_some(self.settings.ema),
+        }]
+    }
+
+    fn terms(&self) -> &'static [&'static str] {
+        &["loss", "feature", "joint", "kl"]
+    }
+
+    fn load(&mut self, state: &TrainState) {
+        self.network = flat::write(self.network.clone(), &state.groups[0].params);
+    }
+
+    fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
+        let (phase, picks, global) = self.pick(step, slice);
+        let cuts: Vec<(usize, usize)> = picks.iter().map(|pick| self.cut(phase, *pick)).collect();
+        let lengths: Vec<usize> = cuts.iter().map(|(_, len)| *len).collect();
+        let (batch, frames, width) = (picks.len(), *lengths.iter().max().expect("no empty slice"), self.dataset.mean.len());
+        let latent = self.settings.latent;
+        let mut rows = vec![0.0; batch * frames * width];
+        let mut noise = vec![0.0; batch * latent.tokens * latent.dim];
+        for (b, (pick, (start, len))) in picks.iter().zip(&cuts).enumerate() {
+            let entry = &self.dataset.entries[self.train[pick.example]];
+            let from = &self.dataset.features(entry)[start * width..(start + len) * width];
+            let to = &mut rows[b * frames * width..][..len * width];
+            to.copy_from_slice(from);
+            self.dataset.normalise(to);
+            let size = latent.tokens * latent.dim;
+            Stream::new(self.seed, &format!("{}/noise", self.purpose), pick.place, phase)
+                .fill_normal(&mut noise[b * size..(b + 1) * size]);
+        }
+        let rows = Tensor::<3>::from_data(TensorData::new(rows, [batch, frames, width]), &self.device);
+        let noise = Tensor::from_data(TensorData::new(noise, [batch, latent.tokens, latent.dim]), &self.device);
+
+        let mut dropout = Dropout::new(self.settings.network.dropout, self.dropout_seed, step, slice as u64);
+        let posterior = self.network.encode(rows.clone(), &lengths, &mut dropout);
+        let decoded = self.network.decode(posterior.sample(noise), &lengths, frames, &mut dropout);
+
+        let weights = &self.settings.loss;
+        let live = weights.masked.then_some(lengths.as_slice());
+        let feature = losses::smooth_l1(decoded.clone(), rows.clone(), live);
+        let kl = losses::kl(posterior.mu_bnd, posterior.logvar_bnd);
+        let mut loss = feature.clone() * weights.feature as f32 + kl.clone() * weights.kl as f32;
+        if weights.velocity > 0.0 {
+            loss = loss + losses::local_positions(decoded.clone(), rows.clone(), self.dataset.skeleton(), live) * weights.velocity as f32;
+        }
+        let mut joint_value = 0.0;
+        if weights.joint > 0.0 && step >= self.share(weights.joint_from) {
+            let statistics = losses::Statistics::new(&self.dataset.mean, &self.dataset.std, &self.device);
+            let joint = losses::joint_error(decoded, rows, &statistics, self.dataset.skeleton(), live);
+            joint_value = joint.clone().inner().into_scalar::<f32>() / global as f32;
+            loss = loss + joint * weights.joint as f32;
+        }
+        let part = |x: Tensor<1>| x.inner().into_scalar::<f32>() / global as f32;
+        let (feature, kl) = (part(feature), part(kl));
+        let (gradient, loss) = slice_gradient(&self.network, loss / global as f32);
+        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss, feature, joint_value, kl] })
+    }
+}
+
+/// Runs one member's attempt.
+pub(super) fn run(cx: &mut dyn GangContext, settings: &TrainVae) -> Result<Outcome, StageError> {
+    let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
+    let dataset = artifacts::dataset(&*cx.blobs(), &manifest)?;
+    let train_entries = dataset.entries_of(Split::Train);
+    let stage = cx.task().name.clone();
+    if train_entries.is_empty() {
+        return Err(StageError::Input(format!("stage `{stage}`: the training split has no clips")));
+    }
+    let meta = VaeMeta {
+        format: dataset.format,
+        features: dataset.mean.len(),
+        latent: settings.latent,
+        network: settings.network.clone(),
+        mean: dataset.mean.clone(),
+        std: dataset.std.clone(),
+    };
+    let (seed, device) = (cx.task().seed, cx.device().autodiff());
+    let purpose = stage.to_string();
+    let mut init = Init::new(seed, &format!("{purpose}/init"), settings.network.positions, &device);
+    let batch = settings.training.batch.global;
+    let window_batch = if settings.windows.batch > 0 { settings.windows.batch } else { batch };
+    let mut objective = VaeObjective {
+        settings: settings.clone(),
+        windows: Order::new(seed, &format!("{purpose}/windows"), train_entries.len(), window_batch, POOL),
+        clips: Order::new(seed, &format!("{purpose}/clips"), train_entries.len(), batch, POOL),
+        train: train_entries,
+        dataset,
+        network: Vae::new(&meta.config(), &mut init),
+        purpose,
+        seed,
+        dropout_seed: super::dropout_seed(cx),
+        device: cx.device(),
+    };
+    match train(&mut objective, &settings.training, cx)? {
+        Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
+        Trained::Finished { state, metrics } => {
+            let bytes = to_bytes(&state.groups[0].entries, state.result(0));
+            let output = artifacts::publish(cx, ArtifactKind::Vae, to_meta(&meta), MODEL_FILE, bytes)?;
+            Ok(Outcome::Finished { output, metrics })
+        }
+    }
+}

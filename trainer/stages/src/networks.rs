@@ -1,0 +1,356 @@
+//! Trained networks out of artifacts, with plain arrays in and out: what evaluation and generation need of `models`.
+//!
+//! Everything runs on the plain device, without dropout. Arrays are row-major f32: rows `[batch, frames, D]` of normalised
+//! features, latents `[batch, N, d]`, caption embeddings `[batch, text]`. Not its job: training, and artifacts other than these two.
+
+use burn::tensor::{Device, Tensor, TensorData};
+use checkpoint::Blobs;
+use models::diffusion::{
+    Grid, LcmTimesteps, Phases, Schedule, TIMESTEPS, ddim_sample, guided, lcm_sample, lcm_timesteps, pcm_sample,
+};
+use models::kernels::Dropout;
+use models::names::load;
+use models::networks::{self, DenoiserConfig, Init, POSITIONS, Vae, VaeConfig, guidance_embedding};
+use motion::Stream;
+use protocol::stage::{DataFormat, Positions, Sampler};
+use protocol::{Manifest, Seed};
+
+use crate::artifacts::{self, DenoiserMeta, Family, MODEL_FILE, VaeMeta};
+use crate::context::{ContextError, StageError};
+
+/// Width of the time sinusoid in every published denoiser.
+const TIME_DIM: usize = 768;
+/// Added to variances in layer norms.
+const NORM_EPS: f64 = 1e-5;
+
+impl VaeMeta {
+    /// The network's size. A bottleneck as wide as the transformer has no projections around it (v1), any other has (v2).
+    pub fn config(&self) -> VaeConfig {
+        VaeConfig {
+            features: self.features,
+            tokens: self.latent.tokens,
+            dim: self.latent.dim,
+            width: self.network.width,
+            layers: self.network.layers,
+            heads: self.network.heads,
+            feed_forward: self.network.feed_forward,
+            projection: self.latent.dim != self.network.width,
+            norm_eps: NORM_EPS,
+        }
+    }
+}
+
+impl DenoiserMeta {
+    /// The network's size; projections as in [`VaeMeta::config`].
+    pub fn config(&self) -> DenoiserConfig {
+        DenoiserConfig {
+            tokens: self.latent.tokens,
+            dim: self.latent.dim,
+            width: self.network.width,
+            layers: self.network.layers,
+            heads: self.network.heads,
+            feed_forward: self.network.feed_forward,
+            text_dim: self.text_dim,
+            time_dim: TIME_DIM,
+            text_relu: self.text_relu,
+            projection: self.latent.dim != self.network.width,
+            guidance_dim: (self.guidance_dim > 0).then_some(self.guidance_dim),
+            norm_eps: NORM_EPS,
+        }
+    }
+}
+
+/// Where a network's parameters come from before the trained ones replace them.
+fn blank(device: &Device) -> Init<'_> {
+    Init::new(Seed(0), "blank", Positions::Uniform, device)
+}
+
+/// Weights that do not fit their manifest are a broken artifact.
+fn misfit(what: &str, error: &models::names::LoadError) -> StageError {
+    StageError::Context(ContextError::Corrupt(format!("{what}: {error}")))
+}
+
+fn tensor(values: Vec<f32>, shape: [usize; 3], device: &Device) -> Tensor<3> {
+    Tensor::from_data(TensorData::new(values, shape), device)
+}
+
+fn host(tensor: Tensor<3>) -> Vec<f32> {
+    tensor.into_data().try_into_vec::<f32>().expect("networks compute in f32")
+}
+
+/// A trained VAE.
+#[derive(Debug)]
+pub struct Autoencoder {
+    vae: Vae,
+    meta: VaeMeta,
+    device: Device,
+}
+
+/// Diagonal normal distributions over latents, `[batch, N, d]`.
+#[derive(Debug, Clone)]
+pub struct Posterior {
+    /// Means.
+    pub mu: Vec<f32>,
+    /// Standard deviations.
+    pub sigma: Vec<f32>,
+}
+
+impl Posterior {
+    /// A sample, with noise from `stream`.
+    pub fn sample(&self, stream: &mut Stream) -> Vec<f32> {
+        self.mu.iter().zip(&self.sigma).map(|(mu, sigma)| mu + sigma * stream.normal()).collect()
+    }
+}
+
+impl Autoencoder {
+    /// Reads an artifact of kind `vae`.
+    pub fn read(blobs: &dyn Blobs, manifest: &Manifest, device: &Device) -> Result<Self, StageError> {
+        Self::load(artifacts::meta(manifest, "the VAE")?, &artifacts::file(blobs, manifest, MODEL_FILE)?, device)
+    }
+
+    /// A VAE from its meta and weights.
+    pub fn load(meta: VaeMeta, weights: &[u8], device: &Device) -> Result<Self, StageError> {
+        let device = device.clone().inner();
+        let fresh = Vae::new(&meta.config(), &mut blank(&device));
+        let vae = load(fresh, weights, "").map_err(|e| misfit("the VAE's weights", &e))?;
+        Ok(Self { vae, meta, device })
+    }
+
+    /// What it is.
+    pub fn meta(&self) -> &VaeMeta {
+        &self.meta
+    }
+
+    /// Longest motion that it has positions for, both ways.
+    pub fn max_frames(&self) -> usize {
+        POSITIONS - 2 * self.meta.latent.tokens
+    }
+
+    /// Refuses data of another format than it was trained on.
+    pub fn check_format(&self, format: DataFormat) -> Result<(), StageError> {
+        if self.meta.format == format {
+            return Ok(());
+        }
+        let ours = self.meta.format;
+        Err(StageError::Input(format!("the VAE was trained on {ours:?} features, the dataset has {format:?} features")))
+    }
+
+    /// `(x - mean) / std` with the statistics of its training data.
+    pub fn normalise(&self, rows: &mut [f32]) {
+        for row in rows.chunks_exact_mut(self.meta.features) {
+            for ((value, mean), std) in row.iter_mut().zip(&self.meta.mean).zip(&self.meta.std) {
+                *value = (*value - mean) / std;
+            }
+        }
+    }
+
+    /// The inverse of [`normalise`](Self::normalise).
+    pub fn denormalise(&self, rows: &mut [f32]) {
+        for row in rows.chunks_exact_mut(self.meta.features) {
+            for ((value, mean), std) in row.iter_mut().zip(&self.meta.mean).zip(&self.meta.std) {
+                *value = *value * std + mean;
+            }
+        }
+    }
+
+    /// Posteriors of clips of one length: `rows` are `[batch, frames, D]`, normalised.
+    pub fn encode(&self, rows: Vec<f32>, frames: usize) -> Posterior {
+        let batch = rows.len() / (frames * self.meta.features);
+        let rows = tensor(rows, [batch, frames, self.meta.features], &self.device);
+        let posterior = self.vae.encode(rows, &vec![frames; batch], &mut Dropout::off());
+        Posterior { sigma: host(posterior.sigma()), mu: host(posterior.mu_bnd) }
+    }
+
+    /// Clips `[batch, frames, D]`, normalised, of latents `[batch, N, d]`.
+    pub fn decode(&self, z: Vec<f32>, frames: usize) -> Vec<f32> {
+        let latent = self.meta.latent;
+        let batch = z.len() / (latent.tokens * latent.dim);
+        let z = tensor(z, [batch, latent.tokens, latent.dim], &self.device);
+        host(self.vae.decode(z, &vec![frames; batch], frames, &mut Dropout::off()))
+    }
+}
+
+/// What latents are drawn for.
+#[derive(Debug, Clone)]
+pub struct Conditions {
+    /// Caption embeddings, `[batch, text]`.
+    pub text: Vec<f32>,
+    /// The empty caption's embedding, `[text]`.
+    pub null: Vec<f32>,
+    /// Standard normal noise that the sampler starts from, `[batch, N, d]`.
+    pub noise: Vec<f32>,
+}
+
+/// A trained denoiser: teacher or student.
+#[derive(Debug)]
+pub struct Denoiser {
+    network: networks::Denoiser,
+    meta: DenoiserMeta,
+    schedule: Schedule,
+    device: Device,
+}
+
+impl Denoiser {
+    /// Reads an artifact of kind `denoiser`.
+    pub fn read(blobs: &dyn Blobs, manifest: &Manifest, device: &Device) -> Result<Self, StageError> {
+        Self::load(artifacts::meta(manifest, "the denoiser")?, &artifacts::file(blobs, manifest, MODEL_FILE)?, device)
+    }
+
+    /// A denoiser from its meta and weights.
+    pub fn load(meta: DenoiserMeta, weights: &[u8], device: &Device) -> Result<Self, StageError> {
+        let device = device.clone().inner();
+        let fresh = networks::Denoiser::new(&meta.config(), &mut blank(&device));
+        let network = load(fresh, weights, "").map_err(|e| misfit("the denoiser's weights", &e))?;
+        Ok(Self { network, meta, schedule: Schedule::published(), device })
+    }
+
+    /// What it is.
+    pub fn meta(&self) -> &DenoiserMeta {
+        &self.meta
+    }
+
+    /// Refuses a sampler that this family does not have.
+    pub fn check_sampler(&self, sampler: &Sampler) -> Result<(), StageError> {
+        check_sampler(&self.meta.family, sampler).map_err(StageError::Input)
+    }
+
+    /// Draws latents `[batch, N, d]`: a teacher by DDIM with guidance g, an LCM with fresh noise between its jumps, a PCM by one jump a
+    /// phase; students embed w. `step_noise(j)` is asked for noise of the same shape after jump j of an LCM.
+    pub fn sample(
+        &self,
+        conditions: &Conditions,
+        sampler: &Sampler,
+        step_noise: &mut dyn FnMut(usize) -> Vec<f32>,
+    ) -> Result<Vec<f32>, StageError> {
+        self.check_sampler(sampler)?;
+        let (latent, text_dim) = (self.meta.latent, self.meta.text_dim);
+        let batch = conditions.noise.len() / (latent.tokens * latent.dim);
+        let shape = [batch, latent.tokens, latent.dim];
+        let on_device = |values: Vec<f32>, shape| tensor(values, shape, &self.device);
+        let z = on_device(conditions.noise.clone(), shape);
+        let off = &mut Dropout::off();
+        Ok(host(match self.meta.family {
+            Family::Mld => {
+                let mut text = conditions.text.clone();
+                text.extend(conditions.null.repeat(batch));
+                let text = on_device(text, [2 * batch, 1, text_dim]);
+                let [_, tokens, dim] = shape;
+                ddim_sample(&self.schedule, sampler.steps, z, |z, t| {
+                    let both = Tensor::cat(vec![z.clone(), z], 0);
+                    let noise = self.network.forward(both, &vec![t; 2 * batch], text.clone(), None, off);
+                    let half = |from: usize| noise.clone().slice([from..from + batch, 0..tokens, 0..dim]);
+                    guided(half(0), half(batch), sampler.guidance)
+                })
+            }
+            Family::Lcm { skip, .. } => {
+                let mut eps = self.student(conditions, sampler, batch);
+                let timesteps = lcm_path(skip, sampler);
+                let fresh: Vec<_> = (1..timesteps.len()).map(|j| on_device(step_noise(j - 1), shape)).collect();
+                lcm_sample(&self.schedule, &timesteps, z, &fresh, &mut eps)
+            }
+            Family::Pcm { skip, phases, .. } => {
+                let mut eps = self.student(conditions, sampler, batch);
+                pcm_sample(&self.schedule, &Phases::new(&Grid::new(skip), phases), z, &mut eps)
+            }
+        }))
+    }
+
+    /// A student's noise prediction as a function of latent and timestep.
+    fn student(
+        &self,
+        conditions: &Conditions,
+        sampler: &Sampler,
+        batch: usize,
+    ) -> impl FnMut(Tensor<3>, usize) -> Tensor<3> {
+        let text = tensor(conditions.text.clone(), [batch, 1, self.meta.text_dim], &self.device);
+        #[expect(clippy::cast_possible_truncation, reason = "embedded in f32 by definition")]
+        let w = vec![sampler.guidance as f32; batch];
+        let guidance = guidance_embedding(&w, self.meta.guidance_dim, &self.device);
+        move |z, t| self.network.forward(z, &vec![t; batch], text.clone(), Some(guidance.clone()), &mut Dropout::off())
+    }
+}
+
+/// Timesteps of an LCM's sampler, noisiest first: as given, else spread evenly over the training grid from 999 down.
+fn lcm_path(skip: usize, sampler: &Sampler) -> Vec<usize> {
+    match sampler.timesteps.is_empty() {
+        true => lcm_timesteps(LcmTimesteps::Even(Grid::new(skip)), sampler.steps),
+        false => sampler.timesteps.clone(),
+    }
+}
+
+/// Why `sampler` is not one of `family`'s.
+fn check_sampler(family: &Family, sampler: &Sampler) -> Result<(), String> {
+    let Sampler { steps, guidance, timesteps } = sampler;
+    let bound = |most: usize| match (1..=most).contains(steps) {
+        true => Ok(()),
+        false => Err(format!("sampler: `steps` is {steps}, expected 1 to {most}")),
+    };
+    if !guidance.is_finite() {
+        return Err(format!("sampler: `guidance` is {guidance}, expected a number"));
+    }
+    if !timesteps.is_empty() && !matches!(family, Family::Lcm { .. }) {
+        return Err("sampler: `timesteps` can be chosen for an LCM only; leave them out".into());
+    }
+    let grid = |skip: usize| match skip > 0 && TIMESTEPS.is_multiple_of(skip) {
+        true => Ok(TIMESTEPS / skip),
+        false => Err(format!("the model's solver step {skip} does not divide {TIMESTEPS}")),
+    };
+    match family {
+        Family::Mld => bound(TIMESTEPS - 1),
+        Family::Lcm { skip, .. } if timesteps.is_empty() => bound(grid(*skip)?),
+        Family::Lcm { .. } => {
+            if timesteps.len() != *steps {
+                return Err(format!("sampler: {} `timesteps` for {steps} `steps`", timesteps.len()));
+            }
+            match timesteps.iter().find(|t| **t >= TIMESTEPS) {
+                Some(t) => Err(format!("sampler: timestep {t}, expected 0 to {}", TIMESTEPS - 1)),
+                None => Ok(()),
+            }
+        }
+        Family::Pcm { skip, phases, .. } => {
+            let most = grid(*skip)?;
+            if !(1..=most).contains(phases) {
+                return Err(format!("the model has {phases} phases, its grid {most} points"));
+            }
+            match steps == phases {
+                true => Ok(()),
+                false => Err(format!(
+                    "sampler: `steps` is {steps}, but this PCM student has {phases} phases and takes as many steps; set {phases}, or \
+                     train another with `phases: {steps}`"
+                )),
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sampler(steps: usize, timesteps: &[usize]) -> Sampler {
+        Sampler { steps, guidance: 2.0, timesteps: timesteps.to_vec() }
+    }
+
+    #[test]
+    fn samplers_that_a_family_does_not_have_are_refused() {
+        let lcm = Family::Lcm { skip: 100, guidance: (5.0, 15.0) };
+        let pcm = Family::Pcm { skip: 100, guidance: (5.0, 15.0), phases: 2 };
+        for (family, sampler, word) in [
+            (&Family::Mld, sampler(0, &[]), "steps"),
+            (&Family::Mld, sampler(1000, &[]), "steps"),
+            (&Family::Mld, sampler(1, &[999]), "timesteps"),
+            (&lcm, sampler(11, &[]), "1 to 10"),
+            (&lcm, sampler(2, &[999]), "timesteps"),
+            (&lcm, sampler(1, &[1000]), "0 to 999"),
+            (&pcm, sampler(1, &[]), "2 phases"),
+            (&pcm, Sampler { guidance: f64::NAN, ..sampler(2, &[]) }, "guidance"),
+        ] {
+            let refused = check_sampler(family, &sampler).expect_err(word);
+            assert!(refused.contains(word), "{refused}");
+        }
+        assert_eq!(check_sampler(&Family::Mld, &sampler(50, &[])), Ok(()));
+        assert_eq!(check_sampler(&lcm, &sampler(2, &[699, 299])), Ok(()));
+        assert_eq!(check_sampler(&pcm, &sampler(2, &[])), Ok(()));
+        assert_eq!(lcm_path(100, &sampler(1, &[])), [999]);
+    }
+}

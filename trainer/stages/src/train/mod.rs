@@ -1,0 +1,250 @@
+//! The one training loop. A kind that trains brings an [`Objective`] (batch to gradients) and gets back the trained state.
+//!
+//! Not its job: what a loss is, where examples come from, who the other members are.
+//!
+//! The non-obvious idea: everything that training changes is a few flat f32 buffers and a step number ([`TrainState`]). A step reads
+//! them, and applies one sum over all slices of the step; nothing else survives from step to step, so a checkpoint, a peer's copy and
+//! a fresh start are the same thing at different steps.
+
+mod order;
+mod state;
+
+use std::collections::BTreeMap;
+
+use models::optim::{clip_factor, global_norm};
+use protocol::stage::Training;
+
+use crate::artifacts::Draft;
+use crate::context::{ContextError, Exchange, GangContext, Rendezvous, StageError};
+use protocol::{ArtifactKind, canonical};
+use serde_json::json;
+
+pub use order::{Order, Pick};
+pub use state::{Group, GroupPlan, TrainState};
+
+/// File of a checkpoint.
+const STATE_FILE: &str = "state.safetensors";
+
+/// What one slice of a step gave.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SliceResult {
+    /// For each group the gradient of `sum over the slice's examples of the example's loss, divided by the global batch`.
+    pub gradients: Vec<Vec<f32>>,
+    /// For each term its sum over the slice's examples, divided by the global batch.
+    pub terms: Vec<f32>,
+}
+
+/// The mathematics of one stage: parameters and examples to gradients.
+pub trait Objective {
+    /// What is trained, with its first values.
+    fn groups(&mut self) -> Vec<GroupPlan>;
+    /// Names of the values that every slice gives besides gradients; the first is the loss that is watched.
+    fn terms(&self) -> &'static [&'static str];
+    /// Takes over the parameters of `state` before the slices of a step.
+    fn load(&mut self, state: &TrainState);
+    /// Computes slice `slice` of step `step`.
+    fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError>;
+}
+
+/// How training ended, short of an error.
+#[derive(Debug)]
+pub enum Trained {
+    /// All steps are applied.
+    Finished {
+        /// The state after the last step.
+        state: TrainState,
+        /// The terms, averaged over the last hundred steps that this attempt applied.
+        metrics: BTreeMap<String, f64>,
+    },
+    /// Stopped between steps, with a checkpoint committed.
+    Yielded {
+        /// Steps applied.
+        at: u64,
+    },
+}
+
+/// Trains to the last step, or until told to stop.
+///
+/// Every member of the gang runs this same loop. What may end the attempt happens between steps, where the state is whole.
+///
+/// # Errors
+/// [`StageError::Diverged`] before the weights change if the loss or the gradient norm is not finite; whatever the context says no
+/// with otherwise.
+pub fn train(
+    objective: &mut dyn Objective,
+    training: &Training,
+    cx: &mut dyn GangContext,
+) -> Result<Trained, StageError> {
+    let (steps, slices) = (training.steps.0, training.batch.slices);
+    let config = canonical::digest(&cx.task().settings);
+    let mut state = TrainState::new(&objective.groups());
+    let mut applied = None;
+    if let Some(manifest) = cx.latest_checkpoint()? {
+        let bytes = crate::artifacts::file(&*cx.blobs(), &manifest, STATE_FILE)?;
+        state.restore(&bytes).map_err(|e| StageError::Context(ContextError::Corrupt(format!("{STATE_FILE}: {e}"))))?;
+        applied = Some(state.step);
+        cx.log(&format!("goes on from the checkpoint after step {}", state.step));
+    }
+    let mut saved_at = applied;
+    let mut recent = Recent::default();
+    'members: loop {
+        if let Rendezvous::Adopt(bytes) = cx.rendezvous(applied, &mut || state.to_bytes())? {
+            state.restore(&bytes).map_err(StageError::Fault)?;
+            cx.log(&format!("took over the state after step {} from a peer", state.step));
+        }
+        applied = Some(state.step);
+        objective.load(&state);
+        let mut done: BTreeMap<usize, Vec<f32>> = BTreeMap::new();
+        while state.step < steps {
+            // A regroup may hand us other slices of the same step; what was computed is not computed again.
+            let share = cx.share(slices);
+            for slice in share.clone() {
+                if !done.contains_key(&slice) {
+                    done.insert(slice, flatten(objective.slice(state.step, slice)?));
+                }
+            }
+            let parts: Vec<_> = share.map(|slice| (slice, done.remove(&slice).expect("just computed"))).collect();
+            let (sum, wind_down) = match cx.exchange(state.step, slices, &parts)? {
+                Exchange::Sum { sum, wind_down } => (sum, wind_down),
+                Exchange::Regroup => {
+                    let keep = (state.step, parts);
+                    if let Rendezvous::Adopt(bytes) = cx.rendezvous(applied, &mut || state.to_bytes())? {
+                        state.restore(&bytes).map_err(StageError::Fault)?;
+                        applied = Some(state.step);
+                        objective.load(&state);
+                    }
+                    if keep.0 == state.step {
+                        done.extend(keep.1);
+                    } else {
+                        done.clear();
+                    }
+                    continue;
+                }
+            };
+            done.clear();
+            let (gradients, terms) = split(&sum, &state, objective.terms().len());
+            let report = apply(&mut state, gradients, terms[0], training)?;
+            applied = Some(state.step);
+            objective.load(&state);
+
+            let mut values: Vec<(&str, f64)> =
+                objective.terms().iter().copied().zip(terms.iter().map(|t| f64::from(*t))).collect();
+            recent.push(&values);
+            values.push(("gradient_norm", report.norm));
+            values.push(("lr", report.lr));
+            if due(state.step, steps) {
+                cx.record(state.step, &values);
+            }
+            cx.progress(state.step, steps, "steps", &values[..1]);
+            let every = cx.task().checkpoint.every.0;
+            if cx.leads() && state.step < steps && (wind_down || (every > 0 && state.step.is_multiple_of(every))) {
+                save(&state, config, &recent, cx)?;
+                saved_at = Some(state.step);
+            }
+            if wind_down && state.step < steps {
+                return Ok(Trained::Yielded { at: state.step });
+            }
+        }
+        break 'members;
+    }
+    if cx.leads() && saved_at != Some(state.step) {
+        // Publishing may fail or be cut off; the last step should not have to be found again.
+        save(&state, config, &recent, cx)?;
+    }
+    Ok(Trained::Finished { state, metrics: recent.means() })
+}
+
+/// Values are recorded for every one of the first 2,000 steps of a stage, then for every tenth, and for the last.
+fn due(step: u64, steps: u64) -> bool {
+    step <= 2000 || step.is_multiple_of(10) || step == steps
+}
+
+fn flatten(result: SliceResult) -> Vec<f32> {
+    let mut flat = Vec::with_capacity(result.gradients.iter().map(Vec::len).sum::<usize>() + result.terms.len());
+    for gradient in result.gradients {
+        flat.extend(gradient);
+    }
+    flat.extend(result.terms);
+    flat
+}
+
+fn split<'a>(sum: &'a [f32], state: &TrainState, terms: usize) -> (Vec<&'a [f32]>, &'a [f32]) {
+    let (mut rest, mut gradients) = (sum, Vec::new());
+    for group in &state.groups {
+        let (head, tail) = rest.split_at(group.params.len());
+        gradients.push(head);
+        rest = tail;
+    }
+    assert_eq!(rest.len(), terms, "an exchange carries gradients and terms");
+    (gradients, rest)
+}
+
+struct Applied {
+    norm: f64,
+    lr: f64,
+}
+
+/// One optimizer update of every group: clip by the group's global norm, AdamW, EMA.
+fn apply(
+    state: &mut TrainState,
+    gradients: Vec<&[f32]>,
+    loss: f32,
+    training: &Training,
+) -> Result<Applied, StageError> {
+    let norms: Vec<f64> = gradients.iter().map(|g| global_norm(g)).collect();
+    if !loss.is_finite() || norms.iter().any(|n| !n.is_finite()) {
+        let norm = norms.iter().copied().find(|n| !n.is_finite()).unwrap_or(norms[0]);
+        return Err(StageError::Diverged { step: state.step, loss: f64::from(loss), norm });
+    }
+    let step = state.step;
+    for ((group, gradient), norm) in state.groups.iter_mut().zip(gradients).zip(&norms) {
+        let factor = if training.max_grad_norm > 0.0 { clip_factor(*norm, training.max_grad_norm) } else { 1.0 };
+        group.update(step, gradient, factor);
+    }
+    state.step += 1;
+    Ok(Applied { norm: norms[0], lr: state.groups[0].lr.at(step) })
+}
+
+fn save(state: &TrainState, config: protocol::Digest, recent: &Recent, cx: &mut dyn GangContext) -> Result<(), StageError> {
+    let meta = json!({
+        "step": state.step,
+        "settings": config,
+        "seed": cx.task().seed,
+        "groups": state.groups.iter().map(|g| json!({"name": g.name, "parameters": g.params.len()})).collect::<Vec<_>>(),
+        "instruction_set": models::instruction_set(),
+        "build": env!("CARGO_PKG_VERSION"),
+    });
+    let mut draft = Draft::new(cx, ArtifactKind::Checkpoint, meta);
+    draft.add(STATE_FILE, state.to_bytes())?;
+    let digest = draft.finish(cx)?;
+    let manifest = cx.manifest(digest)?;
+    cx.commit_checkpoint(state.step, &manifest, &recent.means())?;
+    Ok(())
+}
+
+/// Means of the newest values.
+#[derive(Debug, Default)]
+struct Recent {
+    rows: std::collections::VecDeque<Vec<(String, f64)>>,
+}
+
+impl Recent {
+    const LEN: usize = 100;
+
+    fn push(&mut self, values: &[(&str, f64)]) {
+        if self.rows.len() == Self::LEN {
+            self.rows.pop_front();
+        }
+        self.rows.push_back(values.iter().map(|(k, v)| ((*k).to_owned(), *v)).collect());
+    }
+
+    #[expect(clippy::cast_precision_loss, reason = "at most a hundred rows")]
+    fn means(&self) -> BTreeMap<String, f64> {
+        let mut sums: BTreeMap<String, f64> = BTreeMap::new();
+        for (key, value) in self.rows.iter().flatten() {
+            *sums.entry(key.clone()).or_default() += value;
+        }
+        let count = self.rows.len().max(1) as f64;
+        sums.into_iter().map(|(key, sum)| (key, sum / count)).collect()
+    }
+}

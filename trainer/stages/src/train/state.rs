@@ -1,0 +1,140 @@
+//! What training changes, and its bytes.
+
+use models::flat::Entry;
+use models::optim::{AdamW, LrSchedule, ema};
+
+use crate::artifacts::Tensors;
+
+/// One set of parameters with an optimizer of its own.
+#[derive(Debug, Clone)]
+pub struct GroupPlan {
+    /// Short name: `model`, `heads`.
+    pub name: &'static str,
+    /// Tensors in the buffer.
+    pub entries: Vec<Entry>,
+    /// First values.
+    pub params: Vec<f32>,
+    /// Optimizer.
+    pub optimizer: AdamW,
+    /// Learning rate by step.
+    pub lr: LrSchedule,
+    /// Decay of a moving average that is kept beside the parameters.
+    pub ema: Option<f64>,
+}
+
+/// A group in training: flat buffers of one length.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Group {
+    /// Short name.
+    pub name: &'static str,
+    /// Tensors in the buffer.
+    pub entries: Vec<Entry>,
+    /// Parameters.
+    pub params: Vec<f32>,
+    /// AdamW's first moments.
+    pub m: Vec<f32>,
+    /// AdamW's second moments.
+    pub v: Vec<f32>,
+    /// Moving average of the parameters, if the plan asks for one.
+    pub average: Option<Vec<f32>>,
+    /// Learning rate by step.
+    pub lr: LrSchedule,
+    optimizer: AdamW,
+    ema: f64,
+}
+
+impl Group {
+    /// Applies update number `step` (from 0) with `factor` times the gradient, then moves the average.
+    pub(super) fn update(&mut self, step: u64, gradient: &[f32], factor: f64) {
+        #[expect(clippy::cast_possible_truncation, reason = "a factor in (0, 1]")]
+        let scaled: Vec<f32> = gradient.iter().map(|g| g * factor as f32).collect();
+        self.optimizer.step(step + 1, self.lr.at(step), &mut self.params, &scaled, &mut self.m, &mut self.v);
+        if let Some(average) = &mut self.average {
+            ema(average, &self.params, self.ema);
+        }
+    }
+}
+
+/// All that a training stage carries from step to step.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrainState {
+    /// Updates applied.
+    pub step: u64,
+    /// Groups in the objective's order.
+    pub groups: Vec<Group>,
+}
+
+impl TrainState {
+    /// The state before the first step.
+    pub fn new(plans: &[GroupPlan]) -> Self {
+        let group = |plan: &GroupPlan| Group {
+            name: plan.name,
+            entries: plan.entries.clone(),
+            params: plan.params.clone(),
+            m: vec![0.0; plan.params.len()],
+            v: vec![0.0; plan.params.len()],
+            average: plan.ema.map(|_| plan.params.clone()),
+            lr: plan.lr.clone(),
+            optimizer: plan.optimizer.clone(),
+            ema: plan.ema.unwrap_or(0.0),
+        };
+        Self { step: 0, groups: plans.iter().map(group).collect() }
+    }
+
+    /// Safetensors: `step`, and per group `NAME.params`, `NAME.m`, `NAME.v`, `NAME.average`.
+    ///
+    /// # Panics
+    /// Never: flat f32 buffers always serialise.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let step = i64::try_from(self.step).expect("a step fits");
+        let mut tensors = Tensors::default().with_integers("step", [1], vec![step]);
+        for group in &self.groups {
+            let len = group.params.len();
+            let buffers = [("params", Some(&group.params)), ("m", Some(&group.m)), ("v", Some(&group.v)), ("average", group.average.as_ref())];
+            for (what, values) in buffers {
+                if let Some(values) = values {
+                    tensors = tensors.with(&format!("{}.{what}", group.name), [len], values.clone());
+                }
+            }
+        }
+        tensors.to_bytes().expect("flat buffers serialise")
+    }
+
+    /// Takes over the bytes of another state of the same plan.
+    ///
+    /// # Errors
+    /// If a buffer is missing or has another length; nothing is changed then.
+    pub fn restore(&mut self, bytes: &[u8]) -> Result<(), String> {
+        let text = |e: crate::context::StageError| e.to_string();
+        let mut tensors = Tensors::from_bytes(bytes, "the state").map_err(text)?;
+        let step = tensors.take_integers("step", 1, "the state").map_err(text)?.values;
+        let step = step.first().and_then(|s| u64::try_from(*s).ok()).ok_or("no step")?;
+        let mut groups = self.groups.clone();
+        for group in &mut groups {
+            let (name, len) = (group.name, group.params.len());
+            let mut take = |what: &str| {
+                let values = tensors.take(&format!("{name}.{what}"), 1, "the state").map_err(text)?.values;
+                if values.len() == len {
+                    Ok(values)
+                } else {
+                    Err(format!("`{name}.{what}` has {} values, expected {len}", values.len()))
+                }
+            };
+            group.params = take("params")?;
+            group.m = take("m")?;
+            group.v = take("v")?;
+            if group.average.is_some() {
+                group.average = Some(take("average")?);
+            }
+        }
+        self.step = step;
+        self.groups = groups;
+        Ok(())
+    }
+
+    /// The parameters of group `index` as they should be used: their average where one is kept.
+    pub fn result(&self, index: usize) -> &[f32] {
+        let group = &self.groups[index];
+        group.average.as_ref().unwrap_or(&group.params)
+    }
+}
