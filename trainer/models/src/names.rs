@@ -42,7 +42,8 @@ pub fn to_bytes(entries: &[Entry], flat: &[f32]) -> Vec<u8> {
 /// If the file is not safetensors, or its names or shapes are not those of `entries`.
 pub fn from_bytes(entries: &[Entry], bytes: &[u8], prefix: &str) -> Result<Vec<f32>, LoadError> {
     let file = SafeTensors::deserialize(bytes)?;
-    let mut unused: Vec<String> = file.names().into_iter().filter(|n| n.starts_with(prefix)).map(ToString::to_string).collect();
+    let mut unused: Vec<String> =
+        file.names().into_iter().filter(|n| n.starts_with(prefix)).map(ToString::to_string).collect();
     let (mut flat, mut missing) = (Vec::new(), Vec::new());
     for entry in entries {
         let name = format!("{prefix}{}", entry.name);

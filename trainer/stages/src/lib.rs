@@ -9,3 +9,4 @@ pub mod generate;
 pub mod kinds;
 pub mod networks;
 pub mod testing;
+pub mod train;

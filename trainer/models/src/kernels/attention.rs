@@ -127,7 +127,8 @@ fn stock(
     let mut scores = split(q, queries).matmul(split(k, keys).swap_dims(2, 3)) * sizes.scale();
     if let Some(mask) = mask {
         // Far below any score, and finite, so that a gradient through it is 0 and not undefined.
-        let bias = (0..batch).flat_map(|b| (0..keys).map(move |j| if j < mask.of(b) { 0.0 } else { -1e9_f32 })).collect();
+        let bias =
+            (0..batch).flat_map(|b| (0..keys).map(move |j| if j < mask.of(b) { 0.0 } else { -1e9_f32 })).collect();
         scores = scores + Tensor::from_data(TensorData::new(bias, [batch, 1, 1, keys]), &device);
     }
     let mut weights = softmax(scores, 3);
@@ -453,8 +454,7 @@ mod fused {
         let x = raw::track(qkv);
         let node = x.node();
         let q = contiguous(x.into_primitive());
-        let (out, weights) =
-            forward(&Packed::own(slice(&q), s.width), s, mask, dropout.as_ref().map(|(k, d)| (*k, d)));
+        let (out, weights) = forward(&Packed::own(slice(&q), s.width), s, mask, dropout.as_ref().map(|(k, d)| (*k, d)));
         let out = make(out, &[s.batch, s.queries, s.width]);
         let out = match SelfOp.prepare::<NoCheckpointing>([node]).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {

@@ -83,7 +83,17 @@ impl Backward<Flex, 3> for LinearOp {
         }
         if let Some(node) = pw {
             let mut dw = vec![0.0; w.len()];
-            matmul((out, inner, rows), dy, View::rows(out).t(), x, View::rows(inner), &mut dw, View::rows(inner), 0.0, 1.0);
+            matmul(
+                (out, inner, rows),
+                dy,
+                View::rows(out).t(),
+                x,
+                View::rows(inner),
+                &mut dw,
+                View::rows(inner),
+                0.0,
+                1.0,
+            );
             raw::register(grads, node.id, dw, &[out, inner]);
         }
         if let (Some(node), true) = (pb, self.biased) {

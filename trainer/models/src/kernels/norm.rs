@@ -208,8 +208,7 @@ fn tracked<const D: usize>(
     let nodes = [x.node(), y.node(), gamma.node(), beta.node()];
     let x = contiguous(x.into_primitive());
     let (gamma, beta) = (contiguous(gamma.into_primitive()), contiguous(beta.into_primitive()));
-    let mut hat =
-        if residual { sum(slice(&x), slice(&contiguous(y.into_primitive()))) } else { slice(&x).to_vec() };
+    let mut hat = if residual { sum(slice(&x), slice(&contiguous(y.into_primitive()))) } else { slice(&x).to_vec() };
     let mut scales = vec![0.0; hat.len() / shape[D - 1]];
     standardise(&mut hat, &mut scales, eps);
     let mut out = hat.clone();
@@ -218,7 +217,8 @@ fn tracked<const D: usize>(
     let out = match (NormOp { residual }).prepare::<NoCheckpointing>(nodes).compute_bound().stateful() {
         OpsKind::Tracked(prep) => {
             let rows = scales.len();
-            let state = NormState { hat: make(hat, &shape), scales: make(scales, &[rows]), gamma, shape: shape.to_vec() };
+            let state =
+                NormState { hat: make(hat, &shape), scales: make(scales, &[rows]), gamma, shape: shape.to_vec() };
             prep.finish(state, out)
         }
         OpsKind::UnTracked(prep) => prep.finish(out),

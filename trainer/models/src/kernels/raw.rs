@@ -125,7 +125,10 @@ pub(super) fn matmul(
     if m == 0 || n == 0 {
         return;
     }
-    assert!(k > 0 && av.last(m, k) < a.len() && bv.last(k, n) < b.len() && cv.last(m, n) < c.len(), "matrix out of bounds");
+    assert!(
+        k > 0 && av.last(m, k) < a.len() && bv.last(k, n) < b.len() && cv.last(m, n) < c.len(),
+        "matrix out of bounds"
+    );
     let stride = |s: usize| isize::try_from(s).expect("a stride fits");
     #[expect(unsafe_code, reason = "the product works on strided pointers; every extent was checked above")]
     // SAFETY: all elements that the strides reach lie inside the slices, and `c` overlaps neither `a` nor `b` because it

@@ -106,7 +106,12 @@ impl Denoiser {
     ///
     /// # Panics
     /// If a guidance embedding is given to a network without a place for it.
-    pub fn time_token(&self, timesteps: &[usize], guidance_bg: Option<Tensor<2>>, device: &burn::tensor::Device) -> Tensor<2> {
+    pub fn time_token(
+        &self,
+        timesteps: &[usize],
+        guidance_bg: Option<Tensor<2>>,
+        device: &burn::tensor::Device,
+    ) -> Tensor<2> {
         let mut sinusoid = time_sinusoid(timesteps, self.time_dim, device);
         if let Some(guidance) = guidance_bg {
             let project = self.time_embedding.cond_proj.as_ref().expect("a teacher takes no guidance embedding");

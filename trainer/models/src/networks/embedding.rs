@@ -10,7 +10,8 @@ use burn::tensor::{Device, Tensor, TensorData};
 pub fn time_sinusoid(timesteps: &[usize], width: usize, device: &Device) -> Tensor<2> {
     let half = width / 2;
     #[expect(clippy::cast_precision_loss, clippy::cast_possible_truncation, reason = "f32 by definition")]
-    let frequencies: Vec<f32> = (0..half).map(|i| ((-(10_000_f64.ln()) as f32) * i as f32 / half as f32).exp()).collect();
+    let frequencies: Vec<f32> =
+        (0..half).map(|i| ((-(10_000_f64.ln()) as f32) * i as f32 / half as f32).exp()).collect();
     #[expect(clippy::cast_precision_loss, reason = "timesteps are below 1000")]
     let rows = timesteps.iter().flat_map(|t| {
         let angles = frequencies.iter().map(|f| *t as f32 * f).collect::<Vec<_>>();

@@ -15,7 +15,7 @@ use protocol::stage::{Distance, Distillation, Positions};
 use protocol::{ArtifactKind, Seed};
 
 use super::latent_data::{LatentData, LatentSlice};
-use super::{optimizer, schedule};
+use super::schedule;
 use crate::artifacts::{self, DenoiserMeta, Family, MODEL_FILE};
 use crate::context::{ContextError, GangContext, StageError};
 use crate::train::{GroupPlan, TrainState};
@@ -60,7 +60,9 @@ impl Distiller {
         let teacher_meta: DenoiserMeta = artifacts::meta(&manifest, "the teacher")?;
         let stage = &cx.task().name;
         if teacher_meta.family != Family::Mld {
-            return Err(StageError::Input(format!("stage `{stage}`: `teacher` is a student; name a `train.mld` stage")));
+            return Err(StageError::Input(format!(
+                "stage `{stage}`: `teacher` is a student; name a `train.mld` stage"
+            )));
         }
         if teacher_meta.vae != data.vae() {
             return Err(StageError::Input(format!(
@@ -98,7 +100,7 @@ impl Distiller {
             name: "model",
             entries: flat::layout(&self.student),
             params: flat::read(&self.student),
-            optimizer: optimizer(&self.settings.training.optimizer),
+            optimizer: (&self.settings.training.optimizer).into(),
             lr: schedule(&self.settings.training, self.settings.training.lr),
             ema: Some(self.settings.ema),
         }

@@ -47,8 +47,7 @@ pub(super) fn run(cx: &mut dyn GangContext, settings: &DistillLcm) -> Result<Out
     match train(&mut objective, &settings.distillation.training, cx)? {
         Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
         Trained::Finished { state, metrics } => {
-            let family =
-                Family::Lcm { skip: settings.distillation.skip, guidance: settings.distillation.guidance };
+            let family = Family::Lcm { skip: settings.distillation.skip, guidance: settings.distillation.guidance };
             // The online network is what is kept, as upstream; its average only was the target.
             let bytes = to_bytes(&state.groups[0].entries, &state.groups[0].params);
             let meta = to_meta(&objective.0.meta(family));

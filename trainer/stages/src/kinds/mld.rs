@@ -13,7 +13,7 @@ use protocol::ArtifactKind;
 use protocol::stage::TrainMld;
 
 use super::latent_data::LatentData;
-use super::{optimizer, schedule, slice_gradient};
+use super::{schedule, slice_gradient};
 use crate::artifacts::{self, DenoiserMeta, Family, MODEL_FILE, VaeMeta, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, train};
@@ -32,7 +32,7 @@ impl Objective for Mld {
             name: "model",
             entries: flat::layout(&self.network),
             params: flat::read(&self.network),
-            optimizer: optimizer(&self.settings.training.optimizer),
+            optimizer: (&self.settings.training.optimizer).into(),
             lr: schedule(&self.settings.training, self.settings.training.lr),
             ema: (self.settings.ema > 0.0).then_some(self.settings.ema),
         }]

@@ -1,15 +1,26 @@
 //! One file per stage kind, and the table that finds it.
 
+mod consistency;
 mod data;
 mod encode;
+mod latent_data;
 mod latent_fid;
+mod lcm;
+mod mld;
+mod pcm;
 mod reconstruction;
 pub mod text;
+mod vae;
 
 use std::collections::BTreeMap;
 
+use burn::module::Module;
+use burn::tensor::Tensor;
+use models::flat::add_gradients;
+use models::optim::LrSchedule;
+use motion::Stream;
 use protocol::ArtifactKind;
-use protocol::stage::StageSettings;
+use protocol::stage::{StageSettings, Training};
 use serde_json::{Value, json};
 
 use crate::artifacts;
@@ -49,7 +60,32 @@ pub fn run_part(cx: &mut dyn AttemptContext, part: Part) -> Result<Outcome, Stag
 
 /// Runs a training stage as a member of its gang.
 pub fn run_gang(cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
-    Err(misplaced(&cx.task().settings.clone(), "by a gang"))
+    match cx.task().settings.clone() {
+        StageSettings::TrainVae(settings) => vae::run(cx, &settings),
+        StageSettings::TrainMld(settings) => mld::run(cx, &settings),
+        StageSettings::DistillLcm(settings) => lcm::run(cx, &settings),
+        StageSettings::DistillPcm(settings) => pcm::run(cx, &settings),
+        other => Err(misplaced(&other, "by a gang")),
+    }
+}
+
+/// The stage's learning rates with `lr` as the peak.
+fn schedule(training: &Training, lr: f64) -> LrSchedule {
+    LrSchedule::from(&Training { lr, ..training.clone() })
+}
+
+/// The gradient of a slice's loss for all parameters of `module`, and the loss.
+fn slice_gradient<M: Module>(module: &M, loss: Tensor<1>) -> (Vec<f32>, f32) {
+    let value = loss.clone().inner().into_scalar::<f32>();
+    let mut gradients = loss.backward();
+    let mut flat = vec![0.0; module.num_params()];
+    add_gradients(module, &mut gradients, &mut flat);
+    (flat, value)
+}
+
+/// What a stage's dropout is keyed by: the run's seed and the stage's name.
+fn dropout_seed(cx: &dyn AttemptContext) -> u64 {
+    Stream::new(cx.task().seed, &format!("{}/dropout", cx.task().name), 0, 0).bits()
 }
 
 fn misplaced(settings: &StageSettings, how: &str) -> StageError {

@@ -20,7 +20,7 @@ use protocol::ArtifactKind;
 use protocol::stage::DistillPcm;
 
 use super::consistency::{Distiller, SolverStep};
-use super::{optimizer, schedule, slice_gradient};
+use super::{schedule, slice_gradient};
 use crate::artifacts::{self, Family, MODEL_FILE, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, train};
@@ -43,7 +43,7 @@ impl Objective for Pcm {
                 name: "heads",
                 entries: flat::layout(heads),
                 params: flat::read(heads),
-                optimizer: optimizer(&self.settings.discriminator_optimizer),
+                optimizer: (&self.settings.discriminator_optimizer).into(),
                 lr: schedule(training, lr),
                 ema: None,
             });
@@ -80,9 +80,16 @@ impl Objective for Pcm {
             return Ok(SliceResult { gradients: vec![gradient], terms: vec![loss] });
         };
 
-        let levels: Vec<usize> = solved.batch.picks.iter().zip(&phases).zip(&edges).map(|((pick, m), edge)| {
-            edge + self.it.data.stream("level", *pick).below(self.phases.next_edge_time(*m) - edge)
-        }).collect();
+        let levels: Vec<usize> = solved
+            .batch
+            .picks
+            .iter()
+            .zip(&phases)
+            .zip(&edges)
+            .map(|((pick, m), edge)| {
+                edge + self.it.data.stream("level", *pick).below(self.phases.next_edge_time(*m) - edge)
+            })
+            .collect();
         let (fake, real) = self.levels(&solved, student, &edges, &levels);
         let text = &solved.batch.text_blc;
         let features = |z: Tensor<3>| self.it.teacher.features(z, &levels, text.clone(), &mut Dropout::off());

@@ -7,7 +7,7 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use models::flat;
 use models::kernels::Dropout;
-use models::losses;
+use models::losses::{self, Body, VaeRecipe};
 use models::names::to_bytes;
 use models::networks::{Init, Vae};
 use motion::Stream;
@@ -15,7 +15,7 @@ use motion::dataset::{Dataset, crop, window};
 use protocol::stage::{Split, TrainVae};
 use protocol::{ArtifactKind, Seed};
 
-use super::{optimizer, schedule, slice_gradient};
+use super::{schedule, slice_gradient};
 use crate::artifacts::{self, MODEL_FILE, VaeMeta, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::train::{GroupPlan, Objective, Order, Pick, SliceResult, TrainState, Trained, train};
@@ -33,6 +33,7 @@ struct VaeObjective {
     purpose: String,
     seed: Seed,
     dropout_seed: u64,
+    body: Body,
     device: Device,
 }
 
@@ -80,7 +81,7 @@ impl Objective for VaeObjective {
             name: "model",
             entries: flat::layout(&self.network),
             params: flat::read(&self.network),
-            optimizer: optimizer(&self.settings.training.optimizer),
+            optimizer: (&self.settings.training.optimizer).into(),
             lr: schedule(&self.settings.training, self.settings.training.lr),
             ema: (self.settings.ema > 0.0).then_some(self.settings.ema),
         }]
@@ -98,7 +99,8 @@ impl Objective for VaeObjective {
         let (phase, picks, global) = self.pick(step, slice);
         let cuts: Vec<(usize, usize)> = picks.iter().map(|pick| self.cut(phase, *pick)).collect();
         let lengths: Vec<usize> = cuts.iter().map(|(_, len)| *len).collect();
-        let (batch, frames, width) = (picks.len(), *lengths.iter().max().expect("no empty slice"), self.dataset.mean.len());
+        let (batch, frames, width) =
+            (picks.len(), *lengths.iter().max().expect("no empty slice"), self.dataset.mean.len());
         let latent = self.settings.latent;
         let mut rows = vec![0.0; batch * frames * width];
         let mut noise = vec![0.0; batch * latent.tokens * latent.dim];
@@ -109,8 +111,8 @@ impl Objective for VaeObjective {
             to.copy_from_slice(from);
             self.dataset.normalise(to);
             let size = latent.tokens * latent.dim;
-            Stream::new(self.seed, &format!("{}/noise", self.purpose), pick.place, phase)
-                .fill_normal(&mut noise[b * size..(b + 1) * size]);
+            let mut draw = Stream::new(self.seed, &format!("{}/noise", self.purpose), pick.place, phase);
+            draw.fill_normal(&mut noise[b * size..(b + 1) * size]);
         }
         let rows = Tensor::<3>::from_data(TensorData::new(rows, [batch, frames, width]), &self.device);
         let noise = Tensor::from_data(TensorData::new(noise, [batch, latent.tokens, latent.dim]), &self.device);
@@ -119,25 +121,19 @@ impl Objective for VaeObjective {
         let posterior = self.network.encode(rows.clone(), &lengths, &mut dropout);
         let decoded = self.network.decode(posterior.sample(noise), &lengths, frames, &mut dropout);
 
-        let weights = &self.settings.loss;
-        let live = weights.masked.then_some(lengths.as_slice());
-        let feature = losses::smooth_l1(decoded.clone(), rows.clone(), live);
-        let kl = losses::kl(posterior.mu_bnd, posterior.logvar_bnd);
-        let mut loss = feature.clone() * weights.feature as f32 + kl.clone() * weights.kl as f32;
-        if weights.velocity > 0.0 {
-            loss = loss + losses::local_positions(decoded.clone(), rows.clone(), self.dataset.skeleton(), live) * weights.velocity as f32;
+        // Early in training the joint term's root drift drowns the posture; it may join later.
+        let mut recipe = VaeRecipe::from(self.settings.loss.clone());
+        if step < self.share(self.settings.loss.joint_from) {
+            recipe.weights.joint = 0.0;
         }
-        let mut joint_value = 0.0;
-        if weights.joint > 0.0 && step >= self.share(weights.joint_from) {
-            let statistics = losses::Statistics::new(&self.dataset.mean, &self.dataset.std, &self.device);
-            let joint = losses::joint_error(decoded, rows, &statistics, self.dataset.skeleton(), live);
-            joint_value = joint.clone().inner().into_scalar::<f32>() / global as f32;
-            loss = loss + joint * weights.joint as f32;
-        }
-        let part = |x: Tensor<1>| x.inner().into_scalar::<f32>() / global as f32;
-        let (feature, kl) = (part(feature), part(kl));
+        let terms = losses::vae(&recipe, &self.body, decoded, rows, &posterior, &lengths);
+        let part = |x: &Option<Tensor<1>>| x.clone().map_or(0.0, |x| x.inner().into_scalar::<f32>() / global as f32);
+        let (feature, joint, kl) = (part(&terms.feature), part(&terms.joint), part(&terms.kl));
+        let Some(loss) = terms.total() else {
+            return Err(StageError::Input(format!("stage `{}`: every weight in `loss` is 0", self.purpose)));
+        };
         let (gradient, loss) = slice_gradient(&self.network, loss / global as f32);
-        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss, feature, joint_value, kl] })
+        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss, feature, joint, kl] })
     }
 }
 
@@ -167,6 +163,7 @@ pub(super) fn run(cx: &mut dyn GangContext, settings: &TrainVae) -> Result<Outco
         settings: settings.clone(),
         windows: Order::new(seed, &format!("{purpose}/windows"), train_entries.len(), window_batch, POOL),
         clips: Order::new(seed, &format!("{purpose}/clips"), train_entries.len(), batch, POOL),
+        body: Body::new(dataset.skeleton(), &dataset.mean, &dataset.std, &cx.device()),
         train: train_entries,
         dataset,
         network: Vae::new(&meta.config(), &mut init),

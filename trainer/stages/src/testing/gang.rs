@@ -403,7 +403,7 @@ mod tests {
             seed: Seed(0),
             checkpoint: CheckpointPolicy::default(),
         };
-        let device = models::device::open(protocol::stage::Backend::Flex, 0).unwrap();
+        let device = Device::flex();
         let attempt = || MemoryAttempt::new(task.clone(), device.clone(), Arc::default());
         run(attempt, count, script, saved, &body).unwrap()
     }

@@ -205,7 +205,12 @@ fn apply(
     Ok(Applied { norm: norms[0], lr: state.groups[0].lr.at(step) })
 }
 
-fn save(state: &TrainState, config: protocol::Digest, recent: &Recent, cx: &mut dyn GangContext) -> Result<(), StageError> {
+fn save(
+    state: &TrainState,
+    config: protocol::Digest,
+    recent: &Recent,
+    cx: &mut dyn GangContext,
+) -> Result<(), StageError> {
     let meta = json!({
         "step": state.step,
         "settings": config,

@@ -90,7 +90,12 @@ impl TrainState {
         let mut tensors = Tensors::default().with_integers("step", [1], vec![step]);
         for group in &self.groups {
             let len = group.params.len();
-            let buffers = [("params", Some(&group.params)), ("m", Some(&group.m)), ("v", Some(&group.v)), ("average", group.average.as_ref())];
+            let buffers = [
+                ("params", Some(&group.params)),
+                ("m", Some(&group.m)),
+                ("v", Some(&group.v)),
+                ("average", group.average.as_ref()),
+            ];
             for (what, values) in buffers {
                 if let Some(values) = values {
                     tensors = tensors.with(&format!("{}.{what}", group.name), [len], values.clone());

@@ -1,0 +1,228 @@
+//! Map stages on untrained networks: what they give must not hang on how the work was cut, and misfits are refused.
+
+use std::collections::BTreeMap;
+
+use checkpoint::Blobs;
+use models::names::save;
+use models::networks::{Denoiser, Init, Vae};
+use protocol::artifact::FileEntry;
+use protocol::stage::{
+    DataFormat, DataSynthetic, EncodeLatents, EvaluateLatentFid, EvaluateReconstruction, LatentShape, Network,
+    Positions, Sampler, Split, StageSettings, TextEmbed,
+};
+use protocol::{ArtifactKind, Digest, Manifest, Seed};
+use stages::artifacts::{self, DenoiserMeta, Family, Latents, MODEL_FILE, VaeMeta, to_meta};
+use stages::generate::Generator;
+use stages::testing::Bench;
+
+const LATENT: LatentShape = LatentShape { tokens: 2, dim: 4 };
+
+fn network() -> Network {
+    Network { width: 16, layers: 3, heads: 2, feed_forward: 32, ..Network::default() }
+}
+
+fn bench() -> Bench {
+    Bench::new(burn::tensor::Device::flex(), 11, 1)
+}
+
+fn put(bench: &Bench, kind: ArtifactKind, meta: serde_json::Value, weights: Vec<u8>) -> Digest {
+    let blobs = bench.blobs();
+    let entry = FileEntry { bytes: weights.len() as u64, digest: blobs.put(weights).unwrap() };
+    let mut manifest = Manifest::new(kind, meta);
+    manifest.files.insert(MODEL_FILE.into(), entry);
+    blobs.put(manifest.to_bytes()).unwrap()
+}
+
+fn untrained_vae(bench: &Bench) -> Digest {
+    let meta = VaeMeta {
+        format: DataFormat::Humanml3d,
+        features: 263,
+        latent: LATENT,
+        network: network(),
+        mean: vec![0.0; 263],
+        std: vec![1.0; 263],
+    };
+    let device = bench.device();
+    let vae = Vae::new(&meta.config(), &mut Init::new(Seed(1), "vae", Positions::Sinusoid, &device));
+    put(bench, ArtifactKind::Vae, to_meta(&meta), save(&vae))
+}
+
+fn untrained_denoiser(bench: &Bench, vae: Digest, family: Family, latent: LatentShape) -> Digest {
+    let meta = DenoiserMeta {
+        guidance_dim: if family == Family::Mld { 0 } else { 32 },
+        family,
+        latent,
+        network: network(),
+        text_relu: false,
+        encoder: "hashed".into(),
+        text_dim: 768,
+        vae,
+    };
+    let device = bench.device();
+    let denoiser = Denoiser::new(&meta.config(), &mut Init::new(Seed(2), "denoiser", Positions::Uniform, &device));
+    put(bench, ArtifactKind::Denoiser, to_meta(&meta), save(&denoiser))
+}
+
+/// Dataset, embeddings and VAE.
+fn data(bench: &mut Bench) -> (Digest, Digest, Digest) {
+    let settings = DataSynthetic { clips: 40, val: 0.1, test: 0.2, mirror: false };
+    let dataset = bench.run("dataset", &StageSettings::DataSynthetic(settings), &[]).unwrap().output();
+    let text = StageSettings::TextEmbed(TextEmbed::default());
+    let text = bench.run("text", &text, &[("dataset", dataset)]).unwrap().output();
+    (dataset, text, untrained_vae(bench))
+}
+
+fn encode(bench: &mut Bench, shards: usize, dataset: Digest, vae: Digest) -> Digest {
+    let settings = StageSettings::EncodeLatents(EncodeLatents { crops: 3, shards, ..EncodeLatents::default() });
+    bench.run("latents", &settings, &[("dataset", dataset), ("vae", vae)]).unwrap().output()
+}
+
+#[test]
+fn latents_are_the_same_bytes_however_the_entries_are_cut() {
+    let mut bench = bench();
+    let (dataset, _, vae) = data(&mut bench);
+    let whole = encode(&mut bench, 1, dataset, vae);
+    for shards in [2, 4, 7, 64] {
+        assert_eq!(encode(&mut bench, shards, dataset, vae), whole, "{shards} shards");
+    }
+    let latents = Latents::read(&*bench.blobs(), &bench.manifest(whole).unwrap()).unwrap();
+    assert_eq!(latents.mu.shape, [120, 2, 4]);
+    assert_eq!(latents.meta.lengths.len(), 120);
+    assert!(latents.meta.lengths.iter().all(|l| l % 4 == 0));
+    assert!(latents.sigma.values.iter().all(|s| *s > 0.0));
+    // Another stage name draws other crops.
+    let settings = StageSettings::EncodeLatents(EncodeLatents { crops: 3, ..EncodeLatents::default() });
+    let other = bench.run("latents-2", &settings, &[("dataset", dataset), ("vae", vae)]).unwrap().output();
+    assert_ne!(other, whole);
+}
+
+#[test]
+fn reconstruction_is_the_same_however_the_clips_are_cut() {
+    let mut bench = bench();
+    let (dataset, _, vae) = data(&mut bench);
+    let mut reports = Vec::new();
+    for shards in [1, 3, 50] {
+        let settings = EvaluateReconstruction { shards, split: Split::All, ..EvaluateReconstruction::default() };
+        let settings = StageSettings::EvaluateReconstruction(settings);
+        let ran = bench.run("reconstruction", &settings, &[("dataset", dataset), ("vae", vae)]).unwrap();
+        reports.push((ran.output(), ran.metrics().clone()));
+    }
+    assert_eq!(reports[0], reports[1]);
+    assert_eq!(reports[0], reports[2]);
+    let metrics = &reports[0].1;
+    println!("{metrics:?}");
+    for prefix in ["", "mu_", "clip_mean_"] {
+        for name in ["mpjpe_mm", "mpjpe_local_mm", "mpjpe_global_mm", "feature_error", "feature_smooth_l1"] {
+            assert!(metrics[&format!("{prefix}{name}")] > 0.0, "{prefix}{name}");
+        }
+    }
+    assert!(metrics["clip_mean_mpjpe_mm"] < metrics["mpjpe_mm"], "an untrained VAE is no better than the clip's mean");
+}
+
+fn latent_fid(shards: usize, sampler: Sampler, teacher: bool) -> StageSettings {
+    StageSettings::EvaluateLatentFid(EvaluateLatentFid {
+        teacher: if teacher { "mld".into() } else { String::new() },
+        sampler,
+        repeats: 2,
+        components: 4,
+        shards,
+        ..EvaluateLatentFid::default()
+    })
+}
+
+#[test]
+fn latent_fid_is_the_same_however_the_samples_are_cut() {
+    let mut bench = bench();
+    let (dataset, text, vae) = data(&mut bench);
+    let latents = encode(&mut bench, 2, dataset, vae);
+    let guidance = (0.5, 5.0);
+    let teacher = untrained_denoiser(&bench, vae, Family::Mld, LATENT);
+    let lcm = untrained_denoiser(&bench, vae, Family::Lcm { skip: 100, guidance }, LATENT);
+    let pcm = untrained_denoiser(&bench, vae, Family::Pcm { skip: 100, guidance, phases: 2 }, LATENT);
+    for (model, steps) in [(teacher, 3), (lcm, 2), (pcm, 2)] {
+        let inputs = [("model", model), ("latents", latents), ("text", text), ("teacher", teacher)];
+        let sampler = Sampler { steps, guidance: 2.0, timesteps: vec![] };
+        let mut reports = Vec::new();
+        for shards in [1, 3, 8] {
+            let ran = bench.run("eval", &latent_fid(shards, sampler.clone(), true), &inputs).unwrap();
+            reports.push((ran.output(), ran.metrics().clone()));
+        }
+        println!("{:?}", reports[0].1);
+        assert_eq!(reports[0], reports[1]);
+        assert_eq!(reports[0], reports[2]);
+        let metrics = &reports[0].1;
+        for name in [
+            "latent_fid",
+            "latent_fid_sd",
+            "latent_fid_floor",
+            "latent_std",
+            "latent_std_real",
+            "match",
+            "match_other_noise",
+            "r_precision_top1",
+            "r_precision_top3",
+            "r_precision_top3_test",
+        ] {
+            assert!(metrics.get(name).is_some_and(|v| v.is_finite() && *v >= 0.0), "{name}: {metrics:?}");
+        }
+    }
+    // The teacher's own 50 steps match themselves exactly.
+    let inputs = [("model", teacher), ("latents", latents), ("text", text), ("teacher", teacher)];
+    let own = Sampler { steps: 50, guidance: 2.0, timesteps: vec![] };
+    let ran = bench.run("eval", &latent_fid(2, own.clone(), true), &inputs).unwrap();
+    assert_eq!(ran.metrics()["match"], 0.0);
+    let ran = bench.run("eval", &latent_fid(2, own, false), &inputs[..3]).unwrap();
+    assert!(!ran.metrics().contains_key("match"));
+}
+
+#[test]
+fn what_does_not_fit_is_refused_with_the_reason() {
+    let mut bench = bench();
+    let (dataset, text, vae) = data(&mut bench);
+    let latents = encode(&mut bench, 2, dataset, vae);
+    let other_shape = untrained_denoiser(&bench, vae, Family::Mld, LatentShape { tokens: 3, dim: 4 });
+    let other_vae = untrained_denoiser(&bench, Digest::of(b"another"), Family::Mld, LATENT);
+    let good = untrained_denoiser(&bench, vae, Family::Mld, LATENT);
+    let sampler = Sampler { steps: 3, guidance: 2.0, timesteps: vec![] };
+    for (model, kind_of, reason) in
+        [(other_shape, latents, "3x4"), (other_vae, latents, "another VAE"), (good, text, "kind Embeddings")]
+    {
+        let inputs = [("model", model), ("latents", kind_of), ("text", text)];
+        let refused = bench.run("eval", &latent_fid(1, sampler.clone(), false), &inputs).unwrap_err();
+        assert!(refused.to_string().contains(reason), "{refused}");
+        assert_eq!(refused.class(), protocol::message::FailureClass::Input, "{refused}");
+    }
+    let mut manifest = bench.manifest(vae).unwrap();
+    manifest.files = BTreeMap::new();
+    let empty = bench.blobs().put(manifest.to_bytes()).unwrap();
+    let settings = StageSettings::EncodeLatents(EncodeLatents::default());
+    let refused = bench.run("latents", &settings, &[("dataset", dataset), ("vae", empty)]).unwrap_err().to_string();
+    assert!(refused.contains(MODEL_FILE), "{refused}");
+}
+
+#[test]
+fn a_bundled_model_generates_and_repeats_itself() {
+    let bench = bench();
+    let vae = untrained_vae(&bench);
+    let family = Family::Pcm { skip: 100, guidance: (0.5, 5.0), phases: 2 };
+    let pcm = untrained_denoiser(&bench, vae, family, LATENT);
+    let manifest = |digest| bench.manifest(digest).unwrap();
+    let model = checkpoint::bundle::bundle(&manifest(pcm), &manifest(vae)).expect("they fit");
+    let generator = Generator::load(&model, &*bench.blobs(), &bench.device()).expect("it loads");
+    assert_eq!(generator.sampler().steps, 2);
+    let prompt = "a person walks in a circle";
+    let first = generator.generate(prompt, None, None, Seed(1)).expect("a motion");
+    assert_eq!((first.frames, first.features.len(), first.joints.len()), (120, 120 * 263, 120 * 22 * 3));
+    let again = generator.generate(prompt, None, None, Seed(1)).expect("a motion");
+    assert_eq!((&first.features, &first.joints), (&again.features, &again.joints));
+    let other = generator.generate(prompt, Some(40), None, Seed(2)).expect("a motion");
+    assert_eq!(other.frames, 40);
+    assert_ne!(first.features[..40 * 263], other.features[..]);
+    let refused = generator.generate(prompt, Some(5000), None, Seed(1)).expect_err("too long").to_string();
+    assert!(refused.contains("5000 frames"), "{refused}");
+    let sampler = Sampler { steps: 1, guidance: 2.0, timesteps: vec![] };
+    let refused = generator.generate(prompt, None, Some(&sampler), Seed(1)).expect_err("other phases").to_string();
+    assert!(refused.contains("phases"), "{refused}");
+    let meta: VaeMeta = artifacts::meta(&manifest(vae), "the VAE").unwrap();
+    assert_eq!(generator.format(), meta.format);
+}
