@@ -2,6 +2,7 @@
 //!
 //! Not its job: stages, stores, workers, where data comes from.
 
+pub mod device;
 pub mod diffusion;
 pub mod flat;
 pub mod kernels;

@@ -1,0 +1,125 @@
+//! Which devices there are, and opening one.
+//!
+//! A backend is in the program or not by a Cargo feature; which of those is used is decided here, once, from the
+//! pipeline's setting, never from an environment variable or a "best available" guess.
+
+use burn::tensor::Device;
+use protocol::stage::Backend;
+
+/// Why a device cannot be opened.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum DeviceError {
+    /// The program was built without the backend.
+    #[error("backend `{}` is not in this program: build it with `--features {}`", .0.name(), .0.name())]
+    NotBuilt(Backend),
+    /// The machine has fewer devices.
+    #[error("backend `{}` has {found} device(s), so there is no number {index}; see `trainer devices`", .backend.name())]
+    NotFound {
+        /// The backend.
+        backend: Backend,
+        /// Which device was asked for.
+        index: usize,
+        /// How many there are.
+        found: usize,
+    },
+}
+
+/// A device of this machine, or a backend that could have some.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DeviceInfo {
+    /// The backend.
+    pub backend: Backend,
+    /// Number among the backend's devices, as [`open`] takes it; `None` if the backend has none here.
+    pub index: Option<usize>,
+    /// What the backend calls it.
+    pub name: String,
+    /// What a user should know about it.
+    pub note: String,
+}
+
+const BACKENDS: [Backend; 4] = [Backend::Flex, Backend::Ndarray, Backend::Wgpu, Backend::Cuda];
+
+/// The devices of a backend, or the reason that there cannot be any.
+fn devices(backend: Backend) -> Result<Vec<Device>, DeviceError> {
+    match backend {
+        #[cfg(feature = "flex")]
+        Backend::Flex => Ok(vec![Device::flex()]),
+        #[cfg(feature = "ndarray")]
+        Backend::Ndarray => {
+            #[expect(deprecated, reason = "kept selectable as a cross-check as long as Burn has it")]
+            let device = Device::ndarray();
+            Ok(vec![device])
+        }
+        #[cfg(feature = "wgpu")]
+        Backend::Wgpu => Ok(Device::enumerate(burn::tensor::DeviceType::Wgpu).into_iter().collect()),
+        #[cfg(feature = "cuda")]
+        Backend::Cuda => Ok(Device::enumerate(burn::tensor::DeviceType::Cuda).into_iter().collect()),
+        #[allow(unreachable_patterns, reason = "every backend is built in with all features on")]
+        other => Err(DeviceError::NotBuilt(other)),
+    }
+}
+
+/// Device number `index` of a backend, without autodiff.
+///
+/// # Errors
+/// If the program was built without the backend, or the machine has fewer such devices.
+pub fn open(backend: Backend, index: usize) -> Result<Device, DeviceError> {
+    let mut found = devices(backend)?;
+    if index >= found.len() {
+        return Err(DeviceError::NotFound { backend, index, found: found.len() });
+    }
+    Ok(found.swap_remove(index))
+}
+
+/// Every device of every backend in this program, and a line for each backend that has none or is not built in.
+pub fn available() -> Vec<DeviceInfo> {
+    BACKENDS.into_iter().flat_map(list).collect()
+}
+
+fn list(backend: Backend) -> Vec<DeviceInfo> {
+    let absent = |note: String| vec![DeviceInfo { backend, index: None, name: "-".to_owned(), note }];
+    match devices(backend) {
+        Err(reason) => absent(reason.to_string()),
+        Ok(found) if found.is_empty() => absent("built in, but this machine has no such device".to_owned()),
+        Ok(found) => found
+            .iter()
+            .enumerate()
+            .map(|(index, device)| DeviceInfo {
+                backend,
+                index: Some(index),
+                name: format!("{device:?}"),
+                note: note(backend).to_owned(),
+            })
+            .collect(),
+    }
+}
+
+fn note(backend: Backend) -> &'static str {
+    match backend {
+        Backend::Flex => "CPU, pure Rust, fused kernels; the same bits on every run",
+        Backend::Ndarray => "CPU, kept as a cross-check; slower than flex",
+        Backend::Wgpu => "GPU through Vulkan, Metal or DirectX",
+        Backend::Cuda => "NVIDIA GPU",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[cfg(feature = "flex")]
+    #[test]
+    fn flex_opens_and_has_one_device() {
+        assert!(open(Backend::Flex, 0).is_ok());
+        let error = open(Backend::Flex, 3).unwrap_err();
+        assert_eq!(error, DeviceError::NotFound { backend: Backend::Flex, index: 3, found: 1 });
+    }
+
+    #[cfg(not(feature = "cuda"))]
+    #[test]
+    fn a_missing_backend_names_its_feature() {
+        let error = open(Backend::Cuda, 0).unwrap_err();
+        assert!(error.to_string().contains("--features cuda"), "{error}");
+        assert!(available().iter().any(|d| d.backend == Backend::Cuda && d.index.is_none()));
+    }
+}
