@@ -1,0 +1,1 @@
+//! Published tensor names, pinned.

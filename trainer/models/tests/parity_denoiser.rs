@@ -1,0 +1,1 @@
+//! The denoiser against the fixtures `02_denoiser_*`.

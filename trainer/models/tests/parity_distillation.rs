@@ -1,0 +1,1 @@
+//! One distillation step against the fixtures `03_distill_*`.

@@ -1,0 +1,1 @@
+//! The motion VAE against the fixtures `01_*`.
