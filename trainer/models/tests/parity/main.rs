@@ -6,7 +6,7 @@
 
 #[path = "../common/mod.rs"]
 mod common;
-// mod denoiser;
+mod denoiser;
 // mod distillation;
 mod networks;
 // mod samplers;

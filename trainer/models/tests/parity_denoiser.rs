@@ -1,1 +1,0 @@
-//! The denoiser against the fixtures `02_denoiser_*`.

@@ -1,1 +1,0 @@
-//! One distillation step against the fixtures `03_distill_*`.

@@ -1,1 +1,0 @@
-//! Samplers and the noise loss against the fixtures `03_sampler_*`.

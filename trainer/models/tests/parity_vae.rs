@@ -1,1 +1,0 @@
-//! The motion VAE against the fixtures `01_*`.
