@@ -7,7 +7,7 @@
 #[path = "../common/mod.rs"]
 mod common;
 mod denoiser;
-// mod distillation;
+mod distillation;
 mod networks;
 // mod samplers;
 mod vae;
