@@ -9,7 +9,7 @@ mod common;
 mod denoiser;
 mod distillation;
 mod networks;
-// mod samplers;
+mod samplers;
 mod vae;
 
 /// One forward pass.
