@@ -40,10 +40,7 @@ impl Fleet {
     pub(crate) fn start(count: usize, url: String, backend: Backend, logs: &Path) -> Result<Self> {
         // Their place is a comfort: without the folder they are silent.
         let _ = std::fs::create_dir_all(logs);
-        let devices = match backend {
-            Backend::Flex | Backend::Ndarray => 1,
-            Backend::Wgpu | Backend::Cuda => count,
-        };
+        let devices = device_count(backend);
         let now = Instant::now();
         let member = |i: usize| Member {
             name: WorkerId::new(format!("w{}", i + 1)),
@@ -144,10 +141,16 @@ fn last_lines(path: &Path, count: usize) -> String {
     lines[lines.len().saturating_sub(count)..].join("\n")
 }
 
-/// How many workers a backend gets when nobody says: one a core on CPU, one on a GPU.
+/// How many workers a backend gets when nobody says: one a core on CPU, one a device on GPU.
 pub(crate) fn default_size(backend: Backend) -> usize {
     match backend {
         Backend::Flex | Backend::Ndarray => std::thread::available_parallelism().map_or(1, usize::from),
-        Backend::Wgpu | Backend::Cuda => 1,
+        Backend::Wgpu | Backend::Cuda => device_count(backend),
     }
+}
+
+/// Devices of a backend, at least 1: a backend that has none says so itself, when a worker opens it.
+fn device_count(backend: Backend) -> usize {
+    let here = |device: &models::device::DeviceInfo| device.backend == backend && device.index.is_some();
+    models::device::available().iter().filter(|device| here(device)).count().max(1)
 }

@@ -1,6 +1,7 @@
 //! `trainer config show` and `trainer devices`.
 
-use clap::Subcommand;
+use clap::{Args, Subcommand};
+use models::device::{self, DeviceInfo};
 use serde_json::Value;
 
 use super::PipelineArgs;
@@ -18,6 +19,13 @@ pub(crate) enum ConfigVerb {
         #[arg(short, long, value_enum, default_value_t)]
         output: Output,
     },
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct DevicesArgs {
+    /// How the list is printed
+    #[arg(short, long, value_enum, default_value_t)]
+    pub(super) output: Output,
 }
 
 pub(crate) fn config(verb: &ConfigVerb) -> Result<u8> {
@@ -64,4 +72,30 @@ fn yaml(value: &Value, indent: usize, text: &mut String) {
             text.push_str(&format!("{pad}{key}: {shown}\n"));
         }
     }
+}
+
+pub(crate) fn devices(args: &DevicesArgs) -> u8 {
+    let devices = device::available();
+    match args.output {
+        Output::Json => {
+            let object = |device: &DeviceInfo| {
+                serde_json::json!({
+                    "backend": device.backend.name(),
+                    "index": device.index,
+                    "name": device.name,
+                    "note": device.note,
+                })
+            };
+            let list: Vec<Value> = devices.iter().map(object).collect();
+            print::json(&serde_json::json!({"schema_version": 1, "devices": list}));
+        }
+        Output::Table => {
+            let row = |device: &DeviceInfo| {
+                let index = device.index.map_or_else(|| "-".to_owned(), |index| index.to_string());
+                vec![device.backend.name().to_owned(), index, device.name.clone(), device.note.clone()]
+            };
+            print::out(&print::table(&["BACKEND", "DEVICE", "NAME", "NOTE"], devices.iter().map(row).collect()));
+        }
+    }
+    0
 }

@@ -1,6 +1,7 @@
 //! Arguments, one type and one function per verb.
 
 mod config;
+mod generate;
 mod remote;
 mod serve;
 
@@ -44,6 +45,10 @@ enum Verb {
     Pause(remote::ControlArgs),
     /// Takes a paused, failed or cancelled run up again
     Resume(ResumeArgs),
+    /// Makes a motion from a sentence
+    Generate(generate::GenerateArgs),
+    /// Lists what this build and machine can compute on
+    Devices(config::DevicesArgs),
     /// Pipeline files
     #[command(subcommand)]
     Config(config::ConfigVerb),
@@ -180,6 +185,8 @@ impl Verb {
             Self::Logs(args) => args.output,
             Self::Cancel(args) | Self::Pause(args) => args.output,
             Self::Resume(args) => args.output,
+            Self::Generate(args) => args.report,
+            Self::Devices(args) => args.output,
             Self::Worker(WorkerVerb::List(args)) => args.output,
             Self::Serve(_) | Self::Config(_) | Self::Worker(WorkerVerb::Join(_)) | Self::Registry(_) => Output::Table,
         }
@@ -197,6 +204,8 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Cancel(args) => remote::control(args, "cancel").await,
         Verb::Pause(args) => remote::control(args, "pause").await,
         Verb::Resume(args) => resume(args).await,
+        Verb::Generate(args) => generate::generate(args).await,
+        Verb::Devices(args) => Ok(config::devices(&args)),
         Verb::Config(verb) => config::config(&verb),
         Verb::Worker(WorkerVerb::List(args)) => remote::workers(args).await,
         Verb::Worker(WorkerVerb::Join(_)) => Ok(0),
