@@ -25,8 +25,9 @@ use crate::evaluation::latent_fid::{
 };
 use crate::networks::{Conditions, Denoiser};
 
-/// Samples computed together.
-const BLOCK: usize = 64;
+/// Samples computed together. Measured with 5 blocks of width 128 on one core: 32 take a tenth less time each than 64, which with
+/// guidance are 128 sequences and leave the cache.
+const BLOCK: usize = 32;
 /// Steps of the teacher that `match` compares with.
 const TEACHER_STEPS: usize = 50;
 /// Where a shard's samples are.
