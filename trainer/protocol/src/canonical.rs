@@ -59,6 +59,22 @@ mod tests {
     use super::*;
 
     #[test]
+    fn numbers_survive_being_read() {
+        let mut state = 1_u32;
+        for _ in 0..20_000 {
+            state ^= state << 13;
+            state ^= state >> 17;
+            state ^= state << 5;
+            let number = f64::from(f32::from_bits(state));
+            if number.is_finite() {
+                let bytes = to_bytes(&number);
+                let read: Value = serde_json::from_slice(&bytes).expect("a number");
+                assert_eq!(to_bytes(&read), bytes, "{number}");
+            }
+        }
+    }
+
+    #[test]
     fn key_order_does_not_matter() {
         let text = String::from_utf8(to_bytes(&json!({"b": [1, {"z": 1, "a": "x\"y"}], "a": 0.1}))).expect("utf-8");
         assert_eq!(text, r#"{"a":0.1,"b":[1,{"a":"x\"y","z":1}]}"#);
