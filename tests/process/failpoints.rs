@@ -1,0 +1,67 @@
+//! Promises 2 and 5: `kill -9` before and after each of write, fsync, rename and commit of a checkpoint or a result, then the same
+//! command: the same digests, and nothing half-written is ever visible.
+
+use cluster_tests::{Bench, Running, digests};
+use serde_json::Value;
+
+const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
+
+/// Points inside the store, which run in the trainer's own process.
+const STORE: [&str; 8] = [
+    "blob::before_write",
+    "blob::after_write",
+    "blob::before_fsync",
+    "blob::after_fsync",
+    "blob::before_rename",
+    "blob::after_rename",
+    "db::before_commit",
+    "db::after_commit",
+];
+
+/// Points of a checkpoint on its way from a worker, which dies alone: the trainer replaces it and the same run goes on.
+const WORKER: [&str; 6] = [
+    "checkpoint::before_upload",
+    "checkpoint::after_upload",
+    "checkpoint::before_commit",
+    "checkpoint::after_commit",
+    "outcome::before_report",
+    "outcome::after_report",
+];
+
+fn undisturbed() -> Value {
+    Bench::new(TRAINER).pipeline("smoke.yaml", &["--workers", "1"])
+}
+
+#[test]
+fn p7_the_trainer_dies_at_every_point_of_the_store() {
+    let reference = undisturbed();
+    for point in STORE {
+        let bench = Bench::new(TRAINER);
+        let config = Bench::config("smoke.yaml");
+        // Late enough that training stages have begun: opening the store and its first events come before.
+        let at = if point.starts_with("db::") { 25 } else { 9 };
+        let mut command = bench.command(&["run", &config, "--workers", "2"]);
+        command.env("STRIDE_FAILPOINT", format!("{point}@{at}"));
+        let killed = Running::start(command).wait();
+        assert_eq!(killed.code, None, "{point} was not reached:\n{}", killed.stderr);
+        bench.run(&["registry", "fsck"]).expect_code(0);
+        let report = bench.pipeline("smoke.yaml", &["--workers", "2"]);
+        assert_eq!(digests(&report), digests(&reference), "after a kill at {point}");
+    }
+}
+
+#[test]
+fn p7_a_worker_dies_at_every_point_of_a_checkpoint() {
+    let reference = undisturbed();
+    for point in WORKER {
+        let bench = Bench::new(TRAINER);
+        let config = Bench::config("smoke.yaml");
+        let mut command = bench.command(&["run", &config, "--workers", "2", "-o", "json"]);
+        // Every worker process dies there, also those that replace dead ones; each gets a little further before it does.
+        let at = if point.ends_with("_upload") { 9 } else { 3 };
+        command.env("STRIDE_WORKER_FAILPOINT", format!("{point}@{at}"));
+        let report = Running::start(command).wait().expect_code(0).json();
+        assert_eq!(digests(&report), digests(&reference), "with workers dying at {point}");
+        bench.run(&["registry", "fsck"]).expect_code(0);
+    }
+}
