@@ -2,7 +2,6 @@
 
 mod common;
 
-use burn::tensor::Device;
 use common::{Arrays, Gates, json, shared};
 use models::diffusion::{Schedule, affine, affine_one, boundary, consistency, ddim_timesteps, unzip};
 
@@ -13,7 +12,7 @@ fn golden_schedulers() {
     let Some(root) = shared("golden/schedulers") else { return };
     let info = json(&root.join("info.json"));
     let steps = Arrays::read(&root.join("steps.safetensors"));
-    let (device, schedule, mut gates) = (Device::flex(), Schedule::published(), Gates::default());
+    let (device, schedule, mut gates) = (common::device(), Schedule::published(), Gates::default());
 
     let betas = npy_f32(&root.join("betas.npy"));
     let bars = npy_f32(&root.join("alphas_cumprod.npy"));
@@ -23,18 +22,28 @@ fn golden_schedulers() {
         assert_eq!(schedule.alpha_bar(t) as f32, bars[t], "cumulative alpha {t}, bit for bit");
     }
 
-    for (key, expected) in info.as_object().unwrap() {
+    for (key, expected) in info.as_object().expect("as the README says") {
         if let Some(n) = key.strip_prefix("ddim_timesteps_") {
-            let expected: Vec<usize> = serde_json::from_value(expected.clone()).unwrap();
-            assert_eq!(ddim_timesteps(n.parse().unwrap()), expected, "{key}");
+            let expected: Vec<usize> = serde_json::from_value(expected.clone()).expect("as the README says");
+            assert_eq!(ddim_timesteps(n.parse().expect("as the README says")), expected, "{key}");
         }
     }
 
     let b = &info["lcm_boundary"];
-    for (i, t) in b["t"].as_array().unwrap().iter().enumerate() {
-        let (skip, out) = boundary(t.as_u64().unwrap() as usize);
-        gates.check("boundary", format!("c_skip {t}"), common::relative(skip, b["c_skip"][i].as_f64().unwrap()), 1e-12);
-        gates.check("boundary", format!("c_out {t}"), common::relative(out, b["c_out"][i].as_f64().unwrap()), 1e-12);
+    for (i, t) in b["t"].as_array().expect("as the README says").iter().enumerate() {
+        let (skip, out) = boundary(t.as_u64().expect("as the README says") as usize);
+        gates.check(
+            "boundary",
+            format!("c_skip {t}"),
+            common::relative(skip, b["c_skip"][i].as_f64().expect("as the README says")),
+            1e-12,
+        );
+        gates.check(
+            "boundary",
+            format!("c_out {t}"),
+            common::relative(out, b["c_out"][i].as_f64().expect("as the README says")),
+            1e-12,
+        );
     }
 
     let times = steps.get("addnoise_t").usizes();
@@ -49,12 +58,12 @@ fn golden_schedulers() {
 
 /// Chained steps of the 50-step sampler, each from the stored latent before it.
 fn ddim(info: &serde_json::Value, steps: &Arrays, gates: &mut Gates) {
-    let (device, schedule) = (Device::flex(), Schedule::published());
+    let (device, schedule) = (common::device(), Schedule::published());
     let out = steps.get("ddim_epsilon_model_out");
     let (clean, prev) = (steps.get("ddim_epsilon_pred_x0"), steps.get("ddim_epsilon_prev"));
     let mut z = steps.get("ddim_epsilon_x0").clone();
-    for (j, t) in info["ddim_steps_t"].as_array().unwrap().iter().enumerate() {
-        let t = t.as_u64().unwrap() as usize;
+    for (j, t) in info["ddim_steps_t"].as_array().expect("as the README says").iter().enumerate() {
+        let t = t.as_u64().expect("as the README says") as usize;
         let eps = common::row(out, j);
         let (zt, eps) = (z.tensor::<3>(&device), eps.tensor::<3>(&device));
         let x0 = affine_one(zt.clone(), eps.clone(), schedule.clean(t));
@@ -69,15 +78,15 @@ fn ddim(info: &serde_json::Value, steps: &Arrays, gates: &mut Gates) {
 /// Every `lcm_*` entry: the timesteps by our rules, then each step from the stored latent before it.
 fn lcm(info: &serde_json::Value, steps: &Arrays, gates: &mut Gates) {
     use models::diffusion::{Grid, LcmTimesteps, lcm_timesteps};
-    let (device, schedule) = (Device::flex(), Schedule::published());
+    let (device, schedule) = (common::device(), Schedule::published());
     let mut entries = 0;
-    for (key, entry) in info.as_object().unwrap() {
+    for (key, entry) in info.as_object().expect("as the README says") {
         if !key.starts_with("lcm_") || key == "lcm_boundary" {
             continue;
         }
         entries += 1;
-        let times: Vec<usize> = serde_json::from_value(entry["timesteps"].clone()).unwrap();
-        let grid = Grid::new(1000 / entry["original_inference_steps"].as_u64().unwrap() as usize);
+        let times: Vec<usize> = serde_json::from_value(entry["timesteps"].clone()).expect("as the README says");
+        let grid = Grid::new(1000 / entry["original_inference_steps"].as_u64().expect("as the README says") as usize);
         let rule = if key.contains("motionlcm") { LcmTimesteps::Tuned(grid) } else { LcmTimesteps::Even(grid) };
         assert_eq!(lcm_timesteps(rule, times.len()), times, "{key}");
 
@@ -99,7 +108,7 @@ fn lcm(info: &serde_json::Value, steps: &Arrays, gates: &mut Gates) {
 }
 
 fn npy_f32(path: &std::path::Path) -> Vec<f32> {
-    let bytes = std::fs::read(path).unwrap();
+    let bytes = std::fs::read(path).expect("as the README says");
     let header = 10 + u16::from_le_bytes([bytes[8], bytes[9]]) as usize;
     assert!(String::from_utf8_lossy(&bytes[..header]).contains("'<f4'"), "{} is f32", path.display());
     bytes[header..].chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()

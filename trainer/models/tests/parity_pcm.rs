@@ -28,7 +28,7 @@ fn parity_pcm() {
 }
 
 fn phases(grid: &Grid, count: usize, io: &Arrays, expected: &serde_json::Value, gates: &mut Gates) {
-    let (device, schedule, phases) = (Device::flex(), Schedule::published(), Phases::new(grid, count));
+    let (device, schedule, phases) = (common::device(), Schedule::published(), Phases::new(grid, count));
     let stored = |part: &str| io.get(&format!("M{count}/{part}"));
     let load = |part: &str| stored(part).tensor::<3>(&device);
     let what = |part: &str| format!("M{count}/{part}");
@@ -88,7 +88,7 @@ fn phases(grid: &Grid, count: usize, io: &Arrays, expected: &serde_json::Value, 
 }
 
 fn hinge(io: &Arrays, expected: &serde_json::Value, gates: &mut Gates) {
-    let device = Device::flex();
+    let device = common::device();
     let heads = |side: &str| -> Vec<Tensor<3>> {
         let prefix = format!("hinge/{side}");
         let names: Vec<&str> = io.names().filter(|n| n.starts_with(&prefix)).collect();

@@ -89,6 +89,31 @@ mod tests {
     }
 
     #[test]
+    fn phases_do_not_matter_if_the_prediction_is_constant() {
+        use burn::tensor::{Device, TensorData};
+        let (schedule, device) = (Schedule::published(), Device::flex());
+        let make = |seed: f32| {
+            let values: Vec<f32> = (0..24_u8).map(|i| (f32::from(i) * seed).sin()).collect();
+            Tensor::<3>::from_data(TensorData::new(values, [2, 3, 4]), &device)
+        };
+        let (z, noise) = (make(0.7), make(1.3));
+        let expected = affine_one(z.clone(), noise.clone(), schedule.jump(999, 0)).into_data();
+        for m in [1, 2, 4, 10] {
+            let phases = Phases::new(&Grid::new(100), m);
+            let mut calls = Vec::new();
+            let found = pcm_sample(&schedule, &phases, z.clone(), |_, t| {
+                calls.push(t);
+                noise.clone()
+            });
+            assert_eq!((calls.len(), calls[0]), (m, 999));
+            let off = found.into_data();
+            for (f, e) in off.as_slice::<f32>().unwrap().iter().zip(expected.as_slice::<f32>().unwrap()) {
+                assert!((f - e).abs() < 1e-4, "{m} phases: {f} instead of {e}");
+            }
+        }
+    }
+
+    #[test]
     fn an_edge_timestep_belongs_to_the_phase_below() {
         let phases = Phases::new(&Grid::new(100), 2);
         // tau_4 = 499 = s_1, but index 4 lies in phase 0.

@@ -6,7 +6,7 @@ use models::kernels::Dropout;
 use models::networks::{Denoiser, guidance_embedding, time_sinusoid};
 
 use crate::FORWARD;
-use crate::common::{Arrays, Gates, folders, json, name, shared, values};
+use crate::common::{Arrays, Gates, device, folders, json, name, shared, tracked, values};
 use crate::networks::{denoiser, repeated, timesteps};
 
 /// Arguments up to 1000 multiply what the last bit of a frequency is rounded to. Ours is the nearest f32; the stored ones
@@ -23,7 +23,7 @@ fn parity_denoiser() {
         let mut gates = Gates::default();
         let weights = folder.join("weights.safetensors");
         // With and without autodiff: the kernels have a path for each.
-        for device in [Device::flex(), Device::flex().autodiff()] {
+        for device in [device(), tracked()] {
             let network = denoiser(&config["constructor"], &weights, "", &device);
             for case in io.cases() {
                 if io.find(&format!("{case}/output_pair")).is_some() {

@@ -13,7 +13,7 @@ use models::networks::{Denoiser, guidance_embedding};
 use models::optim::{AdamW, clip_factor, ema, global_norm};
 use serde_json::Value;
 
-use crate::common::{Arrays, Gates, error, folders, json, name, relative, shared};
+use crate::common::{Arrays, Gates, device, error, folders, json, name, relative, shared, tracked};
 use crate::networks::{check_gradients, denoiser, gradients, repeated, scalar, split};
 use crate::{FORWARD, LOSS};
 
@@ -41,7 +41,7 @@ fn parity_distillation() {
         let expected = json(&folder.join("expected.json"));
         let io = Arrays::read(&folder.join("io.safetensors"));
         let weights = folder.join("weights.safetensors");
-        let (plain, tracked) = (Device::flex(), Device::flex().autodiff());
+        let (plain, tracked) = (device(), tracked());
         let student = &config["student_and_target"];
         let points = config["num_ddim_timesteps"].as_u64().expect("grid points") as usize;
         let step = Step {
@@ -93,7 +93,7 @@ impl Step<'_> {
     }
 
     fn intermediates(&self, case: &str, gates: &mut Gates) {
-        let device = Device::flex();
+        let device = device();
         let stored = |part: &str| self.io.get(&format!("{case}/{part}"));
         let load = |part: &str| self.load(case, part, &device);
         let what = |part: &str| format!("{case}/{part}");
@@ -141,7 +141,7 @@ impl Step<'_> {
 
     /// Student and target predictions, by the whole chain.
     fn chain(&self, case: &str, gates: &mut Gates) -> (Tensor<3>, Tensor<3>) {
-        let (plain, tracked) = (Device::flex(), Device::flex().autodiff());
+        let (plain, tracked) = (device(), tracked());
         let (start, end) = self.times(case);
         let (a, e) = unzip(start.iter().map(|t| self.schedule.add_noise(*t)));
         let noisy = affine(self.load(case, "z0", &plain), self.load(case, "noise", &plain), &a, &e);

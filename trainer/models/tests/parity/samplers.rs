@@ -1,6 +1,6 @@
 //! Whole trajectories of the two published samplers, and the noise loss of the teacher (fixtures `03_sampler*`).
 
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Tensor;
 use models::diffusion::{
     Grid, LcmTimesteps, Schedule, affine, ddim_sample, ddim_timesteps, guided, lcm_sample, lcm_timesteps, unzip,
 };
@@ -10,7 +10,7 @@ use models::losses;
 use models::networks::Denoiser;
 use serde_json::Value;
 
-use crate::common::{Array, Arrays, Gates, folders, json, name, relative, row, shared};
+use crate::common::{Array, Arrays, Gates, device, folders, json, name, relative, row, shared, tracked};
 use crate::networks::{check_gradients, denoiser, gradients, repeated, scalar};
 use crate::{FORWARD, LOSS};
 
@@ -25,7 +25,7 @@ fn parity_samplers() {
         let expected = json(&folder.join("expected.json"));
         let io = Arrays::read(&folder.join("io.safetensors"));
         let weights = folder.join("weights.safetensors");
-        let (plain, tracked) = (Device::flex(), Device::flex().autodiff());
+        let (plain, tracked) = (device(), tracked());
         let teacher = denoiser(&config["mld_denoiser"], &weights, "mld.", &plain);
         let trained = denoiser(&config["mld_denoiser"], &weights, "mld.", &tracked);
         let student = denoiser(&config["lcm_denoiser"], &weights, "lcm.", &plain);
@@ -54,7 +54,7 @@ fn compare(gates: &mut Gates, case: &str, seen: &[Tensor<3>], last: Tensor<3>, s
 }
 
 fn ddim(network: &Denoiser, config: &Value, expected: &Value, io: &Arrays, gates: &mut Gates) {
-    let (device, schedule) = (Device::flex(), Schedule::published());
+    let (device, schedule) = (device(), Schedule::published());
     let count = config["ddim"]["steps"].as_u64().expect("steps") as usize;
     assert_eq!(ddim_timesteps(count), steps(&expected["ddim"]));
     let g = config["ddim"]["guidance_scale"].as_f64().expect("a guidance scale");
@@ -74,7 +74,7 @@ fn ddim(network: &Denoiser, config: &Value, expected: &Value, io: &Arrays, gates
 }
 
 fn lcm(case: &str, network: &Denoiser, config: &Value, expected: &Value, io: &Arrays, gates: &mut Gates) {
-    let (device, schedule) = (Device::flex(), Schedule::published());
+    let (device, schedule) = (device(), Schedule::published());
     let settings = &config["lcm"];
     let grid = Grid::new(1000 / settings["original_inference_steps"].as_u64().expect("grid points") as usize);
     let times = steps(&expected[case]);
@@ -101,7 +101,7 @@ fn lcm(case: &str, network: &Denoiser, config: &Value, expected: &Value, io: &Ar
 }
 
 fn train(case: &str, network: &Denoiser, expected: &Value, io: &Arrays, gates: &mut Gates) {
-    let (device, schedule) = (Device::flex().autodiff(), Schedule::published());
+    let (device, schedule) = (tracked(), Schedule::published());
     let load = |part: &str| io.get(&format!("{case}/{part}")).tensor::<3>(&device);
     let times = io.get(&format!("{case}/timesteps")).usizes();
     let (a, e) = unzip(times.iter().map(|t| schedule.add_noise(*t)));

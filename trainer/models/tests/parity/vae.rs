@@ -8,7 +8,7 @@ use motion::skeleton::Skeleton;
 use protocol::stage::{DataFormat, VaeLoss};
 use serde_json::Value;
 
-use crate::common::{Arrays, Gates, folders, json, name, relative, shared};
+use crate::common::{Arrays, Gates, folders, json, name, relative, shared, tracked};
 use crate::networks::{check_gradients, gradients, scalar, vae};
 use crate::{FORWARD, LOSS};
 
@@ -20,7 +20,7 @@ fn parity_vae() {
         let expected = json(&folder.join("expected.json"));
         let io = Arrays::read(&folder.join("io.safetensors"));
         let mut gates = Gates::default();
-        let device = Device::flex().autodiff();
+        let device = tracked();
         let network = vae(&config["constructor"], &folder.join("weights.safetensors"), &device);
         let format = match config["njoints"].as_u64() {
             Some(22) => DataFormat::Humanml3d,
