@@ -21,8 +21,9 @@ use crate::problem::{Problem, Result, exit};
 
 #[derive(Debug, Args)]
 pub(crate) struct GenerateArgs {
-    /// What the motion should be, in words
-    prompt: String,
+    /// What the motion should be, in words; several sentences make one sheet, for `--out FILE.png`
+    #[arg(required = true)]
+    prompt: Vec<String>,
     /// MODEL@ALIAS, MODEL@best or MODEL:VERSION
     #[arg(short, long)]
     model: String,
@@ -41,7 +42,7 @@ pub(crate) struct GenerateArgs {
     /// Where to compute: flex, ndarray, wgpu or cuda [default: the first that this build and machine have]
     #[arg(long)]
     backend: Option<String>,
-    /// Where to write: `.gif` for a moving figure, `.npy` for features
+    /// Where to write: `.gif` for a moving figure, `.png` for a sheet of poses, `.npy` for features
     #[arg(short = 'o', long = "out", value_name = "FILE")]
     out: PathBuf,
     /// Also write joint positions [frames, joints, 3]
@@ -86,10 +87,13 @@ impl Fetched {
 
 pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
     let kind = |path: &Path| path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_lowercase();
-    if !matches!(kind(&args.out).as_str(), "gif" | "npy") {
-        let problem =
-            Problem::usage(format!("cannot write `{}`: expected a name that ends in .gif or .npy", args.out.display()));
-        return Err(problem);
+    let ending = kind(&args.out);
+    if !matches!(ending.as_str(), "gif" | "png" | "npy") {
+        let expected = "expected a name that ends in .gif, .png or .npy";
+        return Err(Problem::usage(format!("cannot write `{}`: {expected}", args.out.display())));
+    }
+    if args.prompt.len() > 1 && (ending != "png" || args.joints.is_some() || args.features.is_some()) {
+        return Err(Problem::usage("several sentences make one sheet: give `--out FILE.png` and no other file"));
     }
     for path in [Some(&args.out), args.joints.as_ref(), args.features.as_ref()].into_iter().flatten() {
         check_parent(path)?;
@@ -104,11 +108,16 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
     let steps = args.steps.unwrap_or(own.steps);
     let timesteps = if steps == own.steps { own.timesteps.clone() } else { Vec::new() };
     let sampler = Sampler { steps, guidance: args.guidance.unwrap_or(own.guidance), timesteps };
-    let motion = generator.generate(&args.prompt, args.frames, Some(&sampler), Seed(args.seed)).map_err(|error| {
-        let exit = if matches!(error, stages::context::StageError::Input(_)) { exit::USAGE } else { exit::FAILED };
-        Problem::new(exit, error)
-    })?;
-    let written = write(&args, &motion)?;
+    let mut motions = Vec::new();
+    for prompt in &args.prompt {
+        let motion = generator.generate(prompt, args.frames, Some(&sampler), Seed(args.seed)).map_err(|error| {
+            let exit = if matches!(error, stages::context::StageError::Input(_)) { exit::USAGE } else { exit::FAILED };
+            Problem::new(exit, error)
+        })?;
+        motions.push((prompt.clone(), motion));
+    }
+    let written = write(&args, &motions)?;
+    let (prompt, motion) = motions.last().expect("at least one sentence is required");
 
     let timing = motion.timing;
     let milliseconds = |time: std::time::Duration| time.as_secs_f64() * 1e3;
@@ -116,7 +125,7 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
         Output::Json => print::json(&serde_json::json!({
             "schema_version": 1,
             "model": label.to_string(),
-            "prompt": args.prompt,
+            "prompt": prompt,
             "frames": motion.frames,
             "sampler": sampler,
             "seed": args.seed,
@@ -195,18 +204,28 @@ async fn fetch(args: &GenerateArgs) -> Result<(Manifest, Fetched, Label)> {
     Ok((manifest, blobs, Label(args.model.clone(), version.version)))
 }
 
-fn write(args: &GenerateArgs, motion: &Generated) -> Result<Vec<String>> {
+/// Poses of one motion on a sheet.
+const POSES: usize = 10;
+
+fn write(args: &GenerateArgs, motions: &[(String, Generated)]) -> Result<Vec<String>> {
+    let (prompt, motion) = &motions[0];
     let failed =
         |path: &Path, error: &dyn fmt::Display| Problem::failed(format!("cannot write `{}`: {error}", path.display()));
     let skeleton = Skeleton::of(motion.format);
     let (rows, width) = (motion.frames, motion.features.len() / motion.frames.max(1));
     let mut written = Vec::new();
     let mut features = args.features.iter().collect::<Vec<_>>();
-    if args.out.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("npy")) {
+    let ends_in = |ending: &str| args.out.extension().is_some_and(|extension| extension.eq_ignore_ascii_case(ending));
+    if ends_in("npy") {
         features.push(&args.out);
     } else {
-        motion::draw::gif(&motion.joints, skeleton, &args.prompt, &args.out)
-            .map_err(|error| failed(&args.out, &error))?;
+        if ends_in("png") {
+            let rows: Vec<_> = motions.iter().map(|(prompt, motion)| (prompt.clone(), motion.joints.clone())).collect();
+            motion::draw::strip_png(&rows, POSES, skeleton, &args.out)
+        } else {
+            motion::draw::gif(&motion.joints, skeleton, prompt, &args.out)
+        }
+        .map_err(|error| failed(&args.out, &error))?;
         written.push(args.out.display().to_string());
     }
     for path in features {
