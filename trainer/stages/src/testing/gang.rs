@@ -94,6 +94,9 @@ impl Member {
 /// What a member runs.
 type Body<'a> = dyn Fn(&mut dyn GangContext) -> Result<Outcome, StageError> + Sync + 'a;
 
+/// How a member's thread ended: who, with what (`None` if it never became a member), and what it told.
+type Ended = (usize, Option<Result<Outcome, StageError>>, Told);
+
 /// Runs `body` with `count` members; `saved` are its checkpoints, old and new.
 pub(super) fn run(
     attempt: impl Fn() -> MemoryAttempt,
@@ -121,7 +124,7 @@ pub(super) fn run(
     let joiners = script.joins.iter().map(|&(me, step)| (member(me), Some(step)));
     let members: Vec<_> = starters.chain(joiners).collect();
 
-    let results: Vec<(usize, Option<Result<Outcome, StageError>>, Told)> = std::thread::scope(|scope| {
+    let results: Vec<Ended> = std::thread::scope(|scope| {
         let threads: Vec<_> = members
             .into_iter()
             .map(|(mut member, join_after)| {
