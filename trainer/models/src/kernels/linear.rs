@@ -20,7 +20,7 @@ use burn::backend::flex::FlexTensor;
 /// `x` [..., in], `weight` [out, in], `bias` [out] -> [..., out].
 pub fn linear<const D: usize>(x: Tensor<D>, weight: Tensor<2>, bias: Option<Tensor<1>>) -> Tensor<D> {
     #[cfg(feature = "flex")]
-    match raw::place(&x, raw::on_tape(&weight)) {
+    match raw::place(&x, raw::on_tape(&weight) || bias.as_ref().is_some_and(raw::on_tape)) {
         Place::Tracked => return tracked(x, weight, bias),
         Place::Plain => {
             let shape = x.dims();

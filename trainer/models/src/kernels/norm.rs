@@ -41,7 +41,7 @@ fn normalise<const D: usize>(
     eps: f64,
 ) -> Tensor<D> {
     #[cfg(feature = "flex")]
-    match raw::place(&x, raw::on_tape(&gamma) || y.as_ref().is_some_and(raw::on_tape)) {
+    match raw::place(&x, raw::on_tape(&gamma) || raw::on_tape(&beta) || y.as_ref().is_some_and(raw::on_tape)) {
         Place::Tracked => return tracked(x, y, gamma, beta, eps),
         Place::Plain => {
             let shape = x.dims();
