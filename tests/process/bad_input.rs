@@ -58,7 +58,8 @@ fn folder(path: &Path) {
     let train = fs::read_to_string(source.join("train.txt")).expect("train.txt");
     let ids: Vec<_> = train.lines().take(12).collect();
     for id in &ids {
-        fs::copy(source.join(format!("new_joint_vecs/{id}.npy")), path.join(format!("new_joint_vecs/{id}.npy"))).expect("copied");
+        fs::copy(source.join(format!("new_joint_vecs/{id}.npy")), path.join(format!("new_joint_vecs/{id}.npy")))
+            .expect("copied");
         fs::copy(source.join(format!("texts/{id}.txt")), path.join(format!("texts/{id}.txt"))).expect("copied");
     }
     fs::write(path.join("train.txt"), ids[..8].join("\n")).expect("written");
@@ -76,13 +77,18 @@ fn a_broken_dataset_folder_is_named_file_by_file() {
     let bench = Bench::new(TRAINER);
     let config = Bench::config("humanml3d-mini.yaml");
     let run = |data: &Path, parts: &[&str]| {
-        refused(&bench, &["run", &config, "--set", &format!("dataset.path={}", data.display()), "--until", "dataset"], parts);
+        refused(
+            &bench,
+            &["run", &config, "--set", &format!("dataset.path={}", data.display()), "--until", "dataset"],
+            parts,
+        );
     };
     run(&bench.path().join("missing"), &["missing"]);
 
     let data = bench.path().join("data");
     folder(&data);
-    let first = fs::read_to_string(data.join("train.txt")).expect("train.txt").lines().next().expect("an id").to_owned();
+    let first =
+        fs::read_to_string(data.join("train.txt")).expect("train.txt").lines().next().expect("an id").to_owned();
     let clip = data.join(format!("new_joint_vecs/{first}.npy"));
     let good = fs::read(&clip).expect("a clip");
 
@@ -119,7 +125,12 @@ fn a_second_run_says_who_holds_the_store() {
     });
     assert!(first.alive(), "the first run goes on");
     let second = second.expect_code(2);
-    assert!(second.stderr.contains(&first.pid().to_string()), "it should name process {}:\n{}", first.pid(), second.stderr);
+    assert!(
+        second.stderr.contains(&first.pid().to_string()),
+        "it should name process {}:\n{}",
+        first.pid(),
+        second.stderr
+    );
     first.kill();
     first.wait();
 }

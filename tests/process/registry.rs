@@ -15,7 +15,15 @@ fn p10_promote_refuse_roll_back_and_generate() {
     let before = aliases(&bench);
 
     let refused = bench.run(&[
-        "registry", "promote", "smoke@best", "--to", "prod", "--require", "latent_fid<=0", "--reason", "too good",
+        "registry",
+        "promote",
+        "smoke@best",
+        "--to",
+        "prod",
+        "--require",
+        "latent_fid<=0",
+        "--reason",
+        "too good",
     ]);
     let refused = refused.expect_code(10);
     assert!(refused.stderr.contains("latent_fid"), "{}", refused.stderr);

@@ -1,1 +1,215 @@
-//! Published tensor names, pinned.
+//! Published tensor names, pinned: a renamed field is a file that nobody can read any more. And published sizes.
+
+use std::collections::BTreeMap;
+
+use burn::module::Module;
+use burn::tensor::Device;
+use models::flat::layout;
+use models::names::{LoadError, load, save, to_bytes};
+use models::networks::{Denoiser, DenoiserConfig, Discriminator, Init, POSITIONS, Vae, VaeConfig};
+use protocol::Seed;
+use protocol::stage::Positions;
+use safetensors::SafeTensors;
+
+fn vae_config(v2: bool) -> VaeConfig {
+    VaeConfig {
+        features: 263,
+        tokens: if v2 { 16 } else { 1 },
+        dim: if v2 { 32 } else { 256 },
+        width: 256,
+        layers: 9,
+        heads: 4,
+        feed_forward: 1024,
+        projection: v2,
+        norm_eps: 1e-5,
+    }
+}
+
+fn denoiser_config(v2: bool, guidance_dim: Option<usize>) -> DenoiserConfig {
+    DenoiserConfig {
+        tokens: if v2 { 16 } else { 1 },
+        dim: if v2 { 32 } else { 256 },
+        width: 256,
+        layers: 9,
+        heads: 4,
+        feed_forward: 1024,
+        text_dim: 768,
+        time_dim: 768,
+        text_relu: !v2,
+        projection: v2,
+        guidance_dim,
+        norm_eps: 1e-5,
+    }
+}
+
+fn small_vae() -> VaeConfig {
+    VaeConfig { tokens: 2, dim: 4, width: 8, layers: 3, heads: 2, feed_forward: 12, ..vae_config(true) }
+}
+
+fn small_denoiser(guidance_dim: Option<usize>) -> DenoiserConfig {
+    let big = denoiser_config(true, guidance_dim);
+    DenoiserConfig {
+        tokens: 2,
+        dim: 4,
+        width: 8,
+        layers: 3,
+        heads: 2,
+        feed_forward: 12,
+        text_dim: 6,
+        time_dim: 10,
+        ..big
+    }
+}
+
+fn with<M>(make: impl Fn(&mut Init<'_>) -> M) -> M {
+    make(&mut Init::new(Seed(7), "names", Positions::Uniform, &Device::flex()))
+}
+
+fn sorted<M: Module>(module: &M) -> BTreeMap<String, Vec<usize>> {
+    layout(module).into_iter().map(|entry| (entry.name, entry.shape)).collect()
+}
+
+/// `name` and its shape, one a line, as the published checkpoints have them for these sizes.
+fn listed(text: &str) -> BTreeMap<String, Vec<usize>> {
+    let line = |line: &str| {
+        let (name, shape) = line.trim().split_once(' ').expect("a name and a shape");
+        (name.to_owned(), shape.split('x').map(|n| n.parse().expect("a size")).collect())
+    };
+    text.lines().filter(|l| !l.trim().is_empty()).map(line).collect()
+}
+
+fn attention(path: &str, (h, h3): (usize, usize)) -> String {
+    format!(
+        "{path}.in_proj_weight {h3}x{h}\n{path}.in_proj_bias {h3}\n{path}.out_proj.weight {h}x{h}\n{path}.out_proj.bias {h}\n"
+    )
+}
+
+/// A stack of three blocks, 8 wide, feed-forward 12.
+fn stack(path: &str, memory: bool) -> String {
+    let mut text = format!(
+        "{path}.norm.weight 8\n{path}.norm.bias 8\n{path}.linear_blocks.0.weight 8x16\n{path}.linear_blocks.0.bias 8\n"
+    );
+    for block in ["input_blocks.0", "middle_block", "output_blocks.0"] {
+        let block = format!("{path}.{block}");
+        text += &attention(&format!("{block}.self_attn"), (8, 24));
+        text += &format!(
+            "{block}.linear1.weight 12x8\n{block}.linear1.bias 12\n{block}.linear2.weight 8x12\n{block}.linear2.bias 8\n"
+        );
+        if memory {
+            text += &attention(&format!("{block}.multihead_attn"), (8, 24));
+        }
+        for norm in ["norm1", "norm2", "norm3"].into_iter().take(if memory { 3 } else { 2 }) {
+            text += &format!("{block}.{norm}.weight 8\n{block}.{norm}.bias 8\n");
+        }
+    }
+    text
+}
+
+#[test]
+fn vae_has_the_published_names() {
+    let v2 = "
+        global_motion_token 4x8
+        skel_embedding.weight 8x263
+        skel_embedding.bias 8
+        query_pos_encoder.pe 500x1x8
+        query_pos_decoder.pe 500x1x8
+        final_layer.weight 263x8
+        final_layer.bias 263
+        latent_pre.weight 4x8
+        latent_pre.bias 4
+        latent_post.weight 8x4
+        latent_post.bias 8
+    ";
+    let mut expected = listed(&format!("{v2}{}{}", stack("encoder", false), stack("decoder", true)));
+    assert_eq!(sorted(&with(|init| Vae::new(&small_vae(), init))), expected);
+    expected.retain(|name, _| !name.starts_with("latent_"));
+    let v1 = VaeConfig { projection: false, dim: 8, ..small_vae() };
+    assert_eq!(sorted(&with(|init| Vae::new(&v1, init))), expected);
+}
+
+#[test]
+fn denoiser_has_the_published_names() {
+    let student = "
+        latent_pre.weight 8x4
+        latent_pre.bias 8
+        latent_post.weight 4x8
+        latent_post.bias 4
+        time_embedding.linear_1.weight 8x10
+        time_embedding.linear_1.bias 8
+        time_embedding.cond_proj.weight 10x14
+        time_embedding.linear_2.weight 8x8
+        time_embedding.linear_2.bias 8
+        emb_proj.1.weight 8x6
+        emb_proj.1.bias 8
+        query_pos.pe 500x1x8
+    ";
+    let mut expected = listed(&format!("{student}{}", stack("encoder", false)));
+    assert_eq!(sorted(&with(|init| Denoiser::new(&small_denoiser(Some(14)), init))), expected);
+    expected.remove("time_embedding.cond_proj.weight");
+    assert_eq!(sorted(&with(|init| Denoiser::new(&small_denoiser(None), init))), expected);
+}
+
+#[test]
+fn networks_have_the_published_numbers_of_parameters() {
+    assert_eq!(POSITIONS, 500);
+    for (found, expected) in [
+        (with(|i| Vae::new(&vae_config(false), i)).num_params(), 18_032_135),
+        (with(|i| Vae::new(&vae_config(true), i)).num_params(), 18_056_487),
+        (with(|i| Vae::new(&VaeConfig { features: 251, ..vae_config(true) }, i)).num_params(), 18_050_331),
+        (with(|i| Denoiser::new(&denoiser_config(false, None), i)).num_params(), 8_221_184),
+        (with(|i| Denoiser::new(&denoiser_config(false, Some(256)), i)).num_params(), 8_417_792),
+        (with(|i| Denoiser::new(&denoiser_config(true, None), i)).num_params(), 8_237_856),
+        (with(|i| Denoiser::new(&denoiser_config(true, Some(256)), i)).num_params(), 8_434_464),
+        (with(|i| Discriminator::new(9, 256, i)).num_params(), 1_195_785),
+    ] {
+        assert_eq!(found, expected);
+    }
+}
+
+#[test]
+fn what_is_saved_loads_bit_for_bit() {
+    let network = with(|init| Denoiser::new(&small_denoiser(Some(14)), init));
+    let bytes = save(&network);
+    let blank =
+        Denoiser::new(&small_denoiser(Some(14)), &mut Init::new(Seed(8), "x", Positions::Uniform, &Device::flex()));
+    assert_ne!(save(&blank), bytes);
+    assert_eq!(save(&load(blank, &bytes, "").unwrap()), bytes);
+    assert_eq!(SafeTensors::deserialize(&bytes).unwrap().len(), sorted(&network).len());
+}
+
+#[test]
+fn weights_that_do_not_fit_are_listed_from_both_sides() {
+    let teacher = with(|init| Denoiser::new(&small_denoiser(None), init));
+    let student = with(|init| Denoiser::new(&small_denoiser(Some(14)), init));
+    let LoadError::Mismatch { missing, unused } = load(student, &save(&teacher), "").unwrap_err() else { panic!() };
+    assert_eq!((missing, unused), (vec!["time_embedding.cond_proj.weight [10, 14]".to_owned()], vec![]));
+
+    // Another size: the name stands on both sides, with both shapes.
+    let mut entries = layout(&teacher);
+    entries[0].shape = vec![4, 8];
+    let other = to_bytes(&entries, &models::flat::read(&teacher));
+    let message = load(teacher, &other, "").unwrap_err().to_string();
+    assert!(message.contains("missing: [latent_pre.weight [8, 4]]; unused: [latent_pre.weight [4, 8]]"), "{message}");
+
+    let teacher = with(|init| Denoiser::new(&small_denoiser(None), init));
+    assert!(matches!(load(teacher, b"not weights", ""), Err(LoadError::Unreadable(_))));
+}
+
+#[test]
+fn a_prefix_chooses_one_of_several_networks() {
+    let teacher = with(|init| Denoiser::new(&small_denoiser(None), init));
+    let student = with(|init| Denoiser::new(&small_denoiser(Some(14)), init));
+    let renamed = |prefix: &str, module: &Denoiser| {
+        let mut entries = layout(module);
+        entries.iter_mut().for_each(|entry| entry.name = format!("{prefix}{}", entry.name));
+        (entries, models::flat::read(module))
+    };
+    let ((mut entries, mut flat), (more, values)) = (renamed("teacher.", &teacher), renamed("student.", &student));
+    entries.extend(more);
+    flat.extend(values);
+    let both = to_bytes(&entries, &flat);
+    let expected = save(&student);
+    let blank =
+        Denoiser::new(&small_denoiser(Some(14)), &mut Init::new(Seed(8), "x", Positions::Uniform, &Device::flex()));
+    assert_eq!(save(&load(blank, &both, "student.").unwrap()), expected);
+}

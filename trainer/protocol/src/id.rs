@@ -139,7 +139,11 @@ impl FromStr for ModelName {
     type Err = ParseNameError;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        if is_name(text) { Ok(Self(text.to_owned())) } else { Err(ParseNameError { what: "model name", text: text.to_owned() }) }
+        if is_name(text) {
+            Ok(Self(text.to_owned()))
+        } else {
+            Err(ParseNameError { what: "model name", text: text.to_owned() })
+        }
     }
 }
 
@@ -147,6 +151,10 @@ impl FromStr for Alias {
     type Err = ParseNameError;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        if is_name(text) { Ok(Self(text.to_owned())) } else { Err(ParseNameError { what: "alias", text: text.to_owned() }) }
+        if is_name(text) {
+            Ok(Self(text.to_owned()))
+        } else {
+            Err(ParseNameError { what: "alias", text: text.to_owned() })
+        }
     }
 }

@@ -193,7 +193,10 @@ async fn fetch(args: &GenerateArgs) -> Result<(Manifest, Fetched, Label)> {
             return Err(problem.hint(format!("name one, such as {}@best {}", args.model, aliases.join(" "))));
         }
         _ => {
-            return Err(Problem::new(exit::FAULT, anyhow::anyhow!("the registry answered something else than a model")));
+            return Err(Problem::new(
+                exit::FAULT,
+                anyhow::anyhow!("the registry answered something else than a model"),
+            ));
         }
     };
     let blobs = Fetched::default();

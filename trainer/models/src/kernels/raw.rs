@@ -7,6 +7,8 @@ pub(super) use flex::*;
 
 #[cfg(feature = "flex")]
 mod flex {
+    use std::cell::Cell;
+
     use burn::backend::autodiff::NodeId;
     use burn::backend::autodiff::checkpoint::strategy::NoCheckpointing;
     use burn::backend::autodiff::grads::Gradients;
@@ -36,9 +38,27 @@ mod flex {
         x.clone().try_into_primitive::<Tracked>().is_ok()
     }
 
+    thread_local! {
+        static STOCK: Cell<bool> = const { Cell::new(false) };
+    }
+
+    /// Runs `body` with every tensor of this thread counted as living elsewhere.
+    pub(in crate::kernels) fn stock<T>(body: impl FnOnce() -> T) -> T {
+        struct Restore(bool);
+        impl Drop for Restore {
+            fn drop(&mut self) {
+                STOCK.set(self.0);
+            }
+        }
+        let _restore = Restore(STOCK.replace(true));
+        body()
+    }
+
     /// Where `x` lives, and with it the others of a call: on the tape if any of them is (`taped`).
     pub(in crate::kernels) fn place<const D: usize>(x: &Tensor<D>, taped: bool) -> Place {
-        if taped || on_tape(x) {
+        if STOCK.get() {
+            Place::Other
+        } else if taped || on_tape(x) {
             Place::Tracked
         } else if x.clone().try_into_primitive::<Flex>().is_ok() {
             Place::Plain

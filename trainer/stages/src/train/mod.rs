@@ -10,6 +10,7 @@ mod order;
 mod state;
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 
 use models::optim::{clip_factor, global_norm};
 use protocol::stage::Training;
@@ -87,71 +88,68 @@ pub fn train(
     }
     let mut saved_at = applied;
     let mut recent = Recent::default();
-    'members: loop {
-        if let Rendezvous::Adopt(bytes) = cx.rendezvous(applied, &mut || state.to_bytes())? {
-            state.restore(&bytes).map_err(StageError::Fault)?;
-            cx.log(&format!("took over the state after step {} from a peer", state.step));
+    meet(&mut state, applied, cx)?;
+    objective.load(&state);
+    let mut done: BTreeMap<usize, Vec<f32>> = BTreeMap::new();
+    while state.step < steps {
+        // A regroup may hand us other slices of the same step; what was computed is not computed again.
+        let share = cx.share(slices);
+        for slice in share.clone() {
+            if let Entry::Vacant(place) = done.entry(slice) {
+                place.insert(flatten(objective.slice(state.step, slice)?));
+            }
         }
-        applied = Some(state.step);
+        let parts: Vec<_> = share.map(|slice| (slice, done.remove(&slice).expect("just computed"))).collect();
+        let (sum, wind_down) = match cx.exchange(state.step, slices, &parts)? {
+            Exchange::Sum { sum, wind_down } => (sum, wind_down),
+            Exchange::Regroup => {
+                let applied = Some(state.step);
+                if meet(&mut state, applied, cx)? {
+                    // A peer was ahead: these slices are of a step that is over.
+                    done.clear();
+                    objective.load(&state);
+                } else {
+                    done.extend(parts);
+                }
+                continue;
+            }
+        };
+        done.clear();
+        let (gradients, terms) = split(&sum, &state, objective.terms().len());
+        let report = apply(&mut state, gradients, terms[0], training)?;
         objective.load(&state);
-        let mut done: BTreeMap<usize, Vec<f32>> = BTreeMap::new();
-        while state.step < steps {
-            // A regroup may hand us other slices of the same step; what was computed is not computed again.
-            let share = cx.share(slices);
-            for slice in share.clone() {
-                if !done.contains_key(&slice) {
-                    done.insert(slice, flatten(objective.slice(state.step, slice)?));
-                }
-            }
-            let parts: Vec<_> = share.map(|slice| (slice, done.remove(&slice).expect("just computed"))).collect();
-            let (sum, wind_down) = match cx.exchange(state.step, slices, &parts)? {
-                Exchange::Sum { sum, wind_down } => (sum, wind_down),
-                Exchange::Regroup => {
-                    let keep = (state.step, parts);
-                    if let Rendezvous::Adopt(bytes) = cx.rendezvous(applied, &mut || state.to_bytes())? {
-                        state.restore(&bytes).map_err(StageError::Fault)?;
-                        applied = Some(state.step);
-                        objective.load(&state);
-                    }
-                    if keep.0 == state.step {
-                        done.extend(keep.1);
-                    } else {
-                        done.clear();
-                    }
-                    continue;
-                }
-            };
-            done.clear();
-            let (gradients, terms) = split(&sum, &state, objective.terms().len());
-            let report = apply(&mut state, gradients, terms[0], training)?;
-            applied = Some(state.step);
-            objective.load(&state);
 
-            let mut values: Vec<(&str, f64)> =
-                objective.terms().iter().copied().zip(terms.iter().map(|t| f64::from(*t))).collect();
-            recent.push(&values);
-            values.push(("gradient_norm", report.norm));
-            values.push(("lr", report.lr));
-            if due(state.step, steps) {
-                cx.record(state.step, &values);
-            }
-            cx.progress(state.step, steps, "steps", &values[..1]);
-            let every = cx.task().checkpoint.every.0;
-            if cx.leads() && state.step < steps && (wind_down || (every > 0 && state.step.is_multiple_of(every))) {
-                save(&state, config, &recent, cx)?;
-                saved_at = Some(state.step);
-            }
-            if wind_down && state.step < steps {
-                return Ok(Trained::Yielded { at: state.step });
-            }
+        let mut values: Vec<(&str, f64)> =
+            objective.terms().iter().copied().zip(terms.iter().map(|t| f64::from(*t))).collect();
+        recent.push(&values);
+        values.push(("gradient_norm", report.norm));
+        values.push(("lr", report.lr));
+        if due(state.step, steps) {
+            cx.record(state.step, &values);
         }
-        break 'members;
+        cx.progress(state.step, steps, "steps", &values[..1]);
+        let every = cx.task().checkpoint.every.0;
+        if cx.leads() && state.step < steps && (wind_down || (every > 0 && state.step.is_multiple_of(every))) {
+            save(&state, config, &recent, cx)?;
+            saved_at = Some(state.step);
+        }
+        if wind_down && state.step < steps {
+            return Ok(Trained::Yielded { at: state.step });
+        }
     }
     if cx.leads() && saved_at != Some(state.step) {
         // Publishing may fail or be cut off; the last step should not have to be found again.
         save(&state, config, &recent, cx)?;
     }
     Ok(Trained::Finished { state, metrics: recent.means() })
+}
+
+/// Meets the others, and takes over a peer's state where one is ahead or this member has none (`applied` is `None`); true if so.
+fn meet(state: &mut TrainState, applied: Option<u64>, cx: &mut dyn GangContext) -> Result<bool, StageError> {
+    let Rendezvous::Adopt(bytes) = cx.rendezvous(applied, &mut || state.to_bytes())? else { return Ok(false) };
+    state.restore(&bytes).map_err(StageError::Fault)?;
+    cx.log(&format!("took over the state after step {} from a peer", state.step));
+    Ok(true)
 }
 
 /// Values are recorded for every one of the first 2,000 steps of a stage, then for every tenth, and for the last.

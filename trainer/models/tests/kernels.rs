@@ -1,0 +1,258 @@
+//! The fused kernels against Burn's operations and against differences of their own values, forward and backward.
+#![cfg(feature = "flex")]
+
+use burn::tensor::{Device, Tensor, TensorData};
+use models::kernels::{self, Dropout, KeyMask, stock};
+
+/// Smooth, distinct values of either sign.
+fn wave(count: usize, seed: usize) -> Vec<f32> {
+    (0..count).map(|i| ((i * 7 + seed * 31) as f32 * 0.731).sin() * 1.5 + ((i + seed) as f32 * 0.013).cos()).collect()
+}
+
+fn tensor<const D: usize>(shape: [usize; D], seed: usize, device: &Device) -> Tensor<D> {
+    Tensor::from_data(TensorData::new(wave(shape.iter().product(), seed), shape), device)
+}
+
+fn leaf<const D: usize>(shape: [usize; D], seed: usize) -> Tensor<D> {
+    tensor(shape, seed, &Device::flex().autodiff()).require_grad()
+}
+
+fn values<const D: usize>(x: Tensor<D>) -> Vec<f32> {
+    x.into_data().as_slice::<f32>().expect("f32").to_vec()
+}
+
+/// `out` against fixed weights, as a loss whose gradient reaches every element differently.
+fn weighted<const D: usize>(out: Tensor<D>) -> Tensor<1> {
+    let weights = tensor(out.dims(), 5, &out.device().inner());
+    (out * weights).sum()
+}
+
+/// Compares results of a kernel with those of the operations it replaces: each list within `tolerance` of its largest value.
+fn agree(name: &str, tolerance: f32, run: impl Fn() -> Vec<Vec<f32>>) {
+    let (fused, plain) = (run(), stock(&run));
+    assert_eq!(fused, run(), "{name}: the same bits again");
+    assert_eq!(fused.len(), plain.len());
+    for (part, (f, p)) in fused.iter().zip(&plain).enumerate() {
+        assert_eq!(f.len(), p.len(), "{name}, part {part}");
+        let scale = p.iter().fold(1e-3_f32, |m, v| m.max(v.abs()));
+        let worst = f.iter().zip(p).fold(0.0_f32, |m, (f, p)| m.max((f - p).abs())) / scale;
+        assert!(worst <= tolerance, "{name}, part {part}: {worst:.1e} > {tolerance:.0e}");
+    }
+}
+
+/// The slope of `loss` along each listed element of `at`, by central differences, against `gradient`.
+fn slopes(name: &str, at: &[f32], gradient: &[f32], loss: impl Fn(&[f32]) -> f64) {
+    let scale = gradient.iter().fold(0.0_f32, |m, v| m.max(v.abs()));
+    let h = 1e-2_f32;
+    for i in (0..at.len()).step_by((at.len() / 40).max(1)) {
+        let mut moved = at.to_vec();
+        moved[i] = at[i] + h;
+        let up = loss(&moved);
+        moved[i] = at[i] - h;
+        let slope = ((up - loss(&moved)) / f64::from(2.0 * h)) as f32;
+        assert!((slope - gradient[i]).abs() < 5e-3 * scale, "{name}, element {i}: {} against {slope}", gradient[i]);
+    }
+}
+
+fn sum(values: &[f32], weights: &[f32]) -> f64 {
+    values.iter().zip(weights).map(|(v, w)| f64::from(*v) * f64::from(*w)).sum()
+}
+
+#[test]
+fn linear_is_the_stock_linear() {
+    for (rows, inner, out) in [(1, 1, 1), (5, 3, 7), (67, 128, 256), (33, 263, 128)] {
+        for biased in [true, false] {
+            agree(&format!("linear {rows}x{inner}->{out}, bias {biased}"), 2e-6, || {
+                let (x, w, b) = (leaf([2, rows, inner], 1), leaf([out, inner], 2), leaf([out], 3));
+                let y = kernels::linear(x.clone(), w.clone(), biased.then(|| b.clone()));
+                let gradients = weighted(y.clone()).backward();
+                let mut all = vec![values(y), values(x.grad(&gradients).unwrap()), values(w.grad(&gradients).unwrap())];
+                all.extend(biased.then(|| values(b.grad(&gradients).unwrap())));
+                all
+            });
+        }
+    }
+}
+
+#[test]
+fn views_are_read_where_they_lie() {
+    agree("linear on a transposed, narrowed view", 2e-6, || {
+        let (x, w) = (leaf([4, 9, 6], 1), leaf([5, 6], 2));
+        let view = x.clone().swap_dims(0, 1).slice([2..7, 1..3, 0..6]);
+        let weight = w.clone().slice([1..4, 0..6]);
+        let y = kernels::gelu(kernels::linear(view, weight, None));
+        let gradients = weighted(y.clone()).backward();
+        vec![values(y), values(x.grad(&gradients).unwrap()), values(w.grad(&gradients).unwrap())]
+    });
+    agree("norm and attention on an expanded view", 2e-6, || {
+        let (x, gamma, beta) = (leaf([1, 6, 24], 1), leaf([24], 2), leaf([24], 3));
+        let wide = x.clone().expand([3, 6, 24]);
+        let y = kernels::layer_norm(wide.clone(), gamma.clone(), beta, 1e-5);
+        let y = kernels::self_attention(y, 2, None, &mut Dropout::off());
+        let gradients = weighted(y.clone()).backward();
+        vec![values(y), values(x.grad(&gradients).unwrap()), values(gamma.grad(&gradients).unwrap())]
+    });
+}
+
+#[test]
+fn gelu_is_the_stock_gelu() {
+    agree("gelu", 8e-7, || {
+        let far: Vec<f32> = (-600..600).map(|i| i as f32 * 0.02).collect();
+        let x = Tensor::<1>::from_data(TensorData::new(far, [1200]), &Device::flex().autodiff()).require_grad();
+        let y = kernels::gelu(x.clone());
+        let gradients = weighted(y.clone()).backward();
+        vec![values(y), values(x.grad(&gradients).unwrap())]
+    });
+}
+
+#[test]
+fn norms_are_the_stock_norms() {
+    for (rows, width) in [(1, 1), (3, 5), (40, 128), (17, 263)] {
+        for residual in [false, true] {
+            agree(&format!("norm {rows}x{width}, residual {residual}"), 8e-6, || {
+                let (x, y) = (leaf([2, rows, width], 1), leaf([2, rows, width], 2));
+                let (gamma, beta) = (leaf([width], 3), leaf([width], 4));
+                let out = if residual {
+                    kernels::add_layer_norm(x.clone(), y.clone(), gamma.clone(), beta.clone(), 1e-5)
+                } else {
+                    kernels::layer_norm(x.clone(), gamma.clone(), beta.clone(), 1e-5)
+                };
+                let gradients = weighted(out.clone()).backward();
+                let mut all = vec![values(out)];
+                // Of a single column nothing but rounding errors reaches the input.
+                if width > 1 {
+                    all.push(values(x.grad(&gradients).unwrap()));
+                    all.extend(residual.then(|| values(y.grad(&gradients).unwrap())));
+                }
+                all.extend([gamma, beta].map(|p| values(p.grad(&gradients).unwrap())));
+                all
+            });
+        }
+    }
+}
+
+#[test]
+fn attention_is_the_stock_attention() {
+    // Batch, items, heads, width of a head.
+    for (batch, len, heads, head) in [(1, 1, 1, 1), (2, 7, 2, 3), (2, 37, 4, 32), (1, 132, 2, 64)] {
+        let lengths: Vec<usize> = (0..batch).map(|b| len - b.min(len - 1)).collect();
+        for (mask, probability) in [(false, 0.0), (true, 0.0), (true, 0.3)] {
+            let width = heads * head;
+            let name = format!("{batch}x{len}, {heads} heads of {head}, mask {mask}, dropout {probability}");
+            let mask = mask.then(|| KeyMask::new(&lengths, 0));
+            agree(&format!("self-attention {name}"), 3e-6, || {
+                let x = leaf([batch, len, 3 * width], 1);
+                let mut dropout = Dropout::new(probability, 9, 2, 1);
+                let y = kernels::self_attention(x.clone(), heads, mask.as_ref(), &mut dropout);
+                let gradients = weighted(y.clone()).backward();
+                vec![values(y), values(x.grad(&gradients).unwrap())]
+            });
+            agree(&format!("cross-attention {name}"), 3e-6, || {
+                let (q, kv) = (leaf([batch, 5, width], 1), leaf([batch, len, 2 * width], 2));
+                let mut dropout = Dropout::new(probability, 9, 2, 1);
+                let y = kernels::cross_attention(q.clone(), kv.clone(), heads, mask.as_ref(), &mut dropout);
+                let gradients = weighted(y.clone()).backward();
+                vec![values(y), values(q.grad(&gradients).unwrap()), values(kv.grad(&gradients).unwrap())]
+            });
+        }
+    }
+}
+
+#[test]
+fn padding_reaches_nothing() {
+    let mask = KeyMask::new(&[2, 5], 1);
+    let run = |junk: f32| {
+        let mut x = wave(2 * 6 * 24, 1);
+        x[3 * 24..6 * 24].fill(junk);
+        let x = Tensor::<3>::from_data(TensorData::new(x, [2, 6, 24]), &Device::flex().autodiff()).require_grad();
+        let y = kernels::self_attention(x.clone(), 2, Some(&mask), &mut Dropout::off());
+        // Rows of padding are no one's business; the loss leaves them out.
+        let live = Tensor::cat(vec![y.clone().slice([0..1, 0..3, 0..8]), y.slice([1..2, 0..3, 0..8])], 0);
+        let gradients = weighted(live.clone()).backward();
+        (values(live), values(x.grad(&gradients).unwrap())[3 * 24..6 * 24].to_vec())
+    };
+    let ((a, gradient), (b, _)) = (run(0.5), run(-3.0));
+    assert_eq!(a, b);
+    assert!(gradient.iter().all(|g| *g == 0.0), "a gradient reaches padding");
+}
+
+#[test]
+fn gradients_are_slopes() {
+    let plain = Device::flex();
+    let weights = wave(2 * 5 * 8, 5);
+    let mask = KeyMask::new(&[5, 3], 0);
+    let attention = |x: Tensor<3>| kernels::self_attention(x, 2, Some(&mask), &mut Dropout::new(0.2, 1, 1, 1));
+    let x = leaf([2, 5, 24], 1);
+    let found = values(x.grad(&weighted(attention(x.clone())).backward()).unwrap());
+    slopes("attention", &wave(240, 1), &found, |at| {
+        sum(&values(attention(Tensor::from_data(TensorData::new(at.to_vec(), [2, 5, 24]), &plain))), &weights)
+    });
+
+    let norm = |x: Tensor<3>| {
+        let device = x.device();
+        kernels::add_layer_norm(
+            x,
+            tensor([2, 5, 8], 2, &device),
+            tensor([8], 3, &device),
+            tensor([8], 4, &device),
+            1e-5,
+        )
+    };
+    let x = leaf([2, 5, 8], 1);
+    let found = values(x.grad(&weighted(norm(x.clone())).backward()).unwrap());
+    slopes("norm", &wave(80, 1), &found, |at| {
+        sum(&values(norm(Tensor::from_data(TensorData::new(at.to_vec(), [2, 5, 8]), &plain))), &weights)
+    });
+
+    let x = leaf([2, 5, 8], 1);
+    let found = values(x.grad(&weighted(kernels::gelu(x.clone())).backward()).unwrap());
+    slopes("gelu", &wave(80, 1), &found, |at| {
+        sum(&values(kernels::gelu(Tensor::<3>::from_data(TensorData::new(at.to_vec(), [2, 5, 8]), &plain))), &weights)
+    });
+}
+
+#[test]
+fn values_do_not_depend_on_the_tape() {
+    let run = |device: &Device| {
+        let x = tensor([2, 9, 24], 1, device);
+        let y = kernels::linear(x.clone(), tensor([72, 24], 2, device), Some(tensor([72], 3, device)));
+        let y = kernels::self_attention(y, 4, Some(&KeyMask::new(&[9, 4], 0)), &mut Dropout::new(0.1, 3, 4, 5));
+        let y = kernels::add_layer_norm(x, y, tensor([24], 6, device), tensor([24], 7, device), 1e-5);
+        values(kernels::gelu(y))
+    };
+    assert_eq!(run(&Device::flex()), run(&Device::flex().autodiff()));
+}
+
+#[test]
+fn constants_take_no_part() {
+    // A frozen network under a tape: its parameters get no gradient, what flows through them does.
+    let x = leaf([1, 4, 6], 1);
+    let weight = tensor([6, 6], 2, &Device::flex());
+    let y = kernels::linear(x.clone(), weight, None);
+    let gradients = weighted(y).backward();
+    assert!(x.grad(&gradients).is_some());
+    let y = kernels::linear(tensor::<3>([1, 4, 6], 1, &Device::flex()), leaf([6, 6], 2), None);
+    weighted(y).backward();
+}
+
+#[test]
+fn dropout_is_a_function_of_its_place() {
+    let device = Device::flex();
+    let draw = |seed, step, slice, layer: usize| {
+        let mut dropout = Dropout::new(0.25, seed, step, slice);
+        let ones = || Tensor::<2>::ones([64, 64], &device);
+        for _ in 0..layer {
+            kernels::dropout(ones(), &mut dropout);
+        }
+        values(kernels::dropout(ones(), &mut dropout))
+    };
+    let base = draw(1, 2, 3, 0);
+    assert_eq!(base, draw(1, 2, 3, 0));
+    for other in [draw(2, 2, 3, 0), draw(1, 3, 3, 0), draw(1, 2, 4, 0), draw(1, 2, 3, 1)] {
+        assert_ne!(base, other);
+    }
+    let kept = base.iter().filter(|v| **v > 0.0).count() as f64 / base.len() as f64;
+    assert!((kept - 0.75).abs() < 0.03, "kept {kept}");
+    assert!(base.iter().all(|v| *v == 0.0 || (*v - 1.0 / 0.75).abs() < 1e-6));
+    assert_eq!(values(kernels::dropout(tensor::<1>([9], 1, &device), &mut Dropout::off())), wave(9, 1));
+}
