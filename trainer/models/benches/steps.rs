@@ -154,14 +154,14 @@ fn main() {
     let device = device::open(Backend::Flex, 0).expect("built with flex");
     let clips: Vec<usize> = (0..8).map(|i| 86 + 4 * i).collect();
     let windows: Vec<usize> = (0..16).map(|i| 40 + 4 * (i % 7)).collect();
-    let mut case = |name: &str, lengths: &[usize], joint: f64, dropout: f64| {
+    let case = |name: &str, lengths: &[usize], joint: f64, dropout: f64| {
         race(name, lengths.len(), count, || vae(&device), |s| vae_step(s, lengths, joint, dropout, &device));
     };
     case("VAE, 8 clips of 100 frames", &clips, 0.0, 0.0);
     case("VAE, 8 clips, joint loss", &clips, 1.0, 0.0);
     case("VAE, 8 clips, dropout 0.1", &clips, 0.0, 0.1);
     case("VAE, 16 windows of 52 frames", &windows, 0.0, 0.0);
-    let mut case = |name: &str, batch: usize, dropout: f64| {
+    let case = |name: &str, batch: usize, dropout: f64| {
         race(name, batch, count, || denoiser(&device), |s| denoiser_step(s, batch, dropout, &device));
     };
     case("denoiser, 64 x 18 tokens", 64, 0.0);

@@ -56,11 +56,11 @@ fn heads(description: &Value) -> usize {
 
 /// A block of the stored weights' sizes.
 fn block(weights: &Path, heads: usize, memory: bool, device: &Device) -> Block {
-    let bytes = std::fs::read(weights).unwrap();
+    let bytes = std::fs::read(weights).expect("readable weights");
     let linear1 = Arrays::read(weights).get("linear1.weight").shape.clone();
     let config = StackConfig { width: linear1[1], layers: 1, heads, feed_forward: linear1[0], norm_eps: 1e-5, memory };
     let block = Block::new(&mut Init::new(Seed(1), "golden", Positions::Uniform, device), &config);
-    names::load(block, &bytes, "").unwrap()
+    names::load(block, &bytes, "").expect("weights that fit")
 }
 
 /// Valid keys of each sequence; a stored mask is 1 where masked, and masks a tail.

@@ -27,10 +27,10 @@ fn bench() -> Bench {
 
 fn put(bench: &Bench, kind: ArtifactKind, meta: serde_json::Value, weights: Vec<u8>) -> Digest {
     let blobs = bench.blobs();
-    let entry = FileEntry { bytes: weights.len() as u64, digest: blobs.put(weights).unwrap() };
+    let entry = FileEntry { bytes: weights.len() as u64, digest: blobs.put(weights).expect("stored") };
     let mut manifest = Manifest::new(kind, meta);
     manifest.files.insert(MODEL_FILE.into(), entry);
-    blobs.put(manifest.to_bytes()).unwrap()
+    blobs.put(manifest.to_bytes()).expect("stored")
 }
 
 fn untrained_vae(bench: &Bench) -> Digest {
@@ -66,15 +66,15 @@ fn untrained_denoiser(bench: &Bench, vae: Digest, family: Family, latent: Latent
 /// Dataset, embeddings and VAE.
 fn data(bench: &mut Bench) -> (Digest, Digest, Digest) {
     let settings = DataSynthetic { clips: 40, val: 0.1, test: 0.2, mirror: false };
-    let dataset = bench.run("dataset", &StageSettings::DataSynthetic(settings), &[]).unwrap().output();
+    let dataset = bench.run("dataset", &StageSettings::DataSynthetic(settings), &[]).expect("the stage runs").output();
     let text = StageSettings::TextEmbed(TextEmbed::default());
-    let text = bench.run("text", &text, &[("dataset", dataset)]).unwrap().output();
+    let text = bench.run("text", &text, &[("dataset", dataset)]).expect("the stage runs").output();
     (dataset, text, untrained_vae(bench))
 }
 
 fn encode(bench: &mut Bench, shards: usize, dataset: Digest, vae: Digest) -> Digest {
     let settings = StageSettings::EncodeLatents(EncodeLatents { crops: 3, shards, ..EncodeLatents::default() });
-    bench.run("latents", &settings, &[("dataset", dataset), ("vae", vae)]).unwrap().output()
+    bench.run("latents", &settings, &[("dataset", dataset), ("vae", vae)]).expect("the stage runs").output()
 }
 
 #[test]
@@ -92,7 +92,8 @@ fn latents_are_the_same_bytes_however_the_entries_are_cut() {
     assert!(latents.sigma.values.iter().all(|s| *s > 0.0));
     // Another stage name draws other crops.
     let settings = StageSettings::EncodeLatents(EncodeLatents { crops: 3, ..EncodeLatents::default() });
-    let other = bench.run("latents-2", &settings, &[("dataset", dataset), ("vae", vae)]).unwrap().output();
+    let other =
+        bench.run("latents-2", &settings, &[("dataset", dataset), ("vae", vae)]).expect("the stage runs").output();
     assert_ne!(other, whole);
 }
 

@@ -37,8 +37,11 @@ fn distillation(steps: u64) -> Distillation {
     }
 }
 
-/// Name, settings and inputs of each stage, in order.
-fn chain(shards: usize) -> Vec<(&'static str, StageSettings, Vec<(&'static str, &'static str)>)> {
+/// Name, settings and inputs (field, stage).
+type Link = (&'static str, StageSettings, Vec<(&'static str, &'static str)>);
+
+/// The stages in order.
+fn chain(shards: usize) -> Vec<Link> {
     let data = DataSynthetic { clips: 24, val: 0.1, test: 0.25, mirror: false };
     let vae = TrainVae {
         latent: LatentShape { tokens: 2, dim: 8 },
@@ -95,7 +98,7 @@ fn run(bench: &mut Bench, shards: usize) -> BTreeMap<&'static str, Digest> {
     for (name, settings, inputs) in chain(shards) {
         let inputs: Vec<_> = inputs.iter().map(|(field, stage)| (*field, outputs[stage])).collect();
         let ran = bench.run(name, &settings, &inputs).unwrap_or_else(|e| panic!("{name}: {e}"));
-        println!("{name}: {} {:?}", ran.output(), ran.metrics());
+        eprintln!("{name}: {} {:?}", ran.output(), ran.metrics());
         outputs.insert(name, ran.output());
     }
     outputs

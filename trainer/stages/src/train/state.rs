@@ -74,8 +74,8 @@ impl TrainState {
             m: vec![0.0; plan.params.len()],
             v: vec![0.0; plan.params.len()],
             average: plan.ema.map(|_| plan.params.clone()),
-            lr: plan.lr.clone(),
-            optimizer: plan.optimizer.clone(),
+            lr: plan.lr,
+            optimizer: plan.optimizer,
             ema: plan.ema.unwrap_or(0.0),
         };
         Self { step: 0, groups: plans.iter().map(group).collect() }
