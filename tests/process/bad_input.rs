@@ -32,7 +32,7 @@ fn p11_a_pipeline_with_mistakes() {
     for (from, to, parts) in [
         ("kind: train.vae", "kind: train.vae\n    warmpu: 3", vec!["p.yaml:", "warmpu", "warmup"]),
         ("kind: train.vae", "kind: train.vea", vec!["p.yaml:", "train.vea", "train.vae"]),
-        ("kind: train.mld", "kind: train.mld\n    lr: fast", vec!["p.yaml:", "lr", "number"]),
+        ("steps: 16", "steps: soon", vec!["p.yaml:", "soon", "whole number"]),
         ("kind: encode.latents", "kind: encode.latents\n    vae: nobody", vec!["p.yaml:", "nobody"]),
         ("kind: train.vae", "kind: train.vae\n    dataset: latents", vec!["p.yaml:", "latents"]),
     ] {
@@ -101,8 +101,9 @@ fn a_broken_dataset_folder_is_named_file_by_file() {
     fs::write(&clip, &nan).expect("written");
     run(&data, &[&first, "frame 2", "NaN"]);
 
-    let text = String::from_utf8_lossy(&good[..header]).into_owned();
-    let mut narrow = text.replace("263)", "251)").into_bytes();
+    let mut narrow = good[..header].to_vec();
+    let width = narrow.windows(4).position(|w| w == b"263)").expect("the shape in the header");
+    narrow[width..width + 4].copy_from_slice(b"251)");
     let frames = (good.len() - header) / (4 * 263);
     narrow.extend_from_slice(&good[header..header + frames * 251 * 4]);
     fs::write(&clip, &narrow).expect("written");

