@@ -7,6 +7,7 @@
 //! Not its job: who works on what (the coordinator), what tensors mean (the stages).
 
 pub mod blob;
+pub mod board;
 pub mod catalog;
 pub mod cli;
 mod clock;

@@ -40,6 +40,27 @@ async fn with_models(dir: &Path) {
 }
 
 #[tokio::test]
+async fn models_are_compared_and_ranked_in_tables_to_paste() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = dir.path();
+    with_models(store).await;
+
+    let compared = stdout(&registry(store, &["compare", "quickstart:1", "quickstart"]));
+    assert!(compared.contains("noise not measured") && compared.contains("-0.100"), "{compared}");
+    let board = stdout(&registry(store, &["leaderboard", "quickstart", "--style", "markdown"]));
+    let rows: Vec<&str> = board.lines().skip(2).collect();
+    assert_eq!(rows, ["| quickstart:2 | **0.200** |", "| quickstart:1 | 0.300 |"], "best first, the best in bold");
+    let kit = stdout(&registry(store, &["leaderboard", "kit", "--style", "latex"]));
+    assert!(kit.contains("MotionPCM, 1 step [MotionPCM] & $0.031$ & $0.433^{\\pm0.007}$"), "{kit}");
+
+    let absent = registry(store, &["compare", "quickstart:1", "quickstart:9"]);
+    assert_eq!(code(&absent), 3, "{}", stderr(&absent));
+    let absent = registry(store, &["leaderboard", "nobody"]);
+    assert_eq!(code(&absent), 3);
+    assert!(stderr(&absent).contains("nobody"), "{}", stderr(&absent));
+}
+
+#[tokio::test]
 async fn a_promotion_from_the_first_gate_to_the_rollback() {
     let dir = tempfile::tempdir().unwrap();
     let store = dir.path();

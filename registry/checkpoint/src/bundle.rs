@@ -93,6 +93,11 @@ pub fn default_sampler(denoiser: &Value) -> Result<Sampler, String> {
     }
 }
 
+/// The data format (`humanml3d`, `kit`) of the motion that a bundled model makes.
+pub fn format(model: &Manifest) -> Option<&str> {
+    model.meta["vae"]["format"].as_str()
+}
+
 fn field<'a>(meta: &'a Value, name: &str) -> Result<&'a Value, String> {
     meta.get(name).ok_or_else(|| format!("the manifest has no `{name}`"))
 }

@@ -1,5 +1,7 @@
 //! Promotion gates: `latent_fid <= 0.2`, `eval.r_precision_top1 >= staging - 0.005`.
 //!
+//! `fid.upper <= 0.05` asks it of the bad end of the metric's 95 % interval.
+//!
 //! On the left a metric of the candidate; on the right a number, or an alias of the same model with a number added or
 //! taken away, which stands for the same metric of the version it points at. A metric that the candidate does not have, or
 //! has as something that is no number, never passes. The alias being promoted to may not exist yet: there is then nothing
@@ -167,12 +169,14 @@ fn short(number: f64) -> String {
     format!("{}", format!("{number:.3e}").parse::<f64>().unwrap_or(number))
 }
 
-/// A metric by its name; or by the last part of its name, if one metric alone ends so.
+/// A metric by its name; or by the last parts of its name, if one metric alone ends so: `fid` and `fid.upper` find `eval.fid` and
+/// `eval.fid.upper`.
 fn find(metrics: &BTreeMap<String, f64>, name: &str) -> Result<f64, String> {
     if let Some(value) = metrics.get(name) {
         return Ok(*value);
     }
-    let ends: Vec<_> = metrics.iter().filter(|(key, _)| key.rsplit('.').next() == Some(name)).collect();
+    let ends: Vec<_> =
+        metrics.iter().filter(|(key, _)| key.strip_suffix(name).is_some_and(|before| before.ends_with('.'))).collect();
     match ends[..] {
         [(_, value)] => Ok(*value),
         [] if metrics.is_empty() => Err(format!("no metric `{name}`: it has none at all")),
@@ -232,6 +236,11 @@ mod tests {
     #[test]
     fn the_last_part_of_a_name_is_enough_if_it_is_unique() {
         assert!(judge("fid <= 1", &[("eval.fid", 0.1)], None).holds);
+        let interval = [("eval.fid", 0.1), ("eval.fid.lower", 0.08), ("eval.fid.upper", 0.12)];
+        assert!(judge("fid.upper <= 0.12", &interval, None).holds);
+        let missed = judge("fid.upper <= 0.11", &interval, None);
+        assert!(!missed.holds && missed.message.ends_with("misses by 0.01"), "{}", missed.message);
+        assert!(judge("fid.upper <= staging", &interval, Some(&[("eval.fid.upper", 0.2)])).holds);
         let two = judge("fid <= 1", &[("a.fid", 0.1), ("b.fid", 0.1)], None);
         assert!(!two.holds && two.message.contains("`a.fid`, `b.fid`"), "{}", two.message);
     }

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Subcommand, ValueEnum};
 
 use super::Command;
+use crate::board::Style;
 use crate::catalog::Expect;
 
 /// How answers are printed.
@@ -75,6 +76,27 @@ pub enum Verb {
         #[arg(long, env = "STRIDE_ACTOR")]
         actor: Option<String>,
     },
+    /// Compares two versions metric by metric, and says which differences are beyond noise
+    Compare {
+        /// MODEL (its best version), MODEL@ALIAS or MODEL:VERSION
+        left: String,
+        /// Likewise
+        right: String,
+        /// How the table is written
+        #[arg(long, value_enum, default_value_t)]
+        style: Style,
+    },
+    /// Shows every version's metrics in the papers' order, beside the papers' own
+    Leaderboard {
+        /// A model, or `humanml3d` or `kit` for all models of that data format
+        of: String,
+        /// Leave the papers' rows out
+        #[arg(long)]
+        no_published: bool,
+        /// How the table is written: `markdown` and `latex` give rows to paste
+        #[arg(long, value_enum, default_value_t)]
+        style: Style,
+    },
     /// Shows what a version or an artifact was made of
     Lineage {
         /// A model version or a digest
@@ -112,6 +134,10 @@ impl Verb {
             }
             Self::Rollback { model, alias, to, expect, reason, actor } => {
                 Command::Rollback { model, alias, to, expect, reason, actor: actor.unwrap_or_else(user) }
+            }
+            Self::Compare { left, right, style } => Command::Compare { left, right, style },
+            Self::Leaderboard { of, no_published, style } => {
+                Command::Leaderboard { of, published: !no_published, style }
             }
             Self::Lineage { artifact } => Command::Lineage { reference: artifact },
             Self::Fsck => Command::Fsck,

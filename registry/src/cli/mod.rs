@@ -10,6 +10,7 @@ mod client;
 mod export;
 mod print;
 
+use checkpoint::bundle;
 use protocol::message::ApiError;
 use protocol::{Alias, Digest, Manifest, ModelName};
 use serde::{Deserialize, Serialize};
@@ -18,7 +19,8 @@ pub use args::{Output, Verb};
 pub use client::{ask, execute};
 pub use print::{render, show_error};
 
-use crate::catalog::{Expect, Gate, Model, ModelRef, Promotion, Version};
+use crate::board::{self, Comparison, Leaderboard, Style};
+use crate::catalog::{BEST, Expect, Gate, LATEST, Model, ModelRef, Promotion, Version};
 use crate::retention::{GRACE_MS, Plan};
 use crate::{LineageNode, OpenError, QueryError, Store, WriteError, fsck};
 
@@ -70,6 +72,24 @@ pub enum Command {
         /// Who.
         actor: String,
     },
+    /// Two versions, metric by metric.
+    Compare {
+        /// `MODEL`, `MODEL@ALIAS`, `MODEL:VERSION`; a model alone is its best version.
+        left: String,
+        /// Likewise.
+        right: String,
+        /// How the table is written.
+        style: Style,
+    },
+    /// All versions of a model, or of all models of a data format, beside what the papers print.
+    Leaderboard {
+        /// A model, or `humanml3d` or `kit`.
+        of: String,
+        /// Whether the papers' rows are shown.
+        published: bool,
+        /// How the table is written.
+        style: Style,
+    },
     /// What an artifact was made of.
     Lineage {
         /// A model version or a digest.
@@ -108,6 +128,10 @@ pub enum Data {
     History { model: ModelName, history: Vec<Promotion> },
     /// Of `promote` and `rollback`.
     Promotion { promotion: Promotion },
+    /// Of `compare`.
+    Comparison { comparison: Comparison, style: Style },
+    /// Of `leaderboard`.
+    Leaderboard { leaderboard: Leaderboard, style: Style },
     /// Of `lineage`.
     Lineage { nodes: Vec<LineageNode> },
     /// Of `fsck`.
@@ -248,6 +272,13 @@ async fn answer(command: Command, store: &Store) -> Result<Answer, Refused> {
             let promotion = store.rollback(&model, &alias, to, expect, &reason, &actor).await?;
             Data::Promotion { promotion }
         }
+        Command::Compare { left, right, style } => {
+            let comparison = board::compare(&one(store, &left).await?, &one(store, &right).await?);
+            Data::Comparison { comparison, style }
+        }
+        Command::Leaderboard { of, published, style } => {
+            Data::Leaderboard { leaderboard: leaderboard(store, &of, published).await?, style }
+        }
         Command::Lineage { reference } => {
             let digest = match reference.parse::<Digest>() {
                 Ok(digest) => digest,
@@ -283,6 +314,37 @@ async fn answer(command: Command, store: &Store) -> Result<Answer, Refused> {
         }
     };
     Ok(Answer::done(data))
+}
+
+/// The version that a reference names; a model alone stands for its best one, or its newest where no metric decides.
+async fn one(store: &Store, text: &str) -> Result<Version, Refused> {
+    let reference: ModelRef = text.parse().map_err(invalid)?;
+    if reference.pick.is_some() {
+        return Ok(store.resolve(text).await?);
+    }
+    let pick = if known(store, text).await?.best.is_some() { BEST } else { LATEST };
+    Ok(store.resolve(&format!("{text}@{pick}")).await?)
+}
+
+/// The data format that a version's VAE makes motion of, which is how the papers name their datasets.
+fn format_of(store: &Store, version: &Version) -> Option<String> {
+    let manifest = store.blobs().manifest(version.artifact).ok()?;
+    bundle::format(&manifest).map(str::to_owned)
+}
+
+async fn leaderboard(store: &Store, of: &str, published: bool) -> Result<Leaderboard, Refused> {
+    if board::FORMATS.contains(&of) {
+        let mut all = Vec::new();
+        for model in store.models().await? {
+            all.extend(store.versions(&model.model).await?);
+        }
+        all.retain(|version| format_of(store, version).as_deref() == Some(of));
+        return Ok(board::leaderboard(of.to_owned(), &all, None, published.then_some(of)));
+    }
+    let model = known(store, of).await?;
+    let versions = store.versions(&model.model).await?;
+    let format = versions.first().and_then(|version| format_of(store, version)).filter(|_| published);
+    Ok(board::leaderboard(of.to_owned(), &versions, model.metric.as_deref(), format.as_deref()))
 }
 
 async fn known(store: &Store, name: &str) -> Result<Model, Refused> {

@@ -115,6 +115,8 @@ pub fn render(data: &Data) -> String {
             }
             text
         }
+        Data::Comparison { comparison, style } => comparison.render(*style),
+        Data::Leaderboard { leaderboard, style } => leaderboard.render(*style),
         Data::Lineage { nodes } => {
             let mut table = table(&["ARTIFACT", "KIND", "STAGE", "RUN", "MADE OF"]);
             for node in nodes {

@@ -1,0 +1,325 @@
+//! Comparing models by the field's metrics: intervals, differences beyond noise, and tables in the papers' column order.
+//!
+//! A metric `fid` may come with `fid.lower` and `fid.upper`, the 95 % interval of its mean over repeats, or with `fid_sd`, the
+//! standard deviation over repeats, which then stands for the interval as 1.96 sd (wider than the mean's). Metrics that several
+//! evaluations of one model gave are told apart by a stage's name in front (`eval_4.fid`); each such stage is a row of its own.
+//!
+//! Published rows are what the papers print, on the full test splits with the published evaluators. They say where a result should
+//! land, and are only comparable with numbers of that evaluator on that split.
+
+mod print;
+mod published;
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::catalog::Version;
+
+pub use print::Style;
+
+/// Which way is better.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Better {
+    /// Such as a distance.
+    Lower,
+    /// Such as a hit rate.
+    Higher,
+    /// The nearer to real motion, the better.
+    NearReal,
+    /// Nothing is said: a property, not a merit.
+    Neither,
+}
+
+/// A metric that tables have a column for.
+#[derive(Debug)]
+struct Column {
+    key: &'static str,
+    /// In a table's head.
+    head: &'static str,
+    better: Better,
+}
+
+const fn column(key: &'static str, head: &'static str, better: Better) -> Column {
+    Column { key, head, better }
+}
+
+/// The text-to-motion papers' order, then what they report of reconstruction and control, then what needs no evaluator.
+const COLUMNS: [Column; 23] = [
+    column("aits", "AITS (s)", Better::Lower),
+    column("r_precision_top1", "R@1", Better::Higher),
+    column("r_precision_top2", "R@2", Better::Higher),
+    column("r_precision_top3", "R@3", Better::Higher),
+    column("fid", "FID", Better::Lower),
+    column("mm_dist", "MM-Dist", Better::Lower),
+    column("diversity", "Diversity", Better::NearReal),
+    column("multimodality", "MModality", Better::Neither),
+    column("mpjpe_mm", "MPJPE (mm)", Better::Lower),
+    column("pa_mpjpe_mm", "PA-MPJPE (mm)", Better::Lower),
+    column("acceleration_error_mm", "ACCEL (mm)", Better::Lower),
+    column("feature_error", "Feature err.", Better::Lower),
+    column("sjpe", "sJPE", Better::Lower),
+    column("sjpe_noise", "sJPE noise", Better::Lower),
+    column("sjpe_static", "sJPE static", Better::Lower),
+    column("foot_skating", "Skating", Better::Lower),
+    column("trajectory_error", "Traj. err.", Better::Lower),
+    column("location_error", "Loc. err.", Better::Lower),
+    column("average_error_m", "Avg. err. (m)", Better::Lower),
+    column("latent_fid", "Latent FID", Better::Lower),
+    column("match", "Match", Better::Lower),
+    column("latent_std", "Latent std", Better::Neither),
+    column("r_precision_top3_test", "R@3 test captions", Better::Higher),
+];
+
+/// The data formats, by which the papers' datasets go.
+pub const FORMATS: [&str; 2] = ["humanml3d", "kit"];
+
+/// Columns of the papers' text-to-motion table: the first ones.
+const PAPER_COLUMNS: usize = 8;
+
+fn better(key: &str) -> Better {
+    COLUMNS.iter().find(|column| column.key == key).map_or(Better::Neither, |column| column.better)
+}
+
+/// A value with its 95 % interval.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Measure {
+    /// The mean.
+    pub value: f64,
+    /// Half the width of its interval, if repeats were measured.
+    pub half: Option<f64>,
+}
+
+/// One evaluation of one model, or a published result.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Row {
+    /// What a table calls it.
+    pub label: String,
+    /// `MODEL:VERSION` of ours; the paper of a published row.
+    pub source: String,
+    /// Whether a paper says so.
+    pub published: bool,
+    /// By metric.
+    pub measures: BTreeMap<String, Measure>,
+}
+
+/// A table of rows.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Leaderboard {
+    /// Of what.
+    pub title: String,
+    /// Ours by the deciding metric, best first; then the published ones in their papers' order.
+    pub rows: Vec<Row>,
+}
+
+/// Who is ahead.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Verdict {
+    /// The left one, beyond noise.
+    Left,
+    /// The right one, beyond noise.
+    Right,
+    /// They differ beyond noise, in what has no better or worse.
+    Differ,
+    /// They do not differ beyond noise.
+    Noise,
+    /// They differ, and how noisy they are was not measured.
+    Unknown,
+}
+
+/// One metric of two rows.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Difference {
+    /// The metric.
+    pub metric: String,
+    /// Of the left one.
+    pub left: Option<Measure>,
+    /// Of the right one.
+    pub right: Option<Measure>,
+    /// Right minus left, with the interval of the difference.
+    pub difference: Option<Measure>,
+    /// Who is ahead.
+    pub verdict: Option<Verdict>,
+}
+
+/// Two models, metric by metric.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Comparison {
+    /// `MODEL:VERSION`.
+    pub left: String,
+    /// `MODEL:VERSION`.
+    pub right: String,
+    /// Every metric that either has.
+    pub metrics: Vec<Difference>,
+}
+
+/// `fid`, `fid.lower`, `fid.upper` and `fid_sd` made one.
+fn measures(metrics: &BTreeMap<String, f64>) -> BTreeMap<String, Measure> {
+    let is_part = |key: &str| {
+        let of = |end: &str| key.strip_suffix(end).is_some_and(|base| metrics.contains_key(base));
+        of(".lower") || of(".upper") || of("_sd")
+    };
+    let half = |key: &str| {
+        let part = |end: &str| metrics.get(&format!("{key}{end}")).copied();
+        match (part(".lower"), part(".upper"), part("_sd")) {
+            (Some(lower), Some(upper), _) => Some((upper - lower) / 2.0),
+            (_, _, Some(sd)) => Some(1.96 * sd),
+            _ => None,
+        }
+    };
+    let whole = metrics.iter().filter(|(key, _)| !is_part(key));
+    whole.map(|(key, &value)| (key.clone(), Measure { value, half: half(key) })).collect()
+}
+
+/// A version's evaluations: metrics under a stage's name are that stage's row; what is under none is shared by all of them.
+fn rows(version: &Version) -> Vec<Row> {
+    let source = format!("{}:{}", version.model, version.version);
+    let mut by_stage: BTreeMap<&str, BTreeMap<String, Measure>> = BTreeMap::new();
+    let mut shared = BTreeMap::new();
+    let all = measures(&version.metrics);
+    for (key, measure) in &all {
+        match key.rsplit_once('.') {
+            Some((stage, metric)) => drop(by_stage.entry(stage).or_default().insert(metric.to_owned(), *measure)),
+            None => drop(shared.insert(key.clone(), *measure)),
+        }
+    }
+    let row = |label: String, measures| Row { label, source: source.clone(), published: false, measures };
+    if by_stage.is_empty() {
+        return vec![row(source.clone(), shared)];
+    }
+    // The value without a stage's name is one of those with a name: shown where it belongs, not twice.
+    let repeated: Vec<String> =
+        shared.keys().filter(|key| by_stage.values().any(|m| m.contains_key(*key))).cloned().collect();
+    shared.retain(|key, _| !repeated.contains(key));
+    let rows = by_stage.into_iter().map(|(stage, mut measures)| {
+        measures.extend(shared.clone());
+        row(format!("{source} ({stage})"), measures)
+    });
+    rows.collect()
+}
+
+/// Rows of `versions`, the best by `metric` first; with the published rows of the data format `published`, if any.
+pub fn leaderboard(title: String, versions: &[Version], metric: Option<&str>, published: Option<&str>) -> Leaderboard {
+    let mut ours: Vec<Row> = versions.iter().flat_map(rows).collect();
+    let deciding = metric.or_else(|| {
+        COLUMNS
+            .iter()
+            .find(|c| c.better != Better::Neither && ours.iter().any(|row| row.measures.contains_key(c.key)))
+            .map(|c| c.key)
+    });
+    if let Some(metric) = deciding {
+        let sign = if better(metric) == Better::Higher { -1.0 } else { 1.0 };
+        let rank = |row: &Row| {
+            row.measures
+                .get(metric)
+                .map_or(f64::INFINITY, |m| if m.value.is_nan() { f64::INFINITY } else { sign * m.value })
+        };
+        ours.sort_by(|a, b| rank(a).total_cmp(&rank(b)));
+    }
+    ours.extend(published.into_iter().flat_map(published::rows));
+    Leaderboard { title, rows: ours }
+}
+
+/// Two versions, metric by metric, in the papers' order; what no paper has comes last.
+pub fn compare(left: &Version, right: &Version) -> Comparison {
+    let name = |version: &Version| format!("{}:{}", version.model, version.version);
+    let (a, b) = (measures(&left.metrics), measures(&right.metrics));
+    let base = |key: &str| key.rsplit('.').next().unwrap_or(key).to_owned();
+    let place = |key: &str| COLUMNS.iter().position(|c| c.key == base(key)).unwrap_or(COLUMNS.len());
+    let mut keys: Vec<&String> = a.keys().chain(b.keys().filter(|key| !a.contains_key(*key))).collect();
+    keys.sort_by_key(|key| (place(key), (*key).clone()));
+    let metrics = keys.into_iter().map(|key| {
+        let (left, right) = (a.get(key).copied(), b.get(key).copied());
+        let both = left.zip(right).map(|(left, right)| difference(left, right, better(&base(key))));
+        Difference { metric: key.clone(), left, right, difference: both.map(|b| b.0), verdict: both.map(|b| b.1) }
+    });
+    Comparison { left: name(left), right: name(right), metrics: metrics.collect() }
+}
+
+fn difference(left: Measure, right: Measure, better: Better) -> (Measure, Verdict) {
+    let value = right.value - left.value;
+    let half = left.half.zip(right.half).map(|(l, r)| l.hypot(r));
+    let verdict = match half {
+        _ if value == 0.0 => Verdict::Noise,
+        None => Verdict::Unknown,
+        Some(half) if value.abs() <= half => Verdict::Noise,
+        Some(_) if value.is_nan() => Verdict::Unknown,
+        Some(_) => match better {
+            Better::Lower if value < 0.0 => Verdict::Right,
+            Better::Lower => Verdict::Left,
+            Better::Higher if value > 0.0 => Verdict::Right,
+            Better::Higher => Verdict::Left,
+            Better::NearReal | Better::Neither => Verdict::Differ,
+        },
+    };
+    (Measure { value, half }, verdict)
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a test may panic")]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn version(number: u64, metrics: &[(&str, f64)]) -> Version {
+        Version {
+            model: "m".into(),
+            version: number,
+            artifact: protocol::Digest::of(b"x"),
+            metrics: metrics.iter().map(|(k, v)| ((*k).to_owned(), *v)).collect(),
+            source: json!({}),
+            created_ms: 0,
+            aliases: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn intervals_are_read_and_differences_beyond_noise_are_told() {
+        let a = version(
+            1,
+            &[
+                ("fid", 0.5),
+                ("fid.lower", 0.45),
+                ("fid.upper", 0.55),
+                ("latent_fid", 0.1),
+                ("latent_fid_sd", 0.01),
+                ("x", 1.0),
+            ],
+        );
+        let b = version(
+            2,
+            &[("fid", 0.3), ("fid.lower", 0.28), ("fid.upper", 0.32), ("latent_fid", 0.11), ("latent_fid_sd", 0.01)],
+        );
+        let found = compare(&a, &b);
+        let of = |name: &str| found.metrics.iter().find(|d| d.metric == name).unwrap();
+        assert_eq!(of("fid").verdict, Some(Verdict::Right));
+        assert!((of("fid").difference.unwrap().half.unwrap() - 0.05_f64.hypot(0.02)).abs() < 1e-12);
+        assert_eq!(of("latent_fid").verdict, Some(Verdict::Noise));
+        assert_eq!(of("x").verdict, None);
+        assert_eq!(found.metrics.len(), 3, "bounds are no metrics of their own");
+        assert_eq!(compare(&b, &a).metrics[0].verdict, Some(Verdict::Left));
+    }
+
+    #[test]
+    fn an_evaluation_is_a_row_and_the_best_comes_first() {
+        let two = version(
+            2,
+            &[
+                ("one.fid", 0.3),
+                ("four.fid", 0.2),
+                ("four.fid.lower", 0.1),
+                ("four.fid.upper", 0.3),
+                ("fid", 0.2),
+                ("aits", 0.03),
+            ],
+        );
+        let board = leaderboard("m".into(), &[version(1, &[("fid", 0.25)]), two], Some("fid"), Some("kit"));
+        let labels: Vec<_> = board.rows.iter().filter(|r| !r.published).map(|r| r.label.as_str()).collect();
+        assert_eq!(labels, ["m:2 (four)", "m:1", "m:2 (one)"]);
+        assert!((board.rows[0].measures["fid"].half.unwrap() - 0.1).abs() < 1e-12);
+        assert_eq!(board.rows[0].measures["aits"].value, 0.03);
+        assert!(board.rows.iter().any(|row| row.label == "MotionPCM, 1 step" && row.measures["fid"].value == 0.355));
+    }
+}
