@@ -2,7 +2,7 @@
 //!
 //! Its threads: one computes (`stage_thread`), one drives all HTTP, on which the poll (`orders`) lives, one a running
 //! attempt sends metrics and logs (`spool`), and a few short-stacked ones serve the connections of a gang (`gang::mesh`). What
-//! binds them is [`Held`](held): an assignment, its newest grant, and whether it has ended.
+//! binds them is `held::Held`: an assignment, its newest grant, and whether it has ended.
 //!
 //! Not its job: what a stage computes (`stages`), and every decision about who does what (the coordinator's).
 

@@ -1,7 +1,7 @@
 //! Models, their versions, and the aliases that point at them.
 //!
-//! A version is numbered in the transaction that registers it: 1, 2, 3, without gaps. An alias moves by [`promote`] or
-//! [`rollback`], each one transaction that compares, judges the gates on stored metrics, moves and logs. `@best` is a
+//! A version is numbered in the transaction that registers it: 1, 2, 3, without gaps. An alias moves by `promote` or
+//! `rollback`, each one transaction that compares, judges the gates on stored metrics, moves and logs. `@best` is a
 //! query over stored metrics, never state.
 
 mod gate;

@@ -1,6 +1,6 @@
 //! Durable events. The journal is the coordinator's memory: recovery replays it through `decide`.
 //!
-//! An entry is one JSON object: the [`Moment`] (`now`, `entropy`) and the [`Event`](crate::event::Event) (`event` and its fields).
+//! An entry is one JSON object: the [`Moment`] (`now`, `entropy`) and the [`Event`] (`event` and its fields).
 //! A new event or field may be added; what is written stays readable, because `decide` must do again what it did.
 
 use serde::{Deserialize, Serialize};

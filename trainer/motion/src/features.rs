@@ -2,7 +2,7 @@
 //!
 //! Source: Guo et al., "Generating Diverse and Natural 3D Human Motions from Text" (CVPR 2022) and its published
 //! feature code. Steps: uniform skeleton, floor, origin, facing +z ([`place`]), then heading, rotations, positions,
-//! velocities and contacts ([`rows`]). The way back is in [`recover`].
+//! velocities and contacts ([`rows`]). The way back is in `recover`.
 //!
 //! Two oddities of the published data are part of the definition. The heading comes from (right - left shoulder)
 //! *minus* (right - left hip), smoothed over time and forced to the identity in frame 0. And every kinematic chain starts

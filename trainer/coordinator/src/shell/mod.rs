@@ -1,6 +1,6 @@
 //! The thin half: server, clock, runner of effects. The only async code of the crate.
 //!
-//! One task, the [`actor`], owns the state and decides events one by one: copy, decide, store, and only then publish the
+//! One task, the `actor`, owns the state and decides events one by one: copy, decide, store, and only then publish the
 //! copy. What a refused transaction would have changed has therefore never been. Everybody else reads published copies.
 
 mod actor;
