@@ -235,7 +235,7 @@ fn report(view: &RunView, pipeline: &Pipeline, end: &End, options: &Options) -> 
     let interrupted = matches!(end, End::Interrupted { .. });
     match options.output {
         Output::Json => print::json(&Summary::of(view, interrupted)),
-        Output::Table => print::out(&summary::table(view)),
+        Output::Table => print::out(&format!("{}{}", summary::table(view), summary::evaluations(view))),
     }
     match end {
         End::Trouble(trouble) => {

@@ -100,6 +100,22 @@ pub(crate) fn table(run: &RunView) -> String {
     print::table(&["STAGE", "KIND", "STATE", "DONE", "TIME", "KEY", "RESULT"], rows.collect())
 }
 
+/// A table for each kind of evaluation that the run has several of, in the papers' column order.
+pub(crate) fn evaluations(run: &RunView) -> String {
+    let mut kinds: Vec<&str> =
+        run.stages.iter().map(|stage| stage.kind.as_str()).filter(|kind| kind.starts_with("evaluate.")).collect();
+    kinds.sort_unstable();
+    kinds.dedup();
+    let of_kind = |kind: &&str| {
+        let stages = run.stages.iter().filter(|stage| stage.kind == *kind && !stage.metrics.is_empty());
+        let all: Vec<_> = stages.map(|stage| (stage.name.to_string(), stage.metrics.clone())).collect();
+        if all.len() < 2 { None } else { registry::board::evaluations(kind, all) }
+    };
+    let tables =
+        kinds.iter().filter_map(of_kind).map(|table| format!("\n{}", table.render(registry::board::Style::Text)));
+    tables.collect()
+}
+
 /// The metric that says most, or why there is none.
 fn headline(stage: &StageView) -> String {
     if matches!(stage.state, StageState::Failed | StageState::Skipped) {

@@ -62,7 +62,7 @@ const COLUMNS: [Column; 23] = [
     column("sjpe", "sJPE", Better::Lower),
     column("sjpe_noise", "sJPE noise", Better::Lower),
     column("sjpe_static", "sJPE static", Better::Lower),
-    column("foot_skating", "Skating", Better::Lower),
+    column("skating_ratio", "Skating", Better::Lower),
     column("trajectory_error", "Traj. err.", Better::Lower),
     column("location_error", "Loc. err.", Better::Lower),
     column("average_error_m", "Avg. err. (m)", Better::Lower),
@@ -77,6 +77,8 @@ pub const FORMATS: [&str; 2] = ["humanml3d", "kit"];
 
 /// Columns of the papers' text-to-motion table: the first ones.
 const PAPER_COLUMNS: usize = 8;
+/// What only an evaluation as in the papers measures.
+const TELLING: &str = "fid";
 
 fn better(key: &str) -> Better {
     COLUMNS.iter().find(|column| column.key == key).map_or(Better::Neither, |column| column.better)
@@ -109,7 +111,7 @@ pub struct Row {
 pub struct Leaderboard {
     /// Of what.
     pub title: String,
-    /// Ours by the deciding metric, best first; then the published ones in their papers' order.
+    /// Of models: ours by the deciding metric, best first; then the published ones in their papers' order.
     pub rows: Vec<Row>,
 }
 
@@ -220,6 +222,19 @@ pub fn leaderboard(title: String, versions: &[Version], metric: Option<&str>, pu
     }
     ours.extend(published.into_iter().flat_map(published::rows));
     Leaderboard { title, rows: ours }
+}
+
+/// A table of evaluations in the order given, each with its name and its metrics; none where no table has a column for any of them.
+pub fn evaluations(title: &str, all: impl IntoIterator<Item = (String, BTreeMap<String, f64>)>) -> Option<Leaderboard> {
+    let row = |(label, metrics): (String, BTreeMap<String, f64>)| Row {
+        source: label.clone(),
+        label,
+        published: false,
+        measures: measures(&metrics),
+    };
+    let mut rows: Vec<Row> = all.into_iter().map(row).collect();
+    rows.retain(|row| COLUMNS.iter().any(|column| row.measures.contains_key(column.key)));
+    (!rows.is_empty()).then(|| Leaderboard { title: title.to_owned(), rows })
 }
 
 /// Two versions, metric by metric, in the papers' order; what no paper has comes last.

@@ -4,7 +4,7 @@ use clap::ValueEnum;
 use comfy_table::{ContentArrangement, Table, presets};
 use serde::{Deserialize, Serialize};
 
-use super::{Better, COLUMNS, Column, Comparison, Leaderboard, Measure, PAPER_COLUMNS, Row, Verdict};
+use super::{Better, COLUMNS, Column, Comparison, Leaderboard, Measure, PAPER_COLUMNS, Row, TELLING, Verdict};
 
 /// How a table is written.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
@@ -20,10 +20,11 @@ pub enum Style {
 }
 
 impl Leaderboard {
-    /// The columns that any row has; the papers' all together as soon as one of them has a value, so that rows can be pasted.
+    /// The columns that any row has; the papers' all together as soon as the one that tells a table of theirs has a value, so that
+    /// rows can be pasted.
     fn columns(&self) -> Vec<&'static Column> {
         let has = |column: &Column| self.rows.iter().any(|row| !row.published && row.measures.contains_key(column.key));
-        let paper = COLUMNS[..PAPER_COLUMNS].iter().any(has) || self.rows.iter().any(|row| row.published);
+        let paper = self.rows.iter().any(|row| row.published || row.measures.contains_key(TELLING));
         COLUMNS
             .iter()
             .enumerate()
@@ -33,7 +34,7 @@ impl Leaderboard {
     }
 
     /// The table.
-    pub(crate) fn render(&self, style: Style) -> String {
+    pub fn render(&self, style: Style) -> String {
         let columns = self.columns();
         let heads: Vec<String> = columns.iter().map(|c| format!("{}{}", c.head, arrow(c.better))).collect();
         let best: Vec<Option<f64>> = columns.iter().map(|c| self.best(c)).collect();

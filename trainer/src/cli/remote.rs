@@ -94,7 +94,7 @@ pub(crate) fn show(view: &RunView, output: Output) {
         Output::Json => print::json(&Summary::of(view, false)),
         Output::Table => {
             print::out(&format!("run {}: {}\n", view.run, summary::run_state(view.state)));
-            print::out(&summary::table(view));
+            print::out(&format!("{}{}", summary::table(view), summary::evaluations(view)));
         }
     }
 }
