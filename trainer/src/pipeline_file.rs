@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use motion::Dataset;
-use motion::folder_digest::folder_digest;
+use motion::folder_digest::{files_digest, folder_digest};
 use protocol::StageName;
 use protocol::pipeline::{self, Pipeline};
 use protocol::stage::StageSettings;
@@ -41,6 +41,9 @@ pub(crate) fn read_with_data(path: &Path, sets: &[String]) -> Result<PipelineFil
     let mut file = read(path, sets)?;
     file.pipeline
         .fill_external(|_, settings| folder_digest(Path::new(&settings.path), settings.format).map_err(bad_folder))?;
+    file.pipeline.fill_files(|stage, path| {
+        files_digest(Path::new(path)).map_err(|e| Problem::usage(format!("stage `{stage}`: {path}: {e}")))
+    })?;
     Ok(file)
 }
 

@@ -121,7 +121,7 @@ fn headline(stage: &StageView) -> String {
     if matches!(stage.state, StageState::Failed | StageState::Skipped) {
         return stage.message.clone().unwrap_or_default().lines().next().unwrap_or_default().chars().take(90).collect();
     }
-    let first = ["latent_fid", "mpjpe", "mpjpe_mm", "loss"]
+    let first = ["latent_fid", "fid", "mpjpe", "mpjpe_mm", "loss"]
         .into_iter()
         .find_map(|key| stage.metrics.get_key_value(key))
         .or_else(|| stage.metrics.first_key_value());

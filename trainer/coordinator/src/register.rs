@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 
 use protocol::pipeline::Pipeline;
-use protocol::stage::{Mode, Register, StageSettings};
+use protocol::stage::{Mode, Register};
 use protocol::{Alias, ArtifactKind, Digest, ModelName, RunId, StageName};
 use registry::Write;
 use serde_json::json;
@@ -113,10 +113,7 @@ fn vae_of(pipeline: &Pipeline, stage: &StageName) -> Option<StageName> {
 fn metrics_of(run: &Run, model: &str) -> BTreeMap<String, f64> {
     let mut all: BTreeMap<String, Vec<(&StageName, f64)>> = BTreeMap::new();
     for (stage, status) in run.pipeline.stages.iter().zip(&run.stages) {
-        let looks_at_it = match &stage.settings {
-            StageSettings::EvaluateLatentFid(settings) => settings.model == model,
-            _ => false,
-        };
+        let looks_at_it = stage.settings.looks_at() == Some(model);
         if let (true, Some(known)) = (looks_at_it, status.known()) {
             for (metric, value) in &known.metrics {
                 all.entry(metric.clone()).or_default().push((&stage.name, *value));

@@ -24,13 +24,17 @@ impl Entry {
     }
 }
 
-/// Names and shapes in declaration order. Paths are the published names, but for `emb_proj`, which upstream is the second entry of
-/// a sequence (`emb_proj.1`) whose first is an activation.
+/// Sequences whose fields are numbered: `main_3` is entry 3 of `main`.
+const SEQUENCES: [&str; 2] = ["main", "output_net"];
+
+/// Names and shapes in declaration order. Paths are the published names, but for entries of upstream's sequences, whose others
+/// have no parameters: `emb_proj` is `emb_proj.1`, and a field `main_3` is `main.3`.
 pub fn layout<M: Module>(module: &M) -> Vec<Entry> {
     struct Layout(Vec<String>, Vec<Entry>);
     impl ModuleVisitor for Layout {
         fn enter_module(&mut self, name: &str, _: &str) {
-            self.0.push(name.to_owned());
+            let entry = name.rsplit_once('_').filter(|(sequence, _)| SEQUENCES.contains(sequence));
+            self.0.push(entry.map_or_else(|| name.to_owned(), |(sequence, n)| format!("{sequence}.{n}")));
         }
         fn exit_module(&mut self, _: &str, _: &str) {
             self.0.pop();

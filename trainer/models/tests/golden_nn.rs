@@ -1,7 +1,7 @@
-//! Transformer blocks against PyTorch's layers (golden `nn`).
+//! Transformer blocks, GRUs, convolutions and the small evaluators against PyTorch's layers (golden `nn`).
 //!
-//! Only layers that the published networks have: norm after the residual, exact GELU. The others are named and skipped,
-//! and so are causal masks.
+//! Only layers that the published networks have: norm after the residual, exact GELU, one layer of GRU. The others are named and
+//! skipped, and so are causal masks.
 
 mod common;
 
@@ -11,7 +11,9 @@ use burn::tensor::{Device, Tensor};
 use common::{Array, Arrays, Gates, json, name, row, shared, values};
 use models::kernels::{Dropout, KeyMask};
 use models::names;
-use models::networks::{Block, Init, StackConfig};
+use models::networks::{
+    BiGru, Block, Deconv, EvaluatorConfig, Init, MotionEncoder, MovementEncoder, StackConfig, TextEncoder,
+};
 use protocol::Seed;
 use protocol::stage::Positions;
 use serde_json::Value;
@@ -29,6 +31,15 @@ fn golden_nn() {
         let file_name = name(&file);
         let Some(layer) = file_name.strip_suffix(".io.safetensors") else { continue };
         let weights = root.join(format!("{layer}.weights.safetensors"));
+        if let Some(check) = recurrent(layer) {
+            seen += 1;
+            let (io, stored, mut gates) = (Arrays::read(&file), Arrays::read(&weights), Gates::default());
+            for device in [Device::flex(), Device::flex().autodiff()] {
+                check(&io, &stored, &device, &mut gates);
+            }
+            gates.close(&format!("golden/nn/{layer}"));
+            continue;
+        }
         let decoder = layer.starts_with("decoder_layer");
         if !(decoder || layer.starts_with("encoder_layer")) || !layer.ends_with("gelu_postnorm") {
             eprintln!("SKIPPED: golden/nn/{layer}: no network here has this layer");
@@ -93,4 +104,111 @@ fn check_decoder(block: &Block, io: &Arrays, device: &Device, gates: &mut Gates)
         let found = block.forward(one(tgt), Some(memory), None, &mut Dropout::off());
         gates.check("decoder", format!("y of {b}"), common::error(&values(found), &row(y, b).values), GATE);
     }
+}
+
+type Check = fn(&Arrays, &Arrays, &Device, &mut Gates);
+
+/// The check of a layer of the evaluators.
+fn recurrent(layer: &str) -> Option<Check> {
+    Some(match layer {
+        "gru_bidirectional" => check_gru,
+        "conv_stack" => check_convolutions,
+        "evaluator_movement_encoder_small" => check_movements,
+        "evaluator_motion_encoder_small" => check_motion,
+        "evaluator_text_encoder_small" => check_text,
+        _ => return None,
+    })
+}
+
+fn draws(device: &Device) -> Init<'_> {
+    Init::new(Seed(1), "golden", Positions::Uniform, device)
+}
+
+fn loaded<M: burn::module::Module>(module: M, stored: &Arrays) -> M {
+    names::load(module, &std::fs::read(&stored.file).expect("readable weights"), "").expect("weights that fit")
+}
+
+/// Sizes out of stored shapes; those that a layer does not have are 1.
+fn sizes(stored: &Arrays) -> EvaluatorConfig {
+    let dim = |name: &str, axis: usize| stored.find(name).map_or(1, |a| a.shape[axis]);
+    EvaluatorConfig {
+        features: dim("main.0.weight", 1),
+        movement_hidden: dim("main.0.weight", 0),
+        movement: dim("main.3.weight", 0).max(dim("input_emb.weight", 1)),
+        motion_hidden: dim("hidden", 2),
+        word: dim("pos_emb.weight", 0),
+        classes: dim("pos_emb.weight", 1),
+        text_hidden: dim("hidden", 2),
+        embedding: dim("output_net.3.weight", 0),
+    }
+}
+
+fn check_movements(io: &Arrays, stored: &Arrays, device: &Device, gates: &mut Gates) {
+    let network = loaded(MovementEncoder::new(&sizes(stored), &mut draws(device)), stored);
+    let found = network.forward(io.get("x").tensor(device), &mut Dropout::off());
+    gates.tensor("movements", "y", found, io.get("y"), GATE);
+}
+
+fn check_motion(io: &Arrays, stored: &Arrays, device: &Device, gates: &mut Gates) {
+    let network = loaded(MotionEncoder::new(&sizes(stored), &mut draws(device)), stored);
+    let found = network.forward(io.get("x").tensor(device), &io.get("lengths").usizes());
+    gates.tensor("motion", "y", found, io.get("y"), GATE);
+}
+
+fn check_text(io: &Arrays, stored: &Arrays, device: &Device, gates: &mut Gates) {
+    let network = loaded(TextEncoder::new(&sizes(stored), &mut draws(device)), stored);
+    let (words, classes) = (io.get("word_embs").tensor(device), io.get("pos_onehot").tensor(device));
+    gates.tensor("text", "y", network.forward(words, classes, &io.get("cap_lens").usizes()), io.get("y"), GATE);
+}
+
+/// All lengths equal, and ragged: a stored state behind a sequence's end is zero, ours is not looked at.
+fn check_gru(io: &Arrays, stored: &Arrays, device: &Device, gates: &mut Gates) {
+    let rows = stored.get("weight_ih_l0").shape.clone();
+    let width = rows[0] / 3;
+    let network = loaded(BiGru::new(&mut draws(device), rows[1], width), stored);
+    let x = io.get("x").tensor::<3>(device);
+    let [batch, tokens, _] = x.dims();
+    let full = vec![tokens; batch];
+    for (lengths, y, last) in [(full, "y", "h_n"), (io.get("lengths").usizes(), "y_packed", "h_n_packed")] {
+        let start = |k: usize| row(io.get("h0"), k).tensor::<2>(device);
+        let states = network.forward(x.clone(), &lengths, [start(0), start(1)]).map(values);
+        let (mut found, mut ends) = (vec![0.0; batch * tokens * 2 * width], vec![0.0; 2 * batch * width]);
+        for (k, states) in states.iter().enumerate() {
+            for (b, length) in lengths.iter().enumerate() {
+                let at = |t: usize| &states[(b * tokens + t) * width..][..width];
+                for t in 0..*length {
+                    found[((b * tokens + t) * 2 + k) * width..][..width].copy_from_slice(at(t));
+                }
+                ends[(k * batch + b) * width..][..width].copy_from_slice(at(if k == 0 { tokens - 1 } else { 0 }));
+            }
+        }
+        gates.check("states", y, common::error(&found, &io.get(y).values), GATE);
+        gates.check("last states", last, common::error(&ends, &io.get(last).values), GATE);
+    }
+}
+
+/// Both convolutions; what stands between and behind them is computed here, in f64.
+fn check_convolutions(io: &Arrays, stored: &Arrays, device: &Device, gates: &mut Gates) {
+    use models::networks::Conv;
+    let x = io.get("x").tensor::<3>(device).swap_dims(1, 2);
+    let part = |name: &str| stored.get(name).tensor::<3>(device);
+    let bias = |name: &str| stored.get(name).tensor::<1>(device);
+    let x = Conv::from_weights(part("0.weight"), bias("0.bias")).forward(x);
+    let x = burn::tensor::activation::leaky_relu(x, 0.2);
+    let x = Deconv::from_weights(part("2.weight"), bias("2.bias")).forward(x).swap_dims(1, 2);
+    let [batch, channels, frames] = x.dims();
+    let (gamma, beta, groups) = (&stored.get("3.weight").values, &stored.get("3.bias").values, 3);
+    let size = channels / groups * frames;
+    let mut found = values(x);
+    for (g, group) in found.chunks_mut(size).enumerate() {
+        let mean = group.iter().map(|v| f64::from(*v)).sum::<f64>() / size as f64;
+        let variance = group.iter().map(|v| (f64::from(*v) - mean).powi(2)).sum::<f64>() / size as f64;
+        for (i, v) in group.iter_mut().enumerate() {
+            let channel = g % groups * (channels / groups) + i / frames;
+            let y = (f64::from(*v) - mean) / (variance + 1e-5).sqrt() * gamma[channel] + beta[channel];
+            *v = (y / (1.0 + (-y).exp())) as f32;
+        }
+    }
+    assert_eq!(io.get("y").shape, [batch, channels, frames]);
+    gates.check("convolutions", "y", common::error(&found, &io.get("y").values), GATE);
 }

@@ -256,3 +256,52 @@ fn dropout_is_a_function_of_its_place() {
     assert!(base.iter().all(|v| *v == 0.0 || (*v - 1.0 / 0.75).abs() < 1e-6));
     assert_eq!(values(kernels::dropout(tensor::<1>([9], 1, &device), &mut Dropout::off())), wave(9, 1));
 }
+
+#[test]
+fn gru_is_the_stock_gru() {
+    for (batch, tokens, width, lengths) in [(1, 1, 1, vec![1]), (3, 7, 5, vec![7, 1, 4]), (2, 4, 33, vec![0, 3])] {
+        for reverse in [false, true] {
+            agree(&format!("gru {batch}x{tokens}x{width}, reverse {reverse}"), 3e-6, || {
+                let (a, h) = (leaf([batch, tokens, 3 * width], 1), leaf([batch, width], 2));
+                let (w, c) = (leaf([3 * width, width], 3), leaf([3 * width], 4));
+                let w_small = w.clone() * 0.3;
+                let y = kernels::gru(a.clone(), h.clone(), w_small, c.clone(), &lengths, reverse);
+                let gradients = weighted(y.clone()).backward();
+                vec![
+                    values(y),
+                    values(a.grad(&gradients).unwrap()),
+                    values(h.grad(&gradients).unwrap()),
+                    values(w.grad(&gradients).unwrap()),
+                    values(c.grad(&gradients).unwrap()),
+                ]
+            });
+        }
+    }
+    let lengths = [3, 2];
+    let run = |a: &[f32]| {
+        let plain = Device::flex();
+        let a = Tensor::from_data(TensorData::new(a.to_vec(), [2, 3, 12]), &plain);
+        let y = kernels::gru(
+            a,
+            tensor([2, 4], 2, &plain),
+            tensor([12, 4], 3, &plain),
+            tensor([12], 4, &plain),
+            &lengths,
+            true,
+        );
+        sum(&values(y), &wave(24, 5))
+    };
+    let a = leaf([2, 3, 12], 1);
+    let plain = Device::flex();
+    let y = kernels::gru(
+        a.clone(),
+        tensor([2, 4], 2, &plain),
+        tensor([12, 4], 3, &plain),
+        tensor([12], 4, &plain),
+        &lengths,
+        true,
+    );
+    let gradient = values(a.grad(&weighted(y).backward()).unwrap());
+    slopes("gru", &wave(72, 1), &gradient, run);
+    assert!(gradient[(3 + 2) * 12..].iter().all(|g| *g == 0.0), "what is behind the end has no part");
+}

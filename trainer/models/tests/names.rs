@@ -6,7 +6,9 @@ use burn::module::Module;
 use burn::tensor::Device;
 use models::flat::layout;
 use models::names::{LoadError, load, save, to_bytes};
-use models::networks::{Denoiser, DenoiserConfig, Discriminator, Init, POSITIONS, Vae, VaeConfig};
+use models::networks::{
+    Denoiser, DenoiserConfig, Discriminator, Evaluator, EvaluatorConfig, Init, POSITIONS, Vae, VaeConfig,
+};
 use protocol::Seed;
 use protocol::stage::Positions;
 use safetensors::SafeTensors;
@@ -149,9 +151,28 @@ fn denoiser_has_the_published_names() {
     assert_eq!(sorted(&with(|init| Denoiser::new(&small_denoiser(None), init))), expected);
 }
 
+fn evaluator_config(features: usize) -> EvaluatorConfig {
+    EvaluatorConfig {
+        features,
+        movement_hidden: 512,
+        movement: 512,
+        motion_hidden: 1024,
+        word: 300,
+        classes: 15,
+        text_hidden: 512,
+        embedding: 512,
+    }
+}
+
 #[test]
 fn networks_have_the_published_numbers_of_parameters() {
     assert_eq!(POSITIONS, 500);
+    for (features, movements) in [(259, 1_842_688), (247, 1_818_112)] {
+        let evaluator = with(|i| Evaluator::new(&evaluator_config(features), i));
+        let found = [&evaluator.movement_encoder.num_params(), &evaluator.motion_encoder.num_params()];
+        assert_eq!(found, [&movements, &15_747_584]);
+        assert_eq!(evaluator.text_encoder.num_params(), 4_100_288);
+    }
     for (found, expected) in [
         (with(|i| Vae::new(&vae_config(false), i)).num_params(), 18_032_135),
         (with(|i| Vae::new(&vae_config(true), i)).num_params(), 18_056_487),

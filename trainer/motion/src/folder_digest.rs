@@ -46,6 +46,32 @@ pub fn folder_digest(path: &Path, format: DataFormat) -> Result<Digest, OpenErro
     }
 }
 
+/// The digest of a file, or of all files in a folder and below it by their paths. Times and permissions do not count.
+pub fn files_digest(path: &Path) -> std::io::Result<Digest> {
+    if path.is_file() {
+        return Ok(Digest::of(&std::fs::read(path)?));
+    }
+    let mut listing = "stride/files/1\n".to_owned();
+    let mut folders = vec![path.to_owned()];
+    let mut files = BTreeSet::new();
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(&folder)? {
+            let entry = entry?.path();
+            if entry.is_dir() {
+                folders.push(entry);
+            } else {
+                files.insert(entry);
+            }
+        }
+    }
+    for file in files {
+        let name = file.strip_prefix(path).unwrap_or(&file).to_string_lossy().replace('\\', "/");
+        let digest = Digest::of(&std::fs::read(&file)?).hex();
+        writeln!(listing, "{name}\0{digest}").expect("a string takes all that is written");
+    }
+    Ok(Digest::of(listing.as_bytes()))
+}
+
 /// Adds one file's line to `listing` and gives its bytes. A missing file is a problem only if it is `needed`.
 fn hash(root: &Path, name: &str, needed: bool, listing: &mut String, problems: &mut Vec<Problem>) -> Option<Vec<u8>> {
     let file = root.join(name);

@@ -11,6 +11,9 @@ use serde::{Deserialize, Serialize};
 /// Width of [`hashed_embedding`].
 pub const EMBEDDING_WIDTH: usize = 768;
 
+/// Width of [`hashed_word`].
+pub const WORD_WIDTH: usize = 300;
+
 /// Tokens that the evaluators read of a caption, without the two markers.
 pub const MAX_TOKENS: usize = 20;
 
@@ -177,6 +180,35 @@ pub fn hashed_embedding(caption: &str) -> [f32; EMBEDDING_WIDTH] {
     sums.map(|v| (f64::from(v) * scale) as f32)
 }
 
+/// The built-in word vector: the directions of the word and of its letter triples, `<` and `>` at its ends, added up; length 6,
+/// about that of the published vectors.
+///
+/// The direction of a text has coordinates of +1 and -1, bit `i mod 64` of the `i div 64`-th number that its hash leads to. The word
+/// itself counts as much as all its triples together.
+pub fn hashed_word(word: &str) -> [f32; WORD_WIDTH] {
+    const LENGTH: f64 = 6.0;
+    let mut sums = [0.0_f64; WORD_WIDTH];
+    let mut add = |text: &str, weight: f64| {
+        let mut bits = fnv1a(text.as_bytes());
+        for (i, sum) in sums.iter_mut().enumerate() {
+            if i % 64 == 0 {
+                bits = finalise(bits.wrapping_add(0x9e37_79b9_7f4a_7c15));
+            }
+            *sum += if bits >> (i % 64) & 1 == 0 { weight } else { -weight };
+        }
+    };
+    let letters: Vec<char> = format!("<{word}>").chars().collect();
+    add(word, 1.0);
+    let triples: Vec<String> = letters.windows(3).map(|triple| triple.iter().collect()).collect();
+    // Directions are about orthogonal, so that n of them have a root of n times the length of one.
+    let weight = 1.0 / (triples.len().max(1) as f64).sqrt();
+    for triple in &triples {
+        add(triple, weight);
+    }
+    let norm = sums.iter().map(|v| v * v).sum::<f64>().sqrt();
+    sums.map(|v| (v * LENGTH / norm) as f32)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -202,6 +234,16 @@ mod tests {
         for ((i, x), (j, sign)) in found.into_iter().zip(signs) {
             assert!(i == j && (x - sign * 0.353_553).abs() < 1e-5, "{i} {x} against {j} {sign}");
         }
+    }
+
+    #[test]
+    fn word_vectors_are_apart_but_for_related_forms() {
+        let cosine = |a: &str, b: &str| {
+            let (a, b) = (hashed_word(a), hashed_word(b));
+            a.iter().zip(&b).map(|(a, b)| f64::from(a * b)).sum::<f64>() / 36.0
+        };
+        assert!((cosine("walk", "walk") - 1.0).abs() < 1e-5);
+        assert!(cosine("walk", "walks") > 0.2 && cosine("walk", "jump").abs() < 0.2);
     }
 
     #[test]

@@ -23,6 +23,8 @@ pub enum ArtifactKind {
     Latents,
     /// A latent denoiser: teacher or student.
     Denoiser,
+    /// Embeds captions and motions in one space.
+    Evaluator,
     /// Metrics of an evaluation.
     Report,
     /// A registered model: everything `generate` needs.

@@ -4,11 +4,15 @@
 //! serialised default, so a field is declared once. Fields that cannot change a stage's value (worker counts,
 //! checkpoint cadence) live in [`Placement`] and stay out of the stage's key.
 
+mod evaluator;
+
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
 use crate::{ArtifactKind, Digest, Seed, StageName, Steps};
+
+pub use evaluator::{EvaluateT2m, EvaluatorNetwork, ImportEvaluator, MovementPhase, MultiModality, TrainEvaluator};
 
 /// How a stage's work is laid over workers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -615,6 +619,15 @@ pub enum StageSettings {
     /// Measures a denoiser.
     #[serde(rename = "evaluate.latent_fid")]
     EvaluateLatentFid(EvaluateLatentFid),
+    /// Trains an evaluator.
+    #[serde(rename = "train.evaluator")]
+    TrainEvaluator(TrainEvaluator),
+    /// Reads a published evaluator.
+    #[serde(rename = "import.evaluator")]
+    ImportEvaluator(ImportEvaluator),
+    /// Measures motions in an evaluator's space.
+    #[serde(rename = "evaluate.t2m")]
+    EvaluateT2m(EvaluateT2m),
     /// Registers and promotes.
     #[serde(rename = "register")]
     Register(Register),
@@ -634,6 +647,9 @@ impl StageSettings {
             Self::DistillPcm(DistillPcm::default()),
             Self::EvaluateReconstruction(EvaluateReconstruction::default()),
             Self::EvaluateLatentFid(EvaluateLatentFid::default()),
+            Self::TrainEvaluator(TrainEvaluator::default()),
+            Self::ImportEvaluator(ImportEvaluator::default()),
+            Self::EvaluateT2m(EvaluateT2m::default()),
             Self::Register(Register::default()),
         ]
     }
@@ -672,6 +688,21 @@ impl StageSettings {
                 s.text.clear();
                 s.teacher.clear();
             }
+            Self::TrainEvaluator(s) => {
+                s.dataset.clear();
+                s.words.clear();
+            }
+            Self::ImportEvaluator(s) => {
+                s.path.clear();
+                s.words.clear();
+            }
+            Self::EvaluateT2m(s) => {
+                s.model.clear();
+                s.vae.clear();
+                s.dataset.clear();
+                s.text.clear();
+                s.evaluator.clear();
+            }
             Self::Register(s) => s.from.clear(),
         }
         settings
@@ -690,6 +721,9 @@ impl StageSettings {
             Self::DistillPcm(_) => "distill.pcm",
             Self::EvaluateReconstruction(_) => "evaluate.reconstruction",
             Self::EvaluateLatentFid(_) => "evaluate.latent_fid",
+            Self::TrainEvaluator(_) => "train.evaluator",
+            Self::ImportEvaluator(_) => "import.evaluator",
+            Self::EvaluateT2m(_) => "evaluate.t2m",
             Self::Register(_) => "register",
         }
     }
@@ -702,9 +736,16 @@ impl StageSettings {
     /// How its work is laid over workers.
     pub fn shape(&self) -> Shape {
         match self {
-            Self::DataOpen(_) | Self::DataSynthetic(_) | Self::TextEmbed(_) => Shape::Plain,
-            Self::TrainVae(_) | Self::TrainMld(_) | Self::DistillLcm(_) | Self::DistillPcm(_) => Shape::Gang,
-            Self::EncodeLatents(_) | Self::EvaluateReconstruction(_) | Self::EvaluateLatentFid(_) => Shape::Map,
+            Self::DataOpen(_) | Self::DataSynthetic(_) | Self::TextEmbed(_) | Self::ImportEvaluator(_) => Shape::Plain,
+            Self::TrainVae(_)
+            | Self::TrainMld(_)
+            | Self::DistillLcm(_)
+            | Self::DistillPcm(_)
+            | Self::TrainEvaluator(_) => Shape::Gang,
+            Self::EncodeLatents(_)
+            | Self::EvaluateReconstruction(_)
+            | Self::EvaluateLatentFid(_)
+            | Self::EvaluateT2m(_) => Shape::Map,
             Self::Register(_) => Shape::Registry,
         }
     }
@@ -715,6 +756,7 @@ impl StageSettings {
             Self::EncodeLatents(s) => s.shards,
             Self::EvaluateReconstruction(s) => s.shards,
             Self::EvaluateLatentFid(s) => s.shards,
+            Self::EvaluateT2m(s) => s.shards,
             _ => 1,
         };
         u32::try_from(shards.max(1)).unwrap_or(u32::MAX)
@@ -727,6 +769,28 @@ impl StageSettings {
             Self::TrainMld(s) => Some(s.training.steps),
             Self::DistillLcm(s) => Some(s.distillation.training.steps),
             Self::DistillPcm(s) => Some(s.distillation.training.steps),
+            Self::TrainEvaluator(s) => Some(s.training.steps),
+            _ => None,
+        }
+    }
+
+    /// Folders and files outside the store that it reads besides a dataset's, by the field that names them. Their contents
+    /// count for its key, not their paths.
+    pub fn files(&self) -> Vec<(&'static str, &str)> {
+        let fields: &[(&'static str, &String)] = match self {
+            Self::TrainEvaluator(s) => &[("words", &s.words)],
+            Self::ImportEvaluator(s) => &[("path", &s.path), ("words", &s.words)],
+            _ => &[],
+        };
+        fields.iter().filter(|(_, path)| !path.is_empty()).map(|(field, path)| (*field, path.as_str())).collect()
+    }
+
+    /// The model that an evaluation measures.
+    pub fn looks_at(&self) -> Option<&str> {
+        match self {
+            Self::EvaluateLatentFid(s) => Some(&s.model),
+            // Shuffled captions say nothing of the model.
+            Self::EvaluateT2m(s) if !s.real && !s.shuffled => Some(&s.model),
             _ => None,
         }
     }
@@ -739,7 +803,10 @@ impl StageSettings {
             Self::TrainVae(_) => ("vae", ArtifactKind::Vae),
             Self::EncodeLatents(_) => ("latents", ArtifactKind::Latents),
             Self::TrainMld(_) | Self::DistillLcm(_) | Self::DistillPcm(_) => ("denoiser", ArtifactKind::Denoiser),
-            Self::EvaluateReconstruction(_) | Self::EvaluateLatentFid(_) => ("report", ArtifactKind::Report),
+            Self::EvaluateReconstruction(_) | Self::EvaluateLatentFid(_) | Self::EvaluateT2m(_) => {
+                ("report", ArtifactKind::Report)
+            }
+            Self::TrainEvaluator(_) | Self::ImportEvaluator(_) => ("evaluator", ArtifactKind::Evaluator),
             Self::Register(_) => ("model", ArtifactKind::Model),
         }
     }
@@ -749,7 +816,20 @@ impl StageSettings {
     pub fn inputs(&self) -> Vec<(String, String, ArtifactKind)> {
         let one = |field: &str, stage: &String, kind| (field.to_owned(), stage.clone(), kind);
         match self {
-            Self::DataOpen(_) | Self::DataSynthetic(_) => vec![],
+            Self::DataOpen(_) | Self::DataSynthetic(_) | Self::ImportEvaluator(_) => vec![],
+            Self::TrainEvaluator(s) => vec![one("dataset", &s.dataset, ArtifactKind::Dataset)],
+            Self::EvaluateT2m(s) => {
+                let mut inputs = vec![
+                    one("dataset", &s.dataset, ArtifactKind::Dataset),
+                    one("evaluator", &s.evaluator, ArtifactKind::Evaluator),
+                ];
+                if !s.real {
+                    inputs.push(one("model", &s.model, ArtifactKind::Denoiser));
+                    inputs.push(one("vae", &s.vae, ArtifactKind::Vae));
+                    inputs.push(one("text", &s.text, ArtifactKind::Embeddings));
+                }
+                inputs
+            }
             Self::TextEmbed(s) => vec![one("dataset", &s.dataset, ArtifactKind::Dataset)],
             Self::TrainVae(s) => vec![one("dataset", &s.dataset, ArtifactKind::Dataset)],
             Self::EncodeLatents(s) => {

@@ -5,8 +5,10 @@
 pub mod artifacts;
 pub mod context;
 pub mod evaluation;
+pub mod evaluator;
 pub mod generate;
 pub mod kinds;
 pub mod networks;
 pub mod testing;
 pub mod train;
+pub mod words;

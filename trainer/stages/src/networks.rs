@@ -170,6 +170,18 @@ impl Autoencoder {
     }
 }
 
+impl Autoencoder {
+    /// Clips of `lengths[b]` frames each, normalised, of latents `[batch, N, d]`.
+    pub fn decode_ragged(&self, z: Vec<f32>, lengths: &[usize]) -> Vec<Vec<f32>> {
+        let (latent, width) = (self.meta.latent, self.meta.features);
+        let frames = lengths.iter().copied().max().unwrap_or_default();
+        let z = tensor(z, [lengths.len(), latent.tokens, latent.dim], &self.device);
+        let rows = host(self.vae.decode(z, lengths, frames, &mut Dropout::off()));
+        let clip = |(rows, len): (&[f32], &usize)| rows[..len * width].to_vec();
+        rows.chunks_exact((frames * width).max(1)).zip(lengths).map(clip).collect()
+    }
+}
+
 /// What latents are drawn for.
 #[derive(Debug, Clone)]
 pub struct Conditions {

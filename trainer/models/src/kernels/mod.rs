@@ -12,6 +12,7 @@
 mod attention;
 mod dropout;
 mod gelu;
+mod gru;
 mod linear;
 mod norm;
 mod raw;
@@ -20,6 +21,7 @@ mod simd;
 pub use attention::{KeyMask, cross_attention, self_attention};
 pub use dropout::{Dropout, dropout};
 pub use gelu::gelu;
+pub use gru::gru;
 pub use linear::linear;
 pub use norm::{add_layer_norm, layer_norm};
 

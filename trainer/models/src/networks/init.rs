@@ -49,6 +49,20 @@ impl<'a> Init<'a> {
         self.draw(-bound, bound, [out, inner])
     }
 
+    /// Normal with deviation `sqrt(2 / (fan_in + fan_out))`, the fans given.
+    #[expect(
+        clippy::cast_precision_loss,
+        clippy::cast_possible_truncation,
+        reason = "widths are small, parameters f32"
+    )]
+    pub fn xavier_normal<const D: usize>(&mut self, fans: usize, shape: [usize; D]) -> Param<Tensor<D>> {
+        let deviation = (2.0 / fans as f64).sqrt() as f32;
+        let mut values = vec![0.0; shape.iter().product()];
+        self.stream.fill_normal(&mut values);
+        values.iter_mut().for_each(|v| *v *= deviation);
+        self.param(values, shape)
+    }
+
     /// Uniform within `±1 / sqrt(fan_in)`: PyTorch's default for a Linear's weight and bias.
     #[expect(clippy::cast_precision_loss, reason = "widths are small")]
     pub fn fan_in<const D: usize>(&mut self, inner: usize, shape: [usize; D]) -> Param<Tensor<D>> {

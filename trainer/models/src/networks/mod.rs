@@ -5,6 +5,7 @@
 mod denoiser;
 mod discriminator;
 mod embedding;
+mod evaluator;
 mod init;
 mod transformer;
 mod vae;
@@ -12,6 +13,9 @@ mod vae;
 pub use denoiser::{Denoiser, DenoiserConfig};
 pub use discriminator::Discriminator;
 pub use embedding::{guidance_embedding, time_sinusoid};
+pub use evaluator::{
+    BiGru, Conv, Deconv, Evaluator, EvaluatorConfig, MotionEncoder, MovementDecoder, MovementEncoder, TextEncoder,
+};
 pub use init::Init;
 pub use transformer::{Attention, Block, Linear, Norm, SkipStack, StackConfig};
 pub use vae::{Posterior, Vae, VaeConfig};

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::rules::Problems;
 use super::{PipelineStage, StageInput};
-use crate::stage::{StageSettings, TrainVae};
+use crate::stage::{Sampler, StageSettings, TrainVae};
 use crate::{ArtifactKind, StageName};
 
 /// Problems by stage.
@@ -18,6 +18,7 @@ pub(super) fn noun(kind: ArtifactKind) -> &'static str {
         ArtifactKind::Vae => "a VAE",
         ArtifactKind::Latents => "latents",
         ArtifactKind::Denoiser => "a denoiser",
+        ArtifactKind::Evaluator => "an evaluator",
         ArtifactKind::Report => "a report",
         ArtifactKind::Model => "a model",
         ArtifactKind::Checkpoint => "a checkpoint",
@@ -36,10 +37,7 @@ pub(super) fn references(settings: &StageSettings) -> Vec<StageInput> {
 pub(super) fn add_evaluations(stages: &mut [PipelineStage]) {
     let looks_at: Vec<(StageName, StageName)> = stages
         .iter()
-        .filter_map(|stage| match &stage.settings {
-            StageSettings::EvaluateLatentFid(s) => Some((stage.name.clone(), StageName::new(&*s.model))),
-            _ => None,
-        })
+        .filter_map(|stage| Some((stage.name.clone(), StageName::new(stage.settings.looks_at()?))))
         .collect();
     for stage in stages {
         if let StageSettings::Register(settings) = &stage.settings {
@@ -207,7 +205,26 @@ pub(super) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
             | StageSettings::DataSynthetic(_)
             | StageSettings::TextEmbed(_)
             | StageSettings::TrainVae(_)
+            | StageSettings::TrainEvaluator(_)
+            | StageSettings::ImportEvaluator(_)
             | StageSettings::EncodeLatents(_) => {}
+            StageSettings::EvaluateT2m(s) if s.real => {}
+            StageSettings::EvaluateT2m(s) => {
+                if let Some(vae) = lookup.vae_of_denoiser(&s.model)
+                    && vae != s.vae
+                {
+                    let message = format!("`{}` makes latents of `{vae}`, but `vae` is `{}`", s.model, s.vae);
+                    p.add("vae", message, "another VAE makes other motions of them; name the same one");
+                }
+                if let Some(data) = lookup.dataset_of_text(&s.text)
+                    && data != s.dataset
+                {
+                    let message =
+                        format!("`{}` embeds the captions of `{data}`, but the clips are of `{}`", s.text, s.dataset);
+                    p.add("text", message, &format!("add a `text.embed` stage with `dataset: {}`", s.dataset));
+                }
+                steps_of(p, &lookup, &s.model, &s.sampler);
+            }
             StageSettings::EvaluateLatentFid(s) => {
                 same_vae(p, &lookup, ("model", lookup.vae_of_denoiser(&s.model)), &s.latents);
                 same_data(p, &lookup, &s.latents, &s.text);
@@ -222,36 +239,11 @@ pub(super) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
                         p.add("components", message, "");
                     }
                 }
-                match lookup.0.get(s.model.as_str()) {
-                    Some(StageSettings::DistillPcm(pcm)) if pcm.phases != s.sampler.steps => {
-                        let message = format!(
-                            "`sampler.steps` is {}, but `{}` has {} phase(s); a PCM student makes one step a phase",
-                            s.sampler.steps, s.model, pcm.phases
-                        );
-                        p.add("sampler.steps", message, &format!("write `steps: {}`", pcm.phases));
-                    }
-                    Some(StageSettings::DistillPcm(_) | StageSettings::TrainMld(_))
-                        if !s.sampler.timesteps.is_empty() =>
-                    {
-                        let message = format!("`sampler.timesteps` are for LCM students, and `{}` is none", s.model);
-                        p.add("sampler.timesteps", message, "leave them out");
-                    }
-                    Some(StageSettings::DistillLcm(lcm)) if s.sampler.steps > 1000 / lcm.distillation.skip.max(1) => {
-                        let points = 1000 / lcm.distillation.skip.max(1);
-                        let message = format!(
-                            "`sampler.steps` is {}, but the grid of `{}` has {points} points",
-                            s.sampler.steps, s.model
-                        );
-                        p.add("sampler.steps", message, "");
-                    }
-                    _ => {}
-                }
+                steps_of(p, &lookup, &s.model, &s.sampler);
             }
             StageSettings::Register(s) => {
                 for (i, from) in s.from.iter().enumerate() {
-                    let judged = stages.iter().any(
-                        |other| matches!(&other.settings, StageSettings::EvaluateLatentFid(e) if &e.model == from),
-                    );
+                    let judged = stages.iter().any(|other| other.settings.looks_at() == Some(from.as_str()));
                     if !judged && (s.from.len() > 1 || !s.promote.to.is_empty()) {
                         let message =
                             format!("no `evaluate.*` stage looks at `{from}`, so `{}` cannot judge it", s.metric);
@@ -261,6 +253,30 @@ pub(super) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
                 }
             }
         }
+    }
+}
+
+/// Steps and timesteps that the model has.
+fn steps_of(p: &mut Problems, lookup: &Lookup<'_>, model: &str, sampler: &Sampler) {
+    match lookup.0.get(model) {
+        Some(StageSettings::DistillPcm(pcm)) if pcm.phases != sampler.steps => {
+            let message = format!(
+                "`sampler.steps` is {}, but `{}` has {} phase(s); a PCM student makes one step a phase",
+                sampler.steps, model, pcm.phases
+            );
+            p.add("sampler.steps", message, &format!("write `steps: {}`", pcm.phases));
+        }
+        Some(StageSettings::DistillPcm(_) | StageSettings::TrainMld(_)) if !sampler.timesteps.is_empty() => {
+            let message = format!("`sampler.timesteps` are for LCM students, and `{}` is none", model);
+            p.add("sampler.timesteps", message, "leave them out");
+        }
+        Some(StageSettings::DistillLcm(lcm)) if sampler.steps > 1000 / lcm.distillation.skip.max(1) => {
+            let points = 1000 / lcm.distillation.skip.max(1);
+            let message =
+                format!("`sampler.steps` is {}, but the grid of `{}` has {points} points", sampler.steps, model);
+            p.add("sampler.steps", message, "");
+        }
+        _ => {}
     }
 }
 

@@ -75,8 +75,14 @@ impl Pipeline {
     pub fn digest(&self) -> Digest {
         let mut pipeline = self.clone();
         for stage in &mut pipeline.stages {
-            if let StageSettings::DataOpen(settings) = &mut stage.settings {
-                settings.path.clear();
+            match &mut stage.settings {
+                StageSettings::DataOpen(settings) => settings.path.clear(),
+                StageSettings::TrainEvaluator(settings) => settings.words.clear(),
+                StageSettings::ImportEvaluator(settings) => {
+                    settings.path.clear();
+                    settings.words.clear();
+                }
+                _ => {}
             }
         }
         crate::canonical::digest(&pipeline)
@@ -94,6 +100,19 @@ impl Pipeline {
             if let StageSettings::DataOpen(settings) = &stage.settings {
                 let digest = folder_digest(&stage.name, settings)?;
                 stage.external.insert("folder".into(), digest);
+            }
+        }
+        Ok(())
+    }
+
+    /// Asks `digest` for the content of every other folder that a stage reads, and keeps the answers by field.
+    ///
+    /// # Errors
+    /// The first error of `digest`.
+    pub fn fill_files<E>(&mut self, mut digest: impl FnMut(&StageName, &str) -> Result<Digest, E>) -> Result<(), E> {
+        for stage in &mut self.stages {
+            for (field, path) in stage.settings.files() {
+                stage.external.insert(field.into(), digest(&stage.name, path)?);
             }
         }
         Ok(())

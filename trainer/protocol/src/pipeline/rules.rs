@@ -4,8 +4,8 @@
 
 use crate::id::is_name;
 use crate::stage::{
-    Batch, Distance, Distillation, LatentShape, Network, Optimizer, Placement, Register, Sampler, StageSettings,
-    Training,
+    Batch, Distance, Distillation, LatentShape, MultiModality, Network, Optimizer, Placement, Register, Sampler,
+    StageSettings, Training,
 };
 
 /// A rule that does not hold.
@@ -144,6 +144,56 @@ pub(super) fn stage(settings: &StageSettings, placement: &Placement) -> Vec<Prob
             p.positive("samples", s.samples);
             p.positive("components", s.components);
             shards(p, s.shards);
+        }
+        StageSettings::TrainEvaluator(s) => {
+            for (field, value) in [
+                ("network.movement", s.network.movement),
+                ("network.motion", s.network.motion),
+                ("network.text", s.network.text),
+                ("network.embedding", s.network.embedding),
+            ] {
+                p.positive(field, value);
+            }
+            p.fraction("network.dropout", s.network.dropout, true);
+            p.fraction("movement.until", s.movement.until, true);
+            if s.movement.until == 0.0 {
+                p.add("movement.until", "`movement.until` is 0; movements must be trained before they are matched", "");
+            }
+            if s.movement.window < 8 {
+                let message = format!("`movement.window` is {}; expected at least 8 frames", s.movement.window);
+                p.add("movement.window", message, "two movements of four frames, so that they have a difference");
+            }
+            if s.movement.batch != 0 {
+                divides(p, "movement.batch", Batch { global: s.movement.batch, slices: s.training.batch.slices });
+            }
+            p.not_negative("movement.sparsity", s.movement.sparsity);
+            p.not_negative("movement.smoothness", s.movement.smoothness);
+            p.above_zero("emphasis", s.emphasis);
+            p.above_zero("margin", s.margin);
+            p.fraction("ema", s.ema, true);
+            training(p, &s.training);
+            let batch = s.training.batch;
+            if batch.slices > 0 && batch.global / batch.slices < 2 {
+                let message = format!("a slice of {} and {} slices has no two captions", batch.global, batch.slices);
+                p.add("batch.slices", message, "captions are told apart within a slice; take fewer slices");
+            }
+        }
+        StageSettings::ImportEvaluator(s) => {
+            if s.path.trim().is_empty() {
+                p.add("path", "`path` is missing: the folder with `text_mot_match/model/finest.tar`", "");
+            }
+        }
+        StageSettings::EvaluateT2m(s) => {
+            if !s.real {
+                sampler(p, &s.sampler);
+            }
+            p.positive("repeats", s.repeats);
+            shards(p, s.shards);
+            let MultiModality { captions, samples, pairs } = s.multimodality;
+            if captions > 0 && !(1..=samples).contains(&pairs) {
+                let message = format!("`multimodality.pairs` is {pairs}; expected 1 to `samples`, {samples}");
+                p.add("multimodality.pairs", message, "");
+            }
         }
         StageSettings::Register(s) => register(p, s),
     }
@@ -353,7 +403,7 @@ mod tests {
             let fields: Vec<String> =
                 stage(&settings, &Placement::default()).into_iter().map(|problem| problem.field).collect();
             let expected: &[&str] = match settings {
-                StageSettings::DataOpen(_) => &["path"],
+                StageSettings::DataOpen(_) | StageSettings::ImportEvaluator(_) => &["path"],
                 StageSettings::Register(_) => &["model", "from"],
                 _ => &[],
             };

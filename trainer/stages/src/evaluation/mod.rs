@@ -1,7 +1,13 @@
 //! Metrics over plain arrays, in f64 and in a fixed order of summation. No tensors, no devices, no artifacts.
 
+pub mod control;
 pub mod frechet;
+pub mod interval;
+pub mod jerk;
 pub mod joints;
 pub mod latent_fid;
+pub mod procrustes;
 pub mod reconstruction;
 pub mod retrieval;
+pub mod skating;
+pub mod spread;

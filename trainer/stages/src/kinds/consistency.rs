@@ -103,6 +103,7 @@ impl Distiller {
             optimizer: (&self.settings.training.optimizer).into(),
             lr: schedule(&self.settings.training, self.settings.training.lr),
             ema: Some(self.settings.ema),
+            active: None,
         }
     }
 

@@ -35,6 +35,7 @@ impl Objective for Mld {
             optimizer: (&self.settings.training.optimizer).into(),
             lr: schedule(&self.settings.training, self.settings.training.lr),
             ema: (self.settings.ema > 0.0).then_some(self.settings.ema),
+            active: None,
         }]
     }
 

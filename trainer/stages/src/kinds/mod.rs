@@ -3,12 +3,15 @@
 mod consistency;
 mod data;
 mod encode;
+mod evaluator;
+mod import;
 mod latent_data;
 mod latent_fid;
 mod lcm;
 mod mld;
 mod pcm;
 mod reconstruction;
+mod t2m;
 pub mod text;
 mod vae;
 
@@ -35,6 +38,7 @@ pub fn run_alone(cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
         StageSettings::DataOpen(settings) => data::open(cx, &settings),
         StageSettings::DataSynthetic(settings) => data::synthetic(cx, &settings),
         StageSettings::TextEmbed(settings) => text::run(cx, &settings),
+        StageSettings::ImportEvaluator(settings) => import::run(cx, &settings),
         other => Err(misplaced(&other, "by one worker alone")),
     }
 }
@@ -54,6 +58,8 @@ pub fn run_part(cx: &mut dyn AttemptContext, part: Part) -> Result<Outcome, Stag
         (StageSettings::EvaluateLatentFid(settings), Part::Merge { shards }) => {
             latent_fid::merge(cx, &settings, &shards)
         }
+        (StageSettings::EvaluateT2m(settings), Part::Shard { index, of }) => t2m::shard(cx, &settings, index, of),
+        (StageSettings::EvaluateT2m(settings), Part::Merge { shards }) => t2m::merge(cx, &settings, &shards),
         (other, _) => Err(misplaced(&other, "in shards")),
     }
 }
@@ -65,6 +71,7 @@ pub fn run_gang(cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
         StageSettings::TrainMld(settings) => mld::run(cx, &settings),
         StageSettings::DistillLcm(settings) => lcm::run(cx, &settings),
         StageSettings::DistillPcm(settings) => pcm::run(cx, &settings),
+        StageSettings::TrainEvaluator(settings) => evaluator::run(cx, &settings),
         other => Err(misplaced(&other, "by a gang")),
     }
 }

@@ -46,6 +46,7 @@ impl Objective for Pcm {
                 optimizer: (&self.settings.discriminator_optimizer).into(),
                 lr: schedule(training, lr),
                 ema: None,
+                active: None,
             });
         }
         groups

@@ -84,6 +84,7 @@ impl Objective for VaeObjective {
             optimizer: (&self.settings.training.optimizer).into(),
             lr: schedule(&self.settings.training, self.settings.training.lr),
             ema: (self.settings.ema > 0.0).then_some(self.settings.ema),
+            active: None,
         }]
     }
 

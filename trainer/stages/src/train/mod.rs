@@ -200,7 +200,10 @@ fn apply(
         group.update(step, gradient, factor);
     }
     state.step += 1;
-    Ok(Applied { norm: norms[0], lr: state.groups[0].lr.at(step) })
+    // The first group that the step trains stands for the step.
+    let watched = state.groups.iter().zip(&norms).find_map(|(group, norm)| Some((group.turn(step)?, group, *norm)));
+    let (turn, group, norm) = watched.unwrap_or((step, &state.groups[0], norms[0]));
+    Ok(Applied { norm, lr: group.lr.at(turn) })
 }
 
 fn save(

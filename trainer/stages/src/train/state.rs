@@ -1,5 +1,7 @@
 //! What training changes, and its bytes.
 
+use std::ops::Range;
+
 use models::flat::Entry;
 use models::optim::{AdamW, LrSchedule, ema};
 
@@ -20,6 +22,8 @@ pub struct GroupPlan {
     pub lr: LrSchedule,
     /// Decay of a moving average that is kept beside the parameters.
     pub ema: Option<f64>,
+    /// Steps that train it, where that is not all; its optimizer and its schedule count from the first of them.
+    pub active: Option<Range<u64>>,
 }
 
 /// A group in training: flat buffers of one length.
@@ -41,11 +45,21 @@ pub struct Group {
     pub lr: LrSchedule,
     optimizer: AdamW,
     ema: f64,
+    active: Option<Range<u64>>,
 }
 
 impl Group {
+    /// The number of the update that step `step` is to this group, from 0; `None` outside the steps that train it.
+    pub(super) fn turn(&self, step: u64) -> Option<u64> {
+        match &self.active {
+            None => Some(step),
+            Some(active) => active.contains(&step).then(|| step - active.start),
+        }
+    }
+
     /// Applies update number `step` (from 0) with `factor` times the gradient, then moves the average.
     pub(super) fn update(&mut self, step: u64, gradient: &[f32], factor: f64) {
+        let Some(step) = self.turn(step) else { return };
         #[expect(clippy::cast_possible_truncation, reason = "a factor in (0, 1]")]
         let scaled: Vec<f32> = gradient.iter().map(|g| g * factor as f32).collect();
         self.optimizer.step(step + 1, self.lr.at(step), &mut self.params, &scaled, &mut self.m, &mut self.v);
@@ -77,6 +91,7 @@ impl TrainState {
             lr: plan.lr,
             optimizer: plan.optimizer,
             ema: plan.ema.unwrap_or(0.0),
+            active: plan.active.clone(),
         };
         Self { step: 0, groups: plans.iter().map(group).collect() }
     }

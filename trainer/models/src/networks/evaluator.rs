@@ -1,0 +1,361 @@
+//! The text-motion evaluator: three networks that put captions and motions into one space, where the metrics are taken.
+//!
+//! Source: text-to-motion (Guo et al., CVPR 2022). Movements are a token per four frames, by two strided convolutions; a bidirectional GRU over the
+//! movements gives a motion's embedding, another over the words a caption's. Sequences are ragged: the forward GRU stops at a
+//! sequence's own last token and the backward GRU starts there, whatever stands behind it. Notation: c channels in, g width of a GRU.
+//!
+//! [`MovementDecoder`] belongs to the first phase of the training alone: encoder and decoder make an autoencoder.
+
+use burn::module::{Module, Param};
+use burn::tensor::activation::leaky_relu;
+use burn::tensor::{Device, Tensor};
+use serde::{Deserialize, Serialize};
+
+use super::{Init, Linear, Norm};
+use crate::kernels::{self, Dropout, dropout, gru};
+
+/// Slope of every leaky ReLU here.
+const SLOPE: f64 = 0.2;
+/// Added to variances in layer norms.
+const EPS: f64 = 1e-5;
+/// Frames that one movement stands for.
+pub(crate) const UNIT: usize = 4;
+
+/// Sizes. The published evaluator: 512, 512, 1024, 300, 15, 512, 512.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct EvaluatorConfig {
+    /// Features of a frame that movements are made of: all but the four foot contacts.
+    pub features: usize,
+    /// Width between the two convolutions.
+    pub movement_hidden: usize,
+    /// Width of a movement.
+    pub movement: usize,
+    /// Width of the motion GRU.
+    pub motion_hidden: usize,
+    /// Width of a word vector.
+    pub word: usize,
+    /// Classes of words.
+    pub classes: usize,
+    /// Width of the text GRU.
+    pub text_hidden: usize,
+    /// Width of an embedding.
+    pub embedding: usize,
+}
+
+/// A convolution over time of four frames, every second one, one frame of zeros on either side.
+#[derive(Module, Debug)]
+pub struct Conv {
+    /// [out, in, 4].
+    pub weight: Param<Tensor<3>>,
+    /// [out].
+    pub bias: Param<Tensor<1>>,
+}
+
+impl Conv {
+    fn new(init: &mut Init<'_>, inner: usize, out: usize) -> Self {
+        Self { weight: init.xavier_normal((inner + out) * UNIT, [out, inner, UNIT]), bias: init.constant(0.0, [out]) }
+    }
+
+    /// A layer with these weights.
+    pub fn from_weights(weight: Tensor<3>, bias: Tensor<1>) -> Self {
+        Self { weight: Param::from_tensor(weight), bias: Param::from_tensor(bias) }
+    }
+
+    /// [B, T, in] -> [B, T / 2, out].
+    ///
+    /// A window is two neighbouring pairs of padded frames, so that the convolution is a Linear over windows.
+    pub fn forward(&self, x_btc: Tensor<3>) -> Tensor<3> {
+        let [batch, frames, inner] = x_btc.dims();
+        let [out, _, taps] = self.weight.dims();
+        let edge = Tensor::zeros([batch, 1, inner], &x_btc.device());
+        let pairs = (frames + 2) / 2;
+        let padded = Tensor::cat(vec![edge.clone(), x_btc, edge], 1);
+        let paired = padded.slice([0..batch, 0..2 * pairs, 0..inner]).reshape([batch, pairs, 2 * inner]);
+        let part = |from: usize| paired.clone().slice([0..batch, from..from + pairs - 1, 0..2 * inner]);
+        let windows = Tensor::cat(vec![part(0), part(1)], 2);
+        let weight = self.weight.val().swap_dims(1, 2).reshape([out, taps * inner]);
+        kernels::linear(windows, weight, Some(self.bias.val()))
+    }
+}
+
+/// The transpose of such a convolution: twice as many frames.
+#[derive(Module, Debug)]
+pub struct Deconv {
+    /// [in, out, 4].
+    pub weight: Param<Tensor<3>>,
+    /// [out].
+    pub bias: Param<Tensor<1>>,
+}
+
+impl Deconv {
+    fn new(init: &mut Init<'_>, inner: usize, out: usize) -> Self {
+        Self { weight: init.xavier_normal((inner + out) * UNIT, [inner, out, UNIT]), bias: init.constant(0.0, [out]) }
+    }
+
+    /// A layer with these weights.
+    pub fn from_weights(weight: Tensor<3>, bias: Tensor<1>) -> Self {
+        Self { weight: Param::from_tensor(weight), bias: Param::from_tensor(bias) }
+    }
+
+    /// [B, T, in] -> [B, 2 T, out].
+    ///
+    /// Frame 2m has taps 3 and 1 on inputs m-1 and m, frame 2m+1 taps 2 and 0 on inputs m and m+1.
+    pub fn forward(&self, x_btc: Tensor<3>) -> Tensor<3> {
+        let [batch, frames, inner] = x_btc.dims();
+        let out = self.weight.dims()[1];
+        let edge = Tensor::zeros([batch, 1, inner], &x_btc.device());
+        let padded = Tensor::cat(vec![edge.clone(), x_btc, edge], 1);
+        let at = |from: usize| padded.clone().slice([0..batch, from..from + frames, 0..inner]);
+        let tap = |k: usize| {
+            let tap = self.weight.val().slice([0..inner, 0..out, k..k + 1]);
+            tap.reshape([inner, out]).swap_dims(0, 1)
+        };
+        let half = |from: usize, first: usize, second: usize| {
+            let windows = Tensor::cat(vec![at(from), at(from + 1)], 2);
+            kernels::linear(windows, Tensor::cat(vec![tap(first), tap(second)], 1), Some(self.bias.val()))
+        };
+        Tensor::cat(vec![half(0, 3, 1), half(1, 2, 0)], 2).reshape([batch, 2 * frames, out])
+    }
+}
+
+fn linear(init: &mut Init<'_>, inner: usize, out: usize) -> Linear {
+    Linear { weight: init.xavier_normal(inner + out, [out, inner]), bias: Some(init.constant(0.0, [out])) }
+}
+
+/// Features to movements.
+#[derive(Module, Debug)]
+pub struct MovementEncoder {
+    /// Features -> hidden.
+    pub main_0: Conv,
+    /// Hidden -> movement.
+    pub main_3: Conv,
+    /// Movement -> movement.
+    pub out_net: Linear,
+}
+
+impl MovementEncoder {
+    /// A fresh one.
+    pub fn new(config: &EvaluatorConfig, init: &mut Init<'_>) -> Self {
+        Self {
+            main_0: Conv::new(init, config.features, config.movement_hidden),
+            main_3: Conv::new(init, config.movement_hidden, config.movement),
+            out_net: linear(init, config.movement, config.movement),
+        }
+    }
+
+    /// [B, T, features] -> [B, T / 4, movement].
+    pub fn forward(&self, features_btf: Tensor<3>, drop: &mut Dropout) -> Tensor<3> {
+        let x = leaky_relu(dropout(self.main_0.forward(features_btf), drop), SLOPE);
+        let x = leaky_relu(dropout(self.main_3.forward(x), drop), SLOPE);
+        self.out_net.forward(x)
+    }
+}
+
+/// Movements to features, contacts included.
+#[derive(Module, Debug)]
+pub struct MovementDecoder {
+    /// Movement -> hidden.
+    pub main_0: Deconv,
+    /// Hidden -> all features.
+    pub main_2: Deconv,
+    /// Features -> features.
+    pub out_net: Linear,
+}
+
+impl MovementDecoder {
+    /// A fresh one; `features` counts the contacts too.
+    pub fn new(config: &EvaluatorConfig, features: usize, init: &mut Init<'_>) -> Self {
+        Self {
+            main_0: Deconv::new(init, config.movement, config.movement_hidden),
+            main_2: Deconv::new(init, config.movement_hidden, features),
+            out_net: linear(init, features, features),
+        }
+    }
+
+    /// [B, N, movement] -> [B, 4 N, features].
+    pub fn forward(&self, movements_bnc: Tensor<3>) -> Tensor<3> {
+        let x = leaky_relu(self.main_0.forward(movements_bnc), SLOPE);
+        self.out_net.forward(leaky_relu(self.main_2.forward(x), SLOPE))
+    }
+}
+
+/// One bidirectional layer of gated recurrent units. Rows of the weights are the gates r, z, n.
+#[derive(Module, Debug)]
+pub struct BiGru {
+    /// [3g, in].
+    pub weight_ih_l0: Param<Tensor<2>>,
+    /// [3g, g].
+    pub weight_hh_l0: Param<Tensor<2>>,
+    /// [3g].
+    pub bias_ih_l0: Param<Tensor<1>>,
+    /// [3g].
+    pub bias_hh_l0: Param<Tensor<1>>,
+    /// Backward in time; [3g, in].
+    pub weight_ih_l0_reverse: Param<Tensor<2>>,
+    /// [3g, g].
+    pub weight_hh_l0_reverse: Param<Tensor<2>>,
+    /// [3g].
+    pub bias_ih_l0_reverse: Param<Tensor<1>>,
+    /// [3g].
+    pub bias_hh_l0_reverse: Param<Tensor<1>>,
+}
+
+impl BiGru {
+    /// PyTorch's default: uniform within `±1 / sqrt(g)`.
+    pub fn new(init: &mut Init<'_>, inner: usize, width: usize) -> Self {
+        let rows = 3 * width;
+        Self {
+            weight_ih_l0: init.fan_in(width, [rows, inner]),
+            weight_hh_l0: init.fan_in(width, [rows, width]),
+            bias_ih_l0: init.fan_in(width, [rows]),
+            bias_hh_l0: init.fan_in(width, [rows]),
+            weight_ih_l0_reverse: init.fan_in(width, [rows, inner]),
+            weight_hh_l0_reverse: init.fan_in(width, [rows, width]),
+            bias_ih_l0_reverse: init.fan_in(width, [rows]),
+            bias_hh_l0_reverse: init.fan_in(width, [rows]),
+        }
+    }
+
+    /// The states after each token of `x_btc` [B, T, in] of which the first `lengths[b]` count, in either direction, from the
+    /// states `start` [B, g]. A state behind a sequence's end is the last one before it (forward) or the first (backward).
+    pub fn forward(&self, x_btc: Tensor<3>, lengths: &[usize], start: [Tensor<2>; 2]) -> [Tensor<3>; 2] {
+        let [forward, backward] = start;
+        let gates = |w: &Param<Tensor<2>>, b: &Param<Tensor<1>>| kernels::linear(x_btc.clone(), w.val(), Some(b.val()));
+        let (w, b) = (self.weight_hh_l0.val(), self.bias_hh_l0.val());
+        let ahead = gru(gates(&self.weight_ih_l0, &self.bias_ih_l0), forward, w, b, lengths, false);
+        let (w, b) = (self.weight_hh_l0_reverse.val(), self.bias_hh_l0_reverse.val());
+        let back = gru(gates(&self.weight_ih_l0_reverse, &self.bias_ih_l0_reverse), backward, w, b, lengths, true);
+        [ahead, back]
+    }
+
+    /// The last state of either direction, side by side [B, 2g], from learned first states `hidden` [2, 1, g].
+    fn last(&self, x_btc: Tensor<3>, lengths: &[usize], hidden: &Param<Tensor<3>>) -> Tensor<2> {
+        let [batch, tokens, _] = x_btc.dims();
+        let width = hidden.dims()[2];
+        let start =
+            |k: usize| hidden.val().slice([k..k + 1, 0..1, 0..width]).reshape([1, width]).expand([batch, width]);
+        let [ahead, back] = self.forward(x_btc, lengths, [start(0), start(1)]);
+        let at = |x: Tensor<3>, t: usize| x.slice([0..batch, t..t + 1, 0..width]).reshape([batch, width]);
+        Tensor::cat(vec![at(ahead, tokens - 1), at(back, 0)], 1)
+    }
+}
+
+/// Movements to the embedding of a motion.
+#[derive(Module, Debug)]
+pub struct MotionEncoder {
+    /// Movement -> g.
+    pub input_emb: Linear,
+    /// Over the movements.
+    pub gru: BiGru,
+    /// 2g -> g.
+    pub output_net_0: Linear,
+    /// After it.
+    pub output_net_1: Norm,
+    /// g -> embedding.
+    pub output_net_3: Linear,
+    /// First states [2, 1, g].
+    pub hidden: Param<Tensor<3>>,
+}
+
+impl MotionEncoder {
+    /// A fresh one.
+    pub fn new(config: &EvaluatorConfig, init: &mut Init<'_>) -> Self {
+        let width = config.motion_hidden;
+        Self {
+            input_emb: linear(init, config.movement, width),
+            gru: BiGru::new(init, width, width),
+            output_net_0: linear(init, 2 * width, width),
+            output_net_1: Norm::new(init, width),
+            output_net_3: linear(init, width, config.embedding),
+            hidden: init.normal([2, 1, width]),
+        }
+    }
+
+    /// Movements [B, N, movement], of which the first `lengths[b]` count, to [B, embedding].
+    pub fn forward(&self, movements_bnc: Tensor<3>, lengths: &[usize]) -> Tensor<2> {
+        let last = self.gru.last(self.input_emb.forward(movements_bnc), lengths, &self.hidden);
+        let x = leaky_relu(self.output_net_1.forward(self.output_net_0.forward(last), EPS), SLOPE);
+        self.output_net_3.forward(x)
+    }
+}
+
+/// Words to the embedding of a caption.
+#[derive(Module, Debug)]
+pub struct TextEncoder {
+    /// Word classes -> word vector.
+    pub pos_emb: Linear,
+    /// Word vector -> g.
+    pub input_emb: Linear,
+    /// Over the words.
+    pub gru: BiGru,
+    /// 2g -> g.
+    pub output_net_0: Linear,
+    /// After it.
+    pub output_net_1: Norm,
+    /// g -> embedding.
+    pub output_net_3: Linear,
+    /// First states [2, 1, g].
+    pub hidden: Param<Tensor<3>>,
+}
+
+impl TextEncoder {
+    /// A fresh one.
+    pub fn new(config: &EvaluatorConfig, init: &mut Init<'_>) -> Self {
+        let width = config.text_hidden;
+        Self {
+            pos_emb: linear(init, config.classes, config.word),
+            input_emb: linear(init, config.word, width),
+            gru: BiGru::new(init, width, width),
+            output_net_0: linear(init, 2 * width, width),
+            output_net_1: Norm::new(init, width),
+            output_net_3: linear(init, width, config.embedding),
+            hidden: init.normal([2, 1, width]),
+        }
+    }
+
+    /// Word vectors [B, W, word] and one-hot classes [B, W, classes], of which the first `lengths[b]` count, to [B, embedding].
+    pub fn forward(&self, words_bwc: Tensor<3>, classes_bwc: Tensor<3>, lengths: &[usize]) -> Tensor<2> {
+        let words = words_bwc + self.pos_emb.forward(classes_bwc);
+        let last = self.gru.last(self.input_emb.forward(words), lengths, &self.hidden);
+        let x = leaky_relu(self.output_net_1.forward(self.output_net_0.forward(last), EPS), SLOPE);
+        self.output_net_3.forward(x)
+    }
+}
+
+/// All three, as the published file has them.
+#[derive(Module, Debug)]
+pub struct Evaluator {
+    /// Captions.
+    pub text_encoder: TextEncoder,
+    /// Motions.
+    pub motion_encoder: MotionEncoder,
+    /// Movements.
+    pub movement_encoder: MovementEncoder,
+}
+
+impl Evaluator {
+    /// A fresh one.
+    pub fn new(config: &EvaluatorConfig, init: &mut Init<'_>) -> Self {
+        Self {
+            text_encoder: TextEncoder::new(config, init),
+            motion_encoder: MotionEncoder::new(config, init),
+            movement_encoder: MovementEncoder::new(config, init),
+        }
+    }
+
+    /// Embeddings [B, embedding] of motions [B, T, features + contacts], normalised, of which the first `frames[b]` count. A length
+    /// is rounded down to whole movements.
+    pub fn motion(&self, motion_btf: Tensor<3>, frames: &[usize]) -> Tensor<2> {
+        let [batch, all, _] = motion_btf.dims();
+        let features = self.movement_encoder.main_0.weight.dims()[1];
+        let movements =
+            self.movement_encoder.forward(motion_btf.slice([0..batch, 0..all, 0..features]), &mut Dropout::off());
+        let lengths: Vec<usize> = frames.iter().map(|frames| frames / UNIT).collect();
+        self.motion_encoder.forward(movements, &lengths)
+    }
+
+    /// Where its parameters live.
+    pub fn device(&self) -> Device {
+        self.text_encoder.hidden.val().device()
+    }
+}

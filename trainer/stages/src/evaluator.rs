@@ -1,0 +1,182 @@
+//! A trained evaluator out of its artifact: captions and motions in, embeddings out.
+//!
+//! Motions come in the data's own scale and are normalised with the evaluator's statistics, whatever the model was trained with. Padding
+//! is zero in that space, and a motion always has a movement of it behind its end, so that an embedding does not hang on the batch.
+//! Source: Guo et al.'s own loader, which pads to 196 frames. Departs: a motion of 196 frames, too, has padding behind it.
+
+use burn::tensor::{Device, Tensor, TensorData};
+use checkpoint::Blobs;
+use models::names::{load, save};
+use models::networks::{Evaluator, EvaluatorConfig, Init};
+use motion::Skeleton;
+use motion::dataset::{Caption, Dataset, statistics};
+use protocol::stage::{DataFormat, EvaluatorNetwork, Positions};
+use protocol::{ArtifactKind, Digest, Manifest, Seed};
+use serde::{Deserialize, Serialize};
+
+use crate::artifacts::{self, Draft, MODEL_FILE, to_meta};
+use crate::context::{AttemptContext, ContextError, StageError};
+use crate::words::{CLASSES, WORD_WIDTH, WORDS, Words, WordsMeta};
+
+/// Frames of a movement.
+pub const UNIT: usize = 4;
+
+/// Meta of an artifact of kind `evaluator`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct EvaluatorMeta {
+    /// The data it was trained on.
+    pub format: DataFormat,
+    /// Sizes.
+    pub config: EvaluatorConfig,
+    /// What it subtracts of features, `[features]`, contacts included.
+    pub mean: Vec<f32>,
+    /// What it divides them by.
+    pub std: Vec<f32>,
+    /// Which word vectors it reads.
+    pub words: WordsMeta,
+    /// `trained` or `imported`.
+    pub origin: String,
+}
+
+/// Sizes of an evaluator for a skeleton.
+pub fn config(network: &EvaluatorNetwork, skeleton: &Skeleton) -> EvaluatorConfig {
+    EvaluatorConfig {
+        features: skeleton.layout().contacts.start,
+        movement_hidden: network.movement,
+        movement: network.movement,
+        motion_hidden: network.motion,
+        word: WORD_WIDTH,
+        classes: CLASSES,
+        text_hidden: network.text,
+        embedding: network.embedding,
+    }
+}
+
+/// Uploads an evaluator.
+pub fn publish(
+    cx: &mut dyn AttemptContext,
+    meta: &EvaluatorMeta,
+    weights: Vec<u8>,
+    words: &Words,
+) -> Result<Digest, StageError> {
+    let mut draft = Draft::new(cx, ArtifactKind::Evaluator, to_meta(meta));
+    draft.add(MODEL_FILE, weights)?;
+    words.write(&mut draft)?;
+    draft.finish(cx)
+}
+
+/// `(x - mean) / std` on rows.
+pub fn normalise(rows: &mut [f32], mean: &[f32], std: &[f32]) {
+    for row in rows.chunks_exact_mut(mean.len()) {
+        for ((value, mean), std) in row.iter_mut().zip(mean).zip(std) {
+            *value = (*value - mean) / std;
+        }
+    }
+}
+
+/// A trained evaluator.
+#[derive(Debug)]
+pub struct Judge {
+    network: Evaluator,
+    meta: EvaluatorMeta,
+    words: Words,
+    device: Device,
+}
+
+impl Judge {
+    /// Reads an artifact of kind `evaluator`.
+    pub fn read(blobs: &dyn Blobs, manifest: &Manifest, device: &Device) -> Result<Self, StageError> {
+        let meta: EvaluatorMeta = artifacts::meta(manifest, "the evaluator")?;
+        let words = Words::read(blobs, manifest, &meta.words)?;
+        let device = device.clone().inner();
+        let fresh = Evaluator::new(&meta.config, &mut Init::new(Seed(0), "blank", Positions::Uniform, &device));
+        let network = load(fresh, &artifacts::file(blobs, manifest, MODEL_FILE)?, "")
+            .map_err(|e| StageError::Context(ContextError::Corrupt(format!("the evaluator's weights: {e}"))))?;
+        Ok(Self { network, meta, words, device })
+    }
+
+    /// What it is.
+    pub fn meta(&self) -> &EvaluatorMeta {
+        &self.meta
+    }
+
+    /// Width of an embedding.
+    pub fn width(&self) -> usize {
+        self.meta.config.embedding
+    }
+
+    /// Its weights, under the published names.
+    pub fn weights(&self) -> Vec<u8> {
+        save(&self.network)
+    }
+
+    /// Embeddings `[captions, width]`.
+    pub fn captions<'a>(&self, captions: impl IntoIterator<Item = &'a Caption>) -> Vec<f32> {
+        let batch = self.words.batch(captions);
+        let count = batch.lengths.len();
+        let words = Tensor::<3>::from_data(TensorData::new(batch.words, [count, WORDS, WORD_WIDTH]), &self.device);
+        let classes = Tensor::<3>::from_data(TensorData::new(batch.classes, [count, WORDS, CLASSES]), &self.device);
+        host(self.network.text_encoder.forward(words, classes, &batch.lengths))
+    }
+
+    /// Embeddings `[motions, width]` of motions of features `[frames, features]` each, in the data's own scale.
+    pub fn motions(&self, motions: &[Vec<f32>]) -> Vec<f32> {
+        let width = self.meta.mean.len();
+        let lengths: Vec<usize> = motions.iter().map(|m| m.len() / width).collect();
+        let frames = lengths.iter().max().map_or(0, |most| most / UNIT * UNIT + UNIT);
+        let mut rows = vec![0.0; motions.len() * frames * width];
+        for (motion, to) in motions.iter().zip(rows.chunks_exact_mut((frames * width).max(1))) {
+            let keep = motion.len().min(to.len());
+            to[..keep].copy_from_slice(&motion[..keep]);
+            normalise(&mut to[..keep], &self.meta.mean, &self.meta.std);
+        }
+        let rows = Tensor::<3>::from_data(TensorData::new(rows, [motions.len(), frames, width]), &self.device);
+        host(self.network.motion(rows, &lengths))
+    }
+
+    /// Refuses data that it was not made for: another skeleton, or features on another scale.
+    ///
+    /// A scale is told by the deviations of positions, rotations and velocities and by how far their means are off. Another body
+    /// of motion moves these a little; metres for millimetres, or features that are normalised already, far.
+    pub fn check(&self, dataset: &Dataset, entries: &[usize]) -> Result<(), StageError> {
+        let ours = self.meta.format;
+        if dataset.format != ours {
+            return Err(StageError::Input(format!(
+                "the evaluator was made for {ours:?} skeletons ({} features), the dataset has {:?} ({}); train one on this data",
+                self.meta.mean.len(),
+                dataset.format,
+                dataset.mean.len()
+            )));
+        }
+        let clips: Vec<&[f32]> = entries.iter().map(|e| dataset.features(&dataset.entries[*e])).collect();
+        let (mean, std) = statistics(dataset.skeleton(), clips.iter().copied());
+        let layout = dataset.skeleton().layout();
+        for (what, group) in
+            [("positions", layout.positions), ("rotations", layout.rotations), ("velocities", layout.velocities)]
+        {
+            let n = group.len() as f64;
+            let own = |i: usize| f64::from(self.meta.std[i]);
+            let ratio = group.clone().map(|i| (std[i].max(1e-9) / own(i)).ln()).sum::<f64>() / n;
+            let shift =
+                (group.map(|i| ((mean[i] - f64::from(self.meta.mean[i])) / own(i)).powi(2)).sum::<f64>() / n).sqrt();
+            if ratio.abs() > MOST_RATIO.ln() || shift > MOST_SHIFT {
+                return Err(StageError::Input(format!(
+                    "the features are on another scale than the evaluator's: their {what} deviate {:.3} times as much and their mean is \
+                     off by {shift:.2} deviations (expected within {MOST_RATIO} times and {MOST_SHIFT}); hand over features that are not \
+                     normalised, in the unit that the evaluator was trained in, or train an evaluator on this data",
+                    ratio.exp()
+                )));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// How many times wider or narrower features may deviate than those that the evaluator was trained on.
+const MOST_RATIO: f64 = 4.0;
+/// How many deviations their mean may be off.
+const MOST_SHIFT: f64 = 2.5;
+
+fn host(tensor: Tensor<2>) -> Vec<f32> {
+    tensor.into_data().try_into_vec::<f32>().expect("networks compute in f32")
+}

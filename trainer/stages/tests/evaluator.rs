@@ -1,0 +1,363 @@
+//! The evaluator's stages: the same bytes however the work is cut, chance where it must be chance, and misfits refused.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use checkpoint::Blobs;
+use models::names::save;
+use models::networks::{Denoiser, Init, Vae};
+use motion::Dataset;
+use motion::dataset::PackError;
+use protocol::artifact::FileEntry;
+use protocol::message::FailureClass;
+use protocol::stage::{
+    Batch, DataFormat, DataSynthetic, EvaluateT2m, EvaluatorNetwork, ImportEvaluator, LatentShape, MovementPhase,
+    MultiModality, Network, Positions, Sampler, Split, StageSettings, TextEmbed, TrainEvaluator, Training,
+};
+use protocol::{ArtifactKind, Digest, Manifest, Seed, Steps};
+use stages::artifacts::{self, DenoiserMeta, Family, MODEL_FILE, VaeMeta, to_meta};
+use stages::context::Outcome;
+use stages::evaluator::{EvaluatorMeta, Judge};
+use stages::kinds::REPORT_FILE;
+use stages::testing::{Bench, Script};
+use stages::words::WordsMeta;
+
+const LATENT: LatentShape = LatentShape { tokens: 2, dim: 4 };
+
+fn bench(members: usize) -> Bench {
+    Bench::new(burn::tensor::Device::flex(), 11, members)
+}
+
+fn dataset(bench: &mut Bench, clips: usize) -> Digest {
+    let settings = DataSynthetic { clips, val: 0.1, test: 0.4, mirror: false };
+    bench.run("dataset", &StageSettings::DataSynthetic(settings), &[]).expect("the stage runs").output()
+}
+
+/// An evaluator of widths 16 to 48.
+fn settings(steps: u64, batch: Batch, width: usize) -> TrainEvaluator {
+    TrainEvaluator {
+        network: EvaluatorNetwork { movement: width, motion: width, text: width, embedding: width, dropout: 0.1 },
+        movement: MovementPhase { until: 0.4, window: 24, batch: 0, ..MovementPhase::default() },
+        training: Training { steps: Steps(steps), batch, lr: 1e-3, ..TrainEvaluator::default().training },
+        ..TrainEvaluator::default()
+    }
+}
+
+fn small() -> StageSettings {
+    StageSettings::TrainEvaluator(settings(10, Batch { global: 12, slices: 4 }, 16))
+}
+
+#[test]
+fn an_evaluator_is_the_same_bytes_with_any_members_and_after_any_stop() {
+    let mut alone = bench(1);
+    let data = dataset(&mut alone, 30);
+    let expected = alone.run("evaluator", &small(), &[("dataset", data)]).expect("the stage runs");
+    for name in ["loss", "reconstruction", "positive", "negative"] {
+        assert!(expected.metrics()[name] > 0.0, "{name}: {:?}", expected.metrics());
+    }
+
+    let mut three = bench(3);
+    assert_eq!(dataset(&mut three, 30), data);
+    three.script = Script { lost: vec![(0, 3)], joins: vec![(5, 5)], wind_down: None };
+    let ran = three.run("evaluator", &small(), &[("dataset", data)]).expect("the stage runs");
+    assert_eq!(ran.output(), expected.output(), "three members, of which the leader is lost and a fourth joins");
+
+    // Stops inside the first phase, at its end, and inside the second.
+    for stop in [1, 3, 6] {
+        let mut cut = bench(2);
+        dataset(&mut cut, 30);
+        cut.script = Script { wind_down: Some(stop), ..Script::default() };
+        let ran = cut.run("evaluator", &small(), &[("dataset", data)]).expect("the stage runs");
+        assert_eq!(ran.outcome, Outcome::Yielded { at: stop + 1 });
+        cut.script = Script::default();
+        cut.members = 3;
+        let ran = cut.run("evaluator", &small(), &[("dataset", data)]).expect("the stage runs");
+        assert_eq!(ran.output(), expected.output(), "stopped after step {}", stop + 1);
+    }
+}
+
+fn put(bench: &Bench, kind: ArtifactKind, meta: serde_json::Value, weights: Vec<u8>) -> Digest {
+    let blobs = bench.blobs();
+    let entry = FileEntry { bytes: weights.len() as u64, digest: blobs.put(weights).expect("stored") };
+    let mut manifest = Manifest::new(kind, meta);
+    manifest.files.insert(MODEL_FILE.into(), entry);
+    blobs.put(manifest.to_bytes()).expect("stored")
+}
+
+fn network() -> Network {
+    Network { width: 16, layers: 3, heads: 2, feed_forward: 32, ..Network::default() }
+}
+
+/// An untrained VAE and denoiser of a family.
+fn untrained(bench: &Bench, family: Family) -> (Digest, Digest) {
+    let device = bench.device();
+    let meta = VaeMeta {
+        format: DataFormat::Humanml3d,
+        features: 263,
+        latent: LATENT,
+        network: network(),
+        mean: vec![0.0; 263],
+        std: vec![1.0; 263],
+    };
+    let net = Vae::new(&meta.config(), &mut Init::new(Seed(1), "vae", Positions::Sinusoid, &device));
+    let vae = put(bench, ArtifactKind::Vae, to_meta(&meta), save(&net));
+    let meta = DenoiserMeta {
+        guidance_dim: if family == Family::Mld { 0 } else { 32 },
+        family,
+        latent: LATENT,
+        network: network(),
+        text_relu: false,
+        encoder: "hashed".into(),
+        text_dim: 768,
+        vae,
+    };
+    let net = Denoiser::new(&meta.config(), &mut Init::new(Seed(2), "denoiser", Positions::Uniform, &device));
+    (vae, put(bench, ArtifactKind::Denoiser, to_meta(&meta), save(&net)))
+}
+
+fn text(bench: &mut Bench, dataset: Digest) -> Digest {
+    let settings = StageSettings::TextEmbed(TextEmbed::default());
+    bench.run("text", &settings, &[("dataset", dataset)]).expect("the stage runs").output()
+}
+
+fn evaluate(shards: usize, of: EvaluateT2m) -> StageSettings {
+    StageSettings::EvaluateT2m(EvaluateT2m { shards, ..of })
+}
+
+#[test]
+fn t2m_is_the_same_however_the_motions_are_cut() {
+    let mut bench = bench(1);
+    let data = dataset(&mut bench, 100);
+    let evaluator = bench.run("evaluator", &small(), &[("dataset", data)]).expect("the stage runs").output();
+    let (vae, model) = untrained(&bench, Family::Lcm { skip: 100, guidance: (0.5, 5.0) });
+    let text = text(&mut bench, data);
+    let inputs = [("dataset", data), ("evaluator", evaluator), ("model", model), ("vae", vae), ("text", text)];
+    let settings = EvaluateT2m {
+        sampler: Sampler { steps: 2, guidance: 2.0, timesteps: vec![] },
+        repeats: 3,
+        multimodality: MultiModality { captions: 2, samples: 5, pairs: 3 },
+        split: Split::Test,
+        ..EvaluateT2m::default()
+    };
+    let mut reports = Vec::new();
+    for shards in [1, 3, 8] {
+        let ran = bench.run("eval", &evaluate(shards, settings.clone()), &inputs).expect("the stage runs");
+        reports.push((ran.output(), ran.metrics().clone()));
+    }
+    assert_eq!(reports[0], reports[1]);
+    assert_eq!(reports[0], reports[2]);
+    let metrics = &reports[0].1;
+    for name in [
+        "fid",
+        "r_precision_top1",
+        "r_precision_top2",
+        "r_precision_top3",
+        "mm_dist",
+        "diversity",
+        "multimodality",
+        "skating_ratio",
+    ] {
+        let (lower, mean, upper) =
+            (metrics[&format!("{name}.lower")], metrics[name], metrics[&format!("{name}.upper")]);
+        assert!(lower <= mean && mean <= upper && mean.is_finite() && mean >= 0.0, "{name}: {metrics:?}");
+    }
+    assert!(metrics["fid"] > 0.0 && metrics["multimodality"] > 0.0 && metrics["samples"] >= 40.0, "{metrics:?}");
+
+    // The lineage says what was looked at, the details which repeats made the interval.
+    let manifest = bench.manifest(reports[0].0).unwrap();
+    assert_eq!(manifest.meta["split"], "test");
+    assert_eq!(manifest.meta["words"]["kind"], "hashed");
+    assert_eq!(manifest.meta["evaluator"], serde_json::to_value(evaluator).unwrap());
+    let report = artifacts::file(&*bench.blobs(), &manifest, REPORT_FILE).unwrap();
+    let report: serde_json::Value = serde_json::from_slice(&report).unwrap();
+    assert_eq!(report["details"]["repeats"]["fid"].as_array().map(Vec::len), Some(3));
+    assert!(report["details"]["note"].as_str().is_some_and(|note| note.contains("FID is taken of")), "{report}");
+}
+
+#[test]
+fn real_motion_is_found_and_shuffled_captions_are_left_to_chance() {
+    let mut bench = bench(1);
+    let data = dataset(&mut bench, 240);
+    let train = settings(400, Batch { global: 32, slices: 1 }, 48);
+    let evaluator = bench.run("evaluator", &StageSettings::TrainEvaluator(train), &[("dataset", data)]).unwrap();
+    println!("{:?}", evaluator.metrics());
+    let inputs = [("dataset", data), ("evaluator", evaluator.output())];
+    let real = EvaluateT2m { real: true, split: Split::Test, ..EvaluateT2m::default() };
+    let shuffled = EvaluateT2m { shuffled: true, ..real.clone() };
+    let mut run = |name: &str, settings| bench.run(name, &evaluate(4, settings), &inputs).unwrap().metrics().clone();
+    let (real, shuffled) = (run("real", real), run("shuffled", shuffled));
+    println!("real {real:?}\nshuffled {shuffled:?}");
+    let chance = 3.0 / 32.0;
+    assert!(real["r_precision_top3"] > 3.0 * chance, "{real:?}");
+    assert!(real["r_precision_top1"] < real["r_precision_top3"]);
+    // 20 repeats of 96 motions: a deviation of about .007.
+    assert!((shuffled["r_precision_top3"] - chance).abs() < 0.03, "{shuffled:?}");
+    assert_eq!(real["fid"], shuffled["fid"], "the motions are the same");
+    assert!(real["mm_dist"] < shuffled["mm_dist"]);
+}
+
+fn shared(part: &str) -> Option<PathBuf> {
+    let root = std::env::var_os("STRIDE_SHARED")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"), PathBuf::from);
+    let path = root.join("data").join(part);
+    if !path.is_dir() {
+        eprintln!("SKIPPED: no fixtures at {} (set STRIDE_SHARED)", path.display());
+        return None;
+    }
+    Some(path)
+}
+
+/// A fixture's evaluator laid out as published.
+fn published(fixture: &Path, file: &str, features: usize) -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    let model = dir.path().join("text_mot_match/model");
+    let meta = dir.path().join("Comp_v6_KLD01/meta");
+    std::fs::create_dir_all(&model).unwrap();
+    std::fs::create_dir_all(&meta).unwrap();
+    let bytes = std::fs::read(fixture.join(file)).unwrap();
+    std::fs::write(model.join(file.replace("weights", "finest")), bytes).unwrap();
+    for (name, value) in [("mean.npy", 0.25), ("std.npy", 0.5)] {
+        motion::npy::write(&meta.join(name), &[features], &vec![value; features]).unwrap();
+    }
+    dir
+}
+
+#[test]
+fn a_published_evaluator_is_read_from_its_pickle() {
+    let Some(root) = shared("parity") else { return };
+    for (fixture, format, features) in
+        [("04_evaluator_humanml", DataFormat::Humanml3d, 263), ("04_evaluator_kit", DataFormat::Kit, 251)]
+    {
+        let mut bench = bench(1);
+        let mut outputs = BTreeMap::new();
+        for file in ["finest.tar", "weights.safetensors"] {
+            let dir = published(&root.join(fixture), file, features);
+            let path = dir.path().to_string_lossy().into_owned();
+            let settings = ImportEvaluator { path, format, words: String::new() };
+            let ran = bench.run("evaluator", &StageSettings::ImportEvaluator(settings), &[]);
+            outputs.insert(file, ran.unwrap_or_else(|e| panic!("{fixture}/{file}: {e}")).output());
+        }
+        assert_eq!(outputs["finest.tar"], outputs["weights.safetensors"], "{fixture}: pickle and safetensors");
+        let manifest = bench.manifest(outputs["finest.tar"]).unwrap();
+        let judge = Judge::read(&*bench.blobs(), &manifest, &bench.device()).unwrap();
+        assert_eq!((judge.meta().origin.as_str(), &judge.meta().words), ("imported", &WordsMeta::Hashed));
+        assert_eq!(judge.meta().mean, vec![0.25; features]);
+        // What is read is what the published file holds.
+        let stored = std::fs::read(root.join(fixture).join("weights.safetensors")).unwrap();
+        let (stored, ours) = (safetensors::SafeTensors::deserialize(&stored).unwrap(), judge.weights());
+        let ours = safetensors::SafeTensors::deserialize(&ours).unwrap();
+        assert_eq!(stored.names().len(), ours.names().len());
+        for (name, view) in stored.iter() {
+            assert_eq!(view.data(), ours.tensor(name).unwrap().data(), "{fixture}: {name}");
+        }
+        // The other skeleton's setting is refused, and so are missing statistics.
+        let other = if format == DataFormat::Kit { DataFormat::Humanml3d } else { DataFormat::Kit };
+        let dir = published(&root.join(fixture), "finest.tar", features);
+        let path = dir.path().to_string_lossy().into_owned();
+        let mut import = |format| {
+            let settings = ImportEvaluator { path: path.clone(), format, words: String::new() };
+            bench.run("evaluator", &StageSettings::ImportEvaluator(settings), &[]).map(|ran| ran.output())
+        };
+        let refused = import(other).unwrap_err();
+        assert!(refused.to_string().contains("set `format`"), "{refused}");
+        std::fs::remove_file(dir.path().join("Comp_v6_KLD01/meta/std.npy")).unwrap();
+        let refused = import(format).unwrap_err();
+        assert!(refused.to_string().contains("std.npy"), "{refused}");
+    }
+}
+
+/// Stores a dataset that a test changed.
+fn store(bench: &Bench, dataset: &Dataset, like: Digest) -> Digest {
+    let blobs = bench.blobs();
+    let mut manifest = Manifest::new(ArtifactKind::Dataset, bench.manifest(like).unwrap().meta);
+    dataset
+        .write_files::<PackError>(|name, bytes| {
+            let entry = FileEntry { bytes: bytes.len() as u64, digest: blobs.put(bytes).expect("stored") };
+            manifest.files.insert(name, entry);
+            Ok(())
+        })
+        .unwrap();
+    blobs.put(manifest.to_bytes()).expect("stored")
+}
+
+#[test]
+fn what_an_evaluator_does_not_fit_is_refused_with_the_reason() {
+    let mut bench = bench(1);
+    let data = dataset(&mut bench, 100);
+    let evaluator = bench.run("evaluator", &small(), &[("dataset", data)]).expect("the stage runs").output();
+    let whole = artifacts::dataset(&*bench.blobs(), &bench.manifest(data).unwrap()).unwrap();
+
+    let mut normalised = whole.clone();
+    for clip in &mut normalised.clips {
+        whole.normalise(&mut clip.features);
+    }
+    let mut millimetres = whole.clone();
+    millimetres.clips.iter_mut().flat_map(|clip| &mut clip.features).for_each(|v| *v *= 1000.0);
+    let mut nothing = whole.clone();
+    nothing.entries.retain(|entry| entry.split != motion::dataset::Split::Test);
+    let few = EvaluateT2m { real: true, split: Split::Val, ..EvaluateT2m::default() };
+    let test = EvaluateT2m { split: Split::Test, ..few.clone() };
+
+    // An evaluator of the other skeleton: the same file, with another format in its meta.
+    let mut manifest = bench.manifest(evaluator).unwrap();
+    let mut meta: EvaluatorMeta = artifacts::meta(&manifest, "the evaluator").unwrap();
+    meta.format = DataFormat::Kit;
+    manifest.meta = to_meta(&meta);
+    let kit = bench.blobs().put(manifest.to_bytes()).unwrap();
+
+    for (data, evaluator, settings, reason) in [
+        (store(&bench, &normalised, data), evaluator, &test, "another scale"),
+        (store(&bench, &millimetres, data), evaluator, &test, "another scale"),
+        (store(&bench, &nothing, data), evaluator, &test, "`test` has no entries"),
+        (data, evaluator, &few, "ranks a motion among 32"),
+        (data, kit, &test, "Kit skeletons"),
+        (data, data, &test, "kind Dataset"),
+    ] {
+        let inputs = [("dataset", data), ("evaluator", evaluator)];
+        let refused = bench.run("eval", &evaluate(2, settings.clone()), &inputs).expect_err(reason);
+        assert!(refused.to_string().contains(reason), "{refused}");
+        assert_eq!(refused.class(), FailureClass::Input, "{refused}");
+    }
+    let inputs = [("dataset", data), ("evaluator", evaluator)];
+    bench.run("eval", &evaluate(2, test), &inputs).expect("the data that it was trained on is fine");
+}
+
+/// A pickle of a dict from text to small numbers, protocol 3.
+fn pickled(rows: &[(&str, u8)]) -> Vec<u8> {
+    let mut bytes = vec![0x80, 3, b'}', b'('];
+    for (word, row) in rows {
+        bytes.push(b'X');
+        bytes.extend(u32::try_from(word.len()).unwrap().to_le_bytes());
+        bytes.extend(word.as_bytes());
+        bytes.extend([b'K', *row]);
+    }
+    bytes.extend(*b"u.");
+    bytes
+}
+
+#[test]
+fn a_vocabulary_is_kept_with_the_evaluator_and_named() {
+    let mut bench = bench(1);
+    let data = dataset(&mut bench, 30);
+    let dir = tempfile::tempdir().unwrap();
+    let rows = [("sos", 0), ("eos", 1), ("unk", 2), ("walk", 3)];
+    let vectors: Vec<f32> = (0..4 * 300).map(|i| (i as f32 * 0.37).sin()).collect();
+    motion::npy::write(&dir.path().join("our_vab_data.npy"), &[4, 300], &vectors).unwrap();
+    let index = dir.path().join("our_vab_idx.pkl");
+    std::fs::write(&index, pickled(&rows)).unwrap();
+    let StageSettings::TrainEvaluator(mut settings) = small() else { unreachable!() };
+    settings.words = dir.path().to_string_lossy().into_owned();
+    let settings = StageSettings::TrainEvaluator(settings);
+    let ours = bench.run("evaluator", &settings, &[("dataset", data)]).expect("the stage runs").output();
+    let hashed = bench.run("evaluator-2", &small(), &[("dataset", data)]).expect("the stage runs").output();
+    let judge = |digest| Judge::read(&*bench.blobs(), &bench.manifest(digest).unwrap(), &bench.device()).unwrap();
+    assert!(matches!(judge(ours).meta().words, WordsMeta::Vocabulary { words: 4, .. }));
+    assert_eq!(judge(hashed).meta().words, WordsMeta::Hashed);
+
+    std::fs::write(&index, pickled(&rows[..2])).unwrap();
+    let refused = bench.run("evaluator-3", &settings, &[("dataset", data)]).unwrap_err().to_string();
+    assert!(refused.contains("our_vab_idx.pkl") && refused.contains("`unk`"), "{refused}");
+    std::fs::write(&index, pickled(&[("sos", 0), ("eos", 1), ("unk", 9)])).unwrap();
+    let refused = bench.run("evaluator-3", &settings, &[("dataset", data)]).unwrap_err().to_string();
+    assert!(refused.contains("`unk`") && refused.contains("0 to 3"), "{refused}");
+}
