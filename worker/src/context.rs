@@ -254,6 +254,10 @@ impl GangContext for HttpContext {
         self.mesh.as_ref().map_or_else(|| self.held.leads(), |mesh| mesh.terms.rank == 0)
     }
 
+    fn can_save(&self) -> bool {
+        !self.held.is_away()
+    }
+
     fn commit_checkpoint(
         &mut self,
         step: u64,

@@ -10,3 +10,4 @@ pub mod kinds;
 pub mod networks;
 pub mod testing;
 pub mod train;
+pub mod verify;
