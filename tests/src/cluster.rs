@@ -13,6 +13,9 @@ use serde_json::Value;
 
 use crate::{Bench, Running, signal, wait_for};
 
+/// What a coordinator that listens beyond this machine wants to be shown.
+pub const TOKEN: &str = "chaos";
+
 /// An answer of the coordinator.
 #[derive(Debug, Clone)]
 pub struct Reply {
@@ -29,7 +32,6 @@ pub struct Cluster {
     address: SocketAddr,
     server: Option<Running>,
     workers: BTreeMap<String, Running>,
-    wrap: Vec<String>,
 }
 
 impl Cluster {
@@ -38,14 +40,14 @@ impl Cluster {
         let free = TcpListener::bind("127.0.0.1:0").expect("a free port");
         let address = free.local_addr().expect("bound");
         drop(free);
-        Self::listen(trainer, address, Vec::new())
+        Self::listen(trainer, address)
     }
 
-    /// The same at a chosen address. `wrap` stands before the coordinator's command, such as `ip netns exec x`.
-    pub fn listen(trainer: &str, address: SocketAddr, wrap: Vec<String>) -> Self {
+    /// The same at a chosen address. Beyond this machine, callers bear [`TOKEN`].
+    pub fn listen(trainer: &str, address: SocketAddr) -> Self {
         let bench = Bench::new(trainer);
         fs::create_dir_all(bench.path().join("logs")).expect("a folder for logs");
-        let mut cluster = Self { bench, address, server: None, workers: BTreeMap::new(), wrap };
+        let mut cluster = Self { bench, address, server: None, workers: BTreeMap::new() };
         cluster.serve();
         cluster
     }
@@ -88,15 +90,13 @@ impl Cluster {
         let address = self.address.to_string();
         let mut arguments = vec!["serve", "--bind", &address];
         if !self.address.ip().is_loopback() {
-            arguments.extend(["--token", "chaos"]);
+            arguments.extend(["--token", TOKEN]);
         }
-        let mut server = self.spawn("serve", &self.wrap, &arguments);
-        if self.wrap.is_empty() {
-            wait_for("the coordinator to answer", || {
-                assert!(server.alive(), "the coordinator ended:\n{}", self.said("serve"));
-                self.get("/v1/health")
-            });
-        }
+        let mut server = self.spawn("serve", &[], &arguments);
+        wait_for("the coordinator to answer", || {
+            assert!(server.alive(), "the coordinator ended:\n{}", self.said("serve"));
+            self.get("/v1/health")
+        });
         self.server = Some(server);
     }
 
@@ -163,7 +163,7 @@ impl Cluster {
         stream.set_read_timeout(Some(Duration::from_secs(30)))?;
         let mut head = format!("{method} {path} HTTP/1.1\r\nhost: x\r\nconnection: close\r\n");
         if !self.address.ip().is_loopback() {
-            head += "authorization: Bearer chaos\r\n";
+            head += &format!("authorization: Bearer {TOKEN}\r\n");
         }
         for (name, value) in headers {
             head += &format!("{name}: {value}\r\n");
@@ -194,6 +194,9 @@ impl Cluster {
     pub fn submit(&self, config: &Path, more: &[&str]) -> String {
         let (config, url) = (config.display().to_string(), self.url());
         let mut arguments = vec!["submit", &config, "--server", &url, "-o", "json"];
+        if !self.address.ip().is_loopback() {
+            arguments.extend(["--token", TOKEN]);
+        }
         arguments.extend_from_slice(more);
         let said = self.bench.run(&arguments).expect_code(0);
         said.json()["run"].as_str().expect("a run").to_owned()

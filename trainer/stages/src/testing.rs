@@ -218,9 +218,22 @@ impl Bench {
         self.checkpoints.get(name).into_iter().flatten().map(|(step, _)| *step).collect()
     }
 
-    /// Forgets the checkpoints of the stage `name`: it begins anew.
+    /// Forgets the checkpoints of the stage `name` after step `last`, as if it had not got further. Returns them.
+    pub fn forget_after(&mut self, name: &str, last: u64) -> Vec<(u64, Manifest)> {
+        let saved = self.checkpoints.entry(name.to_owned()).or_default();
+        let (kept, forgotten) = std::mem::take(saved).into_iter().partition(|(step, _)| *step <= last);
+        *saved = kept;
+        forgotten
+    }
+
+    /// Forgets all checkpoints of the stage `name`: it begins anew.
     pub fn forget(&mut self, name: &str) {
         self.checkpoints.remove(name);
+    }
+
+    /// The newest checkpoint of the stage `name`.
+    pub fn newest(&self, name: &str) -> Option<&(u64, Manifest)> {
+        self.checkpoints.get(name).and_then(|saved| saved.last())
     }
 
     /// Runs the stage `name` to its end, or until its script stops it. A gang stage continues its newest checkpoint.

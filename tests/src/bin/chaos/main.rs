@@ -12,7 +12,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime};
 
-use cluster_tests::cluster::Cluster;
+use cluster_tests::cluster::{Cluster, TOKEN};
 use cluster_tests::{Bench, digests, signal};
 use nix::sys::signal::Signal;
 use serde_json::Value;
@@ -107,7 +107,7 @@ impl Chaos {
     fn start(trainer: &str, seed: u64) -> Self {
         let network = Network::new(WORKERS.len());
         let cluster = match &network {
-            Some(network) => Cluster::listen(trainer, network.coordinator(), Vec::new()),
+            Some(network) => Cluster::listen(trainer, network.coordinator()),
             None => Cluster::start(trainer),
         };
         let mut chaos = Self {
@@ -129,7 +129,7 @@ impl Chaos {
 
     fn join(&mut self, i: usize) {
         match &self.network {
-            Some(network) => self.cluster.join_by(WORKERS[i], &network.inside(i), &["--token", "chaos"]),
+            Some(network) => self.cluster.join_by(WORKERS[i], &network.inside(i), &["--token", TOKEN]),
             None => self.cluster.join(WORKERS[i]),
         }
     }

@@ -55,12 +55,7 @@ fn spread(name: &str, mut all: Vec<f64>) {
         return;
     }
     all.sort_by(f64::total_cmp);
-    println!(
-        "  {name}: {} times, median {:.2} s, longest {:.2} s",
-        all.len(),
-        all[all.len() / 2],
-        all[all.len() - 1]
-    );
+    println!("  {name}: {} times, median {:.2} s, longest {:.2} s", all.len(), all[all.len() / 2], all[all.len() - 1]);
 }
 
 /// Prints what is known about recoveries.
