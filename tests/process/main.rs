@@ -3,7 +3,9 @@
 //! The pipeline is `configs/smoke.yaml`: every stage kind of the quickstart at toy sizes.
 
 mod bad_input;
+mod cluster;
 mod determinism;
 mod failpoints;
 mod registry;
 mod storage;
+mod verify;

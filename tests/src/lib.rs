@@ -3,6 +3,8 @@
 //! Every test gets a folder of its own with its own store. Nothing here waits for time to pass: it waits for a condition,
 //! with a bound after which the test fails and prints what the trainer said.
 
+pub mod cluster;
+
 use std::collections::BTreeMap;
 use std::fs;
 use std::io::Read;
@@ -123,6 +125,14 @@ impl Running {
         let stdout = collect(child.stdout.take().expect("piped"));
         let stderr = collect(child.stderr.take().expect("piped"));
         Self { child, stdout: Some(stdout), stderr: Some(stderr), since: Instant::now() }
+    }
+
+    /// Starts `command`, whose every word goes to the end of a file.
+    pub fn logged(command: &mut Command, log: &Path) -> Self {
+        let file = cluster::append(log);
+        let both = file.try_clone().expect("one file twice");
+        let child = command.stdout(file).stderr(both).spawn().unwrap_or_else(|e| panic!("{command:?}: {e}"));
+        Self { child, stdout: None, stderr: None, since: Instant::now() }
     }
 
     /// Process id.

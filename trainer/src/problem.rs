@@ -12,6 +12,7 @@ pub(crate) mod exit {
     pub(crate) const UNAUTHORISED: u8 = 5;
     pub(crate) const UNREACHABLE: u8 = 6;
     pub(crate) const CANCELLED: u8 = 8;
+    pub(crate) const INTEGRITY: u8 = 9;
     pub(crate) const INTERRUPTED: u8 = 130;
 }
 

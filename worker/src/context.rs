@@ -81,13 +81,13 @@ impl HttpContext {
                 None => {}
             }
             if warned.elapsed() > Duration::from_secs(20) {
-                let lost: Vec<String> = mesh.lost().iter().map(ToString::to_string).collect();
+                let lost = mesh.missing();
                 tracing::warn!(
                     task = %mesh.terms.task,
-                    "waiting for a generation after {} for {:.0} s; lost: {}",
+                    "waiting for a generation after {} for {:.0} s; missing: {}",
                     mesh.terms.generation,
                     begun.elapsed().as_secs_f64(),
-                    if lost.is_empty() { "nobody".to_owned() } else { lost.join(", ") },
+                    if lost.is_empty() { "nobody".to_owned() } else { lost.join("; ") },
                 );
                 warned = Instant::now();
             }
@@ -252,6 +252,10 @@ impl GangContext for HttpContext {
 
     fn leads(&self) -> bool {
         self.mesh.as_ref().map_or_else(|| self.held.leads(), |mesh| mesh.terms.rank == 0)
+    }
+
+    fn can_save(&self) -> bool {
+        !self.held.is_away()
     }
 
     fn commit_checkpoint(

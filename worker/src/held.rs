@@ -41,7 +41,16 @@ pub(crate) struct Held {
     bell: Arc<Bell>,
     wake: Arc<Notify>,
     endpoint: Arc<Endpoint>,
-    leaving: Arc<AtomicBool>,
+    flags: Arc<Flags>,
+}
+
+/// What holds for all that a worker holds.
+#[derive(Debug, Default)]
+pub(crate) struct Flags {
+    /// It is to go.
+    pub(crate) leaving: AtomicBool,
+    /// The last poll was not answered.
+    pub(crate) away: AtomicBool,
 }
 
 /// What a worker does when orders speak of a task that it holds.
@@ -60,7 +69,7 @@ impl Held {
         assignment: Assignment,
         endpoint: Arc<Endpoint>,
         wake: Arc<Notify>,
-        leaving: Arc<AtomicBool>,
+        flags: Arc<Flags>,
     ) -> Arc<Self> {
         let state = State {
             assignment,
@@ -71,7 +80,7 @@ impl Held {
             offered: None,
             newest: None,
         };
-        let held = Self { state: Mutex::new(state), bell: Arc::default(), wake, endpoint, leaving };
+        let held = Self { state: Mutex::new(state), bell: Arc::default(), wake, endpoint, flags };
         held.connect(&mut lock(&held.state));
         Arc::new(held)
     }
@@ -185,7 +194,12 @@ impl Held {
 
     /// Whether to stop between two steps: asked for by the coordinator, or because this process is to go.
     pub(crate) fn wind_down(&self) -> bool {
-        self.leaving.load(Ordering::SeqCst) || lock(&self.state).assignment.wind_down
+        self.flags.leaving.load(Ordering::SeqCst) || lock(&self.state).assignment.wind_down
+    }
+
+    /// Whether the coordinator did not answer the last poll.
+    pub(crate) fn is_away(&self) -> bool {
+        self.flags.away.load(Ordering::SeqCst)
     }
 
     /// Why to give up waiting for peers of `generation`, if there is a reason.

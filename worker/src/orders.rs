@@ -15,7 +15,7 @@ use tokio::time::sleep;
 use crate::bell::{Bell, lock};
 use crate::client::{CallError, Client};
 use crate::gang::endpoint::Endpoint;
-use crate::held::{Held, Reading};
+use crate::held::{Flags, Held, Reading};
 
 /// Longest pause between two polls of a coordinator that is away.
 const LONGEST: Duration = Duration::from_secs(1);
@@ -31,7 +31,7 @@ pub(crate) struct Shared {
     /// Rung when there may be something to start, or nothing more ever.
     pub(crate) work: Bell,
     pub(crate) wake: Arc<Notify>,
-    leaving: Arc<AtomicBool>,
+    flags: Arc<Flags>,
     over: AtomicBool,
     endpoint: Arc<Endpoint>,
 }
@@ -42,7 +42,7 @@ impl Shared {
             held: Mutex::default(),
             work: Bell::default(),
             wake: Arc::default(),
-            leaving: Arc::default(),
+            flags: Arc::default(),
             over: AtomicBool::new(false),
             endpoint,
         })
@@ -58,7 +58,7 @@ impl Shared {
 
     /// Takes nothing new; what runs saves and yields.
     pub(crate) fn leave(&self) {
-        self.leaving.store(true, Ordering::SeqCst);
+        self.flags.leaving.store(true, Ordering::SeqCst);
         for held in lock(&self.held).iter() {
             held.bell().ring();
         }
@@ -67,7 +67,7 @@ impl Shared {
     }
 
     pub(crate) fn is_leaving(&self) -> bool {
-        self.leaving.load(Ordering::SeqCst)
+        self.flags.leaving.load(Ordering::SeqCst)
     }
 
     pub(crate) fn is_over(&self) -> bool {
@@ -118,7 +118,7 @@ impl Shared {
     }
 
     fn hold(&self, assignment: &Assignment) -> Arc<Held> {
-        Held::new(assignment.clone(), self.endpoint.clone(), self.wake.clone(), self.leaving.clone())
+        Held::new(assignment.clone(), self.endpoint.clone(), self.wake.clone(), self.flags.clone())
     }
 
     fn poll(&self, incarnation: Incarnation, version: u64) -> Poll {
@@ -186,6 +186,8 @@ pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> En
             }
             answer = client.poll(&path, &poll, Duration::from_millis(joined.poll_ms)) => answer,
         };
+        let answered = !matches!(answer, Err(CallError::Away(_) | CallError::Fault(_)));
+        shared.flags.away.store(!answered, Ordering::SeqCst);
         match answer {
             Ok(orders) => {
                 if std::mem::take(&mut away) {

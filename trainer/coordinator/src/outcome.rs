@@ -125,9 +125,10 @@ impl Deciding<'_> {
         let write = result(work, Some(grant), &known, now);
         work.state = WorkState::Done { known, cached: false };
         self.writes.push(write);
-        // The value is there: what an interrupted try would have gone on from is of no use any more.
+        // The value is there: what an interrupted try would have gone on from is of no use any more, but for the last way
+        // from one checkpoint to the next, which `trainer run --verify` walks again.
         if !std::mem::take(&mut self.state.work_mut(key).tasks[i].checkpoints).is_empty() {
-            let keep = Keep { latest: 0, best: 0 };
+            let keep = Keep { latest: 2, best: 0 };
             self.effects.push(Effect::Prune { task: report.grant.task.clone(), keep });
         }
     }

@@ -198,6 +198,19 @@ async fn a_run_goes_through_over_http_and_survives_a_restart() -> TestResult {
     let (status, error) = client.refused("/v1/metrics", metrics).await?;
     assert_eq!((status, error.code.as_str()), (409, "stale-fence"));
 
+    // The fence of now with the attempt of before: refused before the store, which knows fences alone, is asked.
+    let other = Grant { attempt: protocol::Attempt(9), ..vae.grant.clone() };
+    let metrics = MetricBatch { grant: other.clone(), rows: vec![] };
+    let logs = LogBatch { grant: other.clone(), first: 0, lines: vec![] };
+    let request = Request::builder().method("PUT").uri("/v1/blobs");
+    let request = request.header("x-stride-grant", serde_json::to_string(&other)?).body(Body::from("late"))?;
+    let refused = [
+        client.try_call("POST", "/v1/metrics", metrics).await?.0,
+        client.try_call("POST", "/v1/logs", logs).await?.0,
+        client.send(request).await?.0,
+    ];
+    assert_eq!(refused, [StatusCode::CONFLICT; 3], "metrics, logs, blob");
+
     // As by `kill -9`: the worker goes on and re-attaches with the same incarnation and grant.
     handle.shutdown().await;
     let (handle, client) = start(dir.path()).await?;
@@ -225,7 +238,7 @@ async fn a_run_goes_through_over_http_and_survives_a_restart() -> TestResult {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestResult {
+async fn p2_a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestResult {
     let dir = tempfile::tempdir()?;
     let (handle, client) = start(dir.path()).await?;
     handle.submit(submission(None)?).await?;
@@ -271,5 +284,50 @@ async fn a_token_is_wanted_where_one_is_set_and_required_beyond_this_machine() -
     let answer: registry::cli::Answer = client.call("POST", "/v1/registry", registry::cli::Command::List).await?;
     assert_eq!(answer.exit, 0);
     handle.shutdown().await;
+    Ok(())
+}
+
+/// Loss of power in the middle of a write: the log of the database is cut at 24 places, 7 of them inside its last frames.
+/// What is left is always a beginning of the journal, and replays.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn p1_a_torn_journal_is_a_whole_beginning_of_itself() -> TestResult {
+    let dir = tempfile::tempdir()?;
+    let (handle, client) = start(dir.path()).await?;
+    for i in 0..6 {
+        handle.submit(submission(Some(&format!("run {i}")))?).await?;
+        join(&client, "w").await?;
+    }
+    // Copied while it is open, as a disk is found after the power failed.
+    let wal = std::fs::read_dir(dir.path())?
+        .flatten()
+        .map(|entry| entry.path())
+        .find(|path| path.extension().is_some_and(|e| e.to_string_lossy().ends_with("-wal")))
+        .ok_or("no write-ahead log")?;
+    let main = wal.with_extension(wal.extension().unwrap_or_default().to_string_lossy().trim_end_matches("-wal"));
+    let (database, log) = (std::fs::read(&main)?, std::fs::read(&wal)?);
+    handle.shutdown().await;
+    let store = Store::open(dir.path(), Holder::this_process("a test")).await?;
+    let whole = store.journal_read().await?;
+    drop(store);
+
+    let mut lengths = Vec::new();
+    let end = log.len();
+    let cuts = (0..=16).map(|i| end * i / 16).chain([1, 31, 32, 500, 4000, 4119, 4121].map(|back| end - back));
+    for cut in cuts {
+        let torn = tempfile::tempdir()?;
+        std::fs::write(torn.path().join(main.file_name().ok_or("a name")?), &database)?;
+        std::fs::write(torn.path().join(wal.file_name().ok_or("a name")?), &log[..cut])?;
+        let store = match Store::open(torn.path(), Holder::this_process("a test")).await {
+            Ok(store) => store,
+            // Cut before the tables were made: an empty place, not a damaged one.
+            Err(error) => return Err(format!("cut at {cut} of {end}: {error}").into()),
+        };
+        let left = store.journal_read().await?;
+        assert_eq!(left[..], whole[..left.len()], "cut at {cut} of {end}");
+        coordinator::journal::replay(Policy::default(), left.clone())?;
+        lengths.push(left.len());
+    }
+    assert!(lengths.iter().any(|l| *l == 0) && lengths.contains(&whole.len()), "{lengths:?} of {}", whole.len());
+    assert!(lengths.iter().any(|l| (1..whole.len()).contains(l)), "some entries were cut off: {lengths:?}");
     Ok(())
 }

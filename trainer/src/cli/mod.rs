@@ -15,7 +15,7 @@ use registry::{Holder, OpenError, Store};
 use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result, exit};
-use crate::{pipeline_file, plan, run};
+use crate::{pipeline_file, plan, run, verify};
 
 /// Trains text-to-motion models across workers and keeps what came out of it
 #[derive(Debug, Parser)]
@@ -90,6 +90,9 @@ struct RunArgs {
     /// Stop after this stage
     #[arg(long, value_name = "STAGE")]
     until: Option<String>,
+    /// Trains nothing; runs N steps of each training stage again and compares them with what is stored [default N: 20]
+    #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "20", conflicts_with_all = ["workers", "until"])]
+    verify: Option<std::num::NonZeroU64>,
     /// How the result is printed
     #[arg(short, long, value_enum, default_value_t)]
     output: Output,
@@ -224,6 +227,9 @@ fn command_line() -> String {
 
 async fn run_pipeline(args: RunArgs) -> Result<u8> {
     let file = pipeline_file::read_with_data(&args.pipeline.pipeline, &args.pipeline.set)?;
+    if let Some(steps) = args.verify {
+        return verify::verify(&file.pipeline, &args.store, steps.get(), args.output).await;
+    }
     let until = args.until.map(StageName::new);
     let options =
         run::Options { store: args.store, workers: args.workers, output: args.output, command: command_line() };

@@ -153,6 +153,12 @@ pub trait GangContext: AttemptContext {
     /// Whether this member is rank 0, which alone saves, records and reports.
     fn leads(&self) -> bool;
 
+    /// Whether a checkpoint could be stored now. A member that keeps its state in memory loses nothing by saving later, so
+    /// training does not wait at a due checkpoint for a coordinator that is away.
+    fn can_save(&self) -> bool {
+        true
+    }
+
     /// Commits an uploaded manifest as the newest checkpoint; returns once it is durable. Rank 0 only.
     fn commit_checkpoint(
         &mut self,

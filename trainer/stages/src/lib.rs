@@ -11,4 +11,5 @@ pub mod kinds;
 pub mod networks;
 pub mod testing;
 pub mod train;
+pub mod verify;
 pub mod words;

@@ -18,7 +18,8 @@ use protocol::{Digest, Manifest, RunId, Seed, StageName};
 use crate::context::{AttemptContext, ContextError, Outcome, Part, StageError};
 use crate::kinds;
 
-pub use gang::{Script, tree_sum};
+pub use crate::train::tree_sum;
+pub use gang::Script;
 
 /// Locks, whether or not another thread panicked while it held the lock: the panic is reported where it happened.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -215,6 +216,24 @@ impl Bench {
     /// The steps at which the stage `name` has saved checkpoints.
     pub fn checkpoints(&self, name: &str) -> Vec<u64> {
         self.checkpoints.get(name).into_iter().flatten().map(|(step, _)| *step).collect()
+    }
+
+    /// Forgets the checkpoints of the stage `name` after step `last`, as if it had not got further. Returns them.
+    pub fn forget_after(&mut self, name: &str, last: u64) -> Vec<(u64, Manifest)> {
+        let saved = self.checkpoints.entry(name.to_owned()).or_default();
+        let (kept, forgotten) = std::mem::take(saved).into_iter().partition(|(step, _)| *step <= last);
+        *saved = kept;
+        forgotten
+    }
+
+    /// Forgets all checkpoints of the stage `name`: it begins anew.
+    pub fn forget(&mut self, name: &str) {
+        self.checkpoints.remove(name);
+    }
+
+    /// The newest checkpoint of the stage `name`.
+    pub fn newest(&self, name: &str) -> Option<&(u64, Manifest)> {
+        self.checkpoints.get(name).and_then(|saved| saved.last())
     }
 
     /// Runs the stage `name` to its end, or until its script stops it. A gang stage continues its newest checkpoint.

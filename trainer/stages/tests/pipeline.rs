@@ -1,95 +1,19 @@
 //! The whole chain in memory, small: its value must not hang on who computed what.
 
+mod common;
+
 use std::collections::BTreeMap;
 
 use protocol::Digest;
-use protocol::Steps;
-use protocol::stage::{
-    Batch, DataSynthetic, Decay, DistillLcm, DistillPcm, Distillation, EncodeLatents, EvaluateLatentFid,
-    EvaluateReconstruction, LatentShape, Network, Optimizer, Sampler, Shape, StageSettings, TextEmbed, TrainMld,
-    TrainVae, Training,
-};
+use protocol::stage::Shape;
 use stages::context::Outcome;
 use stages::testing::{Bench, Script};
 
-fn network() -> Network {
-    Network { width: 16, layers: 3, heads: 2, feed_forward: 32, ..Network::default() }
-}
+use common::Link;
 
-fn training(steps: u64) -> Training {
-    Training {
-        steps: Steps(steps),
-        batch: Batch { global: 6, slices: 6 },
-        lr: 1e-3,
-        warmup: Steps(2),
-        decay: Decay::Cosine,
-        optimizer: Optimizer::default(),
-        max_grad_norm: 1.0,
-    }
-}
-
-fn distillation(steps: u64) -> Distillation {
-    Distillation {
-        training: training(steps),
-        guidance_dim: 16,
-        guidance: (0.5, 5.0),
-        ..DistillLcm::default().distillation
-    }
-}
-
-/// Name, settings and inputs (field, stage).
-type Link = (&'static str, StageSettings, Vec<(&'static str, &'static str)>);
-
-/// The stages in order.
+/// The stages in order, at the lengths of these tests.
 fn chain(shards: usize) -> Vec<Link> {
-    let data = DataSynthetic { clips: 24, val: 0.1, test: 0.25, mirror: false };
-    let vae = TrainVae {
-        latent: LatentShape { tokens: 2, dim: 8 },
-        network: network(),
-        training: training(8),
-        ..TrainVae::default()
-    };
-    let mld = TrainMld { network: network(), ema: 0.9, training: training(10), ..TrainMld::default() };
-    let lcm = DistillLcm { distillation: distillation(6) };
-    let pcm = DistillPcm { phases: 2, distillation: distillation(6), ..DistillPcm::default() };
-    let evaluate = |model: &str, teacher: &str, steps: usize, guidance: f64| {
-        StageSettings::EvaluateLatentFid(EvaluateLatentFid {
-            model: model.into(),
-            teacher: teacher.into(),
-            sampler: Sampler { steps, guidance, timesteps: vec![] },
-            repeats: 2,
-            samples: 2,
-            components: 4,
-            shards,
-            ..EvaluateLatentFid::default()
-        })
-    };
-    let latent = |model| vec![("model", model), ("latents", "latents"), ("text", "text"), ("teacher", "mld")];
-    let teacher = || vec![("teacher", "mld"), ("latents", "latents"), ("text", "text")];
-    vec![
-        ("dataset", StageSettings::DataSynthetic(data), vec![]),
-        ("text", StageSettings::TextEmbed(TextEmbed::default()), vec![("dataset", "dataset")]),
-        ("vae", StageSettings::TrainVae(vae), vec![("dataset", "dataset")]),
-        (
-            "latents",
-            StageSettings::EncodeLatents(EncodeLatents { crops: 3, shards, ..EncodeLatents::default() }),
-            vec![("dataset", "dataset"), ("vae", "vae")],
-        ),
-        (
-            "reconstruction",
-            StageSettings::EvaluateReconstruction(EvaluateReconstruction {
-                shards,
-                ..EvaluateReconstruction::default()
-            }),
-            vec![("dataset", "dataset"), ("vae", "vae")],
-        ),
-        ("mld", StageSettings::TrainMld(mld), vec![("vae", "vae"), ("latents", "latents"), ("text", "text")]),
-        ("lcm", StageSettings::DistillLcm(lcm), teacher()),
-        ("pcm", StageSettings::DistillPcm(pcm), teacher()),
-        ("eval-mld", evaluate("mld", "mld", 4, 3.0), latent("mld")),
-        ("eval-lcm", evaluate("lcm", "mld", 2, 2.0), latent("lcm")),
-        ("eval-pcm", evaluate("pcm", "mld", 2, 2.0), latent("pcm")),
-    ]
+    common::chain(shards, [8, 10, 6, 6])
 }
 
 /// The digest of every stage's output, and the metrics of the evaluations.
@@ -108,8 +32,9 @@ fn bench(members: usize) -> Bench {
     Bench::new(burn::tensor::Device::flex(), 7, members)
 }
 
+/// Sampled: 1, 2 and 3 members, the last with a loss of the leader and a joiner in every training stage.
 #[test]
-fn every_digest_is_the_same_with_any_number_of_members_and_shards() {
+fn p6_every_digest_is_the_same_with_any_number_of_members_and_shards() {
     let alone = run(&mut bench(1), 1);
     let pair = run(&mut bench(2), 3);
     assert_eq!(alone, pair, "1 member and 1 shard against 2 and 3");

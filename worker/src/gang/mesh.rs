@@ -142,6 +142,32 @@ impl Mesh {
         lost.map(|(_, member)| member.worker.clone()).collect()
     }
 
+    /// Who is missing, each with the barrier at which and the reason for which it was given up.
+    pub(crate) fn missing(&self) -> Vec<String> {
+        let peers = lock(&self.peers);
+        let missing = peers.iter().enumerate().filter_map(|(rank, peer)| match &peer.fate {
+            Fate::Lost(reason) => Some(format!("{} (rank {rank}): {reason}", self.name(rank))),
+            Fate::Unmet(_) | Fate::Up | Fate::Left | Fate::Moved => None,
+        });
+        missing.collect()
+    }
+
+    /// Gives up everybody else who is as silent as the one just given up, so that all who are missing are named at once.
+    fn lose_the_silent(&self, barrier: &str, awake: Instant) {
+        let now = Instant::now();
+        let silent: Vec<usize> = {
+            let peers = lock(&self.peers);
+            let silent = |(rank, peer): (usize, &Peer)| {
+                let waits = matches!(peer.fate, Fate::Unmet(_) | Fate::Up) && rank != self.terms.rank;
+                (waits && now.duration_since(peer.heard.max(awake)) > self.timing.patience).then_some(rank)
+            };
+            peers.iter().enumerate().filter_map(silent).collect()
+        };
+        for rank in silent {
+            self.lose(rank, format!("{barrier}: no sign of life for {} s", self.timing.patience.as_secs_f32()));
+        }
+    }
+
     /// Says goodbye and lets go. What was sent still arrives: only our direction of each connection is closed, and the
     /// readers drain the other until the peer does the same.
     pub(crate) fn close(&self, next: Option<Generation>) {
@@ -360,6 +386,7 @@ impl Mesh {
             }
             if let Some(reason) = verdict {
                 self.lose(rank, reason);
+                self.lose_the_silent(barrier, awake);
                 return Err(Halt::Peer);
             }
             self.bell.wait(ticket, GLANCE);

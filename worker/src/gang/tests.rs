@@ -17,9 +17,10 @@ use stages::context::{ContextError, Exchange, GangContext, Rendezvous};
 use tokio::runtime::Runtime;
 
 use super::endpoint::Endpoint;
+use super::exchange;
 use super::frame::{self, Head, Kind};
 use super::handshake;
-use super::mesh::{Mesh, Terms, Timing};
+use super::mesh::{Halt, Mesh, Terms, Timing};
 use super::tree;
 use crate::bell::{Bell, lock};
 use crate::cache::{Bounds, Cache};
@@ -457,6 +458,79 @@ fn a_slow_peer_is_waited_for_and_a_silent_one_is_named() {
     }
 }
 
+/// Sampled: one and two of four members that are stopped before each barrier. A stopped process keeps its connections and
+/// says nothing; that is what a member without signs of life does here.
+#[test]
+fn p18_each_barrier_has_a_name_and_a_time_and_lists_who_is_missing() {
+    let quiet = Timing { keep_alive: Duration::from_secs(3600), ..QUICK };
+    for (stopped, name) in
+        [(vec![3], "rendezvous"), (vec![1, 3], "rendezvous"), (vec![2], "exchange"), (vec![1, 3], "exchange")]
+    {
+        let mut gang = Gang::new(4, QUICK);
+        let silent = Gang::new(4, quiet);
+        {
+            let gang = Arc::get_mut(&mut gang).expect("not shared yet");
+            for &i in &stopped {
+                gang.seats[i].member = silent.seats[i].member.clone();
+                gang.seats[i].endpoint = silent.seats[i].endpoint.clone();
+            }
+        }
+        let meshes: Vec<_> = (0..4).map(|own| mesh(&gang, &[0, 1, 2, 3], own, "s").0).collect();
+        let over = AtomicBool::new(false);
+        let begun = Instant::now();
+        thread::scope(|scope| {
+            let members: Vec<_> = (0..4)
+                .map(|own| {
+                    let (mesh, stopped, over) = (meshes[own].clone(), &stopped, &over);
+                    scope.spawn(move || {
+                        let is_stopped = stopped.contains(&own);
+                        let stop = || {
+                            while !over.load(Ordering::SeqCst) {
+                                thread::sleep(Duration::from_millis(5))
+                            }
+                        };
+                        if is_stopped && name == "rendezvous" {
+                            return stop();
+                        }
+                        let met = exchange::rendezvous(&mesh, Some(5), &mut Vec::new, &|| None);
+                        if name == "exchange" {
+                            met.expect("all are there");
+                            if is_stopped {
+                                return stop();
+                            }
+                            let numbers = [1.0f32; 10];
+                            let parts = vec![(own..own + 1, &numbers[..])];
+                            let bring = exchange::Bring { step: 5, slices: 4, parts, wind_down: false, durable: 0 };
+                            assert!(matches!(exchange::exchange(&mesh, &bring, &|| None), Err(Halt::Peer)));
+                        } else {
+                            assert!(matches!(met, Err(Halt::Peer)));
+                        }
+                    })
+                })
+                .collect();
+            // The first of the others is the one that waits the whole time; it must know all that are missing.
+            for (own, member) in members.into_iter().enumerate().filter(|(own, _)| !stopped.contains(own)) {
+                member.join().expect("no panic");
+                let missing = meshes[own].missing();
+                if own == 0 {
+                    let names: Vec<String> = stopped.iter().map(|i| format!("w{i} (rank {i})")).collect();
+                    let named: Vec<&str> = missing.iter().filter_map(|m| m.split(": ").next()).collect();
+                    assert_eq!(named, names, "{missing:?}");
+                    assert!(missing.iter().all(|m| m.contains(&format!("barrier `{name}`"))), "{missing:?}");
+                    let step = if name == "exchange" { "of step 5" } else { "of generation 7" };
+                    assert!(missing.iter().all(|m| m.contains(step) && m.contains("2 s")), "{missing:?}");
+                    eprintln!("after {:.1?}: {}", begun.elapsed(), missing.join("; "));
+                    assert!(begun.elapsed() < QUICK.patience * 4, "in bounded time");
+                    over.store(true, Ordering::SeqCst);
+                }
+            }
+        });
+        for mesh in meshes {
+            mesh.close(None);
+        }
+    }
+}
+
 #[test]
 fn a_peer_with_another_secret_never_gets_in() {
     let gang = Gang::new(2, QUICK);
@@ -493,6 +567,27 @@ fn an_oversized_frame_ends_the_connection_without_being_read() {
     let mut bytes = frame::header(Head::new(Kind::State, 0, 0, 0), &[]).to_vec();
     bytes[24..28].copy_from_slice(&(frame::MAX_PAYLOAD as u32 + 1).to_le_bytes());
     misbehave(&bytes).close(None);
+}
+
+#[test]
+#[ignore = "a measurement: cargo test --release -p worker state_transfer -- --ignored --nocapture"]
+fn state_transfer() {
+    // 20 M parameters with two moments and a moving average, as bytes.
+    let state = vec![7u8; 20_000_000 * 4 * 4];
+    for _ in 0..3 {
+        let gang = Gang::new(2, Timing::default());
+        gang.regroup(&[0, 1], false);
+        let begun = Instant::now();
+        thread::scope(|scope| {
+            let (donor, state) = (gang.clone(), &state);
+            scope.spawn(move || donor.context(0).rendezvous(Some(9), &mut || state.clone()).expect("met"));
+            match gang.context(1).rendezvous(None, &mut Vec::new).expect("met") {
+                Rendezvous::Adopt(bytes) => assert!(bytes == *state),
+                Rendezvous::Keep => panic!("it had nothing to keep"),
+            }
+        });
+        eprintln!("{} MB taken over from a peer in {:.2?}", state.len() / 1_000_000, begun.elapsed());
+    }
 }
 
 #[test]

@@ -1,4 +1,8 @@
 //! The one task that decides. Events come over a queue; each is decided on a copy of the state, stored, then published.
+//!
+//! What has gathered in the queue while the disk was busy is decided together: one event after the other on one copy, and
+//! all that they write in one transaction. Nobody is answered before it is stored. If the store refuses it, none of it has
+//! happened, and each is tried alone, so that only the one at fault is refused.
 
 use std::sync::{Arc, Mutex, PoisonError, RwLock};
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
@@ -6,7 +10,7 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 use protocol::message::{FailureClass, ReportOutcome, Submit, TaskOutcome};
 use protocol::pipeline::Pipeline;
 use protocol::{Digest, RunId};
-use registry::{Store, WriteError};
+use registry::{Store, Write, WriteError};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 
@@ -16,6 +20,9 @@ use crate::event::{Effect, Event, Millis, Moment, Observation, Rejected};
 use crate::invariants;
 use crate::observe::observe;
 use crate::state::State;
+
+/// How many events are decided together at most.
+const TOGETHER: usize = 128;
 
 /// Why a call was refused. Nothing has changed.
 #[derive(Debug, thiserror::Error)]
@@ -205,13 +212,89 @@ impl Actor {
                 _ = stopped.wait_for(|stop| *stop) => return,
                 ask = queue.recv() => ask,
             };
-            match ask {
-                // Whoever asked may have gone away meanwhile; what was decided stands.
-                Some(Ask::Event(event, reply)) => drop(reply.send(self.happen(*event).await)),
-                Some(Ask::Observation(observation, reply)) => drop(reply.send(self.hear(observation).await)),
-                None => return,
+            let Some(first) = ask else { return };
+            let mut asks = vec![first];
+            while asks.len() < TOGETHER
+                && let Ok(more) = queue.try_recv()
+            {
+                asks.push(more);
+            }
+            if asks.len() > 1 && self.all_happen(&mut asks).await {
+                continue;
+            }
+            for ask in asks {
+                match ask {
+                    // Whoever asked may have gone away meanwhile; what was decided stands.
+                    Ask::Event(event, reply) => drop(reply.send(self.happen(*event).await)),
+                    Ask::Observation(observation, reply) => drop(reply.send(self.hear(observation).await)),
+                }
             }
         }
+    }
+
+    /// Decides all `asks` in their order, stores what they write at once, and answers them. `false`: the store refused it,
+    /// and nothing has happened.
+    async fn all_happen(&mut self, asks: &mut Vec<Ask>) -> bool {
+        let (mut next, mut writes, mut effects) = (self.state.clone(), Vec::new(), Vec::new());
+        let mut decided = Vec::with_capacity(asks.len());
+        for ask in asks.iter() {
+            decided.push(match ask {
+                Ask::Event(event, _) => self.decide_on(&mut next, (**event).clone(), &mut writes),
+                Ask::Observation(observation, _) => {
+                    observe(&mut next, self.desk.now(), observation.clone()).map(|events| {
+                        let mut follow = Vec::new();
+                        for event in events {
+                            match self.decide_on(&mut next, event, &mut writes) {
+                                Ok(mut effects) => follow.append(&mut effects),
+                                Err(rejected) => tracing::debug!(%rejected, "moot"),
+                            }
+                        }
+                        follow
+                    })
+                }
+            });
+        }
+        let durable = !writes.is_empty();
+        if durable {
+            let written = self.desk.store.write(writes).await;
+            self.desk.wrote(&written);
+            if written.is_err() {
+                return false;
+            }
+        }
+        self.state = next;
+        self.desk.publish(&self.state, durable);
+        for (ask, decided) in asks.drain(..).zip(decided) {
+            if let Ok(done) = &decided {
+                effects.extend(done.iter().cloned());
+            }
+            match ask {
+                Ask::Event(_, reply) => drop(reply.send(decided.map_err(Refused::Rejected))),
+                Ask::Observation(_, reply) => drop(reply.send(decided.map(drop).map_err(Refused::Rejected))),
+            }
+        }
+        for effect in &effects {
+            effects::perform(&self.desk, effect);
+        }
+        true
+    }
+
+    /// One event on `next`; what it writes is added to `writes`.
+    fn decide_on(&mut self, next: &mut State, event: Event, writes: &mut Vec<Write>) -> Result<Vec<Effect>, Rejected> {
+        let before = cfg!(debug_assertions).then(|| next.clone());
+        let moment = Moment { now: self.desk.now(), entropy: self.entropy.next() };
+        tracing::debug!(?event, "event");
+        let mut effects = decide(next, moment, event)?;
+        if let Some(before) = before {
+            let broken = invariants::check_change(&before, next);
+            assert!(broken.is_empty(), "broken invariants: {broken:#?}");
+        }
+        if let Some(i) = effects.iter().position(|effect| matches!(effect, Effect::Store(_)))
+            && let Effect::Store(mut stored) = effects.remove(i)
+        {
+            writes.append(&mut stored);
+        }
+        Ok(effects)
     }
 
     async fn hear(&mut self, observation: Observation) -> Result<(), Refused> {

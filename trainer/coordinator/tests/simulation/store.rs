@@ -31,11 +31,14 @@ pub(crate) enum Refusal {
 
 impl FakeStore {
     pub(crate) fn write(&mut self, writes: &[Write]) -> Result<(), Refusal> {
+        // The journal only grows: its new entries wait until nothing can be refused any more, so that it is not copied.
+        let journal = std::mem::take(&mut self.journal);
         let mut next = self.clone();
-        for write in writes {
-            next.apply(write)?;
-        }
-        *self = next;
+        let applied = writes.iter().try_for_each(|write| next.apply(write));
+        self.journal = journal;
+        applied?;
+        self.journal.append(&mut next.journal);
+        *self = Self { journal: std::mem::take(&mut self.journal), ..next };
         Ok(())
     }
 

@@ -14,6 +14,7 @@ use protocol::{Digest, Manifest};
 
 use super::{MemoryAttempt, Ran, Told, lock};
 use crate::context::{AttemptContext, ContextError, Exchange, GangContext, Outcome, Rendezvous, StageError};
+use crate::train::tree_sum;
 
 /// Who leaves or joins a gang, and when. Members are numbered from 0; the lowest alive leads.
 #[derive(Debug, Clone, Default)]
@@ -24,23 +25,6 @@ pub struct Script {
     pub joins: Vec<(usize, u64)>,
     /// All members are told to stop after applying this step.
     pub wind_down: Option<u64>,
-}
-
-/// The sum of `parts` along the fixed tree: a range is split at the largest power of two below its length.
-///
-/// # Panics
-/// If there are no parts, or parts of several lengths.
-pub fn tree_sum(parts: &[Vec<f32>]) -> Vec<f32> {
-    if let [only] = parts {
-        return only.clone();
-    }
-    let (left, right) = parts.split_at(parts.len().next_power_of_two() / 2);
-    let (mut sum, right) = (tree_sum(left), tree_sum(right));
-    assert_eq!(sum.len(), right.len(), "slices give vectors of one length");
-    for (a, b) in sum.iter_mut().zip(right) {
-        *a += b;
-    }
-    sum
 }
 
 #[derive(Debug, Default)]

@@ -8,6 +8,7 @@
 
 mod order;
 mod state;
+mod tree;
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
@@ -22,9 +23,10 @@ use serde_json::json;
 
 pub use order::{Order, Pick};
 pub use state::{Group, GroupPlan, TrainState};
+pub use tree::tree_sum;
 
 /// File of a checkpoint.
-const STATE_FILE: &str = "state.safetensors";
+pub(crate) const STATE_FILE: &str = "state.safetensors";
 
 /// What one slice of a step gave.
 #[derive(Debug, Clone, PartialEq)]
@@ -87,6 +89,7 @@ pub fn train(
         cx.log(&format!("goes on from the checkpoint after step {}", state.step));
     }
     let mut saved_at = applied;
+    let mut save_is_due = false;
     let mut recent = Recent::default();
     meet(&mut state, applied, cx)?;
     objective.load(&state);
@@ -129,9 +132,10 @@ pub fn train(
         }
         cx.progress(state.step, steps, "steps", &values[..1]);
         let every = cx.task().checkpoint.every.0;
-        if cx.leads() && state.step < steps && (wind_down || (every > 0 && state.step.is_multiple_of(every))) {
+        save_is_due |= every > 0 && state.step.is_multiple_of(every);
+        if cx.leads() && state.step < steps && (wind_down || (save_is_due && cx.can_save())) {
             save(&state, config, &recent, cx)?;
-            saved_at = Some(state.step);
+            (saved_at, save_is_due) = (Some(state.step), false);
         }
         if wind_down && state.step < steps {
             return Ok(Trained::Yielded { at: state.step });

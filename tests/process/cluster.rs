@@ -1,0 +1,366 @@
+//! A coordinator and workers as processes of their own: what is promised when one of them stops, hangs or dies.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+use cluster_tests::cluster::{Cluster, stage_of};
+use cluster_tests::{Bench, Running, digests, wait_for};
+use nix::sys::signal::Signal;
+use serde_json::{Value, json};
+
+const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
+/// A stage that takes some seconds, and the one before it.
+const VAE: [&str; 8] = [
+    "--set",
+    "stages.vae.steps=400",
+    "--set",
+    "stages.vae.windows.until=1",
+    "--set",
+    "stages.vae.checkpoint.every=50",
+    "--until",
+    "vae",
+];
+
+fn config() -> PathBuf {
+    Bench::repository().join("configs/smoke.yaml")
+}
+
+type Curves = BTreeMap<String, Vec<(u64, f64)>>;
+
+/// The undisturbed run of one worker: digests and every recorded value.
+fn reference() -> &'static (Value, Curves) {
+    static REFERENCE: OnceLock<(Value, Curves)> = OnceLock::new();
+    REFERENCE.get_or_init(|| {
+        let mut cluster = Cluster::start(TRAINER);
+        cluster.join("w1");
+        let run = cluster.submit(&config(), &VAE);
+        let view = cluster.wait_end(&run);
+        (view.clone(), cluster.metrics(&run, "vae"))
+    })
+}
+
+/// The same values at the same steps, each once, none missing; and the same digests.
+#[track_caller]
+fn equals_reference(cluster: &Cluster, run: &str, view: &Value) {
+    let (expected, curves) = reference();
+    assert_eq!(digests(view), digests(expected), "digests");
+    let found = cluster.metrics(run, "vae");
+    assert_eq!(found.keys().collect::<Vec<_>>(), curves.keys().collect::<Vec<_>>());
+    for (key, points) in &found {
+        assert_eq!(points.len(), curves[key].len(), "`{key}`: a gap or a double");
+        for (point, expected) in points.iter().zip(&curves[key]) {
+            assert!(point.0 == expected.0 && point.1.to_bits() == expected.1.to_bits(), "`{key}`: {point:?}");
+        }
+    }
+}
+
+/// The coordinator is killed in the middle of a training stage of two workers and is away for `down`.
+fn coordinator_away(down: Duration) {
+    let mut cluster = Cluster::start(TRAINER);
+    for name in ["w1", "w2"] {
+        cluster.join(name);
+    }
+    let run = cluster.submit(&config(), &VAE);
+    cluster.wait_step(&run, "vae", 20);
+    let before = cluster.stage(&run, "vae");
+    let pids = ["w1", "w2"].map(|name| cluster.pid(name));
+    cluster.kill_server();
+    let gone = Instant::now();
+    wait_for("the time without a coordinator to pass", || (gone.elapsed() >= down).then_some(()));
+    cluster.serve();
+    let back = wait_for("a poll after the restart", || {
+        let stage = cluster.stage(&run, "vae");
+        let over = stage["state"] != "running";
+        (over || stage["progress"]["done"].as_u64() > Some(0)).then_some(stage)
+    });
+    let (was, is) = (before["progress"]["done"].as_u64(), back["progress"]["done"].as_u64());
+    eprintln!("away for {down:?}: step {was:?} when it went, {is:?} when it was back");
+    let view = cluster.wait_end(&run);
+    let stage = stage_of(&view, "vae");
+    assert_eq!(stage["attempt"], before["attempt"], "the same attempt goes on");
+    assert_eq!(stage["state"], "ran", "nothing was taken up again");
+    for (name, pid) in ["w1", "w2"].into_iter().zip(pids) {
+        assert!(cluster.alive(name) && cluster.pid(name) == pid, "worker {name} is the same process");
+    }
+    let joined = cluster.said("w1").matches(" joined").count() + cluster.said("w2").matches(" joined").count();
+    assert_eq!(joined, 2, "each worker joined once");
+    if down >= Duration::from_secs(5) {
+        assert!(is > was.map(|step| step + 10), "workers go on without a coordinator: from {was:?} to {is:?}");
+    }
+    equals_reference(&cluster, &run, &view);
+    cluster.fsck();
+}
+
+/// Sampled: one kill and a restart at once.
+#[test]
+fn p4_the_coordinator_is_killed_and_back_at_once() {
+    coordinator_away(Duration::ZERO);
+}
+
+/// Sampled: 5 s; 60 s, which is four leases, with `STRIDE_LONG_TESTS=1`.
+#[test]
+fn p4_the_coordinator_is_killed_and_away_for_a_while() {
+    coordinator_away(Duration::from_secs(5));
+    if std::env::var_os("STRIDE_LONG_TESTS").is_some() {
+        coordinator_away(Duration::from_secs(60));
+    } else {
+        eprintln!("SKIPPED: 60 s without a coordinator (set STRIDE_LONG_TESTS=1)");
+    }
+}
+
+/// One worker, stopped past its lease in the middle of a training stage. Every kind of write is tried in its name, by the
+/// test and then by the worker itself.
+#[test]
+fn p2_a_worker_that_slept_past_its_lease_writes_nothing() {
+    let mut cluster = Cluster::start(TRAINER);
+    cluster.join("a");
+    let sets = [&VAE[..], &["--set", "stages.vae.workers={min: 1, max: 1}"]].concat();
+    let run = cluster.submit(&config(), &sets);
+    cluster.wait_step(&run, "vae", 20);
+    // What the worker holds, as it would be told itself.
+    let workers = cluster.get("/v1/workers").expect("the coordinator is there");
+    let orders = cluster
+        .post("/v1/workers/a/poll", &json!({"incarnation": workers[0]["incarnation"], "doing": [], "version": 0}))
+        .expect("answered");
+    let grant = orders.body["assignments"][0]["grant"].clone();
+    assert_eq!(grant["worker"], "a", "{:?}", orders.body);
+    cluster.signal("a", Signal::SIGSTOP);
+    let stopped = Instant::now();
+    cluster.join("b");
+    let taken = wait_for("b to be given the stage", || {
+        let stage = cluster.stage(&run, "vae");
+        (stage["workers"][0] == "b").then_some(stage)
+    });
+    let waited = stopped.elapsed();
+    eprintln!("a stopped worker's task was another's after {waited:.1?}");
+    assert!(waited > Duration::from_secs(14), "unknown is not dead: its lease is 15 s, not {waited:?}");
+    assert_eq!(taken["attempt"], 2);
+    cluster.wait_step(&run, "vae", 30);
+
+    // In the old grant's name, every kind of write there is.
+    let row = json!({"step": 7, "key": "forged", "value": 1.0});
+    let manifest =
+        stage_of(&cluster.view(&run), "dataset")["outputs"].as_object().expect("outputs").values().next().cloned();
+    let writes = [
+        ("/v1/metrics", json!({"grant": grant, "rows": [row]})),
+        ("/v1/logs", json!({"grant": grant, "first": 1u64 << 40, "lines": ["forged"]})),
+        ("/v1/checkpoints", json!({"grant": grant, "step": 5000, "manifest": manifest, "metrics": {}})),
+        ("/v1/outcomes", json!({"grant": grant, "outcome": {"outcome": "yielded", "at": 5000}})),
+        (
+            "/v1/outcomes",
+            json!({"grant": grant, "outcome": {"outcome": "finished", "output": manifest, "metrics": {}}}),
+        ),
+        (
+            "/v1/outcomes",
+            json!({"grant": grant, "outcome": {"outcome": "failed", "class": "input", "message": "forged"}}),
+        ),
+    ];
+    for (path, body) in &writes {
+        let reply = cluster.post(path, body).expect("answered");
+        assert_eq!((reply.status, reply.body["code"].as_str()), (409, Some("stale-fence")), "{path}: {:?}", reply.body);
+    }
+    let forged = format!("forged by {}", std::process::id());
+    let reply = cluster
+        .call("PUT", "/v1/blobs", &[("x-stride-grant", &grant.to_string())], forged.as_bytes())
+        .expect("answered");
+    assert_eq!((reply.status, reply.body["code"].as_str()), (409, Some("stale-fence")), "blob");
+
+    let logged = cluster.logs(&run).len();
+    cluster.signal("a", Signal::SIGCONT);
+    wait_for("a to learn that it has lost the stage", || {
+        let said = cluster.said("a");
+        (said.contains("dropped:") || said.contains("the outcome came too late")).then_some(())
+    });
+    assert!(cluster.alive("a"), "it is back and waits for work");
+    let view = cluster.wait_end(&run);
+    equals_reference(&cluster, &run, &view);
+    assert!(!cluster.metrics(&run, "vae").contains_key("forged"));
+    let late = cluster.logs(&run);
+    let late = late[logged..].iter().filter(|row| row["worker"] == "a" && row["attempt"] == grant["attempt"]);
+    assert_eq!(late.count(), 0, "nothing of the old attempt was stored after its end");
+    cluster.fsck();
+}
+
+/// Sampled: a kill of rank 0 of two in the middle of a stage, twice.
+#[test]
+fn p9_values_are_stored_once_though_rank_0_is_killed() {
+    let mut cluster = Cluster::start(TRAINER);
+    for name in ["w1", "w2"] {
+        cluster.join(name);
+    }
+    let run = cluster.submit(&config(), &VAE);
+    for (step, replaced) in [(60, "w3"), (180, "w4")] {
+        cluster.wait_step(&run, "vae", step);
+        let leader = cluster.stage(&run, "vae")["workers"][0].as_str().expect("a leader").to_owned();
+        cluster.kill(&leader);
+        cluster.join(replaced);
+    }
+    let view = cluster.wait_end(&run);
+    assert_eq!(stage_of(&view, "vae")["attempt"], 1, "the survivor went on from memory");
+    equals_reference(&cluster, &run, &view);
+}
+
+/// Sampled: the lines of a training stage of two workers, one of which is killed.
+#[test]
+fn p13_lines_are_kept_in_order_though_their_worker_is_killed() {
+    let mut cluster = Cluster::start(TRAINER);
+    cluster.join("w1");
+    let run = cluster.submit(&config(), &VAE);
+    cluster.wait_step(&run, "vae", 120);
+    let before = cluster.logs(&run);
+    cluster.kill("w1");
+    cluster.join("w2");
+    cluster.wait_end(&run);
+    let after = cluster.logs(&run);
+    assert_eq!(before[..], after[..before.len()], "what was there stays");
+    let mut last: BTreeMap<String, u64> = BTreeMap::new();
+    for row in &after {
+        let line = row["line"].as_u64().expect("a number");
+        let before = last.insert(format!("{} {}", row["worker"], row["attempt"]), line);
+        assert!(before.is_none_or(|before| before < line), "out of order: {row}");
+    }
+    assert!(
+        after.iter().any(|row| row["worker"] == "w2" && row["text"].as_str().unwrap_or_default().contains("goes on"))
+    );
+}
+
+/// Sampled: a training stage of two workers is paused (and the coordinator killed right after it said yes), taken up and
+/// cancelled; SIGTERM to a worker that trains alone.
+#[test]
+fn p14_pause_resume_cancel_and_sigterm_end_with_saved_work() {
+    let mut cluster = Cluster::start(TRAINER);
+    for name in ["w1", "w2"] {
+        cluster.join(name);
+    }
+    let url = cluster.url();
+    let verb = |cluster: &Cluster, verb: &str, run: &str| {
+        cluster.bench().run(&[verb, run, "--server", &url, "-o", "json"]).expect_code(0).json()["state"].clone()
+    };
+    let run = cluster.submit(&config(), &VAE);
+    cluster.wait_step(&run, "vae", 60);
+    let asked = Instant::now();
+    assert_eq!(verb(&cluster, "pause", &run), "paused");
+    cluster.kill_server();
+    cluster.serve();
+    let released = wait_for("the workers to save and let go", || {
+        let stage = cluster.stage(&run, "vae");
+        (stage["workers"].as_array().is_some_and(Vec::is_empty)).then_some(stage)
+    });
+    assert!(asked.elapsed() < Duration::from_secs(35), "within the grace and 5 s, not {:?}", asked.elapsed());
+    assert_eq!(released["state"], "ready");
+    assert_eq!(cluster.view(&run)["state"], "paused");
+
+    assert_eq!(verb(&cluster, "resume", &run), "running");
+    let at = |cluster: &Cluster| cluster.stage(&run, "vae")["progress"]["done"].as_u64().unwrap_or_default();
+    cluster.wait_step(&run, "vae", 61);
+    assert!(at(&cluster) >= 60, "from the checkpoint, not from nothing");
+
+    // One leaves in good order: exit 0, at once; the other goes on with what it had.
+    cluster.signal("w2", Signal::SIGTERM);
+    assert_eq!(cluster.ended("w2"), Some(0));
+    let before = at(&cluster);
+    // The last one leaves: it saves, and whoever comes goes on.
+    cluster.signal("w1", Signal::SIGTERM);
+    assert_eq!(cluster.ended("w1"), Some(0));
+    cluster.join("w3");
+    wait_for("w3 to go on from the checkpoint", || cluster.said("w3").contains("goes on").then_some(()));
+    cluster.wait_step(&run, "vae", before);
+    let view = cluster.wait_end(&run);
+    assert_eq!(stage_of(&view, "vae")["state"], "resumed");
+    equals_reference(&cluster, &run, &view);
+
+    let second = cluster.submit(&config(), &[&VAE[..], &["--set", "seed=7"]].concat());
+    cluster.wait_step(&second, "vae", 20);
+    assert_eq!(verb(&cluster, "cancel", &second), "cancelled");
+    wait_for("the worker to let go", || {
+        cluster
+            .get("/v1/workers")
+            .filter(|workers| workers.as_array().is_some_and(|all| all.iter().all(|worker| worker["task"].is_null())))
+    });
+    assert_eq!(cluster.wait_end(&second)["state"], "cancelled");
+}
+
+/// 12 kills, at the third to eighth commit of a coordinator and on both sides of it, under clients that submit without a
+/// pause. A client that was not answered asks again with the same key.
+#[test]
+fn p1_what_a_submission_was_answered_survives_and_counts_once() {
+    let bench = Bench::new(TRAINER);
+    let mut known: BTreeMap<String, String> = BTreeMap::new();
+    let mut next = 0;
+    for (point, at) in ["db::before_commit", "db::after_commit"].into_iter().flat_map(|p| (3..9).map(move |at| (p, at)))
+    {
+        let free = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
+        let address = free.local_addr().expect("bound").to_string();
+        drop(free);
+        let mut command = bench.command(&["serve", "--bind", &address]);
+        command.env("STRIDE_FAILPOINT", format!("{point}@{at}"));
+        let mut server = Running::start(command);
+        let url = format!("http://{address}");
+        let mut answered = 0;
+        while server.alive() {
+            let key = format!("key {next}");
+            let said =
+                bench.run(&["submit", &config().display().to_string(), "--server", &url, "--idempotency-key", &key]);
+            match said.code {
+                Some(0) => {
+                    let run = said.stdout.trim().to_owned();
+                    let before = known.insert(key, run.clone());
+                    assert!(before.is_none_or(|before| before == run), "one key gave two runs");
+                    (next, answered) = (next + 1, answered + 1);
+                }
+                // Not there yet, or not any more.
+                Some(6) => {}
+                code => panic!("exit code {code:?}: {}", said.stderr),
+            }
+            assert!(answered < 20, "{point}@{at} was not reached");
+        }
+    }
+    let said = bench.run(&["status", "--all", "-o", "json"]).expect_code(0).json();
+    let stored: Vec<&str> =
+        said["runs"].as_array().expect("runs").iter().filter_map(|run| run["run"].as_str()).collect();
+    for run in known.values() {
+        assert_eq!(stored.iter().filter(|stored| *stored == run).count(), 1, "{run} in {stored:?}");
+    }
+    // What nobody was told may be stored once: the one whose answer the last kill cut off.
+    assert!(stored.len() <= known.len() + 1, "{} keys gave {} runs", known.len(), stored.len());
+    assert!(known.len() >= 12, "{known:?}");
+}
+
+/// 16 coordinators start on one store that does not exist yet.
+#[test]
+fn p16_of_16_first_starts_one_has_the_store_and_15_say_who() {
+    let bench = Bench::new(TRAINER);
+    let mut all: Vec<Running> = (0..16).map(|_| bench.spawn(&["serve", "--bind", "127.0.0.1:0"])).collect();
+    wait_for("15 to give up", || {
+        (all.iter_mut().filter_map(|one| one.alive().then_some(())).count() == 1).then_some(())
+    });
+    let at = all.iter_mut().position(Running::alive).expect("one is left");
+    let winner = all.remove(at);
+    let pid = winner.pid().to_string();
+    for said in all.into_iter().map(Running::wait) {
+        assert_eq!(said.code, Some(2), "{}", said.stderr);
+        assert!(said.stderr.contains(&pid), "it should name process {pid}:\n{}", said.stderr);
+    }
+    winner.signal(Signal::SIGTERM);
+    assert_eq!(winner.wait().code, Some(0));
+    bench.run(&["registry", "fsck"]).expect_code(0);
+}
+
+/// A learning rate under which the loss is no number after some steps: said once, with the step, and not tried again.
+#[test]
+fn p15_a_loss_that_is_no_number_is_final() {
+    let bench = Bench::new(TRAINER);
+    let config = config().display().to_string();
+    let said = bench
+        .run(&["run", &config, "--until", "vae", "--set", "stages.vae.lr=1e30", "--workers", "1", "-o", "json"])
+        .expect_code(1);
+    let report: Value = serde_json::from_str(said.stdout.lines().next().map_or("", |_| said.stdout.as_str()))
+        .unwrap_or_else(|e| panic!("{e}: {}", said.stdout));
+    let message = stage_of(&report, "vae")["message"].as_str().unwrap_or_default().to_owned();
+    assert!(message.contains("step"), "{message}\n{}", said.stderr);
+    let begun = std::fs::read_to_string(bench.store().join("workers/w1.log")).expect("a log");
+    let begins = begun.lines().filter(|line| line.contains(" begin ") && line.contains("/vae attempt=")).count();
+    assert_eq!(begins, 1, "tried once:\n{begun}");
+}

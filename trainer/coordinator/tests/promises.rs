@@ -1,0 +1,366 @@
+//! Promises of `docs` by number, on the pure half with a clock of its own: leases, budgets, and how runs end.
+//!
+//! What is here is exact where a process test could only measure: every moment is tried, and nothing waits.
+
+#[path = "simulation/pipelines.rs"]
+mod pipelines;
+
+use coordinator::state::task::Hold;
+use coordinator::{
+    Control, Effect, Event, Millis, Moment, Observation, Policy, Rejected, State, decide, invariants, journal, observe,
+};
+use protocol::message::{
+    Assignment, FailureClass, Join, PROTOCOL_VERSION, Poll, ReportOutcome, RunState, StageState, TaskOutcome,
+};
+use protocol::stage::{Backend, WorkerRange};
+use protocol::{Digest, Incarnation, RunId, WorkerId};
+use serde_json::Value;
+
+/// A coordinator without a shell: one call after the other, at the times that the test says.
+struct Desk {
+    state: State,
+    journal: Vec<Value>,
+    now: u64,
+}
+
+impl Desk {
+    fn new(policy: Policy) -> Self {
+        Self { state: State::new(policy), journal: Vec::new(), now: 1_000_000 }
+    }
+
+    /// Decides and stores; lookups find nothing.
+    fn happen(&mut self, event: Event) -> Result<Vec<Effect>, Rejected> {
+        let moment = Moment { now: Millis(self.now), entropy: Digest::of(b"entropy") };
+        let before = self.state.clone();
+        let effects = decide(&mut self.state, moment, event)?;
+        let broken = invariants::check_change(&before, &self.state);
+        assert!(broken.is_empty(), "{broken:#?}");
+        for effect in &effects {
+            match effect {
+                Effect::Store(writes) => self.journal.extend(writes.iter().filter_map(|write| match write {
+                    registry::Write::Journal(entry) => Some(entry.clone()),
+                    _ => None,
+                })),
+                Effect::Lookup { key } => drop(self.happen(Event::LookedUp { key: *key, known: None })?),
+                _ => {}
+            }
+        }
+        Ok(effects)
+    }
+
+    fn hear(&mut self, observation: Observation) {
+        for event in observe(&mut self.state, Millis(self.now), observation).expect("heard") {
+            self.happen(event).expect("what follows from the clock is taken");
+        }
+    }
+
+    /// `kill -9`, and a new coordinator on the same store.
+    fn restart(&mut self, alone: bool) {
+        let policy = self.state.policy.clone();
+        self.state = journal::replay(policy, self.journal.clone()).expect("the journal replays");
+        self.happen(Event::Started { alone, park: false }).expect("starts");
+    }
+
+    fn submit(&mut self, until: &str, workers: WorkerRange) -> RunId {
+        let event = Event::Submit {
+            pipeline: Box::new(pipelines::quickstart(1, workers, &[])),
+            source: String::new(),
+            idempotency_key: None,
+            until: Some(until.into()),
+        };
+        let effects = self.happen(event).expect("submitted");
+        let run = effects.into_iter().find_map(|effect| match effect {
+            Effect::Submitted(run) => Some(run),
+            _ => None,
+        });
+        run.expect("a submission gives a run")
+    }
+
+    fn join(&mut self, name: &str) -> Incarnation {
+        let join = Join {
+            protocol: PROTOCOL_VERSION,
+            worker: name.into(),
+            pid: 1,
+            backend: Backend::Flex,
+            peer_address: format!("{name}:1"),
+        };
+        let effects = self.happen(Event::Join { join }).expect("joined");
+        let joined = effects.into_iter().find_map(|effect| match effect {
+            Effect::Joined(incarnation) => Some(incarnation),
+            _ => None,
+        });
+        joined.expect("a join gives an incarnation")
+    }
+
+    fn poll(&mut self, name: &str, incarnation: Incarnation) {
+        let poll = Poll { incarnation, doing: Vec::new(), version: 0 };
+        self.hear(Observation::Poll { worker: name.into(), poll });
+    }
+
+    fn assignment(&self, name: &str) -> Option<Assignment> {
+        let worker: WorkerId = name.into();
+        let incarnation = self.state.workers[&worker].incarnation;
+        self.state.orders(&worker, incarnation).expect("known").assignments.into_iter().next()
+    }
+
+    fn report(&mut self, assignment: &Assignment, outcome: TaskOutcome) {
+        let report = ReportOutcome { grant: assignment.grant.clone(), outcome };
+        self.happen(Event::Outcome { report }).expect("taken");
+    }
+
+    fn run_state(&self, run: &RunId) -> RunState {
+        self.state.run(run).expect("known").state
+    }
+
+    fn is_held(&self) -> bool {
+        self.state.works.values().any(|work| work.is_busy())
+    }
+}
+
+fn failed(class: FailureClass) -> TaskOutcome {
+    TaskOutcome::Failed { class, message: "made up".into() }
+}
+
+/// Sampled: a worker that dies at each of 40 moments between two looks at the clock, 25 ms apart.
+#[test]
+fn p3_the_task_of_a_dead_worker_is_another_s_within_16_seconds() {
+    let policy = Policy::default();
+    assert_eq!((policy.lease_ms, policy.tick_ms), (15_000, 1_000), "what is promised is 15 s and 1 s");
+    for offset in (0..policy.tick_ms).step_by(25) {
+        let mut desk = Desk::new(Policy::default());
+        desk.submit("dataset", WorkerRange::default());
+        let a = desk.join("a");
+        let lost = desk.assignment("a").expect("the only worker gets it").grant;
+        let b = desk.join("b");
+        // The clock is looked at every second, from a moment that has nothing to do with when `a` was last heard.
+        let first = desk.now;
+        desk.now += offset;
+        desk.poll("a", a);
+        let heard = desk.now;
+        let mut tick = first;
+        let taken = loop {
+            tick += policy.tick_ms;
+            desk.now = tick;
+            desk.poll("b", b);
+            desk.hear(Observation::Tick);
+            if let Some(taken) = desk.assignment("b") {
+                break taken.grant;
+            }
+            assert!(tick < heard + 60_000, "never taken");
+        };
+        let after = desk.now - heard;
+        // The loss may be followed by a first back-off of half a second.
+        let bound = policy.lease_ms + policy.tick_ms;
+        assert!(after > policy.lease_ms, "a lease of {} ms ended after {after} ms", policy.lease_ms);
+        let backoff = policy.backoff(1).next_multiple_of(policy.tick_ms);
+        assert!(after <= bound + backoff, "offset {offset}: taken after {after} ms");
+        assert!(taken.fence > lost.fence && taken.attempt > lost.attempt);
+        let refused = ReportOutcome { grant: lost, outcome: failed(FailureClass::Fault) };
+        let refused = desk.happen(Event::Outcome { report: refused });
+        assert!(matches!(refused, Err(Rejected::StaleFence { .. })), "{refused:?}");
+    }
+}
+
+/// One restart after a simulated hour, with workers that come back at once, late within the lease, and never.
+#[test]
+fn p3_after_an_hour_without_a_coordinator_leases_get_one_interval_of_grace() {
+    for back_after in [0, 14_000] {
+        let mut desk = Desk::new(Policy::default());
+        desk.submit("dataset", WorkerRange::default());
+        let a = desk.join("a");
+        let held = desk.assignment("a").expect("held").grant;
+        desk.now += 3_600_000;
+        desk.restart(false);
+        for _ in 0..back_after / 1000 {
+            desk.hear(Observation::Tick);
+            desk.now += 1000;
+        }
+        desk.poll("a", a);
+        desk.hear(Observation::Tick);
+        assert_eq!(desk.assignment("a").expect("still its own").grant, held, "back after {back_after} ms");
+        // Then silent for good: nothing stays with it.
+        for _ in 0..17 {
+            desk.now += 1000;
+            desk.hear(Observation::Tick);
+        }
+        assert!(!desk.is_held(), "an orphan");
+    }
+}
+
+/// All pairs of budgets from 0 to 3, a restart of the coordinator between any two tries, both kinds of failure mixed.
+#[test]
+fn p15_each_budget_allows_exactly_one_try_more_than_it_says() {
+    for (faults, losses) in (0..4u32).flat_map(|f| (0..4u32).map(move |l| (f, l))) {
+        for class in [FailureClass::Fault, FailureClass::Infrastructure] {
+            let policy = Policy { fault_budget: faults, infrastructure_budget: losses, ..Policy::default() };
+            let (own, other) = match class {
+                FailureClass::Fault => (faults, losses),
+                _ => (losses, faults),
+            };
+            let mut desk = Desk::new(policy.clone());
+            let run = desk.submit("dataset", WorkerRange::default());
+            let mut others = 0;
+            let mut attempts = 0;
+            let mut streak = 0;
+            let a = desk.join("a");
+            loop {
+                let assignment = desk.assignment("a").expect("granted once the back-off is over");
+                attempts += 1;
+                // The other budget is used up on the way, to its end and no further.
+                let class = if others < other && attempts % 2 == 0 {
+                    others += 1;
+                    if class == FailureClass::Fault { FailureClass::Infrastructure } else { FailureClass::Fault }
+                } else {
+                    class
+                };
+                desk.report(&assignment, failed(class));
+                streak += 1;
+                desk.restart(false);
+                if desk.run_state(&run) == RunState::Failed {
+                    break;
+                }
+                let backoff = policy.backoff(streak);
+                assert!(backoff <= policy.backoff_max_ms);
+                desk.now += backoff - 1;
+                desk.poll("a", a);
+                desk.hear(Observation::Tick);
+                assert!(desk.assignment("a").is_none(), "granted before {backoff} ms were over");
+                desk.now += 1;
+                desk.hear(Observation::Tick);
+                assert!(attempts < 50, "never given up");
+            }
+            assert_eq!(attempts - others, own + 1, "budgets {faults} and {losses}, failing by {class:?}");
+            let view = desk.state.view(desk.state.run(&run).expect("known"), Millis(desk.now));
+            let message = view.stages[0].message.clone().unwrap_or_default();
+            assert!(message.contains("gave up after") && message.contains("made up"), "{message}");
+        }
+    }
+}
+
+/// Every class of failure that trying again cannot mend, after none and after two tries that could be mended.
+#[test]
+fn p15_a_final_failure_is_not_tried_again() {
+    for class in [FailureClass::Input, FailureClass::Diverged, FailureClass::OutOfMemory, FailureClass::Storage] {
+        for before in [0, 2] {
+            let mut desk = Desk::new(Policy::default());
+            let run = desk.submit("dataset", WorkerRange::default());
+            let a = desk.join("a");
+            for _ in 0..before {
+                let assignment = desk.assignment("a").expect("granted");
+                desk.report(&assignment, failed(FailureClass::Fault));
+                desk.now += desk.state.policy.backoff_max_ms;
+                desk.poll("a", a);
+                desk.hear(Observation::Tick);
+            }
+            let assignment = desk.assignment("a").expect("granted");
+            desk.report(&assignment, failed(class));
+            assert_eq!(desk.run_state(&run), RunState::Failed, "{class:?}");
+            let view = desk.state.view(desk.state.run(&run).expect("known"), Millis(desk.now));
+            assert_eq!(view.stages[0].state, StageState::Failed);
+            assert_eq!(view.stages[0].attempt.0, before + 1);
+            assert!(desk.assignment("a").is_none());
+            // Asked for again, it begins again.
+            desk.happen(Event::Control { run: run.clone(), action: Control::Resume }).expect("taken up");
+            assert!(desk.assignment("a").is_some());
+        }
+    }
+}
+
+/// A run in each of its states, made as a run gets there.
+fn in_state(state: RunState, held: bool) -> (Desk, RunId) {
+    let mut desk = Desk::new(Policy::default());
+    let run = desk.submit("dataset", WorkerRange::default());
+    let control = |desk: &mut Desk, action| desk.happen(Event::Control { run: run.clone(), action }).expect("taken");
+    if held || matches!(state, RunState::Finished | RunState::Failed) {
+        desk.join("a");
+    }
+    match state {
+        RunState::Running => {}
+        RunState::Paused => drop(control(&mut desk, Control::Pause)),
+        RunState::Cancelled => drop(control(&mut desk, Control::Cancel)),
+        RunState::Failed => {
+            let assignment = desk.assignment("a").expect("granted");
+            desk.report(&assignment, failed(FailureClass::Input));
+        }
+        RunState::Finished => {
+            let assignment = desk.assignment("a").expect("granted");
+            let output = Digest::of(b"clips");
+            desk.report(&assignment, TaskOutcome::Finished { output, metrics: Default::default() });
+        }
+    }
+    assert_eq!(desk.run_state(&run), state);
+    (desk, run)
+}
+
+/// The whole table: each state, idle and with a worker that never answers, asked for each action, with the coordinator
+/// killed before the event is stored, after it, and not at all. A process is not told by signal here: a worker that
+/// ignores everything loses its task when the grace is over, and with it the right to write.
+#[test]
+fn p14_pause_resume_and_cancel_end_where_the_table_says_whoever_is_killed() {
+    use RunState::{Cancelled, Failed, Finished, Paused, Running};
+    let table = [
+        (Running, [Some(Paused), Some(Running), Some(Cancelled)]),
+        (Paused, [Some(Paused), Some(Running), Some(Cancelled)]),
+        (Finished, [None, None, None]),
+        (Failed, [None, Some(Running), None]),
+        (Cancelled, [None, Some(Running), Some(Cancelled)]),
+    ];
+    for (state, row) in table {
+        for (action, expected) in [Control::Pause, Control::Resume, Control::Cancel].into_iter().zip(row) {
+            for held in [false, true] {
+                for killed in ["never", "before", "after"] {
+                    let case = format!("{state:?}, held: {held}, {action:?}, killed {killed}");
+                    let (mut desk, run) = in_state(state, held);
+                    if killed == "before" {
+                        // Nobody was answered, so the client asks again.
+                        desk.restart(false);
+                    }
+                    let asked = desk.happen(Event::Control { run: run.clone(), action });
+                    assert_eq!(asked.is_ok(), expected.is_some(), "{case}: {asked:?}");
+                    if killed == "after" {
+                        desk.restart(false);
+                    }
+                    let expected = expected.unwrap_or(state);
+                    assert_eq!(desk.run_state(&run), expected, "{case}");
+                    let begun = desk.now;
+                    let worker = desk.state.workers.contains_key(&"a".into());
+                    while desk.is_held() && expected != Running {
+                        desk.now += 1000;
+                        if worker {
+                            // It lives and polls, and does not do what it is told.
+                            desk.poll("a", desk.state.workers[&"a".into()].incarnation);
+                        }
+                        desk.hear(Observation::Tick);
+                        let limit = desk.state.policy.grace_ms + 5000;
+                        assert!(desk.now - begun <= limit, "{case}: still held after {limit} ms");
+                    }
+                    assert_eq!(desk.run_state(&run), expected, "{case}");
+                }
+            }
+        }
+    }
+}
+
+/// Draining with a worker that does not answer; then a new start gives the work out again.
+#[test]
+fn p14_a_drain_ends_though_a_worker_ignores_it() {
+    let (mut desk, run) = in_state(RunState::Running, true);
+    let a = desk.state.workers[&"a".into()].incarnation;
+    desk.happen(Event::Drain).expect("taken");
+    assert!(desk.assignment("a").is_some_and(|assignment| assignment.wind_down));
+    for _ in 0..(desk.state.policy.grace_ms / 1000 + 1) {
+        desk.now += 1000;
+        desk.poll("a", a);
+        desk.hear(Observation::Tick);
+    }
+    let waits = |desk: &Desk| {
+        let mut tasks = desk.state.works.values().flat_map(|work| &work.tasks);
+        tasks.all(|task| matches!(task.hold, Hold::Waiting { .. }))
+    };
+    assert!(waits(&desk), "released by force");
+    assert_eq!(desk.run_state(&run), RunState::Running, "the run itself was not asked to stop");
+    assert!(desk.state.orders(&"a".into(), a).expect("known").leave);
+    desk.restart(false);
+    desk.poll("a", a);
+    assert!(desk.assignment("a").is_some(), "a new start gives it out again");
+}

@@ -1,0 +1,19 @@
+//! The fixed tree along which the slices of a step are summed, for a gang that is in one place. A gang over a network sums the
+//! same tree piece by piece (`worker::gang`); its tests hold the two together.
+
+/// The sum of `parts` along the fixed tree: a range is split at the largest power of two below its length.
+///
+/// # Panics
+/// If there are no parts, or parts of several lengths.
+pub fn tree_sum(parts: &[Vec<f32>]) -> Vec<f32> {
+    if let [only] = parts {
+        return only.clone();
+    }
+    let (left, right) = parts.split_at(parts.len().next_power_of_two() / 2);
+    let (mut sum, right) = (tree_sum(left), tree_sum(right));
+    assert_eq!(sum.len(), right.len(), "slices give vectors of one length");
+    for (a, b) in sum.iter_mut().zip(right) {
+        *a += b;
+    }
+    sum
+}

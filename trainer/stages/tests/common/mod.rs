@@ -1,0 +1,91 @@
+//! Every kind of stage at sizes at which a step takes a few milliseconds.
+
+use protocol::Steps;
+use protocol::stage::{
+    Batch, DataSynthetic, Decay, DistillLcm, DistillPcm, Distillation, EncodeLatents, EvaluateLatentFid,
+    EvaluateReconstruction, LatentShape, Network, Optimizer, Sampler, StageSettings, TextEmbed, TrainMld, TrainVae,
+    Training,
+};
+
+fn network() -> Network {
+    Network { width: 16, layers: 3, heads: 2, feed_forward: 32, ..Network::default() }
+}
+
+fn training(steps: u64) -> Training {
+    Training {
+        steps: Steps(steps),
+        batch: Batch { global: 6, slices: 6 },
+        lr: 1e-3,
+        warmup: Steps(2),
+        decay: Decay::Cosine,
+        optimizer: Optimizer::default(),
+        max_grad_norm: 1.0,
+    }
+}
+
+fn distillation(steps: u64) -> Distillation {
+    Distillation {
+        training: training(steps),
+        guidance_dim: 16,
+        guidance: (0.5, 5.0),
+        ..DistillLcm::default().distillation
+    }
+}
+
+/// Name, settings and inputs (field, stage).
+pub(crate) type Link = (&'static str, StageSettings, Vec<(&'static str, &'static str)>);
+
+/// Steps of the training stages, in order: vae, mld, lcm, pcm.
+pub(crate) type Steps4 = [u64; 4];
+
+/// The stages in order.
+pub(crate) fn chain(shards: usize, steps: Steps4) -> Vec<Link> {
+    let data = DataSynthetic { clips: 24, val: 0.1, test: 0.25, mirror: false };
+    let vae = TrainVae {
+        latent: LatentShape { tokens: 2, dim: 8 },
+        network: network(),
+        training: training(steps[0]),
+        ..TrainVae::default()
+    };
+    let mld = TrainMld { network: network(), ema: 0.9, training: training(steps[1]), ..TrainMld::default() };
+    let lcm = DistillLcm { distillation: distillation(steps[2]) };
+    let pcm = DistillPcm { phases: 2, distillation: distillation(steps[3]), ..DistillPcm::default() };
+    let evaluate = |model: &str, teacher: &str, steps: usize, guidance: f64| {
+        StageSettings::EvaluateLatentFid(EvaluateLatentFid {
+            model: model.into(),
+            teacher: teacher.into(),
+            sampler: Sampler { steps, guidance, timesteps: vec![] },
+            repeats: 2,
+            samples: 2,
+            components: 4,
+            shards,
+            ..EvaluateLatentFid::default()
+        })
+    };
+    let latent = |model| vec![("model", model), ("latents", "latents"), ("text", "text"), ("teacher", "mld")];
+    let teacher = || vec![("teacher", "mld"), ("latents", "latents"), ("text", "text")];
+    vec![
+        ("dataset", StageSettings::DataSynthetic(data), vec![]),
+        ("text", StageSettings::TextEmbed(TextEmbed::default()), vec![("dataset", "dataset")]),
+        ("vae", StageSettings::TrainVae(vae), vec![("dataset", "dataset")]),
+        (
+            "latents",
+            StageSettings::EncodeLatents(EncodeLatents { crops: 3, shards, ..EncodeLatents::default() }),
+            vec![("dataset", "dataset"), ("vae", "vae")],
+        ),
+        (
+            "reconstruction",
+            StageSettings::EvaluateReconstruction(EvaluateReconstruction {
+                shards,
+                ..EvaluateReconstruction::default()
+            }),
+            vec![("dataset", "dataset"), ("vae", "vae")],
+        ),
+        ("mld", StageSettings::TrainMld(mld), vec![("vae", "vae"), ("latents", "latents"), ("text", "text")]),
+        ("lcm", StageSettings::DistillLcm(lcm), teacher()),
+        ("pcm", StageSettings::DistillPcm(pcm), teacher()),
+        ("eval-mld", evaluate("mld", "mld", 4, 3.0), latent("mld")),
+        ("eval-lcm", evaluate("lcm", "mld", 2, 2.0), latent("lcm")),
+        ("eval-pcm", evaluate("pcm", "mld", 2, 2.0), latent("pcm")),
+    ]
+}

@@ -1,0 +1,115 @@
+//! A training stage that is killed at any step, and any number of times, ends with the bytes of one that is not.
+//!
+//! In memory: a kill of all members loses everything but the committed checkpoints, which is what `kill -9` of the whole
+//! gang leaves. The process tests do the same to real processes at sampled steps.
+
+mod common;
+
+use std::collections::BTreeMap;
+
+use protocol::stage::{CheckpointPolicy, Shape, StageSettings};
+use protocol::{Digest, Steps};
+use stages::testing::{Bench, Script};
+
+/// Steps of the stage that is killed at every step.
+const STEPS: u64 = 60;
+
+/// A stage to be disturbed: the world before it, its settings, its inputs, and what it should give.
+struct Case {
+    bench: Bench,
+    settings: StageSettings,
+    inputs: Vec<(&'static str, Digest)>,
+    expected: Digest,
+}
+
+/// Runs everything up to the stage `name`, and that stage undisturbed by one member.
+fn case(name: &str, steps: common::Steps4) -> Case {
+    let mut bench = Bench::new(burn::tensor::Device::flex(), 7, 1);
+    // No divisor of the steps, and not in step with the batches.
+    bench.checkpoint = CheckpointPolicy { every: Steps(7), ..CheckpointPolicy::default() };
+    let mut outputs: BTreeMap<&'static str, Digest> = BTreeMap::new();
+    for (stage, settings, inputs) in common::chain(2, steps) {
+        let inputs: Vec<_> = inputs.iter().map(|(field, from)| (*field, outputs[from])).collect();
+        let output = bench.run(stage, &settings, &inputs).unwrap_or_else(|e| panic!("{stage}: {e}")).output();
+        if stage == name {
+            return Case { bench, settings, inputs, expected: output };
+        }
+        outputs.insert(stage, output);
+    }
+    panic!("no stage {name}")
+}
+
+impl Case {
+    /// Runs the stage afresh, with all members killed at each of `kills` and started again in other numbers; then to its
+    /// end. `as_name` is for people.
+    fn run(&mut self, name: &str, as_name: &str, kills: &[u64]) {
+        self.bench.forget(name);
+        for (round, step) in kills.iter().enumerate() {
+            let members = 1 + round % 3;
+            self.bench.members = members;
+            self.bench.script = Script { lost: (0..members).map(|m| (m, *step)).collect(), ..Script::default() };
+            let killed = self.bench.run(name, &self.settings, &self.inputs);
+            assert!(killed.is_err(), "{as_name}: over before the kill at step {step}");
+        }
+        self.bench.script = Script::default();
+        self.bench.members = 1 + kills.len() % 2;
+        let ran = self.bench.run(name, &self.settings, &self.inputs).unwrap_or_else(|e| panic!("{as_name}: {e}"));
+        assert_eq!(ran.output(), self.expected, "{as_name}");
+    }
+}
+
+/// All 60 steps of every kind of training stage, one after the other. A kill at a step loses what came after the last
+/// checkpoint before it; from there the next checkpoint is reached again, and must be the same object. The last one goes on
+/// to the end.
+#[test]
+fn p5_a_kill_at_every_step_changes_no_byte() {
+    for name in ["vae", "mld", "lcm", "pcm"] {
+        let mut case = case(name, [STEPS; 4]);
+        let whole: BTreeMap<u64, _> = case.bench.forget_after(name, 0).into_iter().collect();
+        assert_eq!(whole.keys().copied().collect::<Vec<_>>(), [7, 14, 21, 28, 35, 42, 49, 56, STEPS], "{name}");
+        for step in 0..STEPS {
+            case.bench.script = Script { lost: vec![(0, step)], ..Script::default() };
+            assert!(case.bench.run(name, &case.settings, &case.inputs).is_err(), "{name}: over before step {step}");
+            let next = *whole.range(step + 1..).next().expect("the last is one").0;
+            case.bench.script = Script { wind_down: Some(next - 1), ..Script::default() };
+            let ran = case.bench.run(name, &case.settings, &case.inputs);
+            let ran = ran.unwrap_or_else(|e| panic!("{name} killed at step {step}: {e}"));
+            let (at, saved) = case.bench.newest(name).expect("it has saved");
+            assert_eq!((*at, saved.digest()), (next, whole[&next].digest()), "{name} killed at step {step}");
+            if next == STEPS {
+                assert_eq!(ran.output(), case.expected, "{name} killed at step {step}");
+            }
+            case.bench.forget_after(name, step + 1);
+        }
+    }
+}
+
+/// Chains of 1, 2 and 5 kills with 1 to 3 members in turn, for every kind of training stage: some right after a
+/// checkpoint, some before the first, two at one step.
+#[test]
+fn p5_chains_of_1_2_and_5_kills_change_no_byte() {
+    let chains: [&[u64]; 3] = [&[13], &[7, 8], &[2, 9, 9, 15, 17]];
+    for name in ["vae", "mld", "lcm", "pcm"] {
+        let mut case = case(name, [18; 4]);
+        for chain in chains {
+            case.run(name, &format!("{name} killed at {chain:?}"), chain);
+        }
+    }
+}
+
+/// 1 -> 3 -> 2 -> 1 members within one stage, without a restart, for every kind of training stage. The joiners take the
+/// state of a peer, the first member is lost, and so is one of the joiners,
+/// in one order or the other.
+#[test]
+fn p6_members_1_to_3_to_2_to_1_change_no_byte() {
+    for name in ["vae", "mld", "lcm", "pcm"] {
+        let mut case = case(name, [24; 4]);
+        assert_eq!(case.settings.shape(), Shape::Gang);
+        case.bench.forget(name);
+        case.bench.members = 1;
+        let lost = if name == "vae" { vec![(0, 13), (2, 19)] } else { vec![(2, 13), (0, 19)] };
+        case.bench.script = Script { joins: vec![(1, 5), (2, 5)], lost, wind_down: None };
+        let ran = case.bench.run(name, &case.settings, &case.inputs).unwrap_or_else(|e| panic!("{name}: {e}"));
+        assert_eq!(ran.output(), case.expected, "{name}");
+    }
+}
