@@ -7,6 +7,7 @@
 mod pipelines;
 mod random;
 mod store;
+mod sweeps;
 mod wild;
 mod worker;
 
@@ -46,6 +47,11 @@ struct World {
     cancelled: Vec<RunId>,
     /// Try every event now and then.
     wild: bool,
+    /// Kill the coordinator after each stored event whose number is a multiple of the first, from the second on; its answer is lost.
+    kills: Option<(u64, u64)>,
+    /// Only the first of them.
+    once: bool,
+    stored: u64,
 }
 
 fn policy() -> Policy {
@@ -61,8 +67,12 @@ impl World {
                 let max = random.below(4) as usize;
                 let range = WorkerRange { min: 1, max };
                 let gates: &[&str] = if random.chance(15) { &["never <= 0"] } else { &["latent_fid <= 1"] };
+                let pipeline = match random.below(4) {
+                    0 => pipelines::swept(random.below(2), 4 + random.below(8)),
+                    _ => pipelines::quickstart(random.below(2), range, gates),
+                };
                 let event = Event::Submit {
-                    pipeline: Box::new(pipelines::quickstart(random.below(2), range, gates)),
+                    pipeline: Box::new(pipeline),
                     source: String::new(),
                     idempotency_key: random.chance(30).then(|| format!("key-{i}")),
                     until: random.chance(20).then(|| "mld".into()),
@@ -86,6 +96,9 @@ impl World {
             events: 0,
             cancelled: Vec::new(),
             wild: false,
+            kills: None,
+            once: false,
+            stored: 0,
         }
     }
 
@@ -119,6 +132,23 @@ impl World {
             assert_eq!(durable(&next), durable(&self.state), "{event:?} changed something without a write");
         }
         self.state = next;
+        self.stored += 1;
+        let started = self.store.journal.last().is_some_and(|entry| entry["event"] == "started");
+        if let Some((every, from)) = self.kills
+            && !started
+            && self.stored >= from
+            && self.stored.is_multiple_of(every)
+        {
+            self.effects.clear();
+            if self.once {
+                self.kills = None;
+            }
+            let recovered = journal::replay(policy(), self.store.journal.clone()).expect("the journal replays");
+            assert_eq!(durable(&recovered), durable(&self.state), "replay gives what was");
+            self.state = recovered;
+            self.happen(Event::Started { alone: false, park: false }).expect("starts again");
+            return Err(Refused::Store(Refusal::Full));
+        }
         for effect in &effects {
             if let Effect::Lookup { .. } | Effect::Register { .. } = effect {
                 let at = self.now.after(self.random.below(if self.chaos() { 3000 } else { 10 }));
