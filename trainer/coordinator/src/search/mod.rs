@@ -18,6 +18,7 @@ mod grid;
 mod random;
 
 use std::ops::Range;
+use std::sync::Arc;
 
 use protocol::stage::{Mode, StageSettings};
 use protocol::sweep::{SearchKind, Sweep, Values};
@@ -70,7 +71,8 @@ pub struct Search {
     factor: usize,
     parallel: usize,
     rungs: Vec<u64>,
-    trials: Vec<Values>,
+    /// Never changes; shared, because a decision copies the state.
+    trials: Arc<[Values]>,
     tickets: Vec<Ticket>,
     /// By ticket; filled in any order.
     scores: Vec<Option<Score>>,
@@ -97,7 +99,7 @@ impl Search {
             factor: usize::try_from(sweep.rungs.factor.max(2)).unwrap_or(usize::MAX),
             parallel: sweep.parallel.max(1),
             rungs: sweep.rungs(budget),
-            trials,
+            trials: trials.into(),
             tickets: Vec::new(),
             scores: Vec::new(),
             folded: 0,

@@ -133,9 +133,11 @@ impl World {
         }
         self.state = next;
         self.stored += 1;
-        let started = self.store.journal.last().is_some_and(|entry| entry["event"] == "started");
+        // Whoever never hears that it has joined joins for ever.
+        let spared: &[&str] = if self.once { &["started"] } else { &["started", "join"] };
+        let spared = self.store.journal.last().is_some_and(|entry| spared.iter().any(|event| entry["event"] == *event));
         if let Some((every, from)) = self.kills
-            && !started
+            && !spared
             && self.stored >= from
             && self.stored.is_multiple_of(every)
         {

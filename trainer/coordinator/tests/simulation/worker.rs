@@ -229,7 +229,7 @@ impl FakeWorker {
             return self.report(grant, TaskOutcome::Yielded { at: before });
         }
         if before >= steps {
-            if leads && stop.is_some() && self.saved_at != before {
+            if leads && stop.is_some() && saved != before {
                 return self.commit(grant, before);
             }
             if leads {
