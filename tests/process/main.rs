@@ -7,3 +7,4 @@ mod determinism;
 mod failpoints;
 mod registry;
 mod storage;
+mod sweeps;
