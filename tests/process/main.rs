@@ -8,4 +8,5 @@ mod determinism;
 mod failpoints;
 mod registry;
 mod storage;
+mod sweeps;
 mod verify;

@@ -12,6 +12,7 @@ mod problem;
 mod progress;
 mod run;
 mod summary;
+mod sweep_plot;
 mod verify;
 
 use std::process::ExitCode;

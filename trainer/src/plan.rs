@@ -2,9 +2,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use protocol::pipeline::{Pipeline, PipelineStage};
-use protocol::{Digest, StageName, TaskId};
-use registry::{RunRow, Store};
+use coordinator::search::{Score, Search, Ticket};
+use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
+use protocol::sweep::{STATE_OUTPUT, rung_name};
+use protocol::{ArtifactKind, Digest, StageName, Steps, TaskId};
+use registry::{RunRow, StageResultRow, Store};
 use serde::Serialize;
 use serde_json::Value;
 
@@ -49,6 +51,17 @@ struct Known {
 async fn known(pipeline: &Pipeline, store: Option<&Store>) -> Result<Known> {
     let mut known = Known { keys: BTreeMap::new(), outputs: BTreeMap::new(), made_by: BTreeMap::new() };
     for stage in &pipeline.stages {
+        if stage.sweep.is_some() {
+            if let Some(store) = store
+                && let Some((key, row)) = best_of_sweep(pipeline, stage, &known.outputs, store).await?
+            {
+                known.keys.insert(stage.name.clone(), key);
+                known.made_by.insert(stage.name.clone(), row.run.to_string());
+                let output = row.outputs.get(stage.settings.output().0).copied();
+                known.outputs.extend(output.map(|output| (stage.name.clone(), output)));
+            }
+            continue;
+        }
         let inputs: Option<BTreeMap<String, Digest>> =
             stage.inputs.iter().map(|input| Some((input.field.clone(), *known.outputs.get(&input.stage)?))).collect();
         let Some(inputs) = inputs else { continue };
@@ -62,6 +75,48 @@ async fn known(pipeline: &Pipeline, store: Option<&Store>) -> Result<Known> {
         }
     }
     Ok(known)
+}
+
+/// The best trial of a sweep, if the store has all that the sweep would ask for: the searcher is asked, with the store's results.
+async fn best_of_sweep(
+    pipeline: &Pipeline,
+    stage: &PipelineStage,
+    outputs: &BTreeMap<StageName, Digest>,
+    store: &Store,
+) -> Result<Option<(Digest, StageResultRow)>> {
+    let Some(sweep) = &stage.sweep else { return Ok(None) };
+    let mut search = Search::new(sweep, &stage.settings, &stage.name, pipeline.seed);
+    let mut made: BTreeMap<StageName, (Digest, StageResultRow)> = BTreeMap::new();
+    let mut next = 0;
+    while let Some(ticket) = search.tickets().get(next).copied() {
+        next += 1;
+        let Ticket::Rung { trial, rung } = ticket else { continue };
+        let stop = search.stop(rung).map(Steps);
+        let Ok(stages) = stage.rung(trial, rung, stop, &search.trials()[trial]) else {
+            search.report(next - 1, Score::Failed);
+            continue;
+        };
+        let mut score = Score::Failed;
+        for stage in stages {
+            let read = |input: &StageInput| match (made.get(&input.stage), input.kind) {
+                (Some((_, row)), ArtifactKind::Checkpoint) => row.outputs.get(STATE_OUTPUT).copied(),
+                (Some((_, row)), _) => {
+                    row.outputs.iter().find(|(name, _)| *name != STATE_OUTPUT).map(|(_, output)| *output)
+                }
+                (None, _) => outputs.get(&input.stage).copied(),
+            };
+            let inputs: Option<BTreeMap<String, Digest>> =
+                stage.inputs.iter().map(|input| Some((input.field.clone(), read(input)?))).collect();
+            let Some(inputs) = inputs else { return Ok(None) };
+            let key = pipeline.identity(&stage, &inputs).key();
+            let Some(row) = store.stage_result(key).await? else { return Ok(None) };
+            score = row.metrics.get(&sweep.metric).map_or(Score::Failed, |value| Score::of(*value));
+            made.insert(stage.name, (key, row));
+        }
+        search.report(next - 1, score);
+    }
+    let last = search.rungs().len() - 1;
+    Ok(search.best().and_then(|(trial, _)| made.remove(&rung_name(&stage.name, trial, last))))
 }
 
 /// Says what a run of `pipeline` on `store` would do; `None` is a store that does not exist yet.
@@ -90,6 +145,10 @@ pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&Store>) -> Result<P
                 _ => None,
             };
             match (resume, upstream) {
+                (None, None) if stage.sweep.is_some() => {
+                    let trials = stage.sweep.as_ref().map_or(0, protocol::sweep::Sweep::trials);
+                    ("run", format!("a sweep of up to {trials} trials; those that are known are not run again"))
+                }
                 (Some(why), _) => ("resume", why),
                 (None, Some(input)) => ("run", format!("upstream `{}` runs", input.stage)),
                 (None, None) => ("run", difference(pipeline, stage, &earlier)),

@@ -203,6 +203,7 @@ mod tests {
             attempt: protocol::Attempt(1),
             workers: vec!["w1".into(), "w2".into()],
             message: None,
+            of: None,
         }
     }
 

@@ -274,7 +274,7 @@ fn report(view: &RunView, pipeline: &Pipeline, end: &End, options: &Options) -> 
             exit::CANCELLED
         }
         RunState::Running | RunState::Paused | RunState::Failed => {
-            let failed = view.stages.iter().filter(|stage| stage.state == StageState::Failed);
+            let failed = view.stages.iter().filter(|stage| stage.state == StageState::Failed && stage.of.is_none());
             let reasons: Vec<String> = failed
                 .map(|stage| {
                     format!("stage `{}` failed: {}", stage.name, stage.message.as_deref().unwrap_or("no reason given"))

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use protocol::message::{RunState, RunView, StageState, StageView};
+use protocol::message::{RunState, RunView, StageState, StageView, SweepView};
 use protocol::pipeline::Pipeline;
 use protocol::stage::StageSettings;
 use protocol::{Digest, StageName};
@@ -18,6 +18,8 @@ pub(crate) struct Summary {
     pipeline: String,
     state: String,
     stages: Vec<StageSummary>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    sweeps: Vec<SweepView>,
 }
 
 #[derive(Debug, Serialize)]
@@ -31,6 +33,9 @@ struct StageSummary {
     wall_s: f64,
     #[serde(skip_serializing_if = "Option::is_none")]
     message: Option<String>,
+    /// The swept stage that it is a trial of.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    of: Option<StageName>,
 }
 
 impl Summary {
@@ -45,6 +50,7 @@ impl Summary {
             metrics: stage.metrics.clone(),
             wall_s: stage.wall_s,
             message: stage.message.clone(),
+            of: stage.of.clone(),
         };
         let interrupted = interrupted && !run.state.is_final();
         Self {
@@ -53,6 +59,7 @@ impl Summary {
             pipeline: run.pipeline.clone(),
             state: if interrupted { "interrupted".to_owned() } else { run_state(run.state).to_owned() },
             stages: run.stages.iter().map(stage).collect(),
+            sweeps: run.sweeps.clone(),
         }
     }
 }
@@ -82,9 +89,9 @@ pub(crate) fn run_state(state: RunState) -> &'static str {
     }
 }
 
-/// The stages of a run, one a line.
+/// The stages of a run, one a line, and a line for each sweep. Trials are for `trainer sweep status`.
 pub(crate) fn table(run: &RunView) -> String {
-    let rows = run.stages.iter().map(|stage| {
+    let rows = run.stages.iter().filter(|stage| stage.of.is_none()).map(|stage| {
         let progress = &stage.progress;
         let steps = if progress.total > 0 { format!("{}/{}", progress.done, progress.total) } else { String::new() };
         vec![
@@ -97,7 +104,27 @@ pub(crate) fn table(run: &RunView) -> String {
             headline(stage),
         ]
     });
-    print::table(&["STAGE", "KIND", "STATE", "DONE", "TIME", "KEY", "RESULT"], rows.collect())
+    let table = print::table(&["STAGE", "KIND", "STATE", "DONE", "TIME", "KEY", "RESULT"], rows.collect());
+    run.sweeps.iter().fold(table, |text, sweep| format!("{text}\n\nsweep of {}", sweep_line(sweep)))
+}
+
+/// `pcm: trial 7 is best, latent_fid 0.1234 with adversarial 0.1; 24 trials, 5200 of 21600 steps (24 %)`.
+pub(crate) fn sweep_line(sweep: &SweepView) -> String {
+    let best =
+        sweep.best.and_then(|best| sweep.trials.get(best)).map_or("no trial is at its end yet".to_owned(), |best| {
+            let value = best.results.last().copied().flatten().unwrap_or(f64::NAN);
+            let values: Vec<String> = best.values.iter().map(|(path, value)| format!("{path} {value}")).collect();
+            format!(
+                "trial {} is best, {} {} with {}",
+                best.trial,
+                sweep.metric,
+                print::number(value),
+                values.join(", ")
+            )
+        });
+    let percent = 100.0 * sweep.spent as f64 / sweep.full.max(1) as f64;
+    let (stage, trials, spent, full) = (&sweep.stage, sweep.trials.len(), sweep.spent, sweep.full);
+    format!("{stage}: {best}; {trials} trials, {spent} of {full} steps ({percent:.0} %)")
 }
 
 /// A table for each kind of evaluation that the run has several of, in the papers' column order.
@@ -120,6 +147,9 @@ pub(crate) fn evaluations(run: &RunView) -> String {
 fn headline(stage: &StageView) -> String {
     if matches!(stage.state, StageState::Failed | StageState::Skipped) {
         return stage.message.clone().unwrap_or_default().lines().next().unwrap_or_default().chars().take(90).collect();
+    }
+    if let (StageState::Running, Some(message)) = (stage.state, &stage.message) {
+        return message.clone();
     }
     let first = ["latent_fid", "fid", "mpjpe", "mpjpe_mm", "loss"]
         .into_iter()
@@ -167,12 +197,14 @@ mod tests {
             attempt: protocol::Attempt(1),
             workers: vec![],
             message: None,
+            of: None,
         };
         RunView {
             run: "p-1".into(),
             pipeline: "p".into(),
             state: RunState::Finished,
             stages: states.iter().map(stage).collect(),
+            sweeps: vec![],
         }
     }
 

@@ -131,7 +131,7 @@ impl Deciding<'_> {
                 if self.state.works.get(&key).is_none_or(|work| work.state != WorkState::Bundling) {
                     return Ok(false);
                 }
-                self.fail_work(key, message);
+                self.fail_work(key, message, true);
             }
         }
         Ok(true)
@@ -196,7 +196,7 @@ impl Deciding<'_> {
         let id = run.id.clone();
         for i in 0..self.state.runs.len() {
             let old = &self.state.runs[i];
-            if old.parked && old.state == RunState::Paused && old.pipeline.digest() == run.pipeline.digest() {
+            if old.parked && old.state == RunState::Paused && old.submitted.digest() == run.submitted.digest() {
                 Arc::make_mut(&mut self.state.runs[i]).skip_rest(&format!("taken over by run `{id}`"));
                 self.set_run_state(i, RunState::Cancelled);
             }
@@ -370,15 +370,15 @@ impl Deciding<'_> {
         *count += u32::from(!winding);
         if *count > budget {
             let message = format!("gave up after {count} {what}; the last: {why}");
-            self.fail_work(key, message);
+            self.fail_work(key, message, fault);
             return;
         }
         let fence = task.release((!winding).then(|| now.after(policy.backoff(task.streak))));
         self.fences.push(fence);
     }
 
-    pub(crate) fn fail_work(&mut self, key: Digest, message: String) {
-        let mut fences = self.state.work_mut(key).fail(message);
+    pub(crate) fn fail_work(&mut self, key: Digest, message: String, own: bool) {
+        let mut fences = self.state.work_mut(key).fail(message, own);
         self.fences.append(&mut fences);
     }
 
@@ -413,7 +413,7 @@ impl Deciding<'_> {
         let state = serde_json::to_value(run.state).expect("a state is a word");
         self.writes.push(Write::Run {
             run: run.id.clone(),
-            pipeline: serde_json::to_value(&*run.pipeline).expect("a pipeline serialises"),
+            pipeline: serde_json::to_value(&*run.submitted).expect("a pipeline serialises"),
             source: run.source.clone(),
             state: state.as_str().unwrap_or_default().to_owned(),
             idempotency_key: run.idempotency_key.clone(),

@@ -15,6 +15,7 @@
 //! | C10 | A run is finished exactly if all that was asked for is done, and failed only with a failed stage. |
 //! | C11 | While a small task is ready and not backing off, no worker of its backend is idle. |
 //! | C12 | A checkpoint's steps grow within a task. |
+//! | C13 | A stage that is swept has a searcher that is not over, and a place for each of its tickets. |
 
 use std::collections::BTreeSet;
 
@@ -67,8 +68,17 @@ pub fn check(state: &State) -> Vec<String> {
                 broken.push(format!("C9: stage {i} of `{}` is active and its work is over", run.id));
             }
         }
-        let failed = run.stages.iter().any(|status| matches!(status, Status::Failed { .. }));
-        let open = run.stages.iter().any(|status| matches!(status, Status::Waiting | Status::Active { .. }));
+        let failed = run.failed().is_some();
+        let open = |status: &Status| matches!(status, Status::Waiting | Status::Sweeping | Status::Active { .. });
+        let open = run.stages.iter().any(open);
+        for (i, status) in run.stages.iter().enumerate().filter(|(_, status)| **status == Status::Sweeping) {
+            if run
+                .sweep(i)
+                .is_none_or(|sweep| sweep.search.is_over() || sweep.places.len() != sweep.search.tickets().len())
+            {
+                broken.push(format!("C13: stage {i} of `{}` is {status:?}, and its searcher is not", run.id));
+            }
+        }
         let fits = match run.state {
             RunState::Running | RunState::Paused => !failed && open,
             RunState::Finished => !failed && !open,

@@ -16,9 +16,11 @@ mod outcome;
 pub mod policy;
 pub mod register;
 mod schedule;
+pub mod search;
 mod settle;
 pub mod shell;
 pub mod state;
+mod sweep;
 mod view;
 
 pub use decide::decide;

@@ -12,13 +12,14 @@
 use std::collections::BTreeMap;
 
 use protocol::message::{CommitCheckpoint, FailureClass, ReportOutcome, TaskOutcome};
-use protocol::stage::Keep;
+use protocol::stage::{Keep, StageSettings};
+use protocol::sweep::STATE_OUTPUT;
 use protocol::{Digest, WorkerId};
 use registry::Write;
 
 use crate::decide::{Deciding, result};
 use crate::event::{Effect, Known, Rejected};
-use crate::state::task::{Hold, Part, Saved};
+use crate::state::task::{Hold, Part, Saved, Task};
 use crate::state::work::WorkState;
 
 impl Deciding<'_> {
@@ -64,7 +65,7 @@ impl Deciding<'_> {
                 if rank != 0 {
                     return Err(only_rank_0(&worker, "reports the end"));
                 }
-                self.finished(&report, key, i, *output, metrics.clone());
+                self.finished(&report, key, i, *output, metrics.clone())?;
             }
             TaskOutcome::Yielded { .. } => {
                 if rank != 0 {
@@ -84,7 +85,8 @@ impl Deciding<'_> {
                     | FailureClass::Diverged
                     | FailureClass::OutOfMemory
                     | FailureClass::Storage => {
-                        self.fail_work(key, format!("stage `{stage}`: {message}"));
+                        let own = *class != FailureClass::Storage;
+                        self.fail_work(key, format!("stage `{stage}`: {message}"), own);
                         self.accepted(key, i, &report);
                         return Ok(true);
                     }
@@ -111,17 +113,20 @@ impl Deciding<'_> {
         i: usize,
         output: Digest,
         metrics: BTreeMap<String, f64>,
-    ) {
+    ) -> Result<(), Rejected> {
         let now = self.now();
         let grant = report.grant.clone();
         let work = self.state.work_mut(key);
+        let state = left_state(&work.settings, &work.tasks[i])?;
         work.tasks[i].finish(output);
         if let Part::Shard { .. } = work.tasks[i].part {
             self.writes.push(Write::Shard { grant, output });
-            return;
+            return Ok(());
         }
         let (name, _) = work.settings.output();
-        let known = Known { outputs: BTreeMap::from([(name.to_owned(), output)]), metrics };
+        let mut outputs = BTreeMap::from([(name.to_owned(), output)]);
+        outputs.extend(state.map(|state| (STATE_OUTPUT.to_owned(), state)));
+        let known = Known { outputs, metrics };
         let write = result(work, Some(grant), &known, now);
         work.state = WorkState::Done { known, cached: false };
         self.writes.push(write);
@@ -131,6 +136,21 @@ impl Deciding<'_> {
             let keep = Keep { latest: 2, best: 0 };
             self.effects.push(Effect::Prune { task: report.grant.task.clone(), keep });
         }
+        Ok(())
+    }
+}
+
+/// The state that a stage leaves which stops before its schedule's end: the checkpoint of its last step, which every training saves.
+fn left_state(settings: &StageSettings, task: &Task) -> Result<Option<Digest>, Rejected> {
+    let Some(training) = settings.training().filter(|training| training.stop.is_some()) else { return Ok(None) };
+    let end = training.end().0;
+    match task.newest() {
+        Some(saved) if saved.step == end => Ok(Some(saved.manifest)),
+        other => Err(Rejected::Conflict(format!(
+            "task `{}` stops at step {end} for another stage to go on from, but its newest checkpoint is of step {:?}",
+            task.id,
+            other.map(|saved| saved.step)
+        ))),
     }
 }
 

@@ -12,7 +12,7 @@ use registry::Write;
 use serde_json::json;
 
 use crate::event::{Candidate, Known};
-use crate::state::run::Run;
+use crate::state::run::{Run, value};
 
 /// All that a register stage needs to know, once its inputs are there.
 #[derive(Debug, Clone, PartialEq)]
@@ -91,7 +91,7 @@ impl Registration {
 }
 
 fn output(run: &Run, stage: &StageName) -> Option<Digest> {
-    run.status(stage)?.known()?.outputs.values().next().copied()
+    value(run.status(stage)?.known()?).copied()
 }
 
 /// The VAE behind a denoiser: the one it reads, or its teacher's.

@@ -5,7 +5,7 @@
 //! that are ready, one worker each: they are short, and much waits for them. Then gangs that are under way take in whoever
 //! is left, up to their `max`; then gangs that wait start with everybody who is left. A gang does not start while a map
 //! stage that its workers could merge is almost done (its last shards are out), or the merge would wait for the whole
-//! training.
+//! training; one that takes a single worker leaves the others to it.
 
 use protocol::message::Member;
 use protocol::stage::Backend;
@@ -90,7 +90,7 @@ fn start_gangs(cx: &mut Deciding<'_>, key: Digest) {
         let task = &work.tasks[i];
         if task.part == Part::Gang
             && task.is_free(now)
-            && !merge_is_near(cx.state, work.backend)
+            && (work.placement.workers.max == 1 || !merge_is_near(cx.state, work.backend))
             && let Some(members) = gang::start(&idle(cx.state, work.backend), work.placement.workers)
         {
             grant(cx, key, i, members);

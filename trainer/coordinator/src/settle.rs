@@ -20,18 +20,18 @@ impl Deciding<'_> {
     pub(crate) fn settle(&mut self) {
         for i in 0..self.state.runs.len() {
             loop {
-                let over = self.take_over_results(i);
+                let mut moved = self.take_over_results(i);
+                moved |= self.sweep(i);
                 let settled = self.state.runs[i].settled();
                 if settled != self.state.runs[i].state {
                     if settled == RunState::Failed {
                         let run = Arc::make_mut(&mut self.state.runs[i]);
-                        let failed = run.stages.iter().position(|s| matches!(s, Status::Failed { .. }));
-                        let name = failed.map(|j| run.pipeline.stages[j].name.to_string()).unwrap_or_default();
+                        let name = run.failed().map(|j| run.pipeline.stages[j].name.to_string()).unwrap_or_default();
                         run.skip_rest(&format!("stage `{name}` failed"));
                     }
                     self.set_run_state(i, settled);
                 }
-                if !self.attach_ready(i) && !over {
+                if !self.attach_ready(i) && !moved {
                     break;
                 }
             }
@@ -47,7 +47,7 @@ impl Deciding<'_> {
             let work = &self.state.works[&key];
             let status = match &work.state {
                 WorkState::Looking | WorkState::Open | WorkState::Bundling => continue,
-                WorkState::Failed { message } => Status::Failed { key, message: message.clone() },
+                WorkState::Failed { message, .. } => Status::Failed { key, message: message.clone() },
                 WorkState::Done { known, cached } => {
                     let how = match (cached, work.resumed) {
                         (true, _) => StageState::Cached,
@@ -74,7 +74,11 @@ impl Deciding<'_> {
             if self.state.runs[i].stages[j] == Status::Waiting
                 && let Some(inputs) = self.state.runs[i].inputs(j)
             {
-                let status = self.attach(i, j, inputs);
+                let status = if self.state.runs[i].pipeline.stages[j].sweep.is_some() {
+                    self.begin_sweep(i, j)
+                } else {
+                    self.attach(i, j, inputs)
+                };
                 Arc::make_mut(&mut self.state.runs[i]).stages[j] = status;
                 moved = true;
             }
@@ -113,6 +117,7 @@ impl Deciding<'_> {
                     key,
                     run: run.id.clone(),
                     stage: stage.name.clone(),
+                    keyed_as: protocol::pipeline::keyed_as(stage).clone(),
                     settings: stage.settings.clone(),
                     inputs,
                     seed: run.pipeline.seed,

@@ -72,7 +72,8 @@ impl State {
     /// A run as clients see it at `now`.
     pub fn view(&self, run: &Run, now: Millis) -> RunView {
         let stages = (0..run.stages.len()).map(|i| self.stage_view(run, i, now)).collect();
-        RunView { run: run.id.clone(), pipeline: run.pipeline.name.clone(), state: run.state, stages }
+        let sweeps = run.sweeps.iter().map(|sweep| self.sweep_view(run, sweep)).collect();
+        RunView { run: run.id.clone(), pipeline: run.pipeline.name.clone(), state: run.state, stages, sweeps }
     }
 
     fn stage_view(&self, run: &Run, i: usize, now: Millis) -> StageView {
@@ -90,9 +91,23 @@ impl State {
             attempt: work.map(Work::attempt).unwrap_or_default(),
             workers: Vec::new(),
             message: None,
+            of: stage.derived.as_ref().map(|derived| derived.of.clone()),
         };
         match status {
             Status::Waiting => {}
+            Status::Sweeping => {
+                view.state = StageState::Running;
+                if let Some(sweep) = run.sweep(i) {
+                    let sweep = self.sweep_view(run, sweep);
+                    let progress = Progress {
+                        done: sweep.spent,
+                        total: sweep.planned,
+                        unit: "steps".into(),
+                        ..Default::default()
+                    };
+                    (view.progress, view.message) = (progress, Some(crate::sweep::in_words(&sweep)));
+                }
+            }
             Status::Active { .. } => {
                 if let Some(work) = work {
                     view.workers = workers(work);
@@ -181,7 +196,7 @@ fn assignment(work: &Work, task: &Task, worker: &WorkerId, incarnation: Incarnat
         grant: task.grant_of(worker, incarnation),
         stage: StageTask {
             run: work.run.clone(),
-            name: work.stage.clone(),
+            name: work.keyed_as.clone(),
             settings: work.settings.clone(),
             inputs: work.inputs.clone(),
             seed: work.seed,

@@ -91,6 +91,8 @@ fn pipeline() -> Pipeline {
             placement: Placement::default(),
             inputs,
             external: BTreeMap::new(),
+            sweep: None,
+            derived: None,
         }
     };
     Pipeline {

@@ -10,6 +10,7 @@ pub mod id;
 pub mod message;
 pub mod pipeline;
 pub mod stage;
+pub mod sweep;
 pub mod units;
 
 pub use artifact::{ArtifactKind, FileEntry, Manifest};

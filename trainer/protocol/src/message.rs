@@ -11,7 +11,8 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::stage::{Backend, CheckpointPolicy, StageSettings};
+use crate::stage::{Backend, CheckpointPolicy, Mode, StageSettings};
+use crate::sweep::{SearchKind, Values};
 use crate::{Attempt, Digest, Fence, Generation, Incarnation, RunId, Seed, StageName, TaskId, WorkerId};
 
 /// The version of these messages; a worker of another version is turned away.
@@ -295,8 +296,11 @@ pub struct RunView {
     pub pipeline: String,
     /// Where it stands.
     pub state: RunState,
-    /// Stages in topological order.
+    /// Stages in topological order, and behind them those that sweeps made.
     pub stages: Vec<StageView>,
+    /// Sweeps that have begun.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub sweeps: Vec<SweepView>,
 }
 
 /// Where a run stands.
@@ -347,6 +351,72 @@ pub struct StageView {
     pub workers: Vec<WorkerId>,
     /// Why it failed or what it waits for.
     pub message: Option<String>,
+    /// The swept stage that it is a part of, if a sweep made it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub of: Option<StageName>,
+}
+
+/// A sweep as clients see it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SweepView {
+    /// The swept stage.
+    pub stage: StageName,
+    /// How it is searched.
+    pub search: SearchKind,
+    /// What decides.
+    pub metric: String,
+    /// Its direction.
+    pub mode: Mode,
+    /// Steps at which trials are compared; the last is the whole budget.
+    pub rungs: Vec<u64>,
+    /// Nothing is under way and nothing will be.
+    pub over: bool,
+    /// Steps trained so far, for this sweep or another before it.
+    pub spent: u64,
+    /// Steps that it will take if no trial fails.
+    pub planned: u64,
+    /// Steps of every trial at the whole budget.
+    pub full: u64,
+    /// The best trial at the whole budget so far.
+    pub best: Option<usize>,
+    /// All trials, by number.
+    pub trials: Vec<TrialView>,
+}
+
+/// A trial as clients see it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TrialView {
+    /// Its number, from 0.
+    pub trial: usize,
+    /// Its values by the settings' paths.
+    pub values: Values,
+    /// Where it stands.
+    pub state: TrialState,
+    /// Steps trained.
+    pub steps: u64,
+    /// The metric after each rung that has a result; `None` is a failure.
+    pub results: Vec<Option<f64>>,
+    /// Why it failed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub message: Option<String>,
+}
+
+/// Where a trial stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum TrialState {
+    /// Has not begun.
+    Waiting,
+    /// A rung is asked for: workers are on it or will be.
+    Running,
+    /// Done with a rung; whether it goes on is not decided.
+    Paused,
+    /// Did not go on after a rung.
+    Stopped,
+    /// Trained for the whole budget.
+    Finished,
+    /// Failed, and was stopped.
+    Failed,
 }
 
 /// Where a stage stands.

@@ -143,6 +143,10 @@ pub struct Training {
     pub optimizer: Optimizer,
     /// Gradients are scaled down to this global norm; 0 leaves them alone.
     pub max_grad_norm: f64,
+    /// Stops after so many steps, before the schedule's end, and leaves its state to go on from: a rung of a sweep. Not for users: the
+    /// reader knows only keys that the default has.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stop: Option<Steps>,
 }
 
 impl Training {
@@ -155,7 +159,13 @@ impl Training {
             decay: Decay::Cosine,
             optimizer: Optimizer::default(),
             max_grad_norm: 1.0,
+            stop: None,
         }
+    }
+
+    /// The last step of this stage.
+    pub fn end(&self) -> Steps {
+        self.stop.map_or(self.steps, |stop| stop.min(self.steps))
     }
 }
 
@@ -791,6 +801,28 @@ impl StageSettings {
             Self::EvaluateLatentFid(s) => Some(&s.model),
             // Shuffled captions say nothing of the model.
             Self::EvaluateT2m(s) if !s.real && !s.shuffled => Some(&s.model),
+            _ => None,
+        }
+    }
+
+    /// What every training stage shares, of one that can be swept.
+    pub fn training(&self) -> Option<&Training> {
+        match self {
+            Self::TrainVae(s) => Some(&s.training),
+            Self::TrainMld(s) => Some(&s.training),
+            Self::DistillLcm(s) => Some(&s.distillation.training),
+            Self::DistillPcm(s) => Some(&s.distillation.training),
+            _ => None,
+        }
+    }
+
+    /// As [`training`](Self::training), to change it.
+    pub fn training_mut(&mut self) -> Option<&mut Training> {
+        match self {
+            Self::TrainVae(s) => Some(&mut s.training),
+            Self::TrainMld(s) => Some(&mut s.training),
+            Self::DistillLcm(s) => Some(&mut s.distillation.training),
+            Self::DistillPcm(s) => Some(&mut s.distillation.training),
             _ => None,
         }
     }

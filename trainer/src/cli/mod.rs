@@ -4,6 +4,7 @@ mod config;
 mod generate;
 mod remote;
 mod serve;
+pub(crate) mod sweep;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -39,6 +40,9 @@ enum Verb {
     Status(remote::StatusArgs),
     /// Shows what workers said
     Logs(remote::LogsArgs),
+    /// What the sweeps of a run have tried, and what came of it
+    #[command(subcommand)]
+    Sweep(sweep::SweepVerb),
     /// Ends a run
     Cancel(remote::ControlArgs),
     /// Holds a run back: its workers save and stop
@@ -187,6 +191,7 @@ impl Verb {
             Self::Status(args) => args.output,
             Self::Logs(args) => args.output,
             Self::Cancel(args) | Self::Pause(args) => args.output,
+            Self::Sweep(verb) => verb.output(),
             Self::Resume(args) => args.output,
             Self::Generate(args) => args.report,
             Self::Devices(args) => args.output,
@@ -204,6 +209,7 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Serve(args) => serve::serve(args).await,
         Verb::Status(args) => remote::status(args).await,
         Verb::Logs(args) => remote::logs(args).await,
+        Verb::Sweep(verb) => sweep::sweep(verb).await,
         Verb::Cancel(args) => remote::control(args, "cancel").await,
         Verb::Pause(args) => remote::control(args, "pause").await,
         Verb::Resume(args) => resume(args).await,

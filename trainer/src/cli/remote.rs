@@ -152,9 +152,10 @@ pub(crate) async fn status(args: StatusArgs) -> Result<u8> {
             }
             Output::Table => {
                 let row = |run: &RunView| {
-                    let done = run.stages.iter().filter(|stage| !stage.outputs.is_empty()).count();
+                    let asked = || run.stages.iter().filter(|stage| stage.of.is_none());
+                    let done = asked().filter(|stage| !stage.outputs.is_empty()).count();
                     let state = summary::run_state(run.state).to_owned();
-                    vec![run.run.to_string(), run.pipeline.clone(), state, format!("{done}/{}", run.stages.len())]
+                    vec![run.run.to_string(), run.pipeline.clone(), state, format!("{done}/{}", asked().count())]
                 };
                 print::out(&print::table(&["RUN", "PIPELINE", "STATE", "STAGES"], runs.iter().map(row).collect()));
             }

@@ -236,6 +236,11 @@ impl Bench {
         self.checkpoints.get(name).and_then(|saved| saved.last())
     }
 
+    /// The newest checkpoint of the stage `name`, which is forgotten with all others of it: what a rung of a sweep leaves.
+    pub fn take_checkpoint(&mut self, name: &str) -> Option<(u64, Digest)> {
+        self.checkpoints.remove(name)?.pop().map(|(step, manifest)| (step, manifest.digest()))
+    }
+
     /// Runs the stage `name` to its end, or until its script stops it. A gang stage continues its newest checkpoint.
     ///
     /// Shards of a map stage run last to first: their order must not matter.

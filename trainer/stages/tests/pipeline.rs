@@ -4,8 +4,8 @@ mod common;
 
 use std::collections::BTreeMap;
 
-use protocol::Digest;
 use protocol::stage::Shape;
+use protocol::{Digest, Steps};
 use stages::context::Outcome;
 use stages::testing::{Bench, Script};
 
@@ -65,5 +65,39 @@ fn a_stage_that_yields_and_goes_on_gives_the_same_bytes() {
         assert_eq!(ran.output(), expected, "{name}: 4 steps by two, the rest by three");
         cut.members = 2;
         outputs.insert(name, expected);
+    }
+}
+
+/// What a sweep rests on: a trial that is trained in rungs is bit for bit the stage that is trained in one go.
+#[test]
+fn a_stage_that_is_trained_in_rungs_gives_the_same_bytes() {
+    let mut bench = bench(1);
+    let mut outputs: BTreeMap<&'static str, Digest> = BTreeMap::new();
+    for (name, settings, inputs) in chain(2) {
+        let inputs: Vec<_> = inputs.iter().map(|(field, stage)| (*field, outputs[stage])).collect();
+        let expected = bench.run(name, &settings, &inputs).unwrap_or_else(|e| panic!("{name}: {e}")).output();
+        outputs.insert(name, expected);
+        if settings.shape() != Shape::Gang {
+            continue;
+        }
+        bench.take_checkpoint(name);
+        let mut state = None;
+        for (stop, members) in [(Some(2), 2), (Some(5), 1), (None, 3)] {
+            let mut rung = settings.clone();
+            rung.training_mut().expect("a gang trains").stop = stop.map(Steps);
+            let inputs: Vec<_> = inputs.iter().copied().chain(state.map(|state| ("state", state))).collect();
+            bench.members = members;
+            let ran = bench.run(name, &rung, &inputs).unwrap_or_else(|e| panic!("{name}: {e}"));
+            let (step, left) = bench.take_checkpoint(name).expect("a rung leaves its state");
+            match stop {
+                Some(stop) => {
+                    assert_eq!(step, stop, "{name}");
+                    assert_ne!(ran.output(), expected, "{name}: what was trained for {stop} steps is something else");
+                }
+                None => assert_eq!(ran.output(), expected, "{name}"),
+            }
+            state = Some(left);
+        }
+        bench.members = 1;
     }
 }

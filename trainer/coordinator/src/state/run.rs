@@ -16,15 +16,19 @@ use std::sync::Arc;
 
 use protocol::message::{RunState, StageState};
 use protocol::pipeline::Pipeline;
-use protocol::{Attempt, Digest, RunId, StageName};
+use protocol::sweep::STATE_OUTPUT;
+use protocol::{ArtifactKind, Attempt, Digest, RunId, StageName};
 
 use crate::event::{Control, Known};
+use crate::search::Search;
 
 /// Where a stage of a run stands.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Status {
     /// Its inputs are not there yet.
     Waiting,
+    /// Its trials are under way; the searcher is in [`Run::sweeps`].
+    Sweeping,
     /// Its work is under way, under the stage's key.
     Active {
         /// The key.
@@ -63,7 +67,7 @@ impl Status {
     /// The stage's key, once known.
     pub fn key(&self) -> Option<Digest> {
         match self {
-            Self::Waiting => None,
+            Self::Waiting | Self::Sweeping => None,
             Self::Active { key } | Self::Done { key, .. } | Self::Failed { key, .. } => Some(*key),
             Self::Skipped { key, .. } => *key,
         }
@@ -73,9 +77,23 @@ impl Status {
     pub fn known(&self) -> Option<&Known> {
         match self {
             Self::Done { known, .. } => Some(known),
-            Self::Waiting | Self::Active { .. } | Self::Failed { .. } | Self::Skipped { .. } => None,
+            Self::Waiting | Self::Sweeping | Self::Active { .. } | Self::Failed { .. } | Self::Skipped { .. } => None,
         }
     }
+}
+
+/// A sweep under way or over.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sweeping {
+    /// The place of the swept stage.
+    pub stage: usize,
+    /// Who is tried next.
+    pub search: Search,
+    /// By ticket: the place of the training stage that was made for it, with its evaluation behind it. `None` for a ticket that asks for
+    /// nothing, or for what cannot be.
+    pub places: Vec<Option<usize>>,
+    /// Why trials failed, by trial.
+    pub failures: BTreeMap<usize, String>,
 }
 
 /// A run.
@@ -85,7 +103,9 @@ pub struct Run {
     pub id: RunId,
     /// Its place in the order of submission.
     pub number: u64,
-    /// What it executes.
+    /// What it was asked to execute.
+    pub submitted: Arc<Pipeline>,
+    /// What it executes: what was submitted, and behind it the stages that sweeps made.
     pub pipeline: Arc<Pipeline>,
     /// The YAML as written.
     pub source: String,
@@ -99,6 +119,8 @@ pub struct Run {
     pub parked: bool,
     /// Stage by stage, as in the pipeline.
     pub stages: Vec<Status>,
+    /// Sweeps that have begun.
+    pub sweeps: Vec<Sweeping>,
 }
 
 impl Run {
@@ -119,6 +141,7 @@ impl Run {
         Self {
             id,
             number,
+            submitted: Arc::clone(&pipeline),
             pipeline,
             source,
             idempotency_key: key,
@@ -126,6 +149,7 @@ impl Run {
             state: RunState::Running,
             parked: false,
             stages,
+            sweeps: Vec::new(),
         }
     }
 
@@ -154,7 +178,11 @@ impl Run {
         let mut inputs = stage.external.clone();
         for input in &stage.inputs {
             let known = self.status(&input.stage)?.known()?;
-            inputs.insert(input.field.clone(), *known.outputs.values().next()?);
+            let output = match input.kind {
+                ArtifactKind::Checkpoint => known.outputs.get(STATE_OUTPUT),
+                _ => value(known),
+            };
+            inputs.insert(input.field.clone(), *output?);
         }
         Some(inputs)
     }
@@ -178,9 +206,9 @@ impl Run {
         match self.state {
             RunState::Running | RunState::Paused => {
                 let not_asked_for = not_asked_for();
-                if self.stages.iter().any(|status| matches!(status, Status::Failed { .. })) {
+                if self.failed().is_some() {
                     RunState::Failed
-                } else if self.stages.iter().all(|s| matches!(s, Status::Done { .. }) || *s == not_asked_for) {
+                } else if self.asked().iter().all(|s| matches!(s, Status::Done { .. }) || *s == not_asked_for) {
                     RunState::Finished
                 } else {
                     self.state
@@ -190,11 +218,28 @@ impl Run {
         }
     }
 
+    /// The stages of the pipeline as submitted: what counts for the run. A failed trial is a result of its sweep.
+    pub fn asked(&self) -> &[Status] {
+        &self.stages[..self.submitted.stages.len()]
+    }
+
+    /// The first stage that failed for good.
+    pub fn failed(&self) -> Option<usize> {
+        self.asked().iter().position(|status| matches!(status, Status::Failed { .. }))
+    }
+
+    /// The sweep of a stage, if it has begun.
+    pub fn sweep(&self, stage: usize) -> Option<&Sweeping> {
+        self.sweeps.iter().find(|sweep| sweep.stage == stage)
+    }
+
     /// Skips everything that is not over.
     pub fn skip_rest(&mut self, reason: &str) {
         for status in &mut self.stages {
             match status {
-                Status::Waiting => *status = Status::Skipped { key: None, reason: reason.to_owned() },
+                Status::Waiting | Status::Sweeping => {
+                    *status = Status::Skipped { key: None, reason: reason.to_owned() }
+                }
                 Status::Active { key } => *status = Status::Skipped { key: Some(*key), reason: reason.to_owned() },
                 Status::Done { .. } | Status::Failed { .. } | Status::Skipped { .. } => {}
             }
@@ -203,18 +248,32 @@ impl Run {
 
     /// Takes up again whatever was asked for and is not done.
     pub fn reopen(&mut self) {
-        let wanted = wanted(&self.pipeline, self.until.as_ref());
+        let mut wanted = wanted(&self.submitted, self.until.as_ref());
+        // A trial whose result counts already is not tried again.
+        for sweep in self.sweeps.iter().filter(|sweep| wanted.contains(&sweep.stage)).collect::<Vec<_>>() {
+            for (ticket, place) in sweep.places.iter().enumerate() {
+                if let (Some(place), None) = (place, sweep.search.score(ticket)) {
+                    wanted.extend([*place, place + 1]);
+                }
+            }
+        }
         for (i, status) in self.stages.iter_mut().enumerate() {
             match status {
                 Status::Failed { .. } | Status::Skipped { .. } if wanted.contains(&i) => *status = Status::Waiting,
                 Status::Failed { .. }
                 | Status::Skipped { .. }
                 | Status::Waiting
+                | Status::Sweeping
                 | Status::Active { .. }
                 | Status::Done { .. } => {}
             }
         }
     }
+}
+
+/// What a stage gives, among its outputs.
+pub(crate) fn value(known: &Known) -> Option<&Digest> {
+    known.outputs.iter().find(|(name, _)| *name != STATE_OUTPUT).map(|(_, output)| output)
 }
 
 fn not_asked_for() -> Status {
@@ -251,6 +310,8 @@ mod tests {
             placement: Default::default(),
             inputs: Vec::new(),
             external: BTreeMap::new(),
+            sweep: None,
+            derived: None,
         };
         let pipeline = Pipeline { name: "p".into(), seed: Seed(1), backend: Backend::Flex, stages: vec![stage] };
         Run::new(1, Arc::new(pipeline), String::new(), None, None)

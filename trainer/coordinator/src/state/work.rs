@@ -40,6 +40,8 @@ pub enum WorkState {
     Failed {
         /// Why.
         message: String,
+        /// It would fail again wherever it ran: because of its settings and inputs, not of the machines or the store.
+        own: bool,
     },
 }
 
@@ -52,6 +54,8 @@ pub struct Work {
     pub run: RunId,
     /// The stage.
     pub stage: StageName,
+    /// What keys its randomness: its name, but for a trial of a sweep.
+    pub keyed_as: StageName,
     /// Its settings, as written.
     pub settings: StageSettings,
     /// Artifacts by the field that names them.
@@ -157,8 +161,8 @@ impl Work {
     }
 
     /// Ends it: whoever still works on it can write no more. The fences that this takes are returned.
-    pub fn fail(&mut self, message: String) -> Vec<registry::Write> {
-        self.state = WorkState::Failed { message };
+    pub fn fail(&mut self, message: String, own: bool) -> Vec<registry::Write> {
+        self.state = WorkState::Failed { message, own };
         self.tasks.iter_mut().filter(|task| task.is_held()).map(|task| task.release(None)).collect()
     }
 

@@ -9,6 +9,7 @@
 mod pipelines;
 mod random;
 mod store;
+mod sweeps;
 mod wild;
 mod worker;
 
@@ -51,6 +52,11 @@ struct World {
     torn: u64,
     /// Try every event now and then.
     wild: bool,
+    /// Kill the coordinator after each stored event whose number is a multiple of the first, from the second on; its answer is lost.
+    kills: Option<(u64, u64)>,
+    /// Only the first of them.
+    once: bool,
+    stored: u64,
 }
 
 fn policy() -> Policy {
@@ -66,8 +72,12 @@ impl World {
                 let max = random.below(4) as usize;
                 let range = WorkerRange { min: 1, max };
                 let gates: &[&str] = if random.chance(15) { &["never <= 0"] } else { &["latent_fid <= 1"] };
+                let pipeline = match random.below(4) {
+                    0 => pipelines::swept(random.below(2), 4 + random.below(8)),
+                    _ => pipelines::quickstart(random.below(2), range, gates),
+                };
                 let event = Event::Submit {
-                    pipeline: Box::new(pipelines::quickstart(random.below(2), range, gates)),
+                    pipeline: Box::new(pipeline),
                     source: String::new(),
                     idempotency_key: random.chance(30).then(|| format!("key-{i}")),
                     until: random.chance(20).then(|| "mld".into()),
@@ -92,6 +102,9 @@ impl World {
             cancelled: Vec::new(),
             torn: 0,
             wild: false,
+            kills: None,
+            once: false,
+            stored: 0,
         }
     }
 
@@ -139,6 +152,25 @@ impl World {
             assert_eq!(durable(&next), durable(&self.state), "{event:?} changed something without a write");
         }
         self.state = next;
+        self.stored += 1;
+        // Whoever never hears that it has joined joins for ever.
+        let spared: &[&str] = if self.once { &["started"] } else { &["started", "join"] };
+        let spared = self.store.journal.last().is_some_and(|entry| spared.iter().any(|event| entry["event"] == *event));
+        if let Some((every, from)) = self.kills
+            && !spared
+            && self.stored >= from
+            && self.stored.is_multiple_of(every)
+        {
+            self.effects.clear();
+            if self.once {
+                self.kills = None;
+            }
+            let recovered = journal::replay(policy(), self.store.journal.clone()).expect("the journal replays");
+            assert_eq!(durable(&recovered), durable(&self.state), "replay gives what was");
+            self.state = recovered;
+            self.happen(Event::Started { alone: false, park: false }).expect("starts again");
+            return Err(Refused::Store(Refusal::Full));
+        }
         for effect in &effects {
             if let Effect::Lookup { .. } | Effect::Register { .. } = effect {
                 let at = self.now.after(self.random.below(if self.chaos() { 3000 } else { 10 }));

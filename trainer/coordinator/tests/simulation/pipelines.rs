@@ -46,7 +46,43 @@ pub(crate) fn quickstart(seed: u64, workers: WorkerRange, require: &[&str]) -> P
                 inputs.push(StageInput { field, stage: stage.into(), kind: ArtifactKind::Report });
             }
         }
-        PipelineStage { name: name.into(), settings, placement: placement.clone(), inputs, external: BTreeMap::new() }
+        PipelineStage {
+            name: name.into(),
+            settings,
+            placement: placement.clone(),
+            inputs,
+            external: BTreeMap::new(),
+            sweep: None,
+            derived: None,
+        }
     });
     Pipeline { name: "quickstart".into(), seed: Seed(seed), backend: Backend::Flex, stages: stages.to_vec() }
+}
+
+/// A sweep of `trials` trials with three rungs, and what goes on from its best.
+pub(crate) fn swept(seed: u64, trials: u64) -> Pipeline {
+    let text = format!(
+        "name: swept
+seed: {seed}
+dataset: {{format: synthetic}}
+stages:
+  vae: {{kind: train.vae}}
+  latents: {{kind: encode.latents, shards: 2}}
+  mld: {{kind: train.mld}}
+  pcm:
+    kind: distill.pcm
+    steps: 18
+    checkpoint: {{every: 3}}
+    sweep:
+      metric: latent_fid
+      trials: {trials}
+      parallel: 6
+      rungs: {{first: 2, factor: 3}}
+      space: {{adversarial: {{choice: [0, 0.1, 1]}}, skip: {{choice: [50, 100]}}, ema: {{uniform: [0.9, 0.99]}}}}
+      evaluate: {{kind: evaluate.latent_fid, shards: 2}}
+  fid: {{kind: evaluate.latent_fid, model: pcm@best, shards: 2}}
+  release: {{kind: register, model: m, from: pcm}}
+"
+    );
+    protocol::pipeline::read("swept.yaml", &text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"))
 }

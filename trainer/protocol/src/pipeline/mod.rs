@@ -10,6 +10,7 @@ mod overrides;
 mod read;
 mod rules;
 mod schema;
+mod sweep;
 mod yaml;
 
 use std::collections::BTreeMap;
@@ -17,11 +18,14 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::stage::{Backend, DataOpen, Placement, StageIdentity, StageSettings};
+use crate::sweep::{Derived, Sweep};
 use crate::{ArtifactKind, Digest, Seed, StageName};
 
 pub use diagnostic::{Diagnostic, Diagnostics};
 pub use read::read;
 
+#[cfg(test)]
+mod sweep_tests;
 #[cfg(test)]
 mod tests;
 
@@ -51,6 +55,12 @@ pub struct PipelineStage {
     pub inputs: Vec<StageInput>,
     /// Digests of what it reads from outside the pipeline: `folder` is the content of a dataset folder.
     pub external: BTreeMap<String, Digest>,
+    /// A search over its settings.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sweep: Option<Sweep>,
+    /// Set on a stage that a sweep made while the run went on; never in a pipeline that is submitted.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub derived: Option<Derived>,
 }
 
 /// An edge of the DAG.
@@ -136,15 +146,27 @@ impl Pipeline {
             for input in stage.inputs.iter().filter(before) {
                 wrong.push(format!("stage `{}` reads `{}`, which does not come before it", stage.name, input.stage));
             }
+            if stage.derived.is_some() {
+                wrong.push(format!(
+                    "stage `{}` says that a sweep made it; sweeps are unfolded while a run goes on",
+                    stage.name
+                ));
+            }
             let references = graph::references(&stage.settings);
             if references.iter().any(|reference| !stage.inputs.contains(reference)) {
                 wrong.push(format!("the inputs of stage `{}` are not those of its settings", stage.name));
             }
-            found.entry(stage.name.clone()).or_default().0.extend(rules::stage(&stage.settings, &stage.placement));
+            if sweep::references(stage).iter().any(|reference| !stage.inputs.contains(reference)) {
+                wrong.push(format!("the inputs of stage `{}` are not those of its sweep", stage.name));
+            }
+            let problems = &mut found.entry(stage.name.clone()).or_default().0;
+            problems.extend(rules::stage(&stage.settings, &stage.placement));
+            problems.extend(sweep::rules(stage));
         }
         graph::check_references(&self.stages, &mut found);
         if wrong.is_empty() && found.values().all(|problems| problems.0.is_empty()) {
             graph::check_agreement(&self.stages, &mut found);
+            sweep::check_agreement(&self.stages, &mut found);
         }
         for (stage, problems) in &found {
             wrong.extend(problems.0.iter().map(|problem| format!("stage `{stage}`: {}", problem.message)));
@@ -172,7 +194,17 @@ pub fn identity(
         code_version: stage.settings.code_version(),
         inputs: all,
         seed,
-        name: stage.name.clone(),
+        name: keyed_as(stage).clone(),
         backend,
     }
+}
+
+/// The name that keys a stage's randomness.
+pub fn keyed_as(stage: &PipelineStage) -> &StageName {
+    stage.derived.as_ref().map_or(&stage.name, |derived| &derived.keyed_as)
+}
+
+/// What does not hold of one stage's settings, a line for each.
+pub fn broken_rules(settings: &StageSettings, placement: &Placement) -> Vec<String> {
+    rules::stage(settings, placement).into_iter().map(|problem| problem.message).collect()
 }

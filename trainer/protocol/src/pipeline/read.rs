@@ -13,6 +13,7 @@ use super::yaml::{self, Content, Entry, Node};
 use super::{Pipeline, PipelineStage, graph};
 use crate::id::is_name;
 use crate::stage::{Backend, DataOpen, DataSynthetic, Placement, StageSettings, TextEmbed};
+use crate::sweep::Sweep;
 use crate::{Seed, StageName};
 
 /// Reads a pipeline. `file` is its name for messages, `sets` are overrides such as `stages.vae.lr=1e-4`.
@@ -58,12 +59,12 @@ struct Written {
     path: String,
 }
 
-struct Reader {
-    mistakes: Vec<Mistake>,
+pub(super) struct Reader {
+    pub(super) mistakes: Vec<Mistake>,
 }
 
 impl Reader {
-    fn mistake(&mut self, at: Position, path: &str, message: impl Into<String>, help: Option<String>) {
+    pub(super) fn mistake(&mut self, at: Position, path: &str, message: impl Into<String>, help: Option<String>) {
         self.mistakes.push(Mistake { at, path: path.to_owned(), message: message.into(), help });
     }
 
@@ -185,8 +186,11 @@ impl Reader {
                             node: Some(entry.value.clone()),
                             path: format!("stages.{}", entry.key),
                         });
-                        if let Some((settings, placement)) = self.stage(entry) {
-                            stages.push(stage(&entry.key, settings, placement));
+                        if let Some((settings, placement, sweep)) = self.stage(entry) {
+                            let mut stage = stage(&entry.key, settings, placement);
+                            stage.sweep = sweep;
+                            stage.inputs.extend(super::sweep::references(&stage));
+                            stages.push(stage);
                         }
                     }
                 }
@@ -239,7 +243,7 @@ impl Reader {
     }
 
     /// A settings struct by itself; `None` if anything in it is wrong.
-    fn typed<T: Default + Serialize + serde::de::DeserializeOwned>(
+    pub(super) fn typed<T: Default + Serialize + serde::de::DeserializeOwned>(
         &mut self,
         node: &Node,
         owner: &str,
@@ -249,7 +253,7 @@ impl Reader {
         self.overlaid(serde_json::to_value(T::default()).ok()?, node, owner, path, skip)
     }
 
-    fn overlaid<T: serde::de::DeserializeOwned>(
+    pub(super) fn overlaid<T: serde::de::DeserializeOwned>(
         &mut self,
         mut base: Value,
         node: &Node,
@@ -271,7 +275,7 @@ impl Reader {
         }
     }
 
-    fn stage(&mut self, entry: &Entry) -> Option<(StageSettings, Placement)> {
+    fn stage(&mut self, entry: &Entry) -> Option<(StageSettings, Placement, Option<Sweep>)> {
         let (name, node) = (&entry.key, &entry.value);
         let path = format!("stages.{name}");
         let owner = format!("stage `{name}`");
@@ -286,24 +290,7 @@ impl Reader {
             self.mistake(node.at, &path, message, Some(format!("such as `{name}: {{kind: train.vae}}`")));
             return None;
         }
-        let all = StageSettings::all();
-        let kinds: Vec<&str> = all.iter().map(StageSettings::kind).collect();
-        let Some(kind) = node.entry("kind") else {
-            let message = format!("{owner} has no `kind`");
-            self.mistake(entry.key_at, &format!("{path}.kind"), message, Some(format!("kinds: {}", list_keys(kinds))));
-            return None;
-        };
-        let Some(default) = kind.value.as_text().and_then(|text| all.iter().find(|s| s.kind() == text)) else {
-            let near = kind.value.as_text().and_then(|text| nearest(text, kinds.iter().copied()));
-            let question = near.map(|near| format!("; did you mean `{near}`?")).unwrap_or_default();
-            let message = match kind.value.as_text() {
-                Some(text) => format!("unknown kind `{text}` of {owner}{question}"),
-                None => format!("`kind` of {owner} is {}; expected a text", kind.value.describe()),
-            };
-            let help = Some(format!("kinds: {}", list_keys(kinds)));
-            self.mistake(kind.value.at, &format!("{path}.kind"), message, help);
-            return None;
-        };
+        let default = self.kind(node, entry.key_at, &owner, &path)?;
         let placed = Node {
             at: node.at,
             value: Content::Map(
@@ -316,9 +303,36 @@ impl Reader {
             ),
         };
         let placement = self.typed::<Placement>(&placed, &owner, &path, &[]);
-        let settings =
-            self.overlaid(serde_json::to_value(default).ok()?, node, &owner, &path, &["workers", "checkpoint"]);
-        Some((settings?, placement?))
+        let skip = ["workers", "checkpoint", "sweep"];
+        let sweep = match node.entry("sweep") {
+            Some(entry) => self.sweep(entry, name, &default).map(Some),
+            None => Some(None),
+        };
+        let settings = self.overlaid(serde_json::to_value(&default).ok()?, node, &owner, &path, &skip);
+        Some((settings?, placement?, sweep?))
+    }
+
+    /// The default settings of the kind that `node` names.
+    pub(super) fn kind(&mut self, node: &Node, at: Position, owner: &str, path: &str) -> Option<StageSettings> {
+        let mut all = StageSettings::all();
+        let kinds: Vec<&str> = all.iter().map(StageSettings::kind).collect();
+        let Some(kind) = node.entry("kind") else {
+            let message = format!("{owner} has no `kind`");
+            self.mistake(at, &format!("{path}.kind"), message, Some(format!("kinds: {}", list_keys(kinds))));
+            return None;
+        };
+        let Some(found) = kind.value.as_text().and_then(|text| all.iter().position(|s| s.kind() == text)) else {
+            let near = kind.value.as_text().and_then(|text| nearest(text, kinds.iter().copied()));
+            let question = near.map(|near| format!("; did you mean `{near}`?")).unwrap_or_default();
+            let message = match kind.value.as_text() {
+                Some(text) => format!("unknown kind `{text}` of {owner}{question}"),
+                None => format!("`kind` of {owner} is {}; expected a text", kind.value.describe()),
+            };
+            let help = Some(format!("kinds: {}", list_keys(kinds)));
+            self.mistake(kind.value.at, &format!("{path}.kind"), message, help);
+            return None;
+        };
+        Some(all.swap_remove(found))
     }
 
     /// Adds edges, applies rules, sorts. Rules between stages wait until every stage could be read.
@@ -328,8 +342,13 @@ impl Reader {
         written: &[Written],
         mut stages: Vec<PipelineStage>,
     ) -> Option<Vec<PipelineStage>> {
-        for stage in &stages {
-            for problem in rules::stage(&stage.settings, &stage.placement) {
+        for stage in &mut stages {
+            for problem in super::sweep::resolve_best(stage, written.iter().map(|w| (&w.name, w.swept()))) {
+                self.problem(written, &stage.name, problem);
+            }
+            let problems =
+                rules::stage(&stage.settings, &stage.placement).into_iter().chain(super::sweep::rules(stage));
+            for problem in problems.collect::<Vec<_>>() {
                 self.problem(written, &stage.name, problem);
             }
         }
@@ -362,6 +381,7 @@ impl Reader {
             Ok(stages) => {
                 if sound {
                     graph::check_agreement(&stages, &mut found);
+                    super::sweep::check_agreement(&stages, &mut found);
                 }
                 Some(stages)
             }
@@ -406,6 +426,10 @@ impl Reader {
 }
 
 impl Written {
+    fn swept(&self) -> bool {
+        self.node.as_ref().is_some_and(|node| node.entry("sweep").is_some())
+    }
+
     fn implicit(name: &str, entry: &Entry) -> Self {
         Self { name: name.into(), key_at: entry.key_at, node: Some(entry.value.clone()), path: name.into() }
     }
@@ -417,7 +441,8 @@ fn is_implicit(written: &[Written], name: &StageName) -> bool {
 
 fn stage(name: &str, settings: StageSettings, placement: Placement) -> PipelineStage {
     let inputs = graph::references(&settings);
-    PipelineStage { name: name.into(), settings, placement, inputs, external: BTreeMap::new() }
+    let external = BTreeMap::new();
+    PipelineStage { name: name.into(), settings, placement, inputs, external, sweep: None, derived: None }
 }
 
 /// `[a-z][a-z0-9_-]*`, at most 64.

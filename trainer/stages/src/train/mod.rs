@@ -25,6 +25,8 @@ pub use order::{Order, Pick};
 pub use state::{Group, GroupPlan, TrainState};
 pub use tree::tree_sum;
 
+/// The input that a rung of a sweep goes on from: the checkpoint that the rung before left.
+const STATE_INPUT: &str = protocol::sweep::STATE_OUTPUT;
 /// File of a checkpoint.
 pub(crate) const STATE_FILE: &str = "state.safetensors";
 
@@ -66,7 +68,7 @@ pub enum Trained {
     },
 }
 
-/// Trains to the last step, or until told to stop.
+/// Trains to the last step (of the schedule, or of a rung that stops before), or until told to stop.
 ///
 /// Every member of the gang runs this same loop. What may end the attempt happens between steps, where the state is whole.
 ///
@@ -78,17 +80,23 @@ pub fn train(
     training: &Training,
     cx: &mut dyn GangContext,
 ) -> Result<Trained, StageError> {
-    let (steps, slices) = (training.steps.0, training.batch.slices);
-    let config = canonical::digest(&cx.task().settings);
+    let (steps, slices) = (training.end().0, training.batch.slices);
+    // Names of other stages say nothing about a state, which the key of the next rung rests on.
+    let config = canonical::digest(&cx.task().settings.without_references());
     let mut state = TrainState::new(&objective.groups());
     let mut applied = None;
+    let mut saved_at = None;
     if let Some(manifest) = cx.latest_checkpoint()? {
-        let bytes = crate::artifacts::file(&*cx.blobs(), &manifest, STATE_FILE)?;
-        state.restore(&bytes).map_err(|e| StageError::Context(ContextError::Corrupt(format!("{STATE_FILE}: {e}"))))?;
+        restore(&mut state, &manifest, cx)?;
         applied = Some(state.step);
+        saved_at = applied;
         cx.log(&format!("goes on from the checkpoint after step {}", state.step));
+    } else if cx.task().inputs.contains_key(STATE_INPUT) {
+        let (_, manifest) = crate::artifacts::input(cx, STATE_INPUT, ArtifactKind::Checkpoint)?;
+        restore(&mut state, &manifest, cx)?;
+        applied = Some(state.step);
+        cx.log(&format!("goes on from the rung that ended after step {}", state.step));
     }
-    let mut saved_at = applied;
     let mut save_is_due = false;
     let mut recent = Recent::default();
     meet(&mut state, applied, cx)?;
@@ -146,6 +154,12 @@ pub fn train(
         save(&state, config, &recent, cx)?;
     }
     Ok(Trained::Finished { state, metrics: recent.means() })
+}
+
+/// Takes over the state of a checkpoint.
+fn restore(state: &mut TrainState, manifest: &protocol::Manifest, cx: &dyn GangContext) -> Result<(), StageError> {
+    let bytes = crate::artifacts::file(&*cx.blobs(), manifest, STATE_FILE)?;
+    state.restore(&bytes).map_err(|e| StageError::Context(ContextError::Corrupt(format!("{STATE_FILE}: {e}"))))
 }
 
 /// Meets the others, and takes over a peer's state where one is ahead or this member has none (`applied` is `None`); true if so.

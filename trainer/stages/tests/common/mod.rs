@@ -20,6 +20,7 @@ fn training(steps: u64) -> Training {
         decay: Decay::Cosine,
         optimizer: Optimizer::default(),
         max_grad_norm: 1.0,
+        stop: None,
     }
 }
 

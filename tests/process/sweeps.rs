@@ -1,0 +1,97 @@
+//! Promise 19: a sweep decides the same whoever works on it and whoever is killed, and its best trial is the stage with the trial's values.
+
+use std::collections::BTreeSet;
+
+use cluster_tests::{Bench, digests, states, wait_for};
+use serde_json::Value;
+
+const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
+const CONFIG: &str = "smoke.yaml";
+const SWEEP: &str = "stages.pcm.sweep={metric: latent_fid, trials: 8, parallel: 3, rungs: {first: 6, factor: 2}, \
+    space: {adversarial: {choice: [0, 0.1]}, skip: {choice: [50, 100]}, ema: {uniform: [0.8, 0.99]}}, \
+    evaluate: {kind: evaluate.latent_fid, sampler: {steps: 1, guidance: 2}, repeats: 1, components: 8, shards: 2}}";
+/// A budget that is three rungs: 6, 12 and 24 steps.
+const STEPS: [&str; 4] = ["--set", "stages.pcm.steps=24", "--until", "pcm"];
+
+fn swept(workers: &str) -> Vec<&str> {
+    [&["--workers", workers, "--set", SWEEP][..], &STEPS].concat()
+}
+
+/// All that a sweep decided, without how long it took and who did it.
+fn decided(report: &Value) -> (Value, Value, Value) {
+    let sweep = &report["sweeps"][0];
+    assert_eq!(sweep["over"], true, "{report:#}");
+    (sweep["trials"].clone(), sweep["best"].clone(), digests(report)["pcm"].clone())
+}
+
+#[test]
+fn p19_a_sweep_decides_the_same_with_other_workers_and_when_it_is_killed() {
+    let bench = Bench::new(TRAINER);
+    let report = bench.pipeline(CONFIG, &swept("2"));
+    let reference = decided(&report);
+    let trials = reference.0.as_array().expect("trials");
+    let steps: Vec<u64> = trials.iter().filter_map(|trial| trial["steps"].as_u64()).collect();
+    // 8 at the first rung, 4 at the second, 2 at the last.
+    assert_eq!((steps.len(), steps.iter().filter(|s| **s == 24).count()), (8, 2), "{steps:?}");
+    assert_eq!(steps.iter().sum::<u64>(), 8 * 6 + 4 * 6 + 2 * 12);
+    let values: BTreeSet<String> = trials.iter().map(|trial| trial["values"].to_string()).collect();
+    assert_eq!(values.len(), 8, "no trial is tried twice");
+
+    // The best trial is what the plain stage gives with its values, bit for bit.
+    let best = &trials[reference.1.as_u64().expect("a best trial") as usize];
+    let sets: Vec<String> = best["values"]
+        .as_object()
+        .expect("values")
+        .iter()
+        .map(|(path, value)| format!("stages.pcm.{path}={value}"))
+        .collect();
+    let sets: Vec<&str> = sets.iter().flat_map(|set| ["--set", set.as_str()]).collect();
+    let alone = Bench::new(TRAINER);
+    let plain = alone.pipeline(CONFIG, &[&["--workers", "2"][..], &sets, &STEPS].concat());
+    assert_eq!(digests(&plain)["pcm"], reference.2, "trained in rungs against trained in one go");
+
+    // One worker, and the trainer is killed while this and that trial is under way.
+    let killed = Bench::new(TRAINER);
+    let config = Bench::config(CONFIG);
+    for trial in ["pcm.t01.r0", "pcm.t04.r0", "pcm.t07.r0.eval", "r1", "r2"] {
+        let arguments = [&["run", &config, "-o", "json"][..], &swept("1")].concat();
+        let mut running = killed.spawn(&arguments);
+        wait_for(&format!("{trial} to begin, or the end"), || {
+            let logs = std::fs::read_dir(killed.store().join("workers")).into_iter().flatten().flatten();
+            let text: String = logs.filter_map(|entry| std::fs::read_to_string(entry.path()).ok()).collect();
+            let begun = text.contains(&format!("{trial} attempt=")) || text.contains(&format!("{trial}/0 attempt="));
+            (begun || !running.alive()).then_some(())
+        });
+        running.kill();
+        running.wait();
+    }
+    assert_eq!(decided(&killed.pipeline(CONFIG, &swept("1"))), reference);
+
+    // Again: nothing runs, and the commands show what was.
+    let again = bench.pipeline(CONFIG, &swept("2"));
+    assert_eq!(decided(&again), reference);
+    assert!(states(&again).values().all(|state| state == "cached" || state == "skipped"), "{:?}", states(&again));
+    let plot = bench.path().join("sweep.svg");
+    let shown = bench.run(&["sweep", "status", &config, "-o", "json", "--plot", &plot.display().to_string()]);
+    let shown = shown.expect_code(0).json();
+    assert_eq!(shown["sweeps"][0]["trials"], reference.0);
+    let picture = std::fs::read_to_string(&plot).expect("the picture");
+    assert_eq!(picture.matches("<polyline").count(), 8);
+    let table = bench.run(&["sweep", "status"]).expect_code(0).stdout;
+    assert!(
+        table.contains("stopped at 6") && table.contains("stopped at 12") && table.contains("of 192 steps"),
+        "{table}"
+    );
+    let best_said = bench.run(&["sweep", "best", "-o", "json"]).expect_code(0).json();
+    assert_eq!(best_said["best"][0]["values"], best["values"]);
+    bench.run(&["sweep", "best", "--stage", "lcm"]).expect_code(3);
+}
+
+#[test]
+fn a_metric_that_nobody_reports_ends_the_run_and_says_what_there_is() {
+    let bench = Bench::new(TRAINER);
+    let config = Bench::config(CONFIG);
+    let sweep = SWEEP.replace("metric: latent_fid", "metric: fdi");
+    let said = bench.run(&[&["run", &config, "--workers", "2", "--set", &sweep][..], &STEPS].concat()).expect_code(1);
+    assert!(said.stderr.contains("`fdi`") && said.stderr.contains("latent_fid"), "{}", said.stderr);
+}

@@ -1,0 +1,73 @@
+//! Points drawn at random, all different. A number hangs on the seed, the stage, the trial and the setting alone, so that one more setting
+//! or trial changes no other.
+//!
+//! A space of choices is drawn from without putting back. Drawn numbers are rounded to five digits: they are read by people, and the last
+//! bits of a logarithm are not the same on every machine.
+
+use std::collections::BTreeSet;
+
+use protocol::stage::StageSettings;
+use protocol::sweep::{Domain, MAX_TRIALS, Sweep, Values, setting};
+use protocol::{Digest, Seed, StageName, canonical};
+use serde_json::Value;
+
+/// So often a trial is drawn again that would be equal to an earlier one.
+const AGAIN: u64 = 100;
+
+/// The points of all trials; fewer than asked for if the space has no more.
+pub(super) fn points(sweep: &Sweep, settings: &StageSettings, name: &StageName, seed: Seed) -> Vec<Values> {
+    let count = sweep.trials();
+    if let Some(all) = sweep.points().filter(|all| *all <= MAX_TRIALS) {
+        let mut points = super::grid::points(sweep);
+        points.sort_by_cached_key(|point| bits(seed, name, 0, 0, &canonical::digest(point).hex()));
+        points.truncate(count.min(all));
+        return points;
+    }
+    let (mut points, mut seen) = (Vec::new(), BTreeSet::new());
+    for trial in 0..count as u64 {
+        let point = (0..AGAIN).find_map(|again| {
+            let draw = |(path, domain): (&String, &Domain)| {
+                let whole = setting(settings, path).is_some_and(|value| value.is_number() && !value.is_f64());
+                (path.clone(), value(domain, uniform(bits(seed, name, trial, again, path)), whole))
+            };
+            let point: Values = sweep.space.iter().map(draw).collect();
+            seen.insert(canonical::digest(&point)).then_some(point)
+        });
+        points.extend(point);
+    }
+    points
+}
+
+/// 64 bits that hang on their key alone.
+fn bits(seed: Seed, name: &StageName, trial: u64, again: u64, path: &str) -> u64 {
+    let digest = Digest::of(format!("stride/sweep/1 {seed} {name} {trial} {again} {path}").as_bytes());
+    digest.as_bytes()[..8].iter().fold(0, |number, byte| number << 8 | u64::from(*byte))
+}
+
+/// Uniform in [0, 1).
+fn uniform(bits: u64) -> f64 {
+    (bits >> 11) as f64 / (1_u64 << 53) as f64
+}
+
+/// The value at `share` of a domain.
+fn value(domain: &Domain, share: f64, whole: bool) -> Value {
+    let number = |value: f64, low: f64, high: f64| {
+        if whole {
+            return Value::from(value.floor().clamp(low, high) as u64);
+        }
+        let short: f64 = format!("{value:.4e}").parse().unwrap_or(value);
+        Value::from(short.clamp(low, high))
+    };
+    match domain {
+        Domain::Choice(values) => values[((share * values.len() as f64) as usize).min(values.len() - 1)].clone(),
+        // The upper end of whole numbers is one of them.
+        Domain::Uniform(low, high) => {
+            let width = high - low + if whole { 1.0 } else { 0.0 };
+            number(low + share * width, *low, *high)
+        }
+        Domain::LogUniform(low, high) => {
+            let top = if whole { high + 1.0 } else { *high };
+            number((low.ln() + share * (top.ln() - low.ln())).exp(), *low, *high)
+        }
+    }
+}

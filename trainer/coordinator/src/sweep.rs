@@ -1,0 +1,269 @@
+//! Swept stages: the tickets of a searcher become stages of the run, and their results go back to the searcher.
+//!
+//! A rung of a trial is two ordinary stages behind those of the pipeline: one that trains, and one that evaluates what it gave. They have
+//! keys like every stage, so whatever was computed before is found, by this run or another. When the searcher has nothing left to ask, the
+//! swept stage is done with the value of its best trial, and whoever reads it goes on.
+//!
+//! | a trial's stage ends with | becomes |
+//! |---|---|
+//! | a finite metric | a result |
+//! | a metric that is not finite, or a failure of its own (diverged, settings, memory, faults) | the worst result: it is stopped |
+//! | a failure of machines or the store | the end of the run, until it is resumed |
+//! | an evaluation without the metric | the end of the run: no other trial will have it either |
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use protocol::message::{RunState, StageState, SweepView, TrialState, TrialView};
+use protocol::{Digest, Steps};
+
+use crate::decide::Deciding;
+use crate::event::Known;
+use crate::search::{Score, Search, Ticket};
+use crate::state::State;
+use crate::state::run::{Run, Status, Sweeping, value};
+use crate::state::work::WorkState;
+
+/// What became of a ticket.
+enum Found {
+    Score(Score, Option<String>),
+    /// The sweep cannot go on.
+    End {
+        key: Digest,
+        message: String,
+    },
+}
+
+impl Deciding<'_> {
+    /// Begins a sweep, or takes it up again.
+    pub(crate) fn begin_sweep(&mut self, i: usize, j: usize) -> Status {
+        let run = Arc::make_mut(&mut self.state.runs[i]);
+        if run.sweep(j).is_none() {
+            let stage = &run.pipeline.stages[j];
+            let sweep = stage.sweep.as_ref().expect("the stage has a sweep");
+            let search = Search::new(sweep, &stage.settings, &stage.name, run.pipeline.seed);
+            run.sweeps.push(Sweeping { stage: j, search, places: Vec::new(), failures: BTreeMap::new() });
+            unfold(run, run.sweeps.len() - 1);
+        }
+        Status::Sweeping
+    }
+
+    /// Hands results to the searchers of a run, makes the stages that they ask for, and ends sweeps that are over.
+    pub(crate) fn sweep(&mut self, i: usize) -> bool {
+        let mut moved = false;
+        for k in 0..self.state.runs[i].sweeps.len() {
+            let run = &self.state.runs[i];
+            let sweep = &run.sweeps[k];
+            let under_way = matches!(run.state, RunState::Running | RunState::Paused);
+            if !under_way || run.stages[sweep.stage] != Status::Sweeping {
+                continue;
+            }
+            let open = sweep.places.iter().enumerate().filter(|(ticket, _)| sweep.search.score(*ticket).is_none());
+            let found: Vec<(usize, usize, Found)> = open
+                .filter_map(|(ticket, place)| Some((ticket, (*place)?, found(self.state, run, sweep, (*place)?)?)))
+                .collect();
+            if found.is_empty() && !sweep.search.is_over() {
+                continue;
+            }
+            moved = true;
+            let run = Arc::make_mut(&mut self.state.runs[i]);
+            for (ticket, place, found) in found {
+                match found {
+                    Found::Score(score, why) => {
+                        let sweep = &mut run.sweeps[k];
+                        if let (Some(why), Ticket::Rung { trial, .. }) = (why, sweep.search.tickets()[ticket]) {
+                            sweep.failures.insert(trial, why);
+                        }
+                        sweep.search.report(ticket, score);
+                        if run.stages[place + 1] == Status::Waiting {
+                            let reason = "there is nothing to evaluate".to_owned();
+                            run.stages[place + 1] = Status::Skipped { key: None, reason };
+                        }
+                    }
+                    Found::End { key, message } => run.stages[run.sweeps[k].stage] = Status::Failed { key, message },
+                }
+            }
+            unfold(run, k);
+            let stage = run.sweeps[k].stage;
+            if run.stages[stage] == Status::Sweeping && run.sweeps[k].search.is_over() {
+                run.stages[stage] = concluded(run, &run.sweeps[k]);
+            }
+        }
+        moved
+    }
+}
+
+/// Makes the stages of tickets that have none yet.
+fn unfold(run: &mut Run, k: usize) {
+    let Run { sweeps, pipeline, stages, .. } = run;
+    let sweep = &mut sweeps[k];
+    while let Some(ticket) = sweep.search.tickets().get(sweep.places.len()).copied() {
+        let Ticket::Rung { trial, rung } = ticket else {
+            sweep.places.push(None);
+            continue;
+        };
+        let stop = sweep.search.stop(rung).map(Steps);
+        match pipeline.stages[sweep.stage].rung(trial, rung, stop, &sweep.search.trials()[trial]) {
+            Ok(made) => {
+                sweep.places.push(Some(pipeline.stages.len()));
+                stages.extend([Status::Waiting, Status::Waiting]);
+                Arc::make_mut(pipeline).stages.extend(made);
+            }
+            Err(message) => {
+                sweep.failures.insert(trial, message);
+                sweep.places.push(None);
+                sweep.search.report(sweep.places.len() - 1, Score::Failed);
+            }
+        }
+    }
+}
+
+/// What became of the ticket whose stages are at `place`; `None` while they are under way.
+fn found(state: &State, run: &Run, sweep: &Sweeping, place: usize) -> Option<Found> {
+    let (train, eval) = (&run.stages[place], &run.stages[place + 1]);
+    let stage = &run.pipeline.stages[sweep.stage];
+    if let Some((key, message)) = [train, eval].into_iter().find_map(|status| match status {
+        Status::Failed { key, message } => Some((*key, message.clone())),
+        _ => None,
+    }) {
+        let others =
+            matches!(state.works.get(&key).map(|work| &work.state), Some(WorkState::Failed { own: false, .. }));
+        return Some(if others {
+            Found::End {
+                key,
+                message: format!("a trial was cut short, which says nothing about its settings: {message}"),
+            }
+        } else {
+            Found::Score(Score::Failed, Some(message))
+        });
+    }
+    let Status::Done { key, known, .. } = eval else { return None };
+    let metric = stage.sweep.as_ref().map_or("", |sweep| &sweep.metric);
+    let Some(value) = known.metrics.get(metric) else {
+        let names: Vec<&str> = known.metrics.keys().map(String::as_str).collect();
+        let message = format!(
+            "`metric` of the sweep is `{metric}`, which its evaluation does not give; there is: {}",
+            if names.is_empty() { "nothing".to_owned() } else { names.join(", ") }
+        );
+        return Some(Found::End { key: *key, message });
+    };
+    let score = Score::of(*value);
+    Some(Found::Score(score, (score == Score::Failed).then(|| format!("`{metric}` is {value}"))))
+}
+
+/// What the swept stage gives: its best trial.
+fn concluded(run: &Run, sweep: &Sweeping) -> Status {
+    let made = || sweep.places.iter().flatten().flat_map(|place| [&run.stages[*place], &run.stages[place + 1]]);
+    let last = sweep.search.rungs().len() - 1;
+    let best = sweep.search.best().and_then(|(trial, _)| {
+        let ticket = sweep.search.tickets().iter().position(|ticket| *ticket == Ticket::Rung { trial, rung: last })?;
+        Some((trial, sweep.places[ticket]?))
+    });
+    let Some((trial, place)) = best else {
+        let first = sweep.failures.iter().next();
+        let why = first.map(|(trial, why)| format!("; trial {trial}: {why}")).unwrap_or_default();
+        let key = made().find_map(Status::key).unwrap_or_else(|| Digest::of(b"no trial began"));
+        let message = format!("none of the {} trials of the sweep got to the end{why}", sweep.search.trials().len());
+        return Status::Failed { key, message };
+    };
+    let (Status::Done { key, known, attempt, .. }, Status::Done { known: judged, .. }) =
+        (&run.stages[place], &run.stages[place + 1])
+    else {
+        unreachable!("a trial with a result is done");
+    };
+    let name = run.pipeline.stages[place].settings.output().0;
+    let outputs = value(known).map(|output| (name.to_owned(), *output)).into_iter().collect();
+    let mut metrics = known.metrics.clone();
+    metrics.extend(judged.metrics.clone());
+    metrics.insert("sweep.trial".into(), trial as f64);
+    let numbers = sweep.search.trials()[trial].iter().filter_map(|(path, value)| Some((path, value.as_f64()?)));
+    metrics.extend(numbers.map(|(path, value)| (format!("sweep.{path}"), value)));
+    let (mut how, mut seconds) = (StageState::Cached, 0.0);
+    for status in made() {
+        if let Status::Done { how: this, wall_s, .. } = status {
+            seconds += wall_s;
+            how = match (how, this) {
+                (StageState::Resumed, _) | (_, StageState::Resumed) => StageState::Resumed,
+                (StageState::Cached, this) => *this,
+                (how, _) => how,
+            };
+        }
+    }
+    Status::Done { key: *key, how, known: Known { outputs, metrics }, wall_s: seconds, attempt: *attempt }
+}
+
+impl State {
+    /// A sweep as clients see it.
+    pub(crate) fn sweep_view(&self, run: &Run, sweep: &Sweeping) -> SweepView {
+        let stage = &run.pipeline.stages[sweep.stage];
+        let settings = stage.sweep.as_ref().expect("the stage has a sweep");
+        let search = &sweep.search;
+        let over = search.is_over();
+        let waiting = |(trial, values): (usize, &protocol::sweep::Values)| TrialView {
+            trial,
+            values: values.clone(),
+            state: TrialState::Waiting,
+            steps: 0,
+            results: Vec::new(),
+            message: sweep.failures.get(&trial).cloned(),
+        };
+        let mut trials: Vec<TrialView> = search.trials().iter().enumerate().map(waiting).collect();
+        for (n, ticket) in search.tickets().iter().enumerate() {
+            let Ticket::Rung { trial, rung } = *ticket else { continue };
+            let view = &mut trials[trial];
+            let place = sweep.places.get(n).copied().flatten();
+            let trained = place.is_some_and(|place| run.stages[place].known().is_some());
+            view.steps += match place.filter(|_| !trained).and_then(|place| run.stages[place].key()) {
+                _ if trained => search.steps(rung),
+                Some(key) => {
+                    let done = self.works.get(&key).map_or(0, |work| self.progress(work).done);
+                    done.saturating_sub(search.rungs()[rung] - search.steps(rung)).min(search.steps(rung))
+                }
+                None => 0,
+            };
+            view.state = match search.score(n) {
+                None => TrialState::Running,
+                Some(Score::Failed) => TrialState::Failed,
+                Some(Score::Value(_)) if rung + 1 == search.rungs().len() => TrialState::Finished,
+                Some(Score::Value(_)) if over => TrialState::Stopped,
+                Some(Score::Value(_)) => TrialState::Paused,
+            };
+            match search.score(n) {
+                Some(Score::Value(value)) => view.results.push(Some(value)),
+                Some(Score::Failed) => view.results.push(None),
+                None => {}
+            }
+        }
+        SweepView {
+            stage: stage.name.clone(),
+            search: settings.search,
+            metric: settings.metric.clone(),
+            mode: settings.mode,
+            rungs: search.rungs().to_vec(),
+            over,
+            spent: trials.iter().map(|trial| trial.steps).sum(),
+            planned: search.planned(),
+            full: search.full(),
+            best: search.best().map(|(trial, _)| trial),
+            trials,
+        }
+    }
+}
+
+/// `14 of 24 trials begun, 5 at rung 1, 1 failed`.
+pub(crate) fn in_words(sweep: &SweepView) -> String {
+    let begun = sweep.trials.iter().filter(|trial| trial.state != TrialState::Waiting).count();
+    let mut words = format!("{begun} of {} trials begun", sweep.trials.len());
+    for rung in 1..sweep.rungs.len() {
+        let at = |trial: &&TrialView| trial.steps > sweep.rungs[rung - 1];
+        let count = sweep.trials.iter().filter(at).count();
+        if count > 0 {
+            words += &format!(", {count} past step {}", sweep.rungs[rung - 1]);
+        }
+    }
+    let failed = sweep.trials.iter().filter(|trial| trial.state == TrialState::Failed).count();
+    if failed > 0 {
+        words += &format!(", {failed} failed");
+    }
+    words
+}

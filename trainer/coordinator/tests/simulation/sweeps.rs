@@ -1,0 +1,152 @@
+//! A sweep decides the same whoever works on it and wherever the coordinator is killed.
+
+use std::time::Instant;
+
+use coordinator::search::{Score, Ticket};
+use coordinator::state::run::Status;
+use coordinator::{Event, Millis, Moment, Policy, State, decide};
+use protocol::message::{RunState, StageState, TrialState};
+
+use crate::worker::FakeWorker;
+use crate::{CHAOS_MS, World, pipelines};
+
+const TRIALS: u64 = 50;
+
+/// All that a sweep decided.
+type Decisions = (Vec<Ticket>, Vec<Option<Score>>, Option<(usize, f64)>, Status);
+
+fn world(workers: usize, seed: u64) -> World {
+    let mut world = World::new(seed);
+    world.now = Millis(CHAOS_MS);
+    world.workers = (0..workers).map(|i| FakeWorker::new(&format!("w{i}"))).collect();
+    let pipeline = Box::new(pipelines::swept(3, TRIALS));
+    let idempotency_key = Some("once".to_owned());
+    let submit = Event::Submit { pipeline, source: String::new(), idempotency_key, until: None };
+    world.submissions = vec![(Millis(0), submit)];
+    world
+}
+
+fn decisions(world: &World) -> Decisions {
+    let run = &world.state.runs[0];
+    assert_eq!(run.state, RunState::Finished, "{:?}", world.state.view(run, world.now).stages.last());
+    let sweep = &run.sweeps[0];
+    let search = &sweep.search;
+    let scores = (0..search.tickets().len()).map(|ticket| search.score(ticket)).collect();
+    let Status::Done { key, known, .. } = run.stages[sweep.stage].clone() else { panic!("the sweep is not done") };
+    let status = Status::Done { key, how: StageState::Ran, known, wall_s: 0.0, attempt: Default::default() };
+    (search.tickets().to_vec(), scores, search.best(), status)
+}
+
+fn reference() -> (Decisions, u64) {
+    let mut world = world(2, 1);
+    world.run();
+    (decisions(&world), world.stored)
+}
+
+#[test]
+fn p19_a_sweep_decides_the_same_with_any_workers() {
+    let (reference, _) = reference();
+    let (tickets, scores, best, _) = &reference;
+    let rungs = |wanted| tickets.iter().filter(|t| matches!(t, Ticket::Rung { rung, .. } if *rung == wanted)).count();
+    assert_eq!(rungs(0), TRIALS as usize);
+    assert!(rungs(1) >= 12 && rungs(2) >= 3 && best.is_some(), "{tickets:?}");
+    assert!(scores.contains(&Some(Score::Failed)), "some trials fail, and the sweep goes on");
+    for (workers, seed) in [(1, 2), (3, 3), (7, 4), (16, 5)] {
+        let mut world = world(workers, seed);
+        world.run();
+        assert_eq!(decisions(&world), reference, "{workers} workers");
+    }
+}
+
+#[test]
+fn p19_a_sweep_decides_the_same_wherever_the_coordinator_is_killed() {
+    let (reference, events) = reference();
+    // After every event, after every third; then once each, at events spread over the whole of it.
+    let often = [(1, 0), (3, 0)].map(|kill| (kill, false));
+    let single = (0..12).map(|i| ((1, i * events / 12), true));
+    for (i, ((every, from), once)) in often.into_iter().chain(single).enumerate() {
+        let mut world = world(1 + i % 4, 10 + i as u64);
+        (world.kills, world.once) = (Some((every, from)), once);
+        world.run();
+        assert_eq!(decisions(&world), reference, "killed every {every} from {from}");
+    }
+}
+
+#[test]
+fn a_sweep_is_found_again_and_shows_what_became_of_its_trials() {
+    let mut world = world(3, 6);
+    world.run();
+    let results = world.store.results.len();
+    let again = Event::Submit {
+        pipeline: Box::new(pipelines::swept(3, TRIALS)),
+        source: String::new(),
+        idempotency_key: None,
+        until: None,
+    };
+    world.submissions = vec![(Millis(0), again)];
+    world.run();
+    assert_eq!(world.store.results.len(), results, "nothing is computed twice");
+    let views = world.views();
+    assert_eq!(views[0].sweeps[0].trials, views[1].sweeps[0].trials);
+    let swept = |run: usize| views[run].stages.iter().find(|stage| stage.name.as_str() == "pcm").expect("the stage");
+    assert_eq!((swept(0).state, swept(1).state), (StageState::Ran, StageState::Cached));
+    assert_eq!((&swept(0).outputs, &swept(0).metrics), (&swept(1).outputs, &swept(1).metrics));
+    let sweep = &views[0].sweeps[0];
+    let best = &sweep.trials[sweep.best.expect("a best trial")];
+    assert_eq!((best.state, best.steps, best.results.len()), (TrialState::Finished, 18, 3));
+    assert_eq!(swept(0).metrics["latent_fid"], best.results[2].expect("a result"));
+    assert_eq!(swept(0).metrics["sweep.trial"], best.trial as f64);
+    let count = |state| sweep.trials.iter().filter(|trial| trial.state == state).count();
+    assert!(count(TrialState::Stopped) > 25 && count(TrialState::Failed) > 1, "{sweep:?}");
+    assert_eq!(count(TrialState::Waiting) + count(TrialState::Running) + count(TrialState::Paused), 0);
+    assert!(sweep.over && sweep.spent * 2 <= sweep.full && sweep.spent <= sweep.planned, "{sweep:?}");
+}
+
+#[test]
+fn a_metric_that_nobody_reports_ends_the_run_at_once() {
+    let mut world = world(2, 8);
+    let mut pipeline = pipelines::swept(3, TRIALS);
+    let stage = pipeline.stages.iter_mut().find(|stage| stage.sweep.is_some()).expect("the swept stage");
+    stage.sweep.as_mut().expect("a sweep").metric = "fdi".into();
+    let submit =
+        Event::Submit { pipeline: Box::new(pipeline), source: String::new(), idempotency_key: None, until: None };
+    world.submissions = vec![(Millis(0), submit)];
+    while !world.is_over() {
+        world.step();
+    }
+    let view = &world.views()[0];
+    let message = view.stages.iter().find(|stage| stage.name.as_str() == "pcm").and_then(|stage| stage.message.clone());
+    assert_eq!(view.state, RunState::Failed);
+    assert!(
+        message.as_deref().is_some_and(|m| m.contains("`fdi`") && m.contains("there is: latent_fid")),
+        "{message:?}"
+    );
+}
+
+/// What a trial costs the coordinator beyond the work: all events of the sweep, decided once more.
+#[test]
+fn bookkeeping_takes_little_time_for_each_trial() {
+    let mut world = world(4, 9);
+    world.run();
+    let mut state =
+        State::new(Policy { grace_ms: 10_000, fault_budget: 1000, infrastructure_budget: 1000, ..Policy::default() });
+    let entries: Vec<(Moment, Event)> = world
+        .store
+        .journal
+        .iter()
+        .map(|entry| {
+            let read = |value| serde_json::from_value(value).expect("an entry");
+            (serde_json::from_value(entry.clone()).expect("a moment"), read(entry.clone()))
+        })
+        .collect();
+    let since = Instant::now();
+    for (moment, event) in entries {
+        let mut next = state.clone();
+        decide(&mut next, moment, event).expect("what was accepted is accepted");
+        state = next;
+    }
+    let each = since.elapsed().as_secs_f64() * 1000.0 / TRIALS as f64;
+    eprintln!("{} events, {each:.2} ms of deciding for each of {TRIALS} trials", world.stored);
+    let bound = if cfg!(debug_assertions) { 50.0 } else { 5.0 };
+    assert!(each <= bound, "{each} ms for each trial");
+}

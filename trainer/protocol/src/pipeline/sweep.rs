@@ -1,0 +1,531 @@
+//! Sweeps in a pipeline: reading `sweep:`, its rules, and the stages that a trial is made of.
+//!
+//! `space` mirrors the stage's own keys, so that a setting is found, checked and misspelt there as it would be in the stage itself. Every
+//! value of a choice and both ends of a range are checked as if they stood in the stage.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use super::diagnostic::Position;
+use super::graph::{self, ByStage};
+use super::read::Reader;
+use super::rules::{self, Problem, Problems};
+use super::schema::{list_keys, overlay, unknown_key};
+use super::yaml::{Content, Entry, Node};
+use super::{PipelineStage, StageInput};
+use crate::stage::{Mode, Shape, StageSettings};
+use crate::sweep::{
+    Derived, Domain, MAX_TRIALS, Rungs, STATE_OUTPUT, SearchKind, Sweep, Values, beside, judged_field, rung_name,
+    setting, with_values,
+};
+use crate::{ArtifactKind, StageName, Steps};
+
+/// What a domain may be.
+const DOMAINS: [&str; 3] = ["choice", "uniform", "log_uniform"];
+/// What is written behind the name of a swept stage to say that its best trial is meant. It always is.
+const BEST: &str = "@best";
+
+/// The keys of a sweep that have a type of their own.
+#[derive(Debug, Serialize, Deserialize)]
+struct Head {
+    search: SearchKind,
+    metric: String,
+    mode: Mode,
+    trials: usize,
+    parallel: usize,
+    rungs: Rungs,
+}
+
+impl Default for Head {
+    fn default() -> Self {
+        Self {
+            search: SearchKind::Asha,
+            metric: String::new(),
+            mode: Mode::Min,
+            trials: 0,
+            parallel: 4,
+            rungs: Rungs::default(),
+        }
+    }
+}
+
+impl Reader {
+    /// `sweep:` of stage `name`, whose kind has the settings `default`.
+    pub(super) fn sweep(&mut self, entry: &Entry, name: &str, default: &StageSettings) -> Option<Sweep> {
+        let path = format!("stages.{name}.sweep");
+        let owner = format!("`sweep` of stage `{name}`");
+        if default.training().is_none() {
+            let message = format!(
+                "stage `{name}` is of kind `{}`, which does not train; only training stages are swept",
+                default.kind()
+            );
+            self.mistake(entry.key_at, &path, message, None);
+            return None;
+        }
+        let node = &entry.value;
+        if node.map().is_none() {
+            let message = format!("{owner} is {}; expected a mapping", node.describe());
+            let help = "such as `{search: asha, metric: latent_fid, trials: 24, space: {lr: {log_uniform: [1e-4, 1e-3]}}, evaluate: {kind: evaluate.latent_fid}}`";
+            self.mistake(node.at, &path, message, Some(help.into()));
+            return None;
+        }
+        let head = self.typed::<Head>(node, &owner, &path, &["space", "evaluate"]);
+        let mut space = BTreeMap::new();
+        match node.entry("space") {
+            None => {
+                let help = "such as `space: {lr: {log_uniform: [1e-4, 1e-3]}}`";
+                self.mistake(
+                    entry.key_at,
+                    &format!("{path}.space"),
+                    format!("{owner} has no `space`"),
+                    Some(help.into()),
+                );
+                return None;
+            }
+            Some(entry) => {
+                let before = self.mistakes.len();
+                let example = serde_json::to_value(default).ok()?;
+                let walk = Space { default, example: &example, owner: format!("stage `{name}`") };
+                self.space(&walk, &entry.value, &mut Vec::new(), &format!("{path}.space"), &mut space);
+                if self.mistakes.len() > before {
+                    return None;
+                }
+            }
+        }
+        let evaluate = match node.entry("evaluate") {
+            None => {
+                let help = "a stage without its own name, such as `evaluate: {kind: evaluate.latent_fid, sampler: {steps: 1}}`";
+                self.mistake(
+                    entry.key_at,
+                    &format!("{path}.evaluate"),
+                    format!("{owner} has no `evaluate`"),
+                    Some(help.into()),
+                );
+                return None;
+            }
+            Some(entry) => self.judge(entry, name, default, &format!("{path}.evaluate"))?,
+        };
+        let Head { search, metric, mode, trials, parallel, rungs } = head?;
+        Some(Sweep { search, metric, mode, trials, parallel, rungs, space, evaluate: Box::new(evaluate) })
+    }
+
+    /// The stage that judges trials, with its reference to the judged stage filled in.
+    fn judge(&mut self, entry: &Entry, name: &str, default: &StageSettings, path: &str) -> Option<StageSettings> {
+        let owner = format!("`evaluate` of the sweep of stage `{name}`");
+        let node = &entry.value;
+        if node.map().is_none() {
+            let message = format!("{owner} is {}; expected a mapping with `kind`", node.describe());
+            self.mistake(node.at, path, message, Some("such as `{kind: evaluate.latent_fid}`".into()));
+            return None;
+        }
+        let judge = self.kind(node, entry.key_at, &owner, path)?;
+        let gives = default.output().1;
+        let field = judged_field(&judge, gives).filter(|_| judge.output().1 == ArtifactKind::Report);
+        let Some(field) = field else {
+            let judges = StageSettings::all();
+            let judges = judges
+                .iter()
+                .filter(|judge| judge.output().1 == ArtifactKind::Report && judged_field(judge, gives).is_some());
+            let message = format!("`{}` does not measure {}, which `{name}` gives", judge.kind(), graph::noun(gives));
+            let at = node.entry("kind").map_or(node.at, |kind| kind.value.at);
+            let help = format!("kinds that do: {}", list_keys(judges.map(StageSettings::kind)));
+            self.mistake(at, &format!("{path}.kind"), message, Some(help));
+            return None;
+        };
+        if let Some(written) = node.entry(&field)
+            && written.value.as_text() != Some(name)
+        {
+            let message =
+                format!("`{field}` of {owner} is {}; a sweep judges its own trials", written.value.describe());
+            self.mistake(written.value.at, &format!("{path}.{field}"), message, Some("leave it out".into()));
+            return None;
+        }
+        let mut base = serde_json::to_value(&judge).ok()?;
+        base[field.as_str()] = Value::String(name.to_owned());
+        self.overlaid(base, node, &owner, path, &[])
+    }
+
+    fn space(
+        &mut self,
+        walk: &Space<'_>,
+        node: &Node,
+        keys: &mut Vec<String>,
+        path: &str,
+        found: &mut BTreeMap<String, Domain>,
+    ) {
+        let place = if keys.is_empty() { "`space`".to_owned() } else { format!("`space.{}`", keys.join(".")) };
+        let Some(entries) = node.map() else {
+            let message = format!(
+                "{place} is {}; expected settings of {} with the values that they may take",
+                node.describe(),
+                walk.owner
+            );
+            self.mistake(node.at, path, message, Some("such as `lr: {log_uniform: [1e-4, 1e-3]}`".into()));
+            return;
+        };
+        if entries.is_empty() {
+            self.mistake(
+                node.at,
+                path,
+                format!("{place} is empty; expected at least one setting of {}", walk.owner),
+                None,
+            );
+        }
+        let example = keys.iter().fold(walk.example, |value, key| &value[key.as_str()]);
+        for entry in entries {
+            let path = format!("{path}.{}", entry.key);
+            let references = walk.default.inputs();
+            if keys.is_empty() && entry.key == "steps" {
+                let help = "the stage's `steps` are the budget of every trial; search something else";
+                self.mistake(entry.key_at, &path, "`steps` cannot be searched", Some(help.into()));
+                continue;
+            }
+            if keys.is_empty() && references.iter().any(|(field, ..)| *field == entry.key) {
+                let message = format!("`{}` names a stage, which cannot be searched", entry.key);
+                self.mistake(entry.key_at, &path, message, Some("write a stage for each of them instead".into()));
+                continue;
+            }
+            let known = example.as_object().into_iter().flat_map(|known| known.keys().map(String::as_str));
+            let known: Vec<&str> = known
+                .filter(|key| {
+                    !keys.is_empty() || !(["kind", "steps"].contains(key) || references.iter().any(|(f, ..)| f == key))
+                })
+                .collect();
+            if !known.contains(&entry.key.as_str()) {
+                let (message, help) = unknown_key(&entry.key, &format!("in {place} of {}", walk.owner), &known);
+                self.mistake(entry.key_at, &path, message, Some(help));
+                continue;
+            }
+            keys.push(entry.key.clone());
+            if example[entry.key.as_str()].is_object() {
+                self.space(walk, &entry.value, keys, &path, found);
+            } else if let Some(domain) = self.domain(walk, &entry.value, keys, &path) {
+                found.insert(keys.join("."), domain);
+            }
+            keys.pop();
+        }
+    }
+
+    fn domain(&mut self, walk: &Space<'_>, node: &Node, keys: &[String], path: &str) -> Option<Domain> {
+        let label = format!("`space.{}`", keys.join("."));
+        let help =
+            || Some("write `{choice: [a, b]}`, `{uniform: [from, to]}` or `{log_uniform: [from, to]}`".to_owned());
+        let entry = match node.map() {
+            Some([entry]) => entry,
+            Some(entries) if entries.len() > 1 => {
+                let message = format!("{label} has {} keys; expected one of {}", entries.len(), list_keys(DOMAINS));
+                self.mistake(node.at, path, message, help());
+                return None;
+            }
+            _ => {
+                let message = format!("{label} is {}; expected the values that it may take", node.describe());
+                self.mistake(node.at, path, message, help());
+                return None;
+            }
+        };
+        if !DOMAINS.contains(&entry.key.as_str()) {
+            let (message, known) = unknown_key(&entry.key, &format!("in {label}"), &DOMAINS);
+            self.mistake(entry.key_at, &format!("{path}.{}", entry.key), message, Some(known));
+            return None;
+        }
+        let path = format!("{path}.{}", entry.key);
+        let Content::List(items) = &entry.value.value else {
+            let message = format!("`{}` of {label} is {}; expected a list", entry.key, entry.value.describe());
+            self.mistake(entry.value.at, &path, message, None);
+            return None;
+        };
+        let mut values = Vec::new();
+        for item in items {
+            let value = self.value(walk, item, keys, &path)?;
+            if values.contains(&value) {
+                self.mistake(item.at, &path, format!("{label} lists {value} twice"), None);
+                return None;
+            }
+            values.push(value);
+        }
+        if entry.key == "choice" {
+            if values.is_empty() {
+                self.mistake(
+                    entry.value.at,
+                    &path,
+                    format!("`choice` of {label} is empty; expected at least one value"),
+                    None,
+                );
+                return None;
+            }
+            return Some(Domain::Choice(values));
+        }
+        let ends: Vec<f64> = values.iter().filter_map(Value::as_f64).collect();
+        match ends[..] {
+            [low, high] if low < high && values.len() == 2 => {
+                if entry.key == "uniform" {
+                    return Some(Domain::Uniform(low, high));
+                }
+                if low > 0.0 {
+                    return Some(Domain::LogUniform(low, high));
+                }
+                let message = format!("`log_uniform` of {label} begins at {low}; expected a number above 0");
+                self.mistake(items[0].at, &path, message, None);
+            }
+            _ => {
+                let message =
+                    format!("`{}` of {label} is not a range; expected two numbers, the smaller first", entry.key);
+                self.mistake(entry.value.at, &path, message, Some("values without an order go into `choice`".into()));
+            }
+        }
+        None
+    }
+
+    /// A value that the setting may take, as the setting itself would be written out.
+    fn value(&mut self, walk: &Space<'_>, item: &Node, keys: &[String], path: &str) -> Option<Value> {
+        let before = self.mistakes.len();
+        let mut base = walk.example.clone();
+        overlay::<StageSettings>(&mut base, &nested(keys, item), &walk.owner, path, &[], &mut self.mistakes);
+        for mistake in &mut self.mistakes[before..] {
+            mistake.path = path.to_owned();
+        }
+        if self.mistakes.len() > before {
+            return None;
+        }
+        let settings: StageSettings = serde_json::from_value(base).ok()?;
+        setting(&settings, &keys.join("."))
+    }
+}
+
+/// What a space is read against.
+struct Space<'a> {
+    default: &'a StageSettings,
+    example: &'a Value,
+    owner: String,
+}
+
+/// `{a: {b: item}}` for the keys `a`, `b`.
+fn nested(keys: &[String], item: &Node) -> Node {
+    keys.iter().rev().fold(item.clone(), |value, key| {
+        let at: Position = item.at;
+        Node { at, value: Content::Map(vec![Entry { key: key.clone(), key_at: at, value }]) }
+    })
+}
+
+/// What a swept stage reads because its trials' evaluations do.
+pub(super) fn references(stage: &PipelineStage) -> Vec<StageInput> {
+    let Some(sweep) = &stage.sweep else { return Vec::new() };
+    let judged = judged_field(&sweep.evaluate, stage.settings.output().1);
+    let inputs = graph::references(&sweep.evaluate).into_iter().filter(|input| Some(&input.field) != judged.as_ref());
+    inputs.map(|input| StageInput { field: format!("sweep.evaluate.{}", input.field), ..input }).collect()
+}
+
+/// Takes `@best` off references to swept stages: what such a stage gives is its best trial.
+pub(super) fn resolve_best<'a>(
+    stage: &mut PipelineStage,
+    stages: impl Iterator<Item = (&'a StageName, bool)> + Clone,
+) -> Vec<Problem> {
+    let mut problems = Problems::default();
+    let marked: Vec<StageInput> = stage.inputs.iter().filter(|i| i.stage.as_str().ends_with(BEST)).cloned().collect();
+    for input in marked {
+        let name = input.stage.as_str().trim_end_matches(BEST).to_owned();
+        if stages.clone().any(|(other, swept)| other.as_str() == name && !swept) {
+            let message =
+                format!("`{}` is `{}`, but `{name}` has no `sweep`, so it has one result", input.field, input.stage);
+            problems.add(&input.field, message, &format!("write `{name}`"));
+        }
+        let in_sweep = input.field.strip_prefix("sweep.evaluate.");
+        let settings = match (in_sweep, &mut stage.sweep) {
+            (Some(_), Some(sweep)) => &mut *sweep.evaluate,
+            _ => &mut stage.settings,
+        };
+        refer(settings, in_sweep.unwrap_or(&input.field), &name);
+        for other in stage.inputs.iter_mut().filter(|other| other.field == input.field) {
+            other.stage = StageName::new(&*name);
+        }
+    }
+    problems.0
+}
+
+/// Makes the reference `field`, such as `teacher` or `from[0]`, name another stage.
+fn refer(settings: &mut StageSettings, field: &str, stage: &str) {
+    let pointer = format!("/{}", field.replace('.', "/").replace('[', "/").replace(']', ""));
+    if let Ok(mut json) = serde_json::to_value(&*settings)
+        && let Some(place) = json.pointer_mut(&pointer)
+    {
+        *place = Value::String(stage.to_owned());
+        if let Ok(changed) = serde_json::from_value(json) {
+            *settings = changed;
+        }
+    }
+}
+
+/// Everything that can be said of a stage's sweep without looking at other stages.
+pub(super) fn rules(stage: &PipelineStage) -> Vec<Problem> {
+    let mut problems = Problems::default();
+    let (p, Some(sweep), Some(training)) = (&mut problems, &stage.sweep, stage.settings.training()) else {
+        return problems.0;
+    };
+    if sweep.metric.trim().is_empty() {
+        p.add("sweep.metric", "`metric` is missing: the value of `evaluate` that decides which trial is best", "");
+    }
+    if !(1..=1000).contains(&sweep.parallel) {
+        p.add("sweep.parallel", format!("`parallel` is {}; expected 1 to 1000", sweep.parallel), "");
+    }
+    match (sweep.search, sweep.points()) {
+        (SearchKind::Grid, None) => {
+            let ranges = sweep.space.iter().filter(|(_, domain)| !matches!(domain, Domain::Choice(_)));
+            for (path, _) in ranges {
+                let message = format!("`{path}` is a range, which has no grid");
+                p.add(
+                    &format!("sweep.space.{path}"),
+                    message,
+                    "list values with `choice`, or search with `random` or `asha`",
+                );
+            }
+        }
+        (SearchKind::Grid, Some(points)) => {
+            if sweep.trials != 0 && sweep.trials != points {
+                let message = format!("`trials` is {}, but the grid has {points} points", sweep.trials);
+                p.add("sweep.trials", message, "leave it out, or search with `random`");
+            }
+            if points > MAX_TRIALS {
+                p.add("sweep.space", format!("the grid has {points} points; expected at most {MAX_TRIALS}"), "");
+            }
+        }
+        (SearchKind::Random | SearchKind::Asha, _) => {
+            if !(1..=MAX_TRIALS).contains(&sweep.trials) {
+                let message = format!("`trials` is {}; expected 1 to {MAX_TRIALS}", sweep.trials);
+                p.add("sweep.trials", message, "how many points of the space are tried");
+            }
+        }
+    }
+    if sweep.search == SearchKind::Asha {
+        let (Rungs { first, factor }, steps) = (sweep.rungs, training.steps);
+        if first.0 == 0 || first >= steps {
+            let message =
+                format!("`rungs.first` is {first}; expected fewer steps than the stage's {steps}, and at least 1");
+            p.add("sweep.rungs.first", message, "the steps after which trials are compared for the first time");
+        }
+        if factor < 2 {
+            p.add("sweep.rungs.factor", format!("`rungs.factor` is {factor}; expected at least 2"), "");
+        }
+    } else if sweep.rungs != Rungs::default() {
+        let message = format!("`rungs` are for `asha`; with `{}` every trial trains to the end", sweep.search.name());
+        p.add("sweep.rungs", message, "leave them out");
+    }
+    for (path, domain) in &sweep.space {
+        let field = format!("sweep.space.{path}");
+        let whole = setting(&stage.settings, path).is_some_and(|value| value.is_number() && !value.is_f64());
+        for (at, value) in tried(domain, whole) {
+            let at = format!("{field}{at}");
+            let problem = match with_values(&stage.settings, &Values::from([(path.clone(), value.clone())])) {
+                Ok(_) => None,
+                // What is wrong with the stage itself is said there.
+                Err(_) if !rules::stage(&stage.settings, &stage.placement).is_empty() => None,
+                Err(problem) => Some(problem),
+            };
+            if let Some(problem) = problem {
+                p.add(&at, format!("with `{path}` at {value}: {problem}"), "");
+            }
+        }
+    }
+    let judge = rules::stage(&sweep.evaluate, &stage.placement);
+    p.0.extend(judge.into_iter().filter(|problem| !problem.field.starts_with("workers")).map(in_judge));
+    problems.0
+}
+
+/// The values of a domain that are tried before anything runs, with their places below it.
+fn tried(domain: &Domain, whole: bool) -> Vec<(String, Value)> {
+    let end = |value: f64| if whole { Value::from(value as u64) } else { Value::from(value) };
+    match domain {
+        Domain::Choice(values) => {
+            values.iter().enumerate().map(|(i, value)| (format!(".choice[{i}]"), value.clone())).collect()
+        }
+        Domain::Uniform(low, high) => vec![(".uniform[0]".into(), end(*low)), (".uniform[1]".into(), end(*high))],
+        Domain::LogUniform(low, high) => {
+            vec![(".log_uniform[0]".into(), end(*low)), (".log_uniform[1]".into(), end(*high))]
+        }
+    }
+}
+
+fn in_judge(problem: Problem) -> Problem {
+    Problem { field: format!("sweep.evaluate.{}", problem.field), ..problem }
+}
+
+/// Whether trials and their evaluations agree with the other stages, value by value. Call when the stages themselves do.
+pub(super) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
+    for (i, stage) in stages.iter().enumerate() {
+        let Some(sweep) = &stage.sweep else { continue };
+        let judge_name = StageName::new(format!("{}.eval", stage.name));
+        let judge = PipelineStage {
+            name: judge_name.clone(),
+            settings: (*sweep.evaluate).clone(),
+            inputs: graph::references(&sweep.evaluate),
+            sweep: None,
+            ..stage.clone()
+        };
+        let mut all = stages.to_vec();
+        all.push(judge);
+        let mut problems = ByStage::new();
+        graph::check_agreement(&all, &mut problems);
+        if let Some(wrong) = problems.remove(&judge_name).filter(|wrong| !wrong.0.is_empty()) {
+            found.entry(stage.name.clone()).or_default().0.extend(wrong.0.into_iter().map(in_judge));
+            continue;
+        }
+        for (path, domain) in &sweep.space {
+            let Domain::Choice(values) = domain else { continue };
+            for (at, value) in values.iter().enumerate() {
+                let values = Values::from([(path.clone(), value.clone())]);
+                let Ok(settings) = with_values(&stage.settings, &values) else { continue };
+                all[i].settings = settings;
+                let mut problems = ByStage::new();
+                graph::check_agreement(&all, &mut problems);
+                if let Some((other, problem)) =
+                    problems.into_iter().find_map(|(name, wrong)| Some((name, wrong.0.into_iter().next()?)))
+                {
+                    let field = format!("sweep.space.{path}.choice[{at}]");
+                    let message = format!("with `{path}` at {value} stage `{other}` does not fit: {}", problem.message);
+                    found.entry(stage.name.clone()).or_default().add(&field, message, "");
+                }
+            }
+        }
+        all[i] = stage.clone();
+    }
+}
+
+impl PipelineStage {
+    /// The stages of one rung of a trial: the training up to step `stop` (to the end, if `None`), which goes on from the rung before,
+    /// and the evaluation of what it gives.
+    ///
+    /// # Errors
+    /// Why `values` cannot be tried, such as two that are each fine alone.
+    pub fn rung(&self, trial: usize, rung: usize, stop: Option<Steps>, values: &Values) -> Result<[Self; 2], String> {
+        let sweep = self.sweep.as_ref().ok_or("the stage has no sweep")?;
+        let mut settings = with_values(&self.settings, values)?;
+        settings.training_mut().ok_or("the stage does not train")?.stop = stop;
+        let name = rung_name(&self.name, trial, rung);
+        let mut inputs = graph::references(&settings);
+        if let Some(before) = rung.checked_sub(1) {
+            let stage = rung_name(&self.name, trial, before);
+            inputs.push(StageInput { field: STATE_OUTPUT.into(), stage, kind: ArtifactKind::Checkpoint });
+        }
+        let mut judge = (*sweep.evaluate).clone();
+        if let Some(field) = judged_field(&judge, self.settings.output().1) {
+            refer(&mut judge, &field, name.as_str());
+        }
+        debug_assert!(settings.shape() == Shape::Gang, "only gangs train");
+        let placement = beside(&self.placement);
+        let derived = |keyed_as: StageName| Some(Derived { of: self.name.clone(), trial, rung, keyed_as });
+        let eval = Self {
+            name: StageName::new(format!("{name}.eval")),
+            inputs: graph::references(&judge),
+            settings: judge,
+            placement: placement.clone(),
+            external: BTreeMap::new(),
+            sweep: None,
+            derived: derived(StageName::new(format!("{}.eval", self.name))),
+        };
+        let external = self.external.clone();
+        let train =
+            Self { name, settings, placement, inputs, external, sweep: None, derived: derived(self.name.clone()) };
+        Ok([train, eval])
+    }
+}
