@@ -129,7 +129,15 @@ fn pipeline(seed: u64) -> Pipeline {
         let inputs =
             inputs.map(|(field, stage, kind)| StageInput { field, stage: stage.as_str().into(), kind }).collect();
         let placement = Placement { workers: WorkerRange { min: 1, max: 1 }, ..Placement::default() };
-        PipelineStage { name: name.into(), settings, placement, inputs, external: BTreeMap::new() }
+        PipelineStage {
+            name: name.into(),
+            settings,
+            placement,
+            inputs,
+            external: BTreeMap::new(),
+            sweep: None,
+            derived: None,
+        }
     };
     Pipeline {
         name: "bench".into(),

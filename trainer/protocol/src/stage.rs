@@ -812,6 +812,7 @@ impl StageSettings {
             Self::TrainMld(s) => Some(&s.training),
             Self::DistillLcm(s) => Some(&s.distillation.training),
             Self::DistillPcm(s) => Some(&s.distillation.training),
+            Self::TrainEvaluator(s) => Some(&s.training),
             _ => None,
         }
     }
@@ -823,6 +824,7 @@ impl StageSettings {
             Self::TrainMld(s) => Some(&mut s.training),
             Self::DistillLcm(s) => Some(&mut s.distillation.training),
             Self::DistillPcm(s) => Some(&mut s.distillation.training),
+            Self::TrainEvaluator(s) => Some(&mut s.training),
             _ => None,
         }
     }

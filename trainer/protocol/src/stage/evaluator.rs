@@ -89,6 +89,7 @@ impl Default for TrainEvaluator {
                 decay: Decay::Constant,
                 optimizer: Optimizer::default(),
                 max_grad_norm: 0.5,
+                stop: None,
             },
         }
     }
