@@ -57,6 +57,13 @@ impl Timing {
     }
 }
 
+/// Average inference time per sentence (AITS), in seconds: sentences one by one, from the text to the decoded motion, loading and
+/// drawing left out. `None` of none. Of this machine alone, and so no value of a stage.
+pub fn aits(timings: &[Timing]) -> Option<f64> {
+    let seconds: f64 = timings.iter().map(|t| t.total().as_secs_f64()).sum();
+    (!timings.is_empty()).then(|| seconds / timings.len() as f64)
+}
+
 /// A motion.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Generated {
@@ -136,5 +143,21 @@ impl Generator {
         let joints = recover_joints(&features, Skeleton::of(self.format()));
         let timing = Timing { text: embedded - start, sampling: sampled - embedded, decoding: decoded - sampled };
         Ok(Generated { features, joints, frames, format: self.format(), timing })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_time_per_sentence_is_the_mean_of_all_three_parts() {
+        let timing = |ms| Timing {
+            text: Duration::from_millis(ms),
+            sampling: Duration::from_millis(10 * ms),
+            decoding: Duration::from_millis(100 * ms),
+        };
+        assert_eq!(aits(&[timing(1), timing(3)]), Some(0.222));
+        assert_eq!(aits(&[]), None);
     }
 }

@@ -209,15 +209,15 @@ fn shared(part: &str) -> Option<PathBuf> {
 
 /// A fixture's evaluator laid out as published.
 fn published(fixture: &Path, file: &str, features: usize) -> tempfile::TempDir {
-    let dir = tempfile::tempdir().unwrap();
+    let dir = tempfile::tempdir().expect("a test's own files");
     let model = dir.path().join("text_mot_match/model");
     let meta = dir.path().join("Comp_v6_KLD01/meta");
-    std::fs::create_dir_all(&model).unwrap();
-    std::fs::create_dir_all(&meta).unwrap();
-    let bytes = std::fs::read(fixture.join(file)).unwrap();
-    std::fs::write(model.join(file.replace("weights", "finest")), bytes).unwrap();
+    std::fs::create_dir_all(&model).expect("a test's own files");
+    std::fs::create_dir_all(&meta).expect("a test's own files");
+    let bytes = std::fs::read(fixture.join(file)).expect("a test's own files");
+    std::fs::write(model.join(file.replace("weights", "finest")), bytes).expect("a test's own files");
     for (name, value) in [("mean.npy", 0.25), ("std.npy", 0.5)] {
-        motion::npy::write(&meta.join(name), &[features], &vec![value; features]).unwrap();
+        motion::npy::write(&meta.join(name), &[features], &vec![value; features]).expect("a test's own files");
     }
     dir
 }
@@ -269,14 +269,14 @@ fn a_published_evaluator_is_read_from_its_pickle() {
 /// Stores a dataset that a test changed.
 fn store(bench: &Bench, dataset: &Dataset, like: Digest) -> Digest {
     let blobs = bench.blobs();
-    let mut manifest = Manifest::new(ArtifactKind::Dataset, bench.manifest(like).unwrap().meta);
+    let mut manifest = Manifest::new(ArtifactKind::Dataset, bench.manifest(like).expect("a test's own files").meta);
     dataset
         .write_files::<PackError>(|name, bytes| {
             let entry = FileEntry { bytes: bytes.len() as u64, digest: blobs.put(bytes).expect("stored") };
             manifest.files.insert(name, entry);
             Ok(())
         })
-        .unwrap();
+        .expect("a test's own files");
     blobs.put(manifest.to_bytes()).expect("stored")
 }
 
@@ -327,7 +327,7 @@ fn pickled(rows: &[(&str, u8)]) -> Vec<u8> {
     let mut bytes = vec![0x80, 3, b'}', b'('];
     for (word, row) in rows {
         bytes.push(b'X');
-        bytes.extend(u32::try_from(word.len()).unwrap().to_le_bytes());
+        bytes.extend(u32::try_from(word.len()).expect("a short word").to_le_bytes());
         bytes.extend(word.as_bytes());
         bytes.extend([b'K', *row]);
     }

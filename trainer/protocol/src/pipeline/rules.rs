@@ -388,8 +388,15 @@ mod tests {
 
     #[test]
     fn gates_are_comparisons() {
-        for good in ["latent_fid <= 0.3", "fid<=0.05", "eval.r_precision_top1 >= staging - 0.005", "a > 1", "a < prod"]
-        {
+        for good in [
+            "latent_fid <= 0.3",
+            "fid<=0.05",
+            "fid.upper <= 0.05",
+            "eval.r_precision_top1 >= staging - 0.005",
+            "a > 1",
+            "a < prod",
+            "fid.upper <= 0.05",
+        ] {
             assert!(is_gate(good), "{good}");
         }
         for bad in ["", "latent_fid", "<= 1", "a <= ", "a => 1", "a == 1", "a <= b c", "a b <= 1", "a <= nan"] {
