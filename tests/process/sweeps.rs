@@ -71,6 +71,9 @@ fn p19_a_sweep_decides_the_same_with_other_workers_and_when_it_is_killed() {
     let again = bench.pipeline(CONFIG, &swept("2"));
     assert_eq!(decided(&again), reference);
     assert!(states(&again).values().all(|state| state == "cached" || state == "skipped"), "{:?}", states(&again));
+    let plan = bench.run(&["plan", &config, "--set", SWEEP, STEPS[0], STEPS[1], "-o", "json"]).expect_code(0).json();
+    let planned = plan["stages"].as_array().and_then(|stages| stages.iter().find(|stage| stage["stage"] == "pcm"));
+    assert_eq!(planned.expect("the swept stage")["action"], "cached", "{plan:#}");
     let plot = bench.path().join("sweep.svg");
     let shown = bench.run(&["sweep", "status", &config, "-o", "json", "--plot", &plot.display().to_string()]);
     let shown = shown.expect_code(0).json();

@@ -346,7 +346,7 @@ pub(super) fn resolve_best<'a>(
 
 /// Makes the reference `field`, such as `teacher` or `from[0]`, name another stage.
 fn refer(settings: &mut StageSettings, field: &str, stage: &str) {
-    let pointer = format!("/{}", field.replace('.', "/").replace('[', "/").replace(']', ""));
+    let pointer = format!("/{}", field.replace(['.', '['], "/").replace(']', ""));
     if let Ok(mut json) = serde_json::to_value(&*settings)
         && let Some(place) = json.pointer_mut(&pointer)
     {
