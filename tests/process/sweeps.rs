@@ -71,6 +71,9 @@ fn p19_a_sweep_decides_the_same_with_other_workers_and_when_it_is_killed() {
     let again = bench.pipeline(CONFIG, &swept("2"));
     assert_eq!(decided(&again), reference);
     assert!(states(&again).values().all(|state| state == "cached" || state == "skipped"), "{:?}", states(&again));
+    let plan = bench.run(&["plan", &config, "--set", SWEEP, STEPS[0], STEPS[1], "-o", "json"]).expect_code(0).json();
+    let planned = plan["stages"].as_array().and_then(|stages| stages.iter().find(|stage| stage["stage"] == "pcm"));
+    assert_eq!(planned.expect("the swept stage")["action"], "cached", "{plan:#}");
     let plot = bench.path().join("sweep.svg");
     let shown = bench.run(&["sweep", "status", &config, "-o", "json", "--plot", &plot.display().to_string()]);
     let shown = shown.expect_code(0).json();
@@ -94,4 +97,17 @@ fn a_metric_that_nobody_reports_ends_the_run_and_says_what_there_is() {
     let sweep = SWEEP.replace("metric: latent_fid", "metric: fdi");
     let said = bench.run(&[&["run", &config, "--workers", "2", "--set", &sweep][..], &STEPS].concat()).expect_code(1);
     assert!(said.stderr.contains("`fdi`") && said.stderr.contains("latent_fid"), "{}", said.stderr);
+}
+
+#[test]
+fn a_trial_that_diverges_is_stopped_and_the_sweep_goes_on() {
+    let bench = Bench::new(TRAINER);
+    let sweep = "stages.pcm.sweep={search: grid, metric: latent_fid, space: {lr: {choice: [5e-4, 1e30]}}, \
+        evaluate: {kind: evaluate.latent_fid, sampler: {steps: 1, guidance: 2}, repeats: 1, components: 8, shards: 1}}";
+    let report = bench.pipeline(CONFIG, &["--workers", "2", "--set", sweep, "--until", "pcm"]);
+    let sweep = &report["sweeps"][0];
+    assert_eq!((&sweep["best"], &sweep["trials"][1]["state"]), (&0.into(), &"failed".into()), "{sweep:#}");
+    let why = sweep["trials"][1]["message"].as_str().expect("a reason");
+    assert!(why.contains("diverged"), "{why}");
+    assert_eq!(states(&report)["pcm"], "ran");
 }

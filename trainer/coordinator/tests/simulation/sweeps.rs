@@ -61,10 +61,9 @@ fn p19_a_sweep_decides_the_same_with_any_workers() {
 #[test]
 fn p19_a_sweep_decides_the_same_wherever_the_coordinator_is_killed() {
     let (reference, events) = reference();
-    // After every event, after every third; then once each, at events spread over the whole of it.
-    let often = [(1, 0), (3, 0)].map(|kill| (kill, false));
-    let single = (0..12).map(|i| ((1, i * events / 12), true));
-    for (i, ((every, from), once)) in often.into_iter().chain(single).enumerate() {
+    // After every event; then once each, at events spread over the whole of it.
+    let single = (0..8).map(|i| ((1, i * events / 8), true));
+    for (i, ((every, from), once)) in [((1, 0), false)].into_iter().chain(single).enumerate() {
         let mut world = world(1 + i % 4, 10 + i as u64);
         (world.kills, world.once) = (Some((every, from)), once);
         world.run();

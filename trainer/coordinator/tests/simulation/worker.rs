@@ -262,7 +262,7 @@ fn finished(assignment: &Assignment) -> TaskOutcome {
 /// Some trials of a sweep do not survive some of their rungs.
 fn diverges(task: &TaskId) -> bool {
     let path = within_run(task);
-    path.contains(".t") && lot(path) % 9 == 0
+    path.contains(".t") && lot(path).is_multiple_of(9)
 }
 
 fn lot(text: &str) -> u8 {

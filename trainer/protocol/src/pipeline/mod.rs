@@ -11,6 +11,7 @@ mod read;
 mod rules;
 mod schema;
 mod sweep;
+mod trial;
 mod yaml;
 
 use std::collections::BTreeMap;
@@ -156,7 +157,7 @@ impl Pipeline {
             if references.iter().any(|reference| !stage.inputs.contains(reference)) {
                 wrong.push(format!("the inputs of stage `{}` are not those of its settings", stage.name));
             }
-            if sweep::references(stage).iter().any(|reference| !stage.inputs.contains(reference)) {
+            if trial::references(stage).iter().any(|reference| !stage.inputs.contains(reference)) {
                 wrong.push(format!("the inputs of stage `{}` are not those of its sweep", stage.name));
             }
             let problems = &mut found.entry(stage.name.clone()).or_default().0;

@@ -189,7 +189,7 @@ impl Reader {
                         if let Some((settings, placement, sweep)) = self.stage(entry) {
                             let mut stage = stage(&entry.key, settings, placement);
                             stage.sweep = sweep;
-                            stage.inputs.extend(super::sweep::references(&stage));
+                            stage.inputs.extend(super::trial::references(&stage));
                             stages.push(stage);
                         }
                     }
@@ -343,7 +343,7 @@ impl Reader {
         mut stages: Vec<PipelineStage>,
     ) -> Option<Vec<PipelineStage>> {
         for stage in &mut stages {
-            for problem in super::sweep::resolve_best(stage, written.iter().map(|w| (&w.name, w.swept()))) {
+            for problem in super::trial::resolve_best(stage, written.iter().map(|w| (&w.name, w.swept()))) {
                 self.problem(written, &stage.name, problem);
             }
             let problems =

@@ -1,0 +1,101 @@
+//! What a sweep means for the pipeline around it: what it reads, who may read it, and the stages that a trial is made of.
+
+use std::collections::BTreeMap;
+
+use serde_json::Value;
+
+use super::rules::{Problem, Problems};
+use super::{PipelineStage, StageInput, graph};
+use crate::stage::{Shape, StageSettings};
+use crate::sweep::{Derived, STATE_OUTPUT, Values, beside, judged_field, rung_name, with_values};
+use crate::{ArtifactKind, StageName, Steps};
+
+/// What is written behind the name of a swept stage to say that its best trial is meant. It always is.
+const BEST: &str = "@best";
+
+/// What a swept stage reads because its trials' evaluations do.
+pub(super) fn references(stage: &PipelineStage) -> Vec<StageInput> {
+    let Some(sweep) = &stage.sweep else { return Vec::new() };
+    let judged = judged_field(&sweep.evaluate, stage.settings.output().1);
+    let inputs = graph::references(&sweep.evaluate).into_iter().filter(|input| Some(&input.field) != judged.as_ref());
+    inputs.map(|input| StageInput { field: format!("sweep.evaluate.{}", input.field), ..input }).collect()
+}
+
+/// Takes `@best` off references to swept stages: what such a stage gives is its best trial.
+pub(super) fn resolve_best<'a>(
+    stage: &mut PipelineStage,
+    stages: impl Iterator<Item = (&'a StageName, bool)> + Clone,
+) -> Vec<Problem> {
+    let mut problems = Problems::default();
+    let marked: Vec<StageInput> = stage.inputs.iter().filter(|i| i.stage.as_str().ends_with(BEST)).cloned().collect();
+    for input in marked {
+        let name = input.stage.as_str().trim_end_matches(BEST).to_owned();
+        if stages.clone().any(|(other, swept)| other.as_str() == name && !swept) {
+            let message =
+                format!("`{}` is `{}`, but `{name}` has no `sweep`, so it has one result", input.field, input.stage);
+            problems.add(&input.field, message, &format!("write `{name}`"));
+        }
+        let in_sweep = input.field.strip_prefix("sweep.evaluate.");
+        let settings = match (in_sweep, &mut stage.sweep) {
+            (Some(_), Some(sweep)) => &mut *sweep.evaluate,
+            _ => &mut stage.settings,
+        };
+        refer(settings, in_sweep.unwrap_or(&input.field), &name);
+        for other in stage.inputs.iter_mut().filter(|other| other.field == input.field) {
+            other.stage = StageName::new(&*name);
+        }
+    }
+    problems.0
+}
+
+/// Makes the reference `field`, such as `teacher` or `from[0]`, name another stage.
+fn refer(settings: &mut StageSettings, field: &str, stage: &str) {
+    let pointer = format!("/{}", field.replace(['.', '['], "/").replace(']', ""));
+    if let Ok(mut json) = serde_json::to_value(&*settings)
+        && let Some(place) = json.pointer_mut(&pointer)
+    {
+        *place = Value::String(stage.to_owned());
+        if let Ok(changed) = serde_json::from_value(json) {
+            *settings = changed;
+        }
+    }
+}
+
+impl PipelineStage {
+    /// The stages of one rung of a trial: the training up to step `stop` (to the end, if `None`), which goes on from the rung before,
+    /// and the evaluation of what it gives.
+    ///
+    /// # Errors
+    /// Why `values` cannot be tried, such as two that are each fine alone.
+    pub fn rung(&self, trial: usize, rung: usize, stop: Option<Steps>, values: &Values) -> Result<[Self; 2], String> {
+        let sweep = self.sweep.as_ref().ok_or("the stage has no sweep")?;
+        let mut settings = with_values(&self.settings, values)?;
+        settings.training_mut().ok_or("the stage does not train")?.stop = stop;
+        let name = rung_name(&self.name, trial, rung);
+        let mut inputs = graph::references(&settings);
+        if let Some(before) = rung.checked_sub(1) {
+            let stage = rung_name(&self.name, trial, before);
+            inputs.push(StageInput { field: STATE_OUTPUT.into(), stage, kind: ArtifactKind::Checkpoint });
+        }
+        let mut judge = (*sweep.evaluate).clone();
+        if let Some(field) = judged_field(&judge, self.settings.output().1) {
+            refer(&mut judge, &field, name.as_str());
+        }
+        debug_assert!(settings.shape() == Shape::Gang, "only gangs train");
+        let placement = beside(&self.placement);
+        let derived = |keyed_as: StageName| Some(Derived { of: self.name.clone(), trial, rung, keyed_as });
+        let eval = Self {
+            name: StageName::new(format!("{name}.eval")),
+            inputs: graph::references(&judge),
+            settings: judge,
+            placement: placement.clone(),
+            external: BTreeMap::new(),
+            sweep: None,
+            derived: derived(StageName::new(format!("{}.eval", self.name))),
+        };
+        let external = self.external.clone();
+        let train =
+            Self { name, settings, placement, inputs, external, sweep: None, derived: derived(self.name.clone()) };
+        Ok([train, eval])
+    }
+}
