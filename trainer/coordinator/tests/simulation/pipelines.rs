@@ -60,6 +60,7 @@ pub(crate) fn quickstart(seed: u64, workers: WorkerRange, require: &[&str]) -> P
 }
 
 /// A sweep of `trials` trials with three rungs, and what goes on from its best.
+#[allow(dead_code, reason = "not every test that shares this file sweeps")]
 pub(crate) fn swept(seed: u64, trials: u64) -> Pipeline {
     let text = format!(
         "name: swept
