@@ -82,8 +82,48 @@ pub(crate) fn run_state(state: RunState) -> &'static str {
     }
 }
 
-/// The stages of a run, one a line.
+/// The columns of the papers' tables: heading and metric.
+const PAPERS: [(&str, &str); 7] = [
+    ("TOP 1", "r_precision_top1"),
+    ("TOP 2", "r_precision_top2"),
+    ("TOP 3", "r_precision_top3"),
+    ("FID", "fid"),
+    ("MM DIST", "mm_dist"),
+    ("DIVERSITY", "diversity"),
+    ("MODALITY", "multimodality"),
+];
+
+/// The text-to-motion evaluations of a run as the papers print them, the mean and half its 95% interval; `None` if there are none.
+fn papers(run: &RunView) -> Option<String> {
+    let cell = |stage: &StageView, metric: &str| {
+        let value = |key: &str| stage.metrics.get(key).copied();
+        let Some(mean) = value(metric) else { return "-".to_owned() };
+        let upper = value(&format!("{metric}.upper")).unwrap_or(mean);
+        format!("{mean:.3} ±{:.3}", upper - mean)
+    };
+    let rows: Vec<Vec<String>> = run
+        .stages
+        .iter()
+        .filter(|stage| stage.kind == "evaluate.t2m" && stage.metrics.contains_key("fid"))
+        .map(|stage| {
+            let cells = PAPERS.iter().map(|(_, metric)| cell(stage, metric));
+            std::iter::once(stage.name.to_string()).chain(cells).collect()
+        })
+        .collect();
+    let head: Vec<&str> = std::iter::once("EVALUATION").chain(PAPERS.iter().map(|(head, _)| *head)).collect();
+    (!rows.is_empty()).then(|| print::table(&head, rows))
+}
+
+/// The stages of a run, one a line, and below them what its text-to-motion evaluations gave.
 pub(crate) fn table(run: &RunView) -> String {
+    let stages = stages(run);
+    match papers(run) {
+        Some(papers) => format!("{stages}\n\n{papers}"),
+        None => stages,
+    }
+}
+
+fn stages(run: &RunView) -> String {
     let rows = run.stages.iter().map(|stage| {
         let progress = &stage.progress;
         let steps = if progress.total > 0 { format!("{}/{}", progress.done, progress.total) } else { String::new() };
@@ -181,6 +221,18 @@ mod tests {
         let lines: Vec<&str> = table.lines().collect();
         assert!(lines[0].starts_with("STAGE") && lines[1].starts_with("fid"), "{table}");
         assert!(lines[1].contains("resumed") && lines[1].contains("latent_fid 0.2500"), "{table}");
+    }
+
+    #[test]
+    fn evaluations_are_printed_as_the_papers_print_them() {
+        let mut run =
+            view(&[("real", "evaluate.t2m", StageState::Ran), ("fid", "evaluate.latent_fid", StageState::Ran)]);
+        assert_eq!(papers(&run), None, "an evaluation that is not done has no row");
+        let values = [("fid", 0.25), ("fid.upper", 0.3), ("r_precision_top3", 0.8), ("r_precision_top3.upper", 0.82)];
+        run.stages[0].metrics = values.iter().map(|(k, v)| ((*k).to_owned(), *v)).collect();
+        let table = table(&run);
+        let last: Vec<&str> = table.lines().last().unwrap().split_whitespace().collect();
+        assert_eq!(last, ["real", "-", "-", "0.800", "±0.020", "0.250", "±0.050", "-", "-", "-"], "{table}");
     }
 
     #[test]
