@@ -174,11 +174,15 @@ fn working(stage: &StageView, from: Option<(u64, Instant)>, now: Instant) -> Str
     format!("{name:>14}  {}/{} {}{speed}  {}", progress.done, progress.total, progress.unit, values(stage, 3))
 }
 
-/// The first few values, such as `loss 0.1834  grad_norm 0.71`.
+/// What one looks at first.
+const FIRST: [&str; 3] = ["loss", "fid", "r_precision_top3"];
+
+/// The first few values, such as `loss 0.1834  grad_norm 0.71`; ends of intervals are left to reports.
 pub(crate) fn values(stage: &StageView, count: usize) -> String {
-    let loss = stage.metrics.iter().filter(|(key, _)| *key == "loss");
-    let others = stage.metrics.iter().filter(|(key, _)| *key != "loss");
-    let shown = loss.chain(others).take(count).map(|(key, value)| format!("{key} {}", print::number(*value)));
+    let end = |key: &str| key.ends_with(".lower") || key.ends_with(".upper");
+    let first = FIRST.iter().filter_map(|key| stage.metrics.get_key_value(*key));
+    let others = stage.metrics.iter().filter(|(key, _)| !FIRST.contains(&key.as_str()) && !end(key));
+    let shown = first.chain(others).take(count).map(|(key, value)| format!("{key} {}", print::number(*value)));
     shown.collect::<Vec<_>>().join("  ")
 }
 

@@ -232,6 +232,20 @@ mod tests {
     }
 
     #[test]
+    fn evaluations_are_printed_as_the_papers_print_them() {
+        let kinds = [("real", "evaluate.t2m"), ("pcm", "evaluate.t2m"), ("fid", "evaluate.latent_fid")];
+        let mut run = view(&kinds.map(|(name, kind)| (name, kind, StageState::Ran)));
+        assert_eq!(evaluations(&run), "", "an evaluation that is not done has no row");
+        let values = [("fid", 0.25), ("fid.lower", 0.2), ("fid.upper", 0.3), ("r_precision_top3", 0.8)];
+        run.stages[0].metrics = values.iter().map(|(k, v)| ((*k).to_owned(), *v)).collect();
+        run.stages[1].metrics = run.stages[0].metrics.clone();
+        let text = evaluations(&run);
+        let row = text.lines().find(|line| line.contains("real")).unwrap();
+        let cells: Vec<&str> = row.split_whitespace().collect();
+        assert_eq!(cells, ["real", "-", "-", "-", "0.800", "*", "0.250", "±", "0.050", "*", "-", "-", "-"], "{text}");
+    }
+
+    #[test]
     fn the_promoted_model_is_offered_once_it_is_there() {
         let text = "name: p\ndataset: {format: synthetic}\nstages:\n  vae: {kind: train.vae}\n  latents: {kind: encode.latents}\n  mld: {kind: train.mld}\n  pcm: {kind: distill.pcm, phases: 2}\n  fid: {kind: evaluate.latent_fid, model: pcm, sampler: {steps: 2}}\n  out: {kind: register, model: m, from: pcm, promote: {to: staging}}\n";
         let pipeline = protocol::pipeline::read("p.yaml", text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"));
