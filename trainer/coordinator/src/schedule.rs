@@ -38,8 +38,9 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
             spent.push(backend);
         }
     }
-    for key in &wanted {
-        let backend = cx.state.works[key].backend;
+    let mut backends: Vec<Backend> = wanted.iter().map(|key| cx.state.works[key].backend).collect();
+    backends.dedup();
+    for backend in backends {
         if !spent.contains(&backend) && idle(cx.state, backend).is_empty() {
             spent.push(backend);
         }
