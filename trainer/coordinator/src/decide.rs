@@ -146,7 +146,8 @@ impl Deciding<'_> {
             if let Some(since) = work.busy_since.take() {
                 work.wall_ms += before.since(since);
             }
-            if work.state == WorkState::Open && work.has_something() {
+            // Whoever is still at work goes on as if nothing had been.
+            if work.state == WorkState::Open && work.has_something() && (alone || !work.is_busy()) {
                 work.resumed = true;
             }
             match work.state {

@@ -7,6 +7,8 @@
 //! stage that its workers could merge is almost done (its last shards are out), or the merge would wait for the whole
 //! training; one that takes a single worker leaves the others to it.
 
+use std::collections::HashSet;
+
 use protocol::message::Member;
 use protocol::stage::Backend;
 use protocol::{Digest, WorkerId};
@@ -28,20 +30,33 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
     for key in &wanted {
         change_gangs(cx, *key, |_, _| Vec::new());
     }
+    // Backends whose workers are all busy: with a thousand of them one does not look again for each work.
+    let mut spent: Vec<Backend> = Vec::new();
     for key in &wanted {
-        small_tasks(cx, *key);
+        let backend = cx.state.works[key].backend;
+        if !spent.contains(&backend) && !small_tasks(cx, *key) {
+            spent.push(backend);
+        }
     }
-    for key in &wanted {
+    let mut backends: Vec<Backend> = wanted.iter().map(|key| cx.state.works[key].backend).collect();
+    backends.dedup();
+    for backend in backends {
+        if !spent.contains(&backend) && idle(cx.state, backend).is_empty() {
+            spent.push(backend);
+        }
+    }
+    let left: Vec<Digest> = wanted.into_iter().filter(|key| !spent.contains(&cx.state.works[key].backend)).collect();
+    for key in &left {
         change_gangs(cx, *key, idle);
     }
-    for key in &wanted {
+    for key in &left {
         start_gangs(cx, *key);
     }
 }
 
 /// Workers of a backend that can be given work and have none, by name.
 pub(crate) fn idle(state: &State, backend: Backend) -> Vec<Member> {
-    let busy: Vec<&WorkerId> = state
+    let busy: HashSet<&WorkerId> = state
         .works
         .values()
         .flat_map(|work| &work.tasks)
@@ -56,7 +71,8 @@ pub(crate) fn idle(state: &State, backend: Backend) -> Vec<Member> {
         .collect()
 }
 
-fn small_tasks(cx: &mut Deciding<'_>, key: Digest) {
+/// `false`: there is nobody left to give anything to.
+fn small_tasks(cx: &mut Deciding<'_>, key: Digest) -> bool {
     let now = cx.now();
     for i in 0..cx.state.works[&key].tasks.len() {
         let work = &cx.state.works[&key];
@@ -64,9 +80,10 @@ fn small_tasks(cx: &mut Deciding<'_>, key: Digest) {
         if task.part == Part::Gang || !task.is_free(now) || !work.is_ready(task) {
             continue;
         }
-        let Some(worker) = idle(cx.state, work.backend).into_iter().next() else { return };
+        let Some(worker) = idle(cx.state, work.backend).into_iter().next() else { return false };
         grant(cx, key, i, vec![worker]);
     }
+    true
 }
 
 fn change_gangs(cx: &mut Deciding<'_>, key: Digest, joiners: impl Fn(&State, Backend) -> Vec<Member>) {
