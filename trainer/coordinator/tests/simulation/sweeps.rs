@@ -1,6 +1,6 @@
 //! A sweep decides the same whoever works on it and wherever the coordinator is killed.
 
-use std::time::Instant;
+use std::time::Duration;
 
 use coordinator::search::{Score, Ticket};
 use coordinator::state::run::Status;
@@ -138,14 +138,19 @@ fn bookkeeping_takes_little_time_for_each_trial() {
             (serde_json::from_value(entry.clone()).expect("a moment"), read(entry.clone()))
         })
         .collect();
-    let since = Instant::now();
+    let since = worked();
     for (moment, event) in entries {
         let mut next = state.clone();
         decide(&mut next, moment, event).expect("what was accepted is accepted");
         state = next;
     }
-    let each = since.elapsed().as_secs_f64() * 1000.0 / TRIALS as f64;
+    let each = (worked() - since).as_secs_f64() * 1000.0 / TRIALS as f64;
     eprintln!("{} events, {each:.2} ms of deciding for each of {TRIALS} trials", world.stored);
-    let bound = if cfg!(debug_assertions) { 50.0 } else { 5.0 };
-    assert!(each <= bound, "{each} ms for each trial");
+    assert!(each <= 5.0, "{each} ms for each trial");
+}
+
+/// How long this thread has computed: other tests on the machine do not count. Linux says so; elsewhere nothing is measured.
+fn worked() -> Duration {
+    let text = std::fs::read_to_string("/proc/thread-self/schedstat").unwrap_or_default();
+    Duration::from_nanos(text.split(' ').next().and_then(|nanoseconds| nanoseconds.parse().ok()).unwrap_or_default())
 }
