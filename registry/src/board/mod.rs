@@ -46,7 +46,7 @@ const fn column(key: &'static str, head: &'static str, better: Better) -> Column
 }
 
 /// The text-to-motion papers' order, then what they report of reconstruction and control, then what needs no evaluator.
-const COLUMNS: [Column; 23] = [
+const COLUMNS: [Column; 25] = [
     column("aits", "AITS (s)", Better::Lower),
     column("r_precision_top1", "R@1", Better::Higher),
     column("r_precision_top2", "R@2", Better::Higher),
@@ -67,9 +67,11 @@ const COLUMNS: [Column; 23] = [
     column("location_error", "Loc. err.", Better::Lower),
     column("average_error_m", "Avg. err. (m)", Better::Lower),
     column("latent_fid", "Latent FID", Better::Lower),
+    column("latent_r_precision_top1", "Latent R@1", Better::Higher),
+    column("latent_r_precision_top3", "Latent R@3", Better::Higher),
     column("match", "Match", Better::Lower),
     column("latent_std", "Latent std", Better::Neither),
-    column("r_precision_top3_test", "R@3 test captions", Better::Higher),
+    column("latent_r_precision_top3_test", "Latent R@3, test", Better::Higher),
 ];
 
 /// The data formats, by which the papers' datasets go.
@@ -175,6 +177,15 @@ fn measures(metrics: &BTreeMap<String, f64>) -> BTreeMap<String, Measure> {
     whole.map(|(key, &value)| (key.clone(), Measure { value, half: half(key) })).collect()
 }
 
+/// Retrieval among latents is no retrieval by an evaluator: the two never share a column.
+fn apart(row: Row) -> Row {
+    if row.measures.contains_key(TELLING) {
+        return row;
+    }
+    let named = |key: String| if key.starts_with("r_precision") { format!("latent_{key}") } else { key };
+    Row { measures: row.measures.into_iter().map(|(key, measure)| (named(key), measure)).collect(), ..row }
+}
+
 /// A version's evaluations: metrics under a stage's name are that stage's row; what is under none is shared by all of them.
 fn rows(version: &Version) -> Vec<Row> {
     let source = format!("{}:{}", version.model, version.version);
@@ -204,7 +215,7 @@ fn rows(version: &Version) -> Vec<Row> {
 
 /// Rows of `versions`, the best by `metric` first; with the published rows of the data format `published`, if any.
 pub fn leaderboard(title: String, versions: &[Version], metric: Option<&str>, published: Option<&str>) -> Leaderboard {
-    let mut ours: Vec<Row> = versions.iter().flat_map(rows).collect();
+    let mut ours: Vec<Row> = versions.iter().flat_map(rows).map(apart).collect();
     let deciding = metric.or_else(|| {
         COLUMNS
             .iter()
@@ -232,7 +243,7 @@ pub fn evaluations(title: &str, all: impl IntoIterator<Item = (String, BTreeMap<
         published: false,
         measures: measures(&metrics),
     };
-    let mut rows: Vec<Row> = all.into_iter().map(row).collect();
+    let mut rows: Vec<Row> = all.into_iter().map(row).map(apart).collect();
     rows.retain(|row| COLUMNS.iter().any(|column| row.measures.contains_key(column.key)));
     (!rows.is_empty()).then(|| Leaderboard { title: title.to_owned(), rows })
 }

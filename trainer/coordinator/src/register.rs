@@ -108,26 +108,22 @@ fn vae_of(pipeline: &Pipeline, stage: &StageName) -> Option<StageName> {
     }
 }
 
-/// The metrics of every evaluation that looks at `model`. Two evaluations that give one metric (a student at one and at
-/// four steps) keep both as `stage.metric`; the plain name is the first one's.
+/// The metrics of every evaluation that looks at `model`. Of several evaluations (a student at one and at four steps, in latents and
+/// by an evaluator) each keeps its own as `stage.metric`; the plain name is the first one's that gives it.
 fn metrics_of(run: &Run, model: &str) -> BTreeMap<String, f64> {
-    let mut all: BTreeMap<String, Vec<(&StageName, f64)>> = BTreeMap::new();
-    for (stage, status) in run.pipeline.stages.iter().zip(&run.stages) {
-        let looks_at_it = stage.settings.looks_at() == Some(model);
-        if let (true, Some(known)) = (looks_at_it, status.known()) {
-            for (metric, value) in &known.metrics {
-                all.entry(metric.clone()).or_default().push((&stage.name, *value));
+    let stages = run.pipeline.stages.iter().zip(&run.stages);
+    let looking = stages.filter(|(stage, _)| stage.settings.looks_at() == Some(model));
+    let known: Vec<_> = looking.filter_map(|(stage, status)| Some((&stage.name, &status.known()?.metrics))).collect();
+    let mut all = BTreeMap::new();
+    for (stage, metrics) in &known {
+        for (metric, value) in *metrics {
+            if known.len() > 1 {
+                all.insert(format!("{stage}.{metric}"), *value);
             }
+            all.entry(metric.clone()).or_insert(*value);
         }
     }
-    let mut metrics = BTreeMap::new();
-    for (metric, values) in all {
-        if values.len() > 1 {
-            metrics.extend(values.iter().map(|(stage, value)| (format!("{stage}.{metric}"), *value)));
-        }
-        metrics.insert(metric, values[0].1);
-    }
-    metrics
+    all
 }
 
 /// The candidate with the best value; the first of equals.
