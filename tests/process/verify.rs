@@ -13,7 +13,7 @@ fn verify(bench: &Bench, more: &[&str], code: i32) -> Value {
     bench.run(&[&["run", &config, "-o", "json"][..], more].concat()).expect_code(code).json()
 }
 
-/// All four training stages of the smoke pipeline, from a checkpoint to the end, and from nothing.
+/// All five training stages of the smoke pipeline, from a checkpoint to the end, and from nothing.
 #[test]
 fn p5_verify_finds_everything_equal_and_then_what_was_changed() {
     let bench = Bench::new(TRAINER);
@@ -24,7 +24,7 @@ fn p5_verify_finds_everything_equal_and_then_what_was_changed() {
 
     let said = verify(&bench, &["--verify", "5"], 0);
     let stages = said["stages"].as_array().expect("stages");
-    assert_eq!(stages.len(), 4, "{said:#}");
+    assert_eq!(stages.len(), 5, "{said:#}");
     for stage in stages {
         assert!(stage["from"].as_u64() > Some(0), "from a checkpoint: {stage:#}");
         assert_eq!(stage["digests"], 2, "the last state and the output: {stage:#}");
