@@ -320,6 +320,9 @@ fn what_an_evaluator_does_not_fit_is_refused_with_the_reason() {
     }
     let inputs = [("dataset", data), ("evaluator", evaluator)];
     bench.run("eval", &evaluate(2, test), &inputs).expect("the data that it was trained on is fine");
+    let widened = EvaluateT2m { widen: true, ..few };
+    let ran = bench.run("eval", &evaluate(2, widened), &inputs).expect("a small split is widened if asked for");
+    assert_eq!(bench.manifest(ran.output()).unwrap().meta["split"], "all", "and the report says so");
 }
 
 /// A pickle of a dict from text to small numbers, protocol 3.

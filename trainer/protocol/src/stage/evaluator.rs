@@ -155,6 +155,8 @@ pub struct EvaluateT2m {
     pub multimodality: MultiModality,
     /// Clips. Choose on `val`; `test` is for the last look.
     pub split: Split,
+    /// Takes all clips where the split has fewer than a pool of 32, and says so in the report; otherwise that is refused.
+    pub widen: bool,
     /// Shards.
     pub shards: usize,
 }
@@ -173,6 +175,7 @@ impl Default for EvaluateT2m {
             repeats: 20,
             multimodality: MultiModality::default(),
             split: Split::Val,
+            widen: false,
             shards: 8,
         }
     }

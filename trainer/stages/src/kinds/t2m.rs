@@ -16,7 +16,7 @@ use motion::dataset::{Dataset, crop};
 use motion::features::recover_joints;
 use motion::random::permutation;
 use motion::{Skeleton, Stream};
-use protocol::stage::EvaluateT2m;
+use protocol::stage::{EvaluateT2m, Split};
 use protocol::{ArtifactKind, Digest, Seed};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -74,6 +74,8 @@ struct Plan<'a> {
     entries: Vec<usize>,
     judge: Judge,
     evaluator: Digest,
+    /// What they are of.
+    split: Split,
 }
 
 impl<'a> Plan<'a> {
@@ -85,14 +87,17 @@ impl<'a> Plan<'a> {
         let dataset = artifacts::dataset(&*blobs, &manifest)?;
         let (evaluator, manifest) = artifacts::input(cx, "evaluator", ArtifactKind::Evaluator)?;
         let judge = Judge::read(&*blobs, &manifest, &cx.device())?;
-        let entries = dataset.entries_of(settings.split);
-        let split = format!("{:?}", settings.split).to_lowercase();
+        let (mut entries, mut taken) = (dataset.entries_of(settings.split), settings.split);
+        if settings.widen && entries.len() < POOL {
+            (entries, taken) = (dataset.entries_of(Split::All), Split::All);
+        }
+        let split = format!("{taken:?}").to_lowercase();
         if entries.is_empty() {
             return refuse(format!("the split `{split}` has no entries; set `split` to one that has"));
         }
         if entries.len() < POOL {
             return refuse(format!(
-                "the split `{split}` has {} entries, R-precision ranks a motion among {POOL}; set `split: all`, or `split: test` for a last look",
+                "the split `{split}` has {} entries, R-precision ranks a motion among {POOL}; set `split: all`, `split: test` for a last look, or `widen: true`",
                 entries.len()
             ));
         }
@@ -100,7 +105,7 @@ impl<'a> Plan<'a> {
         if settings.repeats == 0 {
             return refuse("`repeats` is 0, expected at least 1".into());
         }
-        Ok(Self { settings, seed: cx.task().seed, dataset, entries, judge, evaluator })
+        Ok(Self { settings, seed: cx.task().seed, dataset, entries, split: taken, judge, evaluator })
     }
 
     fn stream(&self, what: &str, repeat: usize, index: usize) -> Stream {
@@ -421,11 +426,17 @@ pub(super) fn merge(
     if let Some(few) = &few {
         cx.log(few);
     }
+    if plan.split != settings.split {
+        cx.log(&format!(
+            "the split `{:?}` is too small for pools of {POOL}: measured on all {samples} entries",
+            settings.split
+        ));
+    }
     metrics.insert("samples".to_owned(), samples as f64);
     let meta = json!({
         "kind": cx.task().settings.kind(),
         "metrics": metrics,
-        "split": settings.split,
+        "split": plan.split,
         "evaluator": plan.evaluator,
         "words": plan.judge.meta().words,
         "real": settings.real,
@@ -434,7 +445,7 @@ pub(super) fn merge(
     let report = json!({
         "metrics": metrics,
         "details": {
-            "split": settings.split,
+            "split": plan.split,
             "seed": plan.seed,
             "sampler": settings.sampler,
             "samples_per_repeat": samples,
