@@ -7,8 +7,8 @@
 //!
 //! | question | answered by |
 //! |---|---|
-//! | which points are tried, and in which order | [`grid`], [`random`]: fixed before anything runs, all different |
-//! | who goes on to the next rung | [`asha`] |
+//! | which points are tried, and in which order | `grid`, `random`: fixed before anything runs, all different |
+//! | who goes on to the next rung | `asha` |
 //! | who is best | the best result of the last rung; of equals the trial with the lower number |
 //!
 //! A trial that failed or whose metric is no finite number has a result like any other: the worst.
