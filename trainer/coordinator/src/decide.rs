@@ -119,10 +119,14 @@ impl Deciding<'_> {
             }
             Event::BackoffOver { task } => {
                 let (key, i) = self.place(&task)?;
-                match &mut self.state.work_mut(key).tasks[i].hold {
-                    Hold::Waiting { not_before } if not_before.is_some_and(|time| time <= now) => *not_before = None,
-                    Hold::Waiting { .. } | Hold::Held { .. } | Hold::Done { .. } => return Ok(false),
-                }
+                let over = self.state.change(key, i, |task| match &mut task.hold {
+                    Hold::Waiting { not_before } if not_before.is_some_and(|time| time <= now) => {
+                        *not_before = None;
+                        true
+                    }
+                    Hold::Waiting { .. } | Hold::Held { .. } | Hold::Done { .. } => false,
+                });
+                return Ok(over);
             }
             Event::GraceOver { task, fence } => return self.grace_over(&task, fence),
             Event::LookedUp { key, known } => return Ok(self.looked_up(key, known)),
@@ -166,7 +170,7 @@ impl Deciding<'_> {
                 self.set_presence(&worker, Sign::Gone);
                 self.drop_worker(&worker, Loss::Restart);
             } else {
-                self.state.heard.workers.insert(worker, now);
+                Arc::make_mut(&mut self.state.heard.workers).insert(worker, now);
             }
         }
         if park {
@@ -222,8 +226,10 @@ impl Deciding<'_> {
         let last = self.state.workers.get(&join.worker).map(|worker| worker.incarnation).unwrap_or_default();
         let worker = Worker::joined(&join, last.next());
         self.effects.push(Effect::Joined(worker.incarnation));
-        self.state.heard.workers.insert(join.worker.clone(), self.now());
-        self.state.workers.insert(join.worker, worker);
+        let now = self.now();
+        Arc::make_mut(&mut self.state.heard.workers).insert(join.worker.clone(), now);
+        Arc::make_mut(&mut self.state.unused).insert(join.worker.clone());
+        Arc::make_mut(&mut self.state.workers).insert(join.worker, worker);
         Ok(())
     }
 
@@ -262,7 +268,8 @@ impl Deciding<'_> {
             (None, None) => {
                 work.open();
                 let tasks: Vec<TaskId> = work.tasks.iter().map(|task| task.id.clone()).collect();
-                self.state.tasks.extend(tasks.into_iter().map(|task| (task, key)));
+                let places = tasks.into_iter().enumerate().map(|(i, task)| (task, (key, i)));
+                Arc::make_mut(&mut self.state.tasks).extend(places);
             }
         }
         true
@@ -288,13 +295,13 @@ impl Deciding<'_> {
     fn grace_over(&mut self, task: &TaskId, fence: Fence) -> Result<bool, Rejected> {
         let now = self.now();
         let (key, i) = self.place(task)?;
-        let task = &mut self.state.work_mut(key).tasks[i];
+        let task = &self.state.works[&key].tasks[i];
         let over = match task.hold {
             Hold::Held { winding, .. } => winding.is_some_and(|deadline| deadline <= now) && task.fence == fence,
             Hold::Waiting { .. } | Hold::Done { .. } => false,
         };
         if over {
-            let fence = task.release(None);
+            let fence = self.state.change(key, i, |task| task.release(None));
             self.fences.push(fence);
         }
         Ok(over)
@@ -311,7 +318,7 @@ impl Deciding<'_> {
 
     fn set_presence(&mut self, worker: &WorkerId, sign: Sign) {
         let now = self.now();
-        if let Some(worker) = self.state.workers.get_mut(worker) {
+        if let Some(worker) = Arc::make_mut(&mut self.state.workers).get_mut(worker) {
             worker.presence = worker.presence.after(sign, now);
             worker.suspicions += u32::from(sign == Sign::PeersLost);
         }
@@ -328,9 +335,7 @@ impl Deciding<'_> {
     }
 
     fn drop_worker(&mut self, worker: &WorkerId, loss: Loss) {
-        let held: Vec<TaskId> = self.state.held_by(worker).map(|(_, task)| task.id.clone()).collect();
-        for task in held {
-            let (key, i) = self.place(&task).expect("a held task is known");
+        if let Some((key, i)) = self.state.workers.get(worker).and_then(|worker| worker.holds) {
             self.take_from(key, i, std::slice::from_ref(worker), loss);
         }
     }
@@ -346,7 +351,7 @@ impl Deciding<'_> {
             Change::Keep => {}
             Change::Regroup(members) => self.regroup(key, i, members),
             Change::Disband if loss == Loss::Restart => {
-                let fence = self.state.work_mut(key).tasks[i].release(None);
+                let fence = self.state.change(key, i, |task| task.release(None));
                 self.fences.push(fence);
             }
             Change::Disband => {
@@ -359,33 +364,39 @@ impl Deciding<'_> {
     /// Ends a try. The next begins after a back-off, unless the budget is spent: then the work has failed.
     pub(crate) fn try_again(&mut self, key: Digest, i: usize, why: &str, fault: bool) {
         let (now, policy) = (self.now(), self.state.policy.clone());
-        let work = self.state.work_mut(key);
-        let task = &mut work.tasks[i];
-        let winding = matches!(task.hold, Hold::Held { winding: Some(_), .. });
-        task.streak += 1;
-        let (count, budget, what) = if fault {
-            (&mut task.faults, policy.fault_budget, "faults")
-        } else {
-            (&mut task.losses, policy.infrastructure_budget, "lost workers and network errors")
-        };
-        *count += u32::from(!winding);
-        if *count > budget {
-            let message = format!("gave up after {count} {what}; the last: {why}");
-            self.fail_work(key, message, fault);
-            return;
+        let tried = self.state.change(key, i, |task| {
+            let winding = matches!(task.hold, Hold::Held { winding: Some(_), .. });
+            task.streak += 1;
+            let (count, budget, what) = if fault {
+                (&mut task.faults, policy.fault_budget, "faults")
+            } else {
+                (&mut task.losses, policy.infrastructure_budget, "lost workers and network errors")
+            };
+            *count += u32::from(!winding);
+            if *count > budget {
+                return Err(format!("gave up after {count} {what}; the last: {why}"));
+            }
+            Ok(task.release((!winding).then(|| now.after(policy.backoff(task.streak)))))
+        });
+        match tried {
+            Ok(fence) => self.fences.push(fence),
+            Err(message) => self.fail_work(key, message, fault),
         }
-        let fence = task.release((!winding).then(|| now.after(policy.backoff(task.streak))));
-        self.fences.push(fence);
     }
 
     pub(crate) fn fail_work(&mut self, key: Digest, message: String, own: bool) {
-        let mut fences = self.state.work_mut(key).fail(message, own);
-        self.fences.append(&mut fences);
+        self.state.work_mut(key).state = WorkState::Failed { message, own };
+        // Whoever still works on it can write no more.
+        let held: Vec<usize> = self.state.works[&key].tasks.held().collect();
+        for i in held {
+            let fence = self.state.change(key, i, |task| task.release(None));
+            self.fences.push(fence);
+        }
     }
 
     pub(crate) fn regroup(&mut self, key: Digest, i: usize, members: Vec<protocol::message::Member>) {
         let secret = self.secret(&self.state.works[&key].tasks[i]);
-        let fence = self.state.work_mut(key).tasks[i].regroup(members, secret);
+        let fence = self.state.change(key, i, |task| task.regroup(members, secret));
         self.fences.push(fence);
     }
 
@@ -396,8 +407,7 @@ impl Deciding<'_> {
     }
 
     pub(crate) fn place(&self, task: &TaskId) -> Result<(Digest, usize), Rejected> {
-        let (work, _) = self.state.task(task)?;
-        Ok((work.key, work.position(task).expect("it was just found")))
+        self.state.place(task)
     }
 
     pub(crate) fn keys(&self) -> Vec<Digest> {

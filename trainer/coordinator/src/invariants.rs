@@ -16,8 +16,9 @@
 //! | C11 | While a small task is ready and not backing off, no worker of its backend is idle. |
 //! | C12 | A checkpoint's steps grow within a task. |
 //! | C13 | A stage that is swept has a searcher that is not over, and a place for each of its tickets. |
+//! | C14 | What is known twice agrees: which tasks are held or wait, where a task is, what a worker holds, who holds nothing. |
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::message::RunState;
 
@@ -30,7 +31,7 @@ use crate::state::worker::Presence;
 
 /// Which invariants `state` breaks, each with its number; empty if all is well.
 pub fn check(state: &State) -> Vec<String> {
-    let mut broken = Vec::new();
+    let mut broken = check_index(state);
     let mut busy = BTreeSet::new();
     let wanted: BTreeSet<_> = state.wanted().into_iter().collect();
     for work in state.works.values() {
@@ -50,7 +51,7 @@ pub fn check(state: &State) -> Vec<String> {
             }
             let small = task.part != Part::Gang && work.state == WorkState::Open && wanted.contains(&work.key);
             if small && !state.draining && task.is_free(state.now) && work.is_ready(task) {
-                let idle = schedule::idle(state, work.backend);
+                let idle: Vec<_> = schedule::idle(state, work.backend).collect();
                 if !idle.is_empty() {
                     broken.push(format!("C11: `{}` is ready and {idle:?} idle", task.id));
                 }
@@ -87,6 +88,31 @@ pub fn check(state: &State) -> Vec<String> {
         };
         if !fits {
             broken.push(format!("C10: `{}` is {:?} with stages {:?}", run.id, run.state, run.stages));
+        }
+    }
+    broken
+}
+
+/// C14.
+fn check_index(state: &State) -> Vec<String> {
+    let mut broken = Vec::new();
+    let (mut places, mut holds) = (BTreeMap::new(), BTreeMap::new());
+    for (key, work) in &state.works {
+        if !work.tasks.is_indexed() {
+            broken.push(format!("C14: the index of work {key} is not that of {:?}", work.tasks));
+        }
+        for (i, task) in work.tasks.iter().enumerate() {
+            places.insert(&task.id, (*key, i));
+            holds.extend(task.holders().iter().map(|member| (&member.worker, (*key, i))));
+        }
+    }
+    if !places.iter().map(|(task, place)| (*task, place)).eq(state.tasks.iter()) {
+        broken.push("C14: tasks are not where the index says".to_owned());
+    }
+    for (name, worker) in state.workers.iter() {
+        let found = holds.get(name).copied();
+        if worker.holds != found || state.unused.contains(name) != found.is_none() {
+            broken.push(format!("C14: worker `{name}` holds {found:?}, known is {:?}", worker.holds));
         }
     }
     broken
@@ -135,7 +161,7 @@ fn check_task(state: &State, work: &Work, task: &Task, broken: &mut Vec<String>)
 /// Which invariants the step from `before` to `after` breaks, or `after` itself.
 pub fn check_change(before: &State, after: &State) -> Vec<String> {
     let mut broken = check(after);
-    for (name, worker) in &before.workers {
+    for (name, worker) in before.workers.iter() {
         if after.workers.get(name).is_none_or(|now| now.incarnation < worker.incarnation) {
             broken.push(format!("C5: worker `{name}` lost its incarnation {}", worker.incarnation));
         }

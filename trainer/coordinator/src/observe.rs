@@ -1,6 +1,8 @@
 //! What is heard, and what it means. Heartbeats change only [`Heard`](crate::state::Heard); the facts that follow from them
 //! are returned as events, to be decided and journaled one by one.
 
+use std::sync::Arc;
+
 use protocol::WorkerId;
 use protocol::message::Poll;
 
@@ -37,12 +39,14 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
             )));
         }
     }
-    state.heard.workers.insert(worker, now);
+    Arc::make_mut(&mut state.heard.workers).insert(worker, now);
     for doing in poll.doing {
-        let Ok((_, task)) = state.task(&doing.grant.task) else { continue };
+        let Ok((work, task)) = state.task(&doing.grant.task) else { continue };
         let Ok(rank) = task.check(&doing.grant) else { continue };
-        if rank == 0 {
-            state.heard.progress.insert(doing.grant.task.clone(), doing.progress);
+        // Shards are counted, not looked into.
+        if rank == 0 && work.tasks.len() == 1 {
+            let progress = Arc::new(doing.progress);
+            Arc::make_mut(&mut state.heard.progress).insert(doing.grant.task.clone(), progress);
         }
         if !doing.lost.is_empty() {
             events.push(Event::PeersLost { grant: doing.grant, lost: doing.lost });
@@ -55,16 +59,21 @@ fn tick(state: &mut State, now: Millis) -> Vec<Event> {
     // When the clock was not looked at for long, nobody was listening either: that is not the workers' fault.
     let late = state.heard.ticked.map_or(0, |before| now.since(before));
     if late > state.policy.lease_ms / 3 {
-        for heard in state.heard.workers.values_mut() {
+        for heard in Arc::make_mut(&mut state.heard.workers).values_mut() {
             *heard = heard.after(late);
         }
     }
     state.heard.ticked = Some(now);
     let mut events = Vec::new();
-    for (name, worker) in &state.workers {
+    let unheard: Vec<WorkerId> =
+        state.workers.keys().filter(|name| !state.heard.workers.contains_key(*name)).cloned().collect();
+    if !unheard.is_empty() {
+        Arc::make_mut(&mut state.heard.workers).extend(unheard.into_iter().map(|name| (name, now)));
+    }
+    for (name, worker) in state.workers.iter() {
         match worker.presence {
             Presence::Here | Presence::Suspect { .. } => {
-                let heard = *state.heard.workers.entry(name.clone()).or_insert(now);
+                let heard = state.heard.workers[name];
                 if now.since(heard) > state.policy.lease_ms {
                     events.push(Event::LeaseExpired { worker: name.clone(), incarnation: worker.incarnation });
                 }
@@ -72,7 +81,9 @@ fn tick(state: &mut State, now: Millis) -> Vec<Event> {
             Presence::Silent | Presence::Gone => {}
         }
     }
-    for task in state.works.values().flat_map(|work| &work.tasks) {
+    let open =
+        state.works.values().flat_map(|work| work.tasks.held().chain(work.tasks.waiting()).map(|i| &work.tasks[i]));
+    for task in open {
         match task.hold {
             Hold::Waiting { not_before: Some(time) } if time <= now => {
                 events.push(Event::BackoffOver { task: task.id.clone() });

@@ -42,7 +42,7 @@ impl Deciding<'_> {
         let keep = work.placement.checkpoint.keep;
         let (key, i) = self.place(&grant.task)?;
         let saved = Saved { step, manifest, metrics: metrics.clone() };
-        let dropped = self.state.work_mut(key).tasks[i].save(saved, keep);
+        let dropped = self.state.change(key, i, |task| task.save(saved, keep));
         if !dropped.is_empty() {
             self.effects.push(Effect::Prune { task: grant.task.clone(), keep });
         }
@@ -73,9 +73,10 @@ impl Deciding<'_> {
                 }
                 let now = self.now();
                 let soon = now.after(self.state.policy.backoff_ms);
-                let task = &mut self.state.work_mut(key).tasks[i];
-                let asked = matches!(task.hold, Hold::Held { winding: Some(_), .. });
-                task.give_back((!asked).then_some(soon));
+                self.state.change(key, i, |task| {
+                    let asked = matches!(task.hold, Hold::Held { winding: Some(_), .. });
+                    task.give_back((!asked).then_some(soon));
+                });
             }
             TaskOutcome::Failed { class, message } => {
                 let fault = match class {
@@ -103,7 +104,7 @@ impl Deciding<'_> {
     }
 
     fn accepted(&mut self, key: Digest, i: usize, report: &ReportOutcome) {
-        self.state.work_mut(key).tasks[i].reported = Some(report.clone());
+        self.state.change(key, i, |task| task.reported = Some(report.clone()));
     }
 
     fn finished(
@@ -116,9 +117,10 @@ impl Deciding<'_> {
     ) -> Result<(), Rejected> {
         let now = self.now();
         let grant = report.grant.clone();
-        let work = self.state.work_mut(key);
+        let work = &self.state.works[&key];
         let state = left_state(&work.settings, &work.tasks[i])?;
-        work.tasks[i].finish(output);
+        self.state.change(key, i, |task| task.finish(output));
+        let work = self.state.work_mut(key);
         if let Part::Shard { .. } = work.tasks[i].part {
             self.writes.push(Write::Shard { grant, output });
             return Ok(());
@@ -132,7 +134,7 @@ impl Deciding<'_> {
         self.writes.push(write);
         // The value is there: what an interrupted try would have gone on from is of no use any more, but for the last way
         // from one checkpoint to the next, which `trainer run --verify` walks again.
-        if !std::mem::take(&mut self.state.work_mut(key).tasks[i].checkpoints).is_empty() {
+        if !self.state.change(key, i, |task| std::mem::take(&mut task.checkpoints)).is_empty() {
             let keep = Keep { latest: 2, best: 0 };
             self.effects.push(Effect::Prune { task: report.grant.task.clone(), keep });
         }

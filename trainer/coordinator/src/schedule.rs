@@ -7,17 +7,15 @@
 //! stage that its workers could merge is almost done (its last shards are out), or the merge would wait for the whole
 //! training; one that takes a single worker leaves the others to it.
 
-use std::collections::HashSet;
-
+use protocol::Digest;
 use protocol::message::Member;
 use protocol::stage::Backend;
-use protocol::{Digest, WorkerId};
 
 use crate::decide::Deciding;
 use crate::state::State;
 use crate::state::gang::{self, Change};
 use crate::state::task::{Hold, Part};
-use crate::state::work::WorkState;
+use crate::state::work::{Work, WorkState};
 use crate::state::worker::Presence;
 
 /// Gives idle workers what is ready.
@@ -30,24 +28,14 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
     for key in &wanted {
         change_gangs(cx, *key, |_, _| Vec::new());
     }
-    // Backends whose workers are all busy: with a thousand of them one does not look again for each work.
-    let mut spent: Vec<Backend> = Vec::new();
     for key in &wanted {
-        let backend = cx.state.works[key].backend;
-        if !spent.contains(&backend) && !small_tasks(cx, *key) {
-            spent.push(backend);
-        }
+        small_tasks(cx, *key);
     }
-    let mut backends: Vec<Backend> = wanted.iter().map(|key| cx.state.works[key].backend).collect();
-    backends.dedup();
-    for backend in backends {
-        if !spent.contains(&backend) && idle(cx.state, backend).is_empty() {
-            spent.push(backend);
-        }
-    }
-    let left: Vec<Digest> = wanted.into_iter().filter(|key| !spent.contains(&cx.state.works[key].backend)).collect();
+    // With a thousand workers at work one does not look for an idle one again for each gang.
+    let some_idle = |key: &Digest| idle(cx.state, cx.state.works[key].backend).next().is_some();
+    let left: Vec<Digest> = wanted.into_iter().filter(some_idle).collect();
     for key in &left {
-        change_gangs(cx, *key, idle);
+        change_gangs(cx, *key, |state, backend| idle(state, backend).collect());
     }
     for key in &left {
         start_gangs(cx, *key);
@@ -55,43 +43,41 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
 }
 
 /// Workers of a backend that can be given work and have none, by name.
-pub(crate) fn idle(state: &State, backend: Backend) -> Vec<Member> {
-    let busy: HashSet<&WorkerId> = state
-        .works
-        .values()
-        .flat_map(|work| &work.tasks)
-        .flat_map(|task| task.holders())
-        .map(|member| &member.worker)
-        .collect();
-    state
-        .workers
-        .iter()
-        .filter(|(name, w)| w.presence == Presence::Here && w.backend == backend && !busy.contains(name))
-        .map(|(name, worker)| worker.member(name))
-        .collect()
+pub(crate) fn idle(state: &State, backend: Backend) -> impl Iterator<Item = Member> + '_ {
+    let known = state.unused.iter().filter_map(|name| Some((name, state.workers.get(name)?)));
+    let fit = known.filter(move |(_, worker)| worker.presence == Presence::Here && worker.backend == backend);
+    fit.map(|(name, worker)| worker.member(name))
 }
 
-/// `false`: there is nobody left to give anything to.
-fn small_tasks(cx: &mut Deciding<'_>, key: Digest) -> bool {
+fn small_tasks(cx: &mut Deciding<'_>, key: Digest) {
     let now = cx.now();
-    for i in 0..cx.state.works[&key].tasks.len() {
+    if is_gang(&cx.state.works[&key]) || idle(cx.state, cx.state.works[&key].backend).next().is_none() {
+        return;
+    }
+    let waiting: Vec<usize> = cx.state.works[&key].tasks.waiting().collect();
+    for i in waiting {
         let work = &cx.state.works[&key];
         let task = &work.tasks[i];
-        if task.part == Part::Gang || !task.is_free(now) || !work.is_ready(task) {
+        if !task.is_free(now) || !work.is_ready(task) {
             continue;
         }
-        let Some(worker) = idle(cx.state, work.backend).into_iter().next() else { return false };
+        let Some(worker) = idle(cx.state, work.backend).next() else { return };
         grant(cx, key, i, vec![worker]);
     }
-    true
+}
+
+fn is_gang(work: &Work) -> bool {
+    work.tasks.first().is_some_and(|task| task.part == Part::Gang)
 }
 
 fn change_gangs(cx: &mut Deciding<'_>, key: Digest, joiners: impl Fn(&State, Backend) -> Vec<Member>) {
+    if !is_gang(&cx.state.works[&key]) {
+        return;
+    }
     for i in 0..cx.state.works[&key].tasks.len() {
         let work = &cx.state.works[&key];
         let task = &work.tasks[i];
-        let under_way = matches!(task.hold, Hold::Held { winding: None, .. });
-        if task.part == Part::Gang && under_way {
+        if matches!(task.hold, Hold::Held { winding: None, .. }) {
             match gang::with(task.holders(), &joiners(cx.state, work.backend), work.placement.workers) {
                 Change::Keep | Change::Disband => {}
                 Change::Regroup(members) => cx.regroup(key, i, members),
@@ -102,13 +88,16 @@ fn change_gangs(cx: &mut Deciding<'_>, key: Digest, joiners: impl Fn(&State, Bac
 
 fn start_gangs(cx: &mut Deciding<'_>, key: Digest) {
     let now = cx.now();
+    if !is_gang(&cx.state.works[&key]) {
+        return;
+    }
     for i in 0..cx.state.works[&key].tasks.len() {
         let work = &cx.state.works[&key];
         let task = &work.tasks[i];
-        if task.part == Part::Gang
-            && task.is_free(now)
+        if task.is_free(now)
             && (work.placement.workers.max == 1 || !merge_is_near(cx.state, work.backend))
-            && let Some(members) = gang::start(&idle(cx.state, work.backend), work.placement.workers)
+            && let Some(members) =
+                gang::start(&idle(cx.state, work.backend).collect::<Vec<_>>(), work.placement.workers)
         {
             grant(cx, key, i, members);
         }
@@ -117,17 +106,14 @@ fn start_gangs(cx: &mut Deciding<'_>, key: Digest) {
 
 /// Whether some map stage has only shards out that are being done.
 fn merge_is_near(state: &State, backend: Backend) -> bool {
-    state.works.values().filter(|work| work.backend == backend).any(|work| {
-        work.tasks.iter().any(|task| matches!(task.part, Part::Shard { .. }) && task.is_held())
-            && state.wanted().contains(&work.key)
-    })
+    let works = state.wanted().into_iter().map(|key| &state.works[&key]).filter(|work| work.backend == backend);
+    works.flat_map(|work| work.tasks.held().map(|i| &work.tasks[i])).any(|task| matches!(task.part, Part::Shard { .. }))
 }
 
 fn grant(cx: &mut Deciding<'_>, key: Digest, i: usize, holders: Vec<Member>) {
     let secret = cx.secret(&cx.state.works[&key].tasks[i]);
-    let work = cx.state.work_mut(key);
-    let task = &mut work.tasks[i];
-    work.resumed |= task.newest().is_some();
-    let fence = task.grant(holders, secret);
+    let resumed = cx.state.works[&key].tasks[i].newest().is_some();
+    cx.state.work_mut(key).resumed |= resumed;
+    let fence = cx.state.change(key, i, |task| task.grant(holders, secret));
     cx.fences.push(fence);
 }

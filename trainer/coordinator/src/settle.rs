@@ -9,10 +9,10 @@ use protocol::message::{RunState, StageState};
 use protocol::stage::{Shape, StageSettings};
 
 use crate::decide::Deciding;
-use crate::event::Effect;
+use crate::event::{Effect, Millis};
 use crate::register::Registration;
 use crate::state::run::Status;
-use crate::state::task::Task;
+use crate::state::tasks::Tasks;
 use crate::state::work::{Work, WorkState};
 
 impl Deciding<'_> {
@@ -43,7 +43,7 @@ impl Deciding<'_> {
         let mut moved = false;
         for j in 0..self.state.runs[i].stages.len() {
             let Status::Active { key } = self.state.runs[i].stages[j] else { continue };
-            self.state.work_mut(key).count_time(now);
+            self.count_time_of(key, now);
             let work = &self.state.works[&key];
             let status = match &work.state {
                 WorkState::Looking | WorkState::Open | WorkState::Bundling => continue,
@@ -125,7 +125,7 @@ impl Deciding<'_> {
                     placement: stage.placement.clone(),
                     registration,
                     state: WorkState::Looking,
-                    tasks: Vec::new(),
+                    tasks: Tasks::default(),
                     wall_ms: 0,
                     busy_since: None,
                     resumed: false,
@@ -143,9 +143,10 @@ impl Deciding<'_> {
         let wanted: BTreeSet<Digest> = self.state.wanted().into_iter().collect();
         for key in self.keys() {
             let carry_on = wanted.contains(&key) && !self.state.draining;
-            if self.state.works[&key].tasks.iter().any(Task::is_held) {
-                for task in &mut self.state.work_mut(key).tasks {
-                    task.wind((!carry_on).then_some(deadline));
+            if !self.state.works[&key].tasks.all_wind(!carry_on) {
+                let held: Vec<usize> = self.state.works[&key].tasks.held().collect();
+                for i in held {
+                    self.state.change(key, i, |task| task.wind((!carry_on).then_some(deadline)));
                 }
             }
         }
@@ -154,10 +155,14 @@ impl Deciding<'_> {
     pub(crate) fn count_time(&mut self) {
         let now = self.now();
         for key in self.keys() {
-            let work = &self.state.works[&key];
-            if work.is_busy() != work.busy_since.is_some() {
-                self.state.work_mut(key).count_time(now);
-            }
+            self.count_time_of(key, now);
+        }
+    }
+
+    fn count_time_of(&mut self, key: Digest, now: Millis) {
+        let work = &self.state.works[&key];
+        if work.is_busy() != work.busy_since.is_some() {
+            self.state.work_mut(key).count_time(now);
         }
     }
 }

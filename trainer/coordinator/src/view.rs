@@ -33,7 +33,7 @@ impl State {
     /// All workers.
     pub fn worker_views(&self) -> Vec<WorkerView> {
         let view = |(name, worker): (&WorkerId, &Worker)| {
-            let task = self.held_by(name).next().map(|(_, task)| task.id.clone());
+            let task = self.held_by(name).map(|(_, task)| task.id.clone());
             let state = match (worker.presence, &task) {
                 (Presence::Here, None) => "idle",
                 (Presence::Here, Some(_)) => "working",
@@ -56,9 +56,8 @@ impl State {
     /// All that a worker process should be doing.
     pub fn orders(&self, worker: &WorkerId, incarnation: Incarnation) -> Result<Orders, Rejected> {
         self.process(worker, incarnation)?;
-        let mut assignments: Vec<Assignment> =
-            self.held_by(worker).filter_map(|(work, task)| assignment(work, task, worker, incarnation)).collect();
-        assignments.sort_by(|a, b| a.grant.cmp(&b.grant));
+        let held = self.held_by(worker).and_then(|(work, task)| assignment(work, task, worker, incarnation));
+        let assignments: Vec<Assignment> = held.into_iter().collect();
         let leave = self.draining && assignments.is_empty();
         // A new checkpoint is not news for whoever made it, so it does not end a wait.
         let news: Vec<Assignment> =
@@ -159,10 +158,10 @@ impl State {
 
     /// How far a work is: its one task, or the sum over its shards while they are done.
     pub fn progress(&self, work: &Work) -> Progress {
-        let of = |task: &Task| self.heard.progress.get(&task.id).cloned();
+        let of = |task: &Task| self.heard.progress.get(&task.id).map(|progress| Progress::clone(progress));
         let shards = work.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. })).count();
         let done = work.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. }) && task.output().is_some());
-        match work.tasks.as_slice() {
+        match &*work.tasks {
             [] => Progress::default(),
             [task] => of(task).unwrap_or_default(),
             _ => Progress {

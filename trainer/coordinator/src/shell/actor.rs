@@ -131,8 +131,8 @@ impl Desk {
         self.stop.subscribe()
     }
 
-    fn publish(&self, state: &State, durable: bool) {
-        *self.published.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(state.clone());
+    fn publish(&self, state: &Arc<State>, durable: bool) {
+        *self.published.write().unwrap_or_else(PoisonError::into_inner) = Arc::clone(state);
         if durable {
             self.changed.send_modify(|version| *version += 1);
         }
@@ -184,9 +184,10 @@ impl Entropy {
 /// Starts the actor on a recovered state.
 pub(crate) fn start(store: Store, state: State) -> (Arc<Desk>, JoinHandle<()>) {
     let (asks, queue) = mpsc::channel(1024);
+    let state = Arc::new(state);
     let desk = Arc::new(Desk {
         asks,
-        published: RwLock::new(Arc::new(state.clone())),
+        published: RwLock::new(Arc::clone(&state)),
         changed: watch::Sender::new(0),
         trouble: Mutex::new(None),
         stop: watch::Sender::new(false),
@@ -199,7 +200,7 @@ pub(crate) fn start(store: Store, state: State) -> (Arc<Desk>, JoinHandle<()>) {
 
 struct Actor {
     desk: Arc<Desk>,
-    state: State,
+    state: Arc<State>,
     entropy: Entropy,
 }
 
@@ -235,7 +236,7 @@ impl Actor {
     /// Decides all `asks` in their order, stores what they write at once, and answers them. `false`: the store refused it,
     /// and nothing has happened.
     async fn all_happen(&mut self, asks: &mut Vec<Ask>) -> bool {
-        let (mut next, mut writes, mut effects) = (self.state.clone(), Vec::new(), Vec::new());
+        let (mut next, mut writes, mut effects) = (State::clone(&self.state), Vec::new(), Vec::new());
         let mut decided = Vec::with_capacity(asks.len());
         for ask in asks.iter() {
             decided.push(match ask {
@@ -262,7 +263,7 @@ impl Actor {
                 return false;
             }
         }
-        self.state = next;
+        self.state = Arc::new(next);
         self.desk.publish(&self.state, durable);
         for (ask, decided) in asks.drain(..).zip(decided) {
             if let Ok(done) = &decided {
@@ -298,7 +299,7 @@ impl Actor {
     }
 
     async fn hear(&mut self, observation: Observation) -> Result<(), Refused> {
-        let events = observe(&mut self.state, self.desk.now(), observation)?;
+        let events = observe(Arc::make_mut(&mut self.state), self.desk.now(), observation)?;
         for event in events {
             match self.happen(event).await {
                 Ok(_) => {}
@@ -324,7 +325,7 @@ impl Actor {
     }
 
     async fn try_happen(&mut self, event: Event) -> Result<Vec<Effect>, Refused> {
-        let mut next = self.state.clone();
+        let mut next = State::clone(&self.state);
         let moment = Moment { now: self.desk.now(), entropy: self.entropy.next() };
         tracing::debug!(?event, "event");
         let mut effects = decide(&mut next, moment, event)?;
@@ -337,7 +338,7 @@ impl Actor {
         let written = self.desk.store.write(writes).await;
         self.desk.wrote(&written);
         written?;
-        self.state = next;
+        self.state = Arc::new(next);
         self.desk.publish(&self.state, true);
         for effect in &effects {
             effects::perform(&self.desk, effect);

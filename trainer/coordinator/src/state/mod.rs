@@ -4,10 +4,11 @@
 pub mod gang;
 pub mod run;
 pub mod task;
+pub mod tasks;
 pub mod work;
 pub mod worker;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::sync::Arc;
 
 use protocol::message::{Grant, Progress};
@@ -24,14 +25,17 @@ use crate::policy::Policy;
 #[derive(Debug, Clone, Default)]
 pub struct Heard {
     /// When each worker was last heard of.
-    pub workers: BTreeMap<WorkerId, Millis>,
-    /// What was last said about each task, with the fence under which it was said.
-    pub progress: BTreeMap<TaskId, Progress>,
+    pub workers: Arc<BTreeMap<WorkerId, Millis>>,
+    /// What was last said about each task that is all of its work.
+    pub progress: Arc<BTreeMap<TaskId, Arc<Progress>>>,
     /// When the clock was last looked at.
     pub ticked: Option<Millis>,
 }
 
-/// All that the coordinator knows. Runs and works are shared between copies until one changes them, so a copy is cheap.
+/// All that the coordinator knows. What may be large is shared between copies until one changes it, so a copy is cheap.
+///
+/// A task is changed by [`State::change`] alone, which keeps what is known twice, for speed, in step: who waits and who is
+/// held in a work ([`tasks::Tasks`]), what a worker holds, and which workers hold nothing.
 #[derive(Debug, Clone, Default)]
 pub struct State {
     /// Times and budgets.
@@ -39,13 +43,15 @@ pub struct State {
     /// The time of the newest event.
     pub now: Millis,
     /// Workers by name.
-    pub workers: BTreeMap<WorkerId, Worker>,
+    pub workers: Arc<BTreeMap<WorkerId, Worker>>,
+    /// Those of them that hold no task.
+    pub unused: Arc<BTreeSet<WorkerId>>,
     /// Runs in the order of submission; the first has number 1.
     pub runs: Vec<Arc<Run>>,
     /// Works by the stage's key.
     pub works: BTreeMap<Digest, Arc<Work>>,
-    /// Which work a task is of.
-    pub tasks: BTreeMap<TaskId, Digest>,
+    /// Which work a task is of, and its place there.
+    pub tasks: Arc<BTreeMap<TaskId, (Digest, usize)>>,
     /// About to stop: no grants, workers save and leave.
     pub draining: bool,
     /// What was merely heard.
@@ -68,11 +74,14 @@ impl State {
 
     /// The work and the task that a grant is about.
     pub fn task(&self, task: &TaskId) -> Result<(&Work, &Task), Rejected> {
-        self.tasks
-            .get(task)
-            .and_then(|key| self.works.get(key))
-            .and_then(|work| Some((&**work, &work.tasks[work.position(task)?])))
-            .ok_or_else(|| Rejected::NotFound(format!("task `{task}` is not known")))
+        let (key, i) = self.place(task)?;
+        let work = &self.works[&key];
+        Ok((work, &work.tasks[i]))
+    }
+
+    /// The key of the work that a task is of, and its place there.
+    pub(crate) fn place(&self, task: &TaskId) -> Result<(Digest, usize), Rejected> {
+        self.tasks.get(task).copied().ok_or_else(|| Rejected::NotFound(format!("task `{task}` is not known")))
     }
 
     /// Checks that a write's grant has not been superseded and that its process is not known to be over.
@@ -84,6 +93,29 @@ impl State {
     /// Changes a work; other copies of the state keep theirs.
     pub(crate) fn work_mut(&mut self, key: Digest) -> &mut Work {
         Arc::make_mut(self.works.get_mut(&key).expect("works are never forgotten"))
+    }
+
+    /// Changes a task; the only way to.
+    pub(crate) fn change<T>(&mut self, key: Digest, i: usize, change: impl FnOnce(&mut Task) -> T) -> T {
+        let work = Arc::make_mut(self.works.get_mut(&key).expect("works are never forgotten"));
+        let before = work.tasks[i].holders().to_vec();
+        let made = work.tasks.change(i, change);
+        let after = work.tasks[i].holders();
+        if before != after {
+            let (workers, unused) = (Arc::make_mut(&mut self.workers), Arc::make_mut(&mut self.unused));
+            let mut set = |name: &WorkerId, holds| {
+                // Whoever holds something has joined, and nobody is forgotten.
+                workers.get_mut(name).expect("holders are known").holds = holds;
+                if holds.is_none() {
+                    unused.insert(name.clone())
+                } else {
+                    unused.remove(name)
+                };
+            };
+            before.iter().for_each(|member| set(&member.worker, None));
+            after.iter().for_each(|member| set(&member.worker, Some((key, i))));
+        }
+        made
     }
 
     /// The worker, if `incarnation` is its newest process.
@@ -101,26 +133,19 @@ impl State {
         Ok(known)
     }
 
-    /// The tasks that a worker holds; at most one.
-    pub fn held_by<'a>(&'a self, worker: &'a WorkerId) -> impl Iterator<Item = (&'a Work, &'a Task)> + 'a {
-        self.works.values().flat_map(move |work| {
-            work.tasks
-                .iter()
-                .filter(move |task| task.holders().iter().any(|member| member.worker == *worker))
-                .map(move |task| (&**work, task))
-        })
+    /// The task that a worker holds.
+    pub fn held_by(&self, worker: &WorkerId) -> Option<(&Work, &Task)> {
+        let (key, i) = self.workers.get(worker)?.holds?;
+        let work = &self.works[&key];
+        Some((work, &work.tasks[i]))
     }
 
     /// The keys of works that a running run waits for, in the order in which they are served: runs as submitted, stages
     /// as in the pipeline.
     pub fn wanted(&self) -> Vec<Digest> {
-        let mut keys = Vec::new();
-        for (_, key) in self.runs.iter().flat_map(|run| run.active()) {
-            if !keys.contains(&key) {
-                keys.push(key);
-            }
-        }
-        keys
+        let mut seen = HashSet::new();
+        let active = self.runs.iter().flat_map(|run| run.active());
+        active.map(|(_, key)| key).filter(|key| seen.insert(*key)).collect()
     }
 
     /// The work behind a stage of a run, if it has begun or was done here before.

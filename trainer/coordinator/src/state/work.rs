@@ -17,6 +17,7 @@ use protocol::stage::{Backend, Placement, Shape, StageSettings};
 use protocol::{Attempt, Digest, RunId, Seed, StageName, TaskId};
 
 use super::task::{Part, Task};
+use super::tasks::Tasks;
 use crate::event::{Known, Millis};
 use crate::register::Registration;
 
@@ -71,7 +72,7 @@ pub struct Work {
     /// How far it is.
     pub state: WorkState,
     /// Its tasks: none, one, or the shards and their merge.
-    pub tasks: Vec<Task>,
+    pub tasks: Tasks,
     /// Milliseconds of work, up to `busy_since`.
     pub wall_ms: u64,
     /// Set while some task is held.
@@ -88,7 +89,7 @@ impl Work {
             return;
         }
         let task = |shard, part| Task::new(TaskId::of(&self.run, &self.stage, shard), part);
-        self.tasks = match self.settings.shape() {
+        self.tasks = Tasks::new(match self.settings.shape() {
             Shape::Plain => vec![task(None, Part::Alone)],
             Shape::Gang => vec![task(None, Part::Gang)],
             Shape::Map => {
@@ -98,7 +99,7 @@ impl Work {
                 tasks
             }
             Shape::Registry => panic!("a register stage has no tasks: {self:?}"),
-        };
+        });
     }
 
     /// The shards' artifacts in order, once all are there.
@@ -109,19 +110,15 @@ impl Work {
     /// Whether a task can be done now, given that it is free: a merge needs its shards.
     pub fn is_ready(&self, task: &Task) -> bool {
         match task.part {
-            Part::Merge => self.shards().is_some(),
+            // All but the merge itself.
+            Part::Merge => self.tasks.open() == 1,
             Part::Alone | Part::Gang | Part::Shard { .. } => true,
         }
     }
 
-    /// The place of a task.
-    pub fn position(&self, task: &TaskId) -> Option<usize> {
-        self.tasks.iter().position(|t| t.id == *task)
-    }
-
     /// Whether somebody works on it.
     pub fn is_busy(&self) -> bool {
-        self.state == WorkState::Bundling || self.tasks.iter().any(Task::is_held)
+        self.state == WorkState::Bundling || self.tasks.is_any_held()
     }
 
     /// Whether it is over, one way or the other.
@@ -160,17 +157,11 @@ impl Work {
         self.tasks.iter().any(|task| task.output().is_some() || task.newest().is_some())
     }
 
-    /// Ends it: whoever still works on it can write no more. The fences that this takes are returned.
-    pub fn fail(&mut self, message: String, own: bool) -> Vec<registry::Write> {
-        self.state = WorkState::Failed { message, own };
-        self.tasks.iter_mut().filter(|task| task.is_held()).map(|task| task.release(None)).collect()
-    }
-
     /// Wanted again after it was over: the store is asked first, and budgets are whole again.
     pub fn want_again(&mut self, lost_value: bool) {
         self.state = WorkState::Looking;
-        for task in &mut self.tasks {
-            if lost_value { task.reopen() } else { task.reset_budgets() }
+        for i in 0..self.tasks.len() {
+            self.tasks.change(i, |task| if lost_value { task.reopen() } else { task.reset_budgets() });
         }
     }
 }

@@ -11,9 +11,9 @@
 //! the process can say that it is gone, and only a new process (a join, with the next incarnation) returns from that.
 //! Whatever a worker held it loses on leaving `Here`; that is the business of `decide`.
 
-use protocol::Incarnation;
 use protocol::message::{Join, Member};
 use protocol::stage::Backend;
+use protocol::{Digest, Incarnation};
 
 use crate::event::Millis;
 
@@ -89,6 +89,8 @@ pub struct Worker {
     pub presence: Presence,
     /// How often peers could not reach this process; each time it stays out for longer.
     pub suspicions: u32,
+    /// What it holds: the key of a work, and a task's place there.
+    pub holds: Option<(Digest, usize)>,
 }
 
 impl Worker {
@@ -101,6 +103,7 @@ impl Worker {
             peer_address: join.peer_address.clone(),
             presence: Presence::Here,
             suspicions: 0,
+            holds: None,
         }
     }
 

@@ -1,0 +1,113 @@
+//! The tasks of one work, by place, and who of them is held or waits: with thousands of tasks one decision must not look at all.
+//!
+//! Read as a slice. [`Tasks::change`] is the only way to change a task, so that the index cannot be wrong; invariant C14.
+
+use std::collections::BTreeSet;
+use std::ops::Deref;
+
+use super::task::{Hold, Task};
+
+/// The tasks of a work.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Tasks {
+    all: Vec<Task>,
+    index: Index,
+}
+
+#[derive(Debug, Clone, Default, PartialEq)]
+struct Index {
+    held: BTreeSet<usize>,
+    waiting: BTreeSet<usize>,
+    /// Of the held ones, how many are asked to wind down.
+    winding: usize,
+}
+
+impl Index {
+    /// Puts the task at `i` in, or takes it out.
+    fn note(&mut self, i: usize, hold: &Hold, there: bool) {
+        let set = match hold {
+            Hold::Held { winding, .. } => {
+                match there {
+                    true => self.winding += usize::from(winding.is_some()),
+                    false => self.winding -= usize::from(winding.is_some()),
+                }
+                &mut self.held
+            }
+            Hold::Waiting { .. } => &mut self.waiting,
+            Hold::Done { .. } => return,
+        };
+        if there {
+            set.insert(i)
+        } else {
+            set.remove(&i)
+        };
+    }
+
+    fn of(tasks: &[Task]) -> Self {
+        let mut index = Self::default();
+        tasks.iter().enumerate().for_each(|(i, task)| index.note(i, &task.hold, true));
+        index
+    }
+}
+
+impl Tasks {
+    /// These tasks.
+    pub fn new(all: Vec<Task>) -> Self {
+        let index = Index::of(&all);
+        Self { all, index }
+    }
+
+    /// Places of those that somebody has.
+    pub fn held(&self) -> impl Iterator<Item = usize> + '_ {
+        self.index.held.iter().copied()
+    }
+
+    /// Places of those that nobody has and that are not done.
+    pub fn waiting(&self) -> impl Iterator<Item = usize> + '_ {
+        self.index.waiting.iter().copied()
+    }
+
+    /// Whether somebody has any of them.
+    pub fn is_any_held(&self) -> bool {
+        !self.index.held.is_empty()
+    }
+
+    /// How many are not done.
+    pub fn open(&self) -> usize {
+        self.index.held.len() + self.index.waiting.len()
+    }
+
+    /// Whether all (`asked`) or none of the held ones are asked to wind down.
+    pub fn all_wind(&self, asked: bool) -> bool {
+        self.index.winding == if asked { self.index.held.len() } else { 0 }
+    }
+
+    /// Whether the index says what the tasks say.
+    pub fn is_indexed(&self) -> bool {
+        self.index == Index::of(&self.all)
+    }
+
+    pub(super) fn change<T>(&mut self, i: usize, change: impl FnOnce(&mut Task) -> T) -> T {
+        self.index.note(i, &self.all[i].hold, false);
+        let made = change(&mut self.all[i]);
+        self.index.note(i, &self.all[i].hold, true);
+        made
+    }
+}
+
+impl Deref for Tasks {
+    type Target = [Task];
+
+    fn deref(&self) -> &[Task] {
+        &self.all
+    }
+}
+
+impl<'a> IntoIterator for &'a Tasks {
+    type Item = &'a Task;
+    type IntoIter = std::slice::Iter<'a, Task>;
+
+    fn into_iter(self) -> Self::IntoIter {
+        self.all.iter()
+    }
+}
