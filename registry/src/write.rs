@@ -118,6 +118,22 @@ pub enum Write {
     },
 }
 
+impl Write {
+    /// The grant that vouches for it; the store checks its fence. Who adds a write decides here whether it needs one.
+    pub(crate) fn grant(&self) -> Option<&Grant> {
+        match self {
+            Self::Metrics { grant, .. }
+            | Self::Logs { grant, .. }
+            | Self::Checkpoint { grant, .. }
+            | Self::Shard { grant, .. } => Some(grant),
+            Self::StageResult { grant, .. } => grant.as_ref(),
+            Self::Journal(_) | Self::Fence { .. } | Self::Run { .. } | Self::Version { .. } | Self::Promote { .. } => {
+                None
+            }
+        }
+    }
+}
+
 /// Why nothing of a transaction was stored.
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {

@@ -1,11 +1,16 @@
-//! What each [`Write`] does to the tables. Runs inside the writer's transaction, which is what makes the check of the fence
-//! and the write it guards one thing.
+//! What each [`Write`] does to the tables. Runs inside the writer's transaction, which is what makes the check of a fence
+//! and the writes it guards one thing.
+//!
+//! All that one order writes is checked one after the other against the fences as they stand in this transaction, then
+//! stored table by table: a statement for many rows, because with hundreds of workers the statements are what costs.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::message::{Grant, MetricRow};
 use protocol::{Digest, Fence, Manifest, TaskId};
-use sqlx::{Row, SqliteConnection};
+use serde_json::Value;
+use sqlx::query_builder::Separated;
+use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 
 use super::write_error;
 use crate::blob::{BlobStore, ManifestError};
@@ -13,72 +18,72 @@ use crate::{Write, WriteError, catalog, clock};
 
 type Result<T> = std::result::Result<T, WriteError>;
 
-pub(crate) async fn apply(conn: &mut SqliteConnection, blobs: &BlobStore, write: &Write) -> Result<()> {
-    match write {
-        Write::Journal(event) => {
-            let insert = sqlx::query("INSERT INTO journal (at_ms, event) VALUES (?, ?)");
-            run(conn, insert.bind(clock::now_ms()).bind(event.to_string())).await.map(|_| ())
+/// Rows of one statement: eight values each stay below SQLite's limit for a statement's values.
+const ROWS: usize = 250;
+
+/// Does all of `writes`, or says why one of them is refused; then the caller rolls back.
+pub(crate) async fn apply(conn: &mut SqliteConnection, blobs: &BlobStore, writes: &[Write]) -> Result<()> {
+    let mut fences = Fences::read(conn, writes).await?;
+    let (mut entries, mut shards) = (Vec::new(), BTreeMap::new());
+    for write in writes {
+        if let Some(grant) = write.grant() {
+            fences.check(grant)?;
         }
-        Write::Fence { task, fence } => set_fence(conn, task, *fence).await,
-        Write::Run { run, pipeline, source, state, idempotency_key } => {
-            set_run(conn, run.as_str(), &pipeline.to_string(), source, state, idempotency_key.as_deref()).await
-        }
-        Write::Metrics { grant, rows } => {
-            check(conn, grant).await?;
-            add_metrics(conn, grant, rows).await
-        }
-        Write::Logs { grant, first, lines } => {
-            check(conn, grant).await?;
-            add_logs(conn, grant, *first, lines).await
-        }
-        Write::Checkpoint { grant, step, manifest, metrics } => {
-            check(conn, grant).await?;
-            complete(blobs, *manifest)?;
-            let insert = sqlx::query(
-                "INSERT INTO checkpoints (task, attempt, step, manifest, metrics, at_ms) VALUES (?, ?, ?, ?, ?, ?) \
-                 ON CONFLICT DO NOTHING",
-            );
-            let insert = insert.bind(grant.task.as_str()).bind(int(grant.attempt.0)).bind(int(*step));
-            run(conn, insert.bind(manifest.to_string()).bind(json(metrics)).bind(clock::now_ms())).await.map(|_| ())
-        }
-        Write::Shard { grant, output } => {
-            check(conn, grant).await?;
-            complete(blobs, *output)?;
-            set_shard(conn, &grant.task, *output).await
-        }
-        Write::StageResult { grant, key, run, stage, kind, outputs, metrics, inputs, wall_s } => {
-            if let Some(grant) = grant {
-                check(conn, grant).await?;
+        match write {
+            Write::Journal(event) => entries.push(event),
+            Write::Fence { task, fence } => fences.raise(task, *fence)?,
+            Write::Run { run, pipeline, source, state, idempotency_key } => {
+                set_run(conn, run.as_str(), &pipeline.to_string(), source, state, idempotency_key.as_deref()).await?;
             }
-            let made = Made {
-                key: *key,
-                run: run.as_str(),
-                stage: stage.as_str(),
-                kind,
-                outputs,
-                metrics,
-                inputs,
-                wall_s: *wall_s,
-            };
-            set_result(conn, blobs, &made).await
-        }
-        Write::Version { model, artifact, metrics, source } => {
-            let manifest = complete(blobs, *artifact)?;
-            catalog::register(conn, model, *artifact, manifest.kind, metrics, source).await.map(|_| ())
-        }
-        Write::Promote { model, alias, artifact, require, reason, actor } => {
-            let order = catalog::PromoteOrder {
-                model: model.clone(),
-                alias: alias.clone(),
-                to: catalog::Which::Artifact(*artifact),
-                expect: None,
-                require: require.clone(),
-                reason: reason.clone(),
-                actor: actor.clone(),
-            };
-            catalog::promote(conn, &order).await.map(|_| ())
+            Write::Metrics { grant, rows } => add_metrics(conn, grant, rows).await?,
+            Write::Logs { grant, first, lines } => add_logs(conn, grant, *first, lines).await?,
+            Write::Checkpoint { grant, step, manifest, metrics } => {
+                complete(blobs, *manifest)?;
+                let insert = sqlx::query(
+                    "INSERT INTO checkpoints (task, attempt, step, manifest, metrics, at_ms) VALUES (?, ?, ?, ?, ?, ?) \
+                     ON CONFLICT DO NOTHING",
+                );
+                let insert = insert.bind(grant.task.as_str()).bind(int(grant.attempt.0)).bind(int(*step));
+                run(conn, insert.bind(manifest.to_string()).bind(json(metrics)).bind(clock::now_ms())).await?;
+            }
+            Write::Shard { grant, output } => {
+                complete(blobs, *output)?;
+                add_shard(&mut shards, &grant.task, *output)?;
+            }
+            Write::StageResult { grant: _, key, run, stage, kind, outputs, metrics, inputs, wall_s } => {
+                let made = Made {
+                    key: *key,
+                    run: run.as_str(),
+                    stage: stage.as_str(),
+                    kind,
+                    outputs,
+                    metrics,
+                    inputs,
+                    wall_s: *wall_s,
+                };
+                set_result(conn, blobs, &made).await?;
+            }
+            Write::Version { model, artifact, metrics, source } => {
+                let manifest = complete(blobs, *artifact)?;
+                catalog::register(conn, model, *artifact, manifest.kind, metrics, source).await?;
+            }
+            Write::Promote { model, alias, artifact, require, reason, actor } => {
+                let order = catalog::PromoteOrder {
+                    model: model.clone(),
+                    alias: alias.clone(),
+                    to: catalog::Which::Artifact(*artifact),
+                    expect: None,
+                    require: require.clone(),
+                    reason: reason.clone(),
+                    actor: actor.clone(),
+                };
+                catalog::promote(conn, &order).await?;
+            }
         }
     }
+    add_entries(conn, &entries).await?;
+    add_shards(conn, &shards).await?;
+    fences.write(conn).await
 }
 
 pub(crate) type Query<'q> = sqlx::query::Query<'q, sqlx::Sqlite, sqlx::sqlite::SqliteArguments>;
@@ -102,33 +107,102 @@ pub(crate) fn json<T: serde::Serialize>(value: &T) -> String {
     serde_json::to_string(value).unwrap_or_else(|e| panic!("a row that is no JSON: {e}"))
 }
 
-async fn fence_of(conn: &mut SqliteConnection, task: &TaskId) -> Result<Option<Fence>> {
-    let row = one(conn, sqlx::query("SELECT fence FROM fences WHERE task = ?").bind(task.as_str())).await?;
-    Ok(row.map(|row| Fence(row.get::<i64, _>(0).unsigned_abs())))
+/// Runs `begin` with a tuple of values for each row, and `end`, as few statements as there may be.
+async fn insert<T>(
+    conn: &mut SqliteConnection,
+    begin: &'static str,
+    rows: &[T],
+    values: impl Fn(&mut Separated<'_, Sqlite, &'static str>, &T),
+    end: &'static str,
+) -> Result<()> {
+    for rows in rows.chunks(ROWS) {
+        let mut query = QueryBuilder::<Sqlite>::new(begin);
+        query.push_values(rows, |mut row, value| values(&mut row, value)).push(end);
+        // Another number of rows is another statement: not worth keeping.
+        run(conn, query.build().persistent(false)).await?;
+    }
+    Ok(())
 }
 
-/// The check that every write with a grant passes: the grant is the newest that the store knows for its task.
-async fn check(conn: &mut SqliteConnection, grant: &Grant) -> Result<()> {
-    match fence_of(conn, &grant.task).await? {
-        Some(current) if current == grant.fence => Ok(()),
-        Some(current) if current > grant.fence => {
-            Err(WriteError::StaleFence { task: grant.task.clone(), current, carried: grant.fence })
+/// The values of `value` by `task` in `table`, for those of `tasks` that have one.
+async fn by_task<T>(conn: &mut SqliteConnection, select: &'static str, tasks: &[&TaskId]) -> Result<BTreeMap<TaskId, T>>
+where
+    T: for<'r> sqlx::Decode<'r, Sqlite> + sqlx::Type<Sqlite>,
+{
+    let mut found = BTreeMap::new();
+    for tasks in tasks.chunks(ROWS) {
+        let mut query = QueryBuilder::<Sqlite>::new(select);
+        let mut list = query.separated(", ");
+        tasks.iter().for_each(|task| {
+            list.push_bind(task.as_str().to_owned());
+        });
+        let rows = query.push(")").build().persistent(false).fetch_all(&mut *conn).await.map_err(write_error)?;
+        found.extend(rows.iter().map(|row| (TaskId::from(row.get::<&str, _>(0)), row.get::<T, _>(1))));
+    }
+    Ok(found)
+}
+
+/// The fences of the tasks that an order is about, as they stand in its transaction.
+struct Fences {
+    known: BTreeMap<TaskId, Fence>,
+    raised: BTreeSet<TaskId>,
+}
+
+impl Fences {
+    async fn read(conn: &mut SqliteConnection, writes: &[Write]) -> Result<Self> {
+        let of = |write: &Write| match write {
+            Write::Fence { task, .. } => Some(task.clone()),
+            other => other.grant().map(|grant| grant.task.clone()),
+        };
+        let tasks: BTreeSet<TaskId> = writes.iter().filter_map(of).collect();
+        let tasks: Vec<&TaskId> = tasks.iter().collect();
+        let known = by_task::<i64>(conn, "SELECT task, fence FROM fences WHERE task IN (", &tasks).await?;
+        let known = known.into_iter().map(|(task, fence)| (task, Fence(fence.unsigned_abs()))).collect();
+        Ok(Self { known, raised: BTreeSet::new() })
+    }
+
+    /// The check that every write with a grant passes: the grant is the newest that the store knows for its task.
+    fn check(&self, grant: &Grant) -> Result<()> {
+        match self.known.get(&grant.task) {
+            Some(current) if *current == grant.fence => Ok(()),
+            Some(current) if *current > grant.fence => {
+                Err(WriteError::StaleFence { task: grant.task.clone(), current: *current, carried: grant.fence })
+            }
+            current => Err(WriteError::Conflict(format!(
+                "the write for task `{}` carries fence {}, which was never granted: the newest is {}",
+                grant.task,
+                grant.fence,
+                current.map_or_else(|| "none".into(), |fence| fence.to_string())
+            ))),
         }
-        current => Err(WriteError::Conflict(format!(
-            "the write for task `{}` carries fence {}, which was never granted: the newest is {}",
-            grant.task,
-            grant.fence,
-            current.map_or_else(|| "none".into(), |fence| fence.to_string())
-        ))),
+    }
+
+    fn raise(&mut self, task: &TaskId, fence: Fence) -> Result<()> {
+        if let Some(current) = self.known.get(task).filter(|current| **current >= fence) {
+            return Err(WriteError::StaleFence { task: task.clone(), current: *current, carried: fence });
+        }
+        self.known.insert(task.clone(), fence);
+        self.raised.insert(task.clone());
+        Ok(())
+    }
+
+    async fn write(self, conn: &mut SqliteConnection) -> Result<()> {
+        let rows: Vec<(&TaskId, Fence)> = self.raised.iter().map(|task| (task, self.known[task])).collect();
+        let begin = "INSERT INTO fences (task, fence) ";
+        let end = " ON CONFLICT (task) DO UPDATE SET fence = excluded.fence";
+        let values = |row: &mut Separated<'_, Sqlite, &'static str>, (task, fence): &(&TaskId, Fence)| {
+            row.push_bind(task.as_str().to_owned()).push_bind(int(fence.0));
+        };
+        insert(conn, begin, &rows, values, end).await
     }
 }
 
-async fn set_fence(conn: &mut SqliteConnection, task: &TaskId, fence: Fence) -> Result<()> {
-    if let Some(current) = fence_of(conn, task).await?.filter(|current| *current >= fence) {
-        return Err(WriteError::StaleFence { task: task.clone(), current, carried: fence });
-    }
-    let set = "INSERT INTO fences (task, fence) VALUES (?, ?) ON CONFLICT (task) DO UPDATE SET fence = excluded.fence";
-    run(conn, sqlx::query(set).bind(task.as_str()).bind(int(fence.0))).await.map(|_| ())
+async fn add_entries(conn: &mut SqliteConnection, entries: &[&Value]) -> Result<()> {
+    let now = clock::now_ms();
+    let values = |row: &mut Separated<'_, Sqlite, &'static str>, event: &&Value| {
+        row.push_bind(now).push_bind(event.to_string());
+    };
+    insert(conn, "INSERT INTO journal (at_ms, event) ", entries, values, "").await
 }
 
 async fn set_run(
@@ -164,6 +238,7 @@ pub(crate) fn run_and_stage(task: &TaskId) -> (&str, &str) {
 async fn add_metrics(conn: &mut SqliteConnection, grant: &Grant, rows: &[MetricRow]) -> Result<()> {
     let (of_run, stage) = run_and_stage(&grant.task);
     let mut series: BTreeMap<&str, i64> = BTreeMap::new();
+    let mut all = Vec::with_capacity(rows.len());
     for row in rows {
         let id = match series.get(row.key.as_str()) {
             Some(id) => *id,
@@ -184,25 +259,25 @@ async fn add_metrics(conn: &mut SqliteConnection, grant: &Grant, rows: &[MetricR
                 id
             }
         };
-        let value = (!row.value.is_nan()).then_some(row.value);
-        let add = "INSERT INTO metrics (series, step, value) VALUES (?, ?, ?) ON CONFLICT DO NOTHING";
-        run(conn, sqlx::query(add).bind(id).bind(int(row.step)).bind(value)).await?;
+        all.push((id, int(row.step), (!row.value.is_nan()).then_some(row.value)));
     }
-    Ok(())
+    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (id, step, value): &(i64, i64, Option<f64>)| {
+        row.push_bind(*id).push_bind(*step).push_bind(*value);
+    };
+    insert(conn, "INSERT INTO metrics (series, step, value) ", &all, values, " ON CONFLICT DO NOTHING").await
 }
 
 async fn add_logs(conn: &mut SqliteConnection, grant: &Grant, first: u64, lines: &[String]) -> Result<()> {
     let (of_run, stage) = run_and_stage(&grant.task);
     let now = clock::now_ms();
-    for (number, line) in (first..).zip(lines) {
-        let add = sqlx::query(
-            "INSERT INTO logs (run, stage, task, attempt, worker, line, at_ms, text) VALUES (?, ?, ?, ?, ?, ?, ?, ?) \
-             ON CONFLICT DO NOTHING",
-        );
-        let add = add.bind(of_run).bind(stage).bind(grant.task.as_str()).bind(int(grant.attempt.0));
-        run(conn, add.bind(grant.worker.as_str()).bind(int(number)).bind(now).bind(line)).await?;
-    }
-    Ok(())
+    let rows: Vec<(u64, &String)> = (first..).zip(lines).collect();
+    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (number, line): &(u64, &String)| {
+        row.push_bind(of_run.to_owned()).push_bind(stage.to_owned()).push_bind(grant.task.as_str().to_owned());
+        row.push_bind(int(grant.attempt.0)).push_bind(grant.worker.as_str().to_owned());
+        row.push_bind(int(*number)).push_bind(now).push_bind((*line).clone());
+    };
+    let begin = "INSERT INTO logs (run, stage, task, attempt, worker, line, at_ms, text) ";
+    insert(conn, begin, &rows, values, " ON CONFLICT DO NOTHING").await
 }
 
 /// The manifest, once all that it lists is there: before that, no row may name it.
@@ -220,20 +295,34 @@ pub(crate) fn complete(blobs: &BlobStore, digest: Digest) -> Result<Manifest> {
     })
 }
 
-async fn set_shard(conn: &mut SqliteConnection, task: &TaskId, output: Digest) -> Result<()> {
-    let (of_run, _) = run_and_stage(task);
-    let stored = one(conn, sqlx::query("SELECT output FROM shards WHERE task = ?").bind(task.as_str())).await?;
-    let output = output.to_string();
-    match stored.map(|row| row.get::<String, _>(0)) {
-        Some(stored) if stored == output => Ok(()),
-        Some(stored) => {
-            Err(WriteError::Conflict(format!("shard `{task}` is stored as {stored} already; now it is {output}")))
-        }
-        None => {
-            let add = sqlx::query("INSERT INTO shards (task, run, output, at_ms) VALUES (?, ?, ?, ?)");
-            run(conn, add.bind(task.as_str()).bind(of_run).bind(output).bind(clock::now_ms())).await.map(|_| ())
+/// Adds a shard to those that an order stores.
+fn add_shard<'a>(shards: &mut BTreeMap<&'a TaskId, Digest>, task: &'a TaskId, output: Digest) -> Result<()> {
+    match shards.insert(task, output) {
+        Some(other) if other != output => Err(two_shards(task, &other.to_string(), output)),
+        Some(_) | None => Ok(()),
+    }
+}
+
+fn two_shards(task: &TaskId, stored: &str, output: Digest) -> WriteError {
+    WriteError::Conflict(format!("shard `{task}` is stored as {stored} already; now it is {output}"))
+}
+
+async fn add_shards(conn: &mut SqliteConnection, shards: &BTreeMap<&TaskId, Digest>) -> Result<()> {
+    let tasks: Vec<&TaskId> = shards.keys().copied().collect();
+    let stored = by_task::<String>(conn, "SELECT task, output FROM shards WHERE task IN (", &tasks).await?;
+    for (task, stored) in &stored {
+        let output = shards[task];
+        if *stored != output.to_string() {
+            return Err(two_shards(task, stored, output));
         }
     }
+    let now = clock::now_ms();
+    let rows: Vec<_> = shards.iter().filter(|(task, _)| !stored.contains_key(**task)).collect();
+    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (task, output): &(&&TaskId, &Digest)| {
+        row.push_bind(task.as_str().to_owned()).push_bind(run_and_stage(task).0.to_owned());
+        row.push_bind(output.to_string()).push_bind(now);
+    };
+    insert(conn, "INSERT INTO shards (task, run, output, at_ms) ", &rows, values, "").await
 }
 
 struct Made<'a> {

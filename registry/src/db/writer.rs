@@ -193,12 +193,7 @@ async fn run_all(
 
 async fn run(conn: &mut SqliteConnection, blobs: &BlobStore, order: &Order) -> Result<Done, WriteError> {
     match order {
-        Order::Write(writes) => {
-            for write in writes {
-                apply::apply(conn, blobs, write).await?;
-            }
-            Ok(Done::Nothing)
-        }
+        Order::Write(writes) => apply::apply(conn, blobs, writes).await.map(|()| Done::Nothing),
         Order::Promote(order) => catalog::promote(conn, order).await.map(|p| Done::Promoted(Box::new(p))),
         Order::Rollback { model, alias, to, expect, reason, actor } => {
             catalog::rollback(conn, model, alias, *to, *expect, reason, actor)
