@@ -113,10 +113,25 @@ fn reconstruction_is_the_same_however_the_clips_are_cut() {
     let metrics = &reports[0].1;
     println!("{metrics:?}");
     for prefix in ["", "mu_", "clip_mean_"] {
-        for name in ["mpjpe_mm", "mpjpe_local_mm", "mpjpe_global_mm", "feature_error", "feature_smooth_l1"] {
+        for name in [
+            "mpjpe_mm",
+            "pa_mpjpe_mm",
+            "mpjpe_local_mm",
+            "mpjpe_global_mm",
+            "acceleration_mm",
+            "feature_error",
+            "feature_smooth_l1",
+        ] {
             assert!(metrics[&format!("{prefix}{name}")] > 0.0, "{prefix}{name}");
         }
+        let of = |name: &str| metrics[&format!("{prefix}{name}")];
+        assert!(of("pa_mpjpe_mm") < of("mpjpe_global_mm"), "an alignment that makes worse: {metrics:?}");
+        assert!((of("sjpe_noise") + of("sjpe_static") - of("sjpe")).abs() < 1e-12 && of("sjpe") <= 1.0, "{metrics:?}");
+        assert!((0.0..=1.0).contains(&of("skating_ratio")));
     }
+    assert!(metrics["clip_mean_sjpe_static"] > 0.9, "the held mean does not move its wrists: {metrics:?}");
+    assert!(metrics["sjpe_noise"] > 0.5, "an untrained VAE shakes: {metrics:?}");
+    assert!((0.0..0.2).contains(&metrics["real_skating_ratio"]), "synthetic clips hardly skate: {metrics:?}");
     assert!(metrics["clip_mean_mpjpe_mm"] < metrics["mpjpe_mm"], "an untrained VAE is no better than the clip's mean");
 }
 

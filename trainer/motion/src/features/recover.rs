@@ -33,13 +33,18 @@ pub fn root_path(features: &[f32], skeleton: &Skeleton) -> Vec<(Quat, Vec3)> {
 ///
 /// The root of frame 0 stands above the origin. Rotations, velocities and contacts are not read.
 pub fn recover_joints(features: &[f32], skeleton: &Skeleton) -> Vec<f32> {
+    recover_joints_wide(features, skeleton).into_iter().map(|v| v as f32).collect()
+}
+
+/// As [`recover_joints`], before its result is rounded: for what takes differences of neighbouring frames.
+pub fn recover_joints_wide(features: &[f32], skeleton: &Skeleton) -> Vec<f64> {
     let mut joints = Vec::with_capacity(features.len() / skeleton.features * skeleton.joints * 3);
     for (row, (heading, root)) in features.chunks_exact(skeleton.features).zip(root_path(features, skeleton)) {
-        joints.extend(root.map(|v| v as f32));
+        joints.extend(root);
         let back = quat::inverse(heading);
         for local in row[skeleton.layout().positions].chunks_exact(3) {
             let at = quat::rotate(back, [local[0], local[1], local[2]].map(f64::from));
-            joints.extend([at[0] + root[0], at[1], at[2] + root[2]].map(|v| v as f32));
+            joints.extend([at[0] + root[0], at[1], at[2] + root[2]]);
         }
     }
     joints

@@ -1,17 +1,19 @@
 //! What a VAE loses: errors of one clip, and their summary over clips.
 //!
-//! Source: the VAE protocol of MotionLCM and MLD. MPJPE is a mean over all frames of all clips, pelvis at the origin. The feature error
-//! is the sum over clips of the Frobenius norm of the normalised difference, divided by the number of frames; it is not a mean per
-//! frame. Smooth-L1 is a mean over all values of all clips (the VAE's loss instead weighs clips
-//! equally).
+//! Source: the VAE protocol of MotionLCM and MLD, sJPE of DisCoRD. MPJPE is a mean over all frames of all clips, pelvis at the origin;
+//! PA-MPJPE likewise, after each frame's best similarity. The error of accelerations is a mean over all frames but two of each clip, as
+//! they lie in the world. The feature error is the sum over clips of the Frobenius norm of the normalised difference, divided by the
+//! number of frames; it is not a mean per frame. Smooth-L1 is a mean over all values of all clips (the VAE's loss instead weighs clips
+//! equally). sJPE with its parts and the skating ratio are means over clips; a clip of fewer than 4 frames has no jerk and is left out.
 
 use std::collections::BTreeMap;
 
 use motion::Skeleton;
-use motion::features::recover_joints;
+use motion::features::{recover_joints, recover_joints_wide};
 use serde::{Deserialize, Serialize};
 
-use super::joints;
+use super::jerk::{JerkError, jerk, joints_of};
+use super::{joints, procrustes, skating};
 
 /// Errors of one clip, summed over its frames, in the unit of the data.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -20,51 +22,195 @@ pub struct ClipErrors {
     pub frames: usize,
     /// Pelvis at the origin, in each frame.
     pub aligned: f64,
+    /// After each frame's best scale, rotation and shift.
+    pub similar: f64,
     /// Pelvis at the origin and the body facing its heading, in each frame: the posture alone.
     pub local: f64,
     /// As they lie in the world, drift included.
     pub global: f64,
+    /// Of accelerations, summed over the frames but two.
+    pub acceleration: f64,
     /// Frobenius norm of the difference of the normalised features.
     pub feature_distance: f64,
     /// Smooth-L1 of the normalised features, mean over the clip.
     pub smooth_l1: f64,
+    /// sJPE's parts; none of fewer than 4 frames.
+    pub jerk: Option<ClipJerk>,
+    /// Share of the steps in which a foot of the guess skates.
+    pub skating: f64,
+}
+
+/// sJPE's parts of one clip.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ClipJerk {
+    /// Where the guess shakes more than the truth.
+    pub noise: f64,
+    /// Where it is smoother.
+    pub statics: f64,
 }
 
 impl ClipErrors {
     /// Compares a clip with a guess at it; both are rows `[L, D]` of normalised features.
     pub fn between(truth: &[f32], guess: &[f32], mean: &[f32], std: &[f32], skeleton: &Skeleton) -> Self {
-        let natural = |rows: &[f32]| -> Vec<f32> {
-            let scaled = rows.chunks_exact(mean.len()).flat_map(|row| row.iter().zip(std).zip(mean));
-            scaled.map(|((x, s), m)| x * s + m).collect()
-        };
-        let (truth_natural, guess_natural) = (natural(truth), natural(guess));
+        let (truth_natural, guess_natural) = (natural(truth, mean, std), natural(guess, mean, std));
         let (a, b) = (recover_joints(&truth_natural, skeleton), recover_joints(&guess_natural, skeleton));
+        let (a_wide, b_wide) =
+            (recover_joints_wide(&truth_natural, skeleton), recover_joints_wide(&guess_natural, skeleton));
         let posture = |rows: &[f32]| joints::posture(rows, skeleton.features, skeleton.joints);
         let sum = |frames: Vec<f64>| frames.iter().sum::<f64>();
         Self {
             frames: truth.len() / mean.len(),
             aligned: sum(joints::root_aligned(&a, &b, skeleton.joints)),
+            similar: sum(procrustes::aligned(&a_wide, &b_wide, skeleton.joints)),
             local: sum(joints::global(&posture(&truth_natural), &posture(&guess_natural), skeleton.joints)),
             global: sum(joints::global(&a, &b, skeleton.joints)),
+            acceleration: sum(procrustes::acceleration(&a_wide, &b_wide, skeleton.joints)),
             feature_distance: joints::feature_distance(truth, guess),
             smooth_l1: joints::smooth_l1(truth, guess),
+            jerk: clip_jerk(&a_wide, &b_wide, skeleton),
+            skating: skates(b_wide, skeleton),
         }
     }
+}
+
+/// Features in the data's own scale.
+fn natural(rows: &[f32], mean: &[f32], std: &[f32]) -> Vec<f32> {
+    let scaled = rows.chunks_exact(mean.len()).flat_map(|row| row.iter().zip(std).zip(mean));
+    scaled.map(|((x, s), m)| x * s + m).collect()
+}
+
+fn in_metres(mut joints: Vec<f64>, skeleton: &Skeleton) -> Vec<f64> {
+    joints.iter_mut().for_each(|v| *v *= skeleton.metres_per_unit);
+    joints
+}
+
+fn clip_jerk(truth: &[f64], guess: &[f64], skeleton: &Skeleton) -> Option<ClipJerk> {
+    let of = joints_of(skeleton.format);
+    let jerks = |joints: &[f64]| jerk(&in_metres(joints.to_vec(), skeleton), skeleton.joints, of, skeleton.fps);
+    let (truth, guess) = (jerks(truth), jerks(guess));
+    if truth.is_empty() {
+        return None;
+    }
+    let error = JerkError::between(&truth, &guess);
+    Some(ClipJerk { noise: error.noise, statics: error.statics })
+}
+
+/// The skating ratio of global joints in the unit of the data.
+fn skates(joints: Vec<f64>, skeleton: &Skeleton) -> f64 {
+    skating::ratio(&in_metres(joints, skeleton), skeleton.joints, skating::feet(skeleton.format), skeleton.fps)
+}
+
+/// The skating ratio of a clip itself: rows `[L, D]` of normalised features.
+pub fn real_skating(truth: &[f32], mean: &[f32], std: &[f32], skeleton: &Skeleton) -> f64 {
+    skates(recover_joints_wide(&natural(truth, mean, std), skeleton), skeleton)
 }
 
 /// The metrics of a set of clips; names begin with `prefix`, distances are in millimetres.
 pub fn summary(clips: &[ClipErrors], skeleton: &Skeleton, prefix: &str) -> BTreeMap<String, f64> {
     let frames: usize = clips.iter().map(|c| c.frames).sum();
-    let per_frame = |of: fn(&ClipErrors) -> f64| clips.iter().map(of).sum::<f64>() / frames as f64;
+    let inner: usize = clips.iter().map(|c| c.frames.saturating_sub(2)).sum();
+    let sum = |of: fn(&ClipErrors) -> f64| clips.iter().map(of).sum::<f64>();
+    let per_frame = |of: fn(&ClipErrors) -> f64| sum(of) / frames as f64;
     let millimetres = 1000.0 * skeleton.metres_per_unit;
-    [
+    let mut metrics = vec![
         ("mpjpe_mm", per_frame(|c| c.aligned) * millimetres),
+        ("pa_mpjpe_mm", per_frame(|c| c.similar) * millimetres),
         ("mpjpe_local_mm", per_frame(|c| c.local) * millimetres),
         ("mpjpe_global_mm", per_frame(|c| c.global) * millimetres),
         ("feature_error", per_frame(|c| c.feature_distance)),
         ("feature_smooth_l1", per_frame(|c| c.smooth_l1 * c.frames as f64)),
-    ]
-    .into_iter()
-    .map(|(name, value)| (format!("{prefix}{name}"), value))
-    .collect()
+        ("skating_ratio", sum(|c| c.skating) / clips.len() as f64),
+    ];
+    if inner > 0 {
+        metrics.push(("acceleration_mm", sum(|c| c.acceleration) / inner as f64 * millimetres));
+    }
+    let jerks: Vec<ClipJerk> = clips.iter().filter_map(|c| c.jerk).collect();
+    if !jerks.is_empty() {
+        let mean = |of: fn(&ClipJerk) -> f64| jerks.iter().map(of).sum::<f64>() / jerks.len() as f64;
+        let (noise, statics) = (mean(|j| j.noise), mean(|j| j.statics));
+        metrics.extend([("sjpe", noise + statics), ("sjpe_noise", noise), ("sjpe_static", statics)]);
+    }
+    metrics.into_iter().map(|(name, value)| (format!("{prefix}{name}"), value)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use motion::Skeleton;
+    use protocol::stage::DataFormat;
+
+    use super::*;
+
+    /// Features of a figure at rest whose right wrist (joint 21 of 22, 10 of 21) moves by `wrist(frame)` units upwards.
+    fn still(skeleton: &Skeleton, frames: usize, wrist: impl Fn(usize) -> f32) -> Vec<f32> {
+        let joint = joints_of(skeleton.format)[joints_of(skeleton.format).len() - 1];
+        let mut rows = vec![0.0_f32; frames * skeleton.features];
+        for (t, row) in rows.chunks_exact_mut(skeleton.features).enumerate() {
+            row[3] = 1.0;
+            for (k, value) in row[skeleton.layout().positions].iter_mut().enumerate() {
+                *value = (k as f32 * 0.37).sin();
+            }
+            row[skeleton.layout().positions][3 * (joint - 1) + 1] += wrist(t);
+        }
+        rows
+    }
+
+    #[test]
+    fn one_joint_that_jumps_is_counted_as_the_papers_count_it() {
+        for format in [DataFormat::Humanml3d, DataFormat::Kit] {
+            let skeleton = Skeleton::of(format);
+            let (mean, std) = (vec![0.0; skeleton.features], vec![1.0; skeleton.features]);
+            let (rest, jump) = (|_: usize| 0.0, |t: usize| if t == 5 { 0.5 } else { 0.0 });
+            let errors = |frames: usize, truth: &dyn Fn(usize) -> f32, guess: &dyn Fn(usize) -> f32| {
+                let (truth, guess) = (still(skeleton, frames, truth), still(skeleton, frames, guess));
+                ClipErrors::between(&truth, &guess, &mean, &std, skeleton)
+            };
+            let clips = [errors(12, &rest, &jump), errors(20, &rest, &rest), errors(3, &rest, &rest)];
+            let found = summary(&clips, skeleton, "mu_");
+            let millimetres = 1000.0 * skeleton.metres_per_unit;
+            let expect = |name: &str, value: f64| {
+                let found = found[&format!("mu_{name}")];
+                assert!((found - value).abs() <= 1e-6 * value.abs(), "{format:?} {name}: {found}, expected {value}");
+            };
+            // 35 frames; second differences 1, -2 and 1 times the jump, in the 10 + 18 + 1 inner frames.
+            expect("mpjpe_mm", 0.5 / skeleton.joints as f64 / 35.0 * millimetres);
+            expect("acceleration_mm", 4.0 * 0.5 / skeleton.joints as f64 / 29.0 * millimetres);
+            assert!(found["mu_pa_mpjpe_mm"] > 0.0, "a jump of one joint is no similarity");
+            let mut larger = still(skeleton, 12, rest);
+            for row in larger.chunks_exact_mut(skeleton.features) {
+                row[3] *= 1.5;
+                row[skeleton.layout().positions].iter_mut().for_each(|v| *v *= 1.5);
+            }
+            let scaled = ClipErrors::between(&still(skeleton, 12, rest), &larger, &mean, &std, skeleton);
+            assert!(scaled.similar < 1e-5 && scaled.aligned > 1.0, "the scale is aligned: {scaled:?}");
+            // Jerk in 4 of 9 frames of one of the joints, none in the truth; the clip of 3 frames does not count.
+            let share = 4.0 / 9.0 / joints_of(format).len() as f64;
+            expect("sjpe_noise", share / 2.0);
+            expect("sjpe_static", 0.0);
+            expect("sjpe", share / 2.0);
+            expect("skating_ratio", 0.0);
+            let smooth = summary(&[errors(12, &jump, &rest)], skeleton, "");
+            assert!((smooth["sjpe_static"] - share).abs() < 1e-6 && smooth["sjpe_noise"] == 0.0, "{smooth:?}");
+            let short = summary(&clips[2..], skeleton, "");
+            assert!(!short.contains_key("sjpe") && short["acceleration_mm"] == 0.0, "{short:?}");
+        }
+    }
+
+    #[test]
+    fn a_body_dragged_along_the_ground_skates() {
+        for format in [DataFormat::Humanml3d, DataFormat::Kit] {
+            let skeleton = Skeleton::of(format);
+            let (mean, std) = (vec![0.0; skeleton.features], vec![1.0; skeleton.features]);
+            let rest = still(skeleton, 21, |_| 0.0);
+            let mut dragged = rest.clone();
+            for row in dragged.chunks_exact_mut(skeleton.features) {
+                // One metre a second, all joints on the ground.
+                row[1] = (1.0 / skeleton.fps / skeleton.metres_per_unit) as f32;
+                row[skeleton.layout().positions].fill(0.0);
+            }
+            let errors = ClipErrors::between(&rest, &dragged, &mean, &std, skeleton);
+            assert_eq!(errors.skating, 1.0, "{format:?}");
+            assert_eq!(real_skating(&dragged, &mean, &std, skeleton), 1.0, "{format:?}");
+            assert_eq!(real_skating(&rest, &mean, &std, skeleton), 0.0, "{format:?}");
+        }
+    }
 }

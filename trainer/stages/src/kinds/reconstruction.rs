@@ -2,8 +2,8 @@
 //!
 //! Each clip is its entry's first frames, as many as are a multiple of the unit length; it is encoded and decoded alone, so no
 //! number hangs on the sharding. Metrics without a prefix are of a sample z of the posterior, as every later stage uses it; `mu_` of the
-//! posterior's mean; `clip_mean_` of no network at all: the clip's own mean feature vector, held. Definitions:
-//! [`evaluation::reconstruction`](crate::evaluation::reconstruction).
+//! posterior's mean; `clip_mean_` of no network at all: the clip's own mean feature vector, held; `real_` of the clip itself.
+//! Definitions: [`evaluation::reconstruction`](crate::evaluation::reconstruction).
 
 use std::collections::BTreeMap;
 
@@ -17,7 +17,7 @@ use super::{REPORT_FILE, publish_report};
 use crate::artifacts::{self, to_meta};
 use crate::context::{AttemptContext, ContextError, Outcome, StageError};
 use crate::evaluation::joints::time_mean;
-use crate::evaluation::reconstruction::{ClipErrors, summary};
+use crate::evaluation::reconstruction::{ClipErrors, real_skating, summary};
 use crate::networks::Autoencoder;
 
 /// Errors of the three guesses at one clip.
@@ -27,6 +27,8 @@ struct Row {
     sample: ClipErrors,
     mu: ClipErrors,
     clip_mean: ClipErrors,
+    /// Skating ratio of the clip.
+    real_skating: f64,
 }
 
 /// What a shard knows.
@@ -76,6 +78,7 @@ pub(super) fn shard(
             sample: errors(&vae.decode(z, frames)),
             mu: errors(&vae.decode(posterior.mu.clone(), frames)),
             clip_mean: errors(&time_mean(&truth, width)),
+            real_skating: real_skating(&truth, &meta.mean, &meta.std, skeleton),
         });
         cx.progress(rows.len() as u64, total, "clips", &[]);
     }
@@ -105,6 +108,8 @@ pub(super) fn merge(cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Ou
     let mut metrics = summary(&column(|r| r.sample), skeleton, "");
     metrics.extend(summary(&column(|r| r.mu), skeleton, "mu_"));
     metrics.extend(summary(&column(|r| r.clip_mean), skeleton, "clip_mean_"));
+    let skating = rows.iter().map(|row| row.real_skating).sum::<f64>() / rows.len() as f64;
+    metrics.insert("real_skating_ratio".into(), skating);
     if metrics.values().any(|v| !v.is_finite()) {
         return Err(StageError::Input("the VAE's reconstructions are not finite; it has not been trained well".into()));
     }

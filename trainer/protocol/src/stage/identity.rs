@@ -1,0 +1,59 @@
+//! What decides a stage's value.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::StageSettings;
+use crate::{Digest, Seed, StageName};
+
+/// Which backend computes. Part of a stage's key: other backends give other bits.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Backend {
+    /// Burn's pure-Rust CPU backend, with our fused kernels.
+    #[default]
+    Flex,
+    /// Burn's older CPU backend.
+    Ndarray,
+    /// WebGPU.
+    Wgpu,
+    /// CUDA.
+    Cuda,
+}
+
+impl Backend {
+    /// The name in YAML and on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Flex => "flex",
+            Self::Ndarray => "ndarray",
+            Self::Wgpu => "wgpu",
+            Self::Cuda => "cuda",
+        }
+    }
+}
+
+/// All that decides a stage's value; its digest is the stage's key.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct StageIdentity {
+    /// Settings, without references to other stages and without paths: their digests stand in `inputs`.
+    pub settings: StageSettings,
+    /// The kind's code version.
+    pub code_version: u32,
+    /// Artifacts by the field that names them.
+    pub inputs: BTreeMap<String, Digest>,
+    /// The run's seed.
+    pub seed: Seed,
+    /// The stage's name keys its randomness, so that two PCM stages of one pipeline draw different noise.
+    pub name: StageName,
+    /// Which backend computes.
+    pub backend: Backend,
+}
+
+impl StageIdentity {
+    /// The stage's key.
+    pub fn key(&self) -> Digest {
+        crate::canonical::digest(self)
+    }
+}

@@ -1,0 +1,86 @@
+//! What training stages share: batch, schedule, optimizer.
+
+use serde::{Deserialize, Serialize};
+
+use crate::Steps;
+
+/// The global batch and the fixed slices it is cut into. Part of a stage's identity; the number of workers is not.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Batch {
+    /// Examples per optimizer update, over all workers.
+    pub global: usize,
+    /// Forward/backward passes that the batch is cut into; divides `global`.
+    pub slices: usize,
+}
+
+/// Learning rate after the warm-up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Decay {
+    /// Half a cosine down to zero at the last step.
+    Cosine,
+    /// Stays.
+    Constant,
+}
+
+/// AdamW. Defaults are the papers' (betas 0.9/0.999, eps 1e-8, weight decay 0), not a library's.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Optimizer {
+    /// First moment's decay.
+    pub beta1: f64,
+    /// Second moment's decay.
+    pub beta2: f64,
+    /// Added to the root of the second moment.
+    pub eps: f64,
+    /// Decoupled weight decay.
+    pub weight_decay: f64,
+}
+
+impl Default for Optimizer {
+    fn default() -> Self {
+        Self { beta1: 0.9, beta2: 0.999, eps: 1e-8, weight_decay: 0.0 }
+    }
+}
+
+/// What every training stage shares.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Training {
+    /// Optimizer updates.
+    pub steps: Steps,
+    /// Global batch and slices.
+    pub batch: Batch,
+    /// Peak learning rate.
+    pub lr: f64,
+    /// Linear warm-up; the first update has rate 0 when it is positive.
+    pub warmup: Steps,
+    /// What follows the warm-up.
+    pub decay: Decay,
+    /// AdamW's constants.
+    pub optimizer: Optimizer,
+    /// Gradients are scaled down to this global norm; 0 leaves them alone.
+    pub max_grad_norm: f64,
+    /// Stops after so many steps, before the schedule's end, and leaves its state to go on from: a rung of a sweep. Not for users: the
+    /// reader knows only keys that the default has.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stop: Option<Steps>,
+}
+
+impl Training {
+    pub(super) fn published(steps: u64, global: usize, lr: f64) -> Self {
+        Self {
+            steps: Steps(steps),
+            batch: Batch { global, slices: 8 },
+            lr,
+            warmup: Steps(1000),
+            decay: Decay::Cosine,
+            optimizer: Optimizer::default(),
+            max_grad_norm: 1.0,
+            stop: None,
+        }
+    }
+
+    /// The last step of this stage.
+    pub fn end(&self) -> Steps {
+        self.stop.map_or(self.steps, |stop| stop.min(self.steps))
+    }
+}

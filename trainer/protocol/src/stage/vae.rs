@@ -1,0 +1,100 @@
+//! Settings of the stages around the VAE.
+
+use serde::{Deserialize, Serialize};
+
+use super::{LatentShape, Network, Training};
+
+/// Weights of the VAE loss. Source: MotionLCM v2 (feature 1, joint 1, velocity 0, KL 1e-4).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct VaeLoss {
+    /// Smooth-L1 on normalised features.
+    pub feature: f64,
+    /// Smooth-L1 on recovered joints, in metres.
+    pub joint: f64,
+    /// Smooth-L1 on local positions ("velocity" upstream).
+    pub velocity: f64,
+    /// KL to the standard normal, a mean over all elements.
+    pub kl: f64,
+    /// Padded frames are left out (v2); off is v1's plain mean.
+    pub masked: bool,
+    /// Share of the steps before the joint term joins; early, its root drift drowns the posture.
+    pub joint_from: f64,
+}
+
+impl Default for VaeLoss {
+    fn default() -> Self {
+        Self { feature: 1.0, joint: 1.0, velocity: 0.0, kl: 1e-4, masked: true, joint_from: 0.0 }
+    }
+}
+
+/// Short crops for the first part of the training: most steps per second, best result per hour on small budgets.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Windows {
+    /// Shortest crop in frames.
+    pub min: usize,
+    /// Longest crop in frames.
+    pub max: usize,
+    /// Share of the steps that train on windows; 0 turns them off.
+    pub until: f64,
+    /// Examples per update while windows last; 0 keeps `batch.global`.
+    pub batch: usize,
+}
+
+impl Default for Windows {
+    fn default() -> Self {
+        Self { min: 40, max: 64, until: 0.0, batch: 0 }
+    }
+}
+
+/// `train.vae`. Source: MLD (v1, 1x256), MotionLCM v2 (16x32).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TrainVae {
+    /// Stage that gives the clips.
+    pub dataset: String,
+    /// Latent shape.
+    pub latent: LatentShape,
+    /// Size.
+    pub network: Network,
+    /// Loss weights.
+    pub loss: VaeLoss,
+    /// Curriculum.
+    pub windows: Windows,
+    /// Exponential moving average of the weights that is kept as the result; 0 keeps the weights themselves.
+    pub ema: f64,
+    /// The rest.
+    #[serde(flatten)]
+    pub training: Training,
+}
+
+impl Default for TrainVae {
+    fn default() -> Self {
+        Self {
+            dataset: "dataset".into(),
+            latent: LatentShape::default(),
+            network: Network::default(),
+            loss: VaeLoss::default(),
+            windows: Windows::default(),
+            ema: 0.0,
+            training: Training::published(1_150_000, 128, 2e-4),
+        }
+    }
+}
+
+/// `encode.latents`: posteriors of random crops, computed once.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct EncodeLatents {
+    /// Stage that gives the clips.
+    pub dataset: String,
+    /// Stage that gives the VAE.
+    pub vae: String,
+    /// Random crops per entry.
+    pub crops: usize,
+    /// Shards.
+    pub shards: usize,
+}
+
+impl Default for EncodeLatents {
+    fn default() -> Self {
+        Self { dataset: "dataset".into(), vae: "vae".into(), crops: 8, shards: 8 }
+    }
+}
