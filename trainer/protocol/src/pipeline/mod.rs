@@ -96,7 +96,7 @@ impl Pipeline {
                 _ => {}
             }
         }
-        crate::canonical::digest(&pipeline)
+        crate::canonical::digest(&crate::stage::later::pipeline(&pipeline))
     }
 
     /// Asks `folder_digest` for the content of every dataset folder and keeps the answers as `folder`.

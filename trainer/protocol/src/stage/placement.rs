@@ -6,6 +6,7 @@ use crate::Steps;
 
 /// What cannot change a stage's value: where it runs and how often it saves.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
+#[serde(default)]
 pub struct Placement {
     /// How many workers a gang takes.
     pub workers: WorkerRange,
@@ -15,6 +16,7 @@ pub struct Placement {
 
 /// How many workers a gang takes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct WorkerRange {
     /// Below this many it yields and waits.
     pub min: usize,
@@ -30,6 +32,7 @@ impl Default for WorkerRange {
 
 /// When checkpoints are saved and which are kept.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct CheckpointPolicy {
     /// Saved after every so many steps; 0 saves only when the stage yields.
     pub every: Steps,
@@ -45,6 +48,7 @@ impl Default for CheckpointPolicy {
 
 /// Which checkpoints of a task are kept; the union.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct Keep {
     /// Newest.
     pub latest: usize,

@@ -18,7 +18,7 @@ use protocol::stage::Training;
 
 use crate::artifacts::Draft;
 use crate::context::{ContextError, Exchange, GangContext, Rendezvous, StageError};
-use protocol::{ArtifactKind, canonical};
+use protocol::ArtifactKind;
 use serde_json::json;
 
 pub use order::{Order, Pick};
@@ -82,7 +82,7 @@ pub fn train(
 ) -> Result<Trained, StageError> {
     let (steps, slices) = (training.end().0, training.batch.slices);
     // Names of other stages say nothing about a state, which the key of the next rung rests on.
-    let config = canonical::digest(&cx.task().settings.without_references());
+    let config = cx.task().settings.digest();
     let mut state = TrainState::new(&objective.groups());
     let mut applied = None;
     let mut saved_at = None;
