@@ -100,7 +100,7 @@ async fn a_promotion_from_the_first_gate_to_the_rollback() {
     let list = stdout(&registry(store, &["list"]));
     assert!(list.contains("quickstart") && list.contains("latent_fid (min)") && list.contains("prod=1"), "{list}");
     let show = stdout(&registry(store, &["show", "quickstart"]));
-    assert!(show.contains("best") && show.contains("latent_fid=0.2"), "{show}");
+    assert!(show.contains("best") && show.contains("latent_fid=0.200"), "{show}");
     assert!(stdout(&registry(store, &["show", "quickstart@prod"])).contains("content"));
     assert!(stdout(&registry(store, &["fsck"])).contains("0 problems"));
     assert!(stdout(&registry(store, &["gc", "--dry-run"])).contains("would remove 0 blobs"));

@@ -10,6 +10,8 @@
 mod print;
 mod published;
 
+pub(crate) use print::in_words;
+
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
@@ -177,45 +179,64 @@ fn measures(metrics: &BTreeMap<String, f64>) -> BTreeMap<String, Measure> {
     whole.map(|(key, &value)| (key.clone(), Measure { value, half: half(key) })).collect()
 }
 
-/// Retrieval among latents is no retrieval by an evaluator: the two never share a column.
-fn apart(row: Row) -> Row {
-    if row.measures.contains_key(TELLING) {
-        return row;
-    }
-    let named = |key: String| if key.starts_with("r_precision") { format!("latent_{key}") } else { key };
-    Row { measures: row.measures.into_iter().map(|(key, measure)| (named(key), measure)).collect(), ..row }
-}
-
-/// A version's evaluations: metrics under a stage's name are that stage's row; what is under none is shared by all of them.
-fn rows(version: &Version) -> Vec<Row> {
-    let source = format!("{}:{}", version.model, version.version);
-    let mut by_stage: BTreeMap<&str, BTreeMap<String, Measure>> = BTreeMap::new();
+/// A version's evaluations: metrics under a stage's name are that stage's; what is under none is shared by all of them, and the only
+/// one's where no stage has a name.
+pub(crate) fn measured(version: &Version) -> Vec<(Option<String>, BTreeMap<String, Measure>)> {
+    let mut by_stage: BTreeMap<String, BTreeMap<String, Measure>> = BTreeMap::new();
     let mut shared = BTreeMap::new();
-    let all = measures(&version.metrics);
-    for (key, measure) in &all {
+    for (key, measure) in measures(&version.metrics) {
         match key.rsplit_once('.') {
-            Some((stage, metric)) => drop(by_stage.entry(stage).or_default().insert(metric.to_owned(), *measure)),
-            None => drop(shared.insert(key.clone(), *measure)),
+            Some((stage, metric)) => drop(by_stage.entry(stage.into()).or_default().insert(metric.into(), measure)),
+            None => drop(shared.insert(key, measure)),
         }
     }
-    let row = |label: String, measures| Row { label, source: source.clone(), published: false, measures };
     if by_stage.is_empty() {
-        return vec![row(source.clone(), shared)];
+        return vec![(None, shared)];
     }
     // The value without a stage's name is one of those with a name: shown where it belongs, not twice.
-    let repeated: Vec<String> =
-        shared.keys().filter(|key| by_stage.values().any(|m| m.contains_key(*key))).cloned().collect();
-    shared.retain(|key, _| !repeated.contains(key));
-    let rows = by_stage.into_iter().map(|(stage, mut measures)| {
-        measures.extend(shared.clone());
-        row(format!("{source} ({stage})"), measures)
-    });
-    rows.collect()
+    shared.retain(|key, _| !by_stage.values().any(|measures| measures.contains_key(key)));
+    by_stage.values_mut().for_each(|measures| measures.extend(shared.clone()));
+    by_stage.into_iter().map(|(stage, measures)| (Some(stage), measures)).collect()
+}
+
+fn rows(version: &Version) -> Vec<Row> {
+    let source = format!("{}:{}", version.model, version.version);
+    let row = |(stage, measures): (Option<String>, _)| {
+        let label = stage.map_or_else(|| source.clone(), |stage| format!("{source} ({stage})"));
+        Row { label, source: source.clone(), published: false, measures }
+    };
+    measured(version).into_iter().map(row).collect()
+}
+
+/// Metrics in the order of the tables; what no table has comes last, by name.
+pub(crate) fn in_order(metrics: &BTreeMap<String, Measure>) -> Vec<(&String, Measure)> {
+    let place = |key: &str| COLUMNS.iter().position(|column| column.key == key).unwrap_or(COLUMNS.len());
+    let mut all: Vec<_> = metrics.iter().map(|(key, measure)| (key, *measure)).collect();
+    all.sort_by_key(|(key, _)| place(key));
+    all
+}
+
+/// The value of `deciding`, and of the first few others that tables have.
+pub(crate) fn in_brief(version: &Version, deciding: Option<&str>) -> Vec<(String, Measure)> {
+    const FEW: usize = 4;
+    let plain = version.metrics.iter().filter(|(key, _)| !measures_of_a_stage(&version.metrics, key));
+    let all = measures(&plain.map(|(key, value)| (key.clone(), *value)).collect());
+    let first = deciding.and_then(|key| Some((key.to_owned(), *all.get(key)?)));
+    let known = |key: &str| COLUMNS.iter().any(|column| column.key == key);
+    let others = in_order(&all).into_iter().filter(|(key, _)| known(key) && Some(key.as_str()) != deciding);
+    let others = others.map(|(key, measure)| (key.clone(), measure));
+    first.into_iter().chain(others).take(FEW).collect()
+}
+
+/// Whether `key` is `STAGE.METRIC`, and not an interval's end.
+fn measures_of_a_stage(metrics: &BTreeMap<String, f64>, key: &str) -> bool {
+    let base = key.strip_suffix(".lower").or_else(|| key.strip_suffix(".upper")).filter(|b| metrics.contains_key(*b));
+    base.unwrap_or(key).contains('.')
 }
 
 /// Rows of `versions`, the best by `metric` first; with the published rows of the data format `published`, if any.
 pub fn leaderboard(title: String, versions: &[Version], metric: Option<&str>, published: Option<&str>) -> Leaderboard {
-    let mut ours: Vec<Row> = versions.iter().flat_map(rows).map(apart).collect();
+    let mut ours: Vec<Row> = versions.iter().flat_map(rows).collect();
     let deciding = metric.or_else(|| {
         COLUMNS
             .iter()
@@ -243,7 +264,7 @@ pub fn evaluations(title: &str, all: impl IntoIterator<Item = (String, BTreeMap<
         published: false,
         measures: measures(&metrics),
     };
-    let mut rows: Vec<Row> = all.into_iter().map(row).map(apart).collect();
+    let mut rows: Vec<Row> = all.into_iter().map(row).collect();
     rows.retain(|row| COLUMNS.iter().any(|column| row.measures.contains_key(column.key)));
     (!rows.is_empty()).then(|| Leaderboard { title: title.to_owned(), rows })
 }

@@ -150,6 +150,11 @@ fn arrow(better: Better) -> &'static str {
     }
 }
 
+/// A value with its interval, as tables show it.
+pub(crate) fn in_words(measure: Measure) -> String {
+    number(measure, " ± ")
+}
+
 /// As many decimals as the interval has to say something about, and three without one, as the papers print.
 fn number(measure: Measure, plus_minus: &str) -> String {
     let decimals = match measure.half {

@@ -7,6 +7,7 @@ use protocol::message::ApiError;
 use serde_json::json;
 
 use super::{Answer, Data, Output};
+use crate::board;
 use crate::catalog::{Action, Promotion, Version};
 use crate::clock::format_ms;
 
@@ -63,7 +64,11 @@ pub fn render(data: &Data) -> String {
                 table.add_row([
                     version.version.to_string(),
                     list(best.into_iter().chain(version.aliases.iter().cloned())),
-                    metrics(version),
+                    list(
+                        board::in_brief(version, model.metric.as_deref())
+                            .into_iter()
+                            .map(|(metric, measure)| format!("{metric}={}", board::in_words(measure))),
+                    ),
                     source(version),
                     format_ms(version.created_ms),
                 ]);
@@ -75,12 +80,20 @@ pub fn render(data: &Data) -> String {
             let lines = [
                 ("artifact", version.artifact.to_string()),
                 ("aliases", list(version.aliases.iter().cloned())),
-                ("metrics", metrics(version)),
                 ("from", source(version)),
                 ("registered", format_ms(version.created_ms)),
             ];
             for (name, value) in lines {
                 text += &format!("  {name:<11} {value}\n");
+            }
+            let mut values = table(&["EVALUATION", "METRIC", "VALUE, ± HALF THE 95 % INTERVAL"]);
+            for (stage, measures) in board::measured(version) {
+                for (metric, measure) in board::in_order(&measures) {
+                    values.add_row([dash(stage.as_ref()), metric.clone(), board::in_words(measure)]);
+                }
+            }
+            if !version.metrics.is_empty() {
+                text += &format!("{}\n\n", values.trim_fmt());
             }
             let mut table = table(&["FILE", "BYTES", "BLOB"]);
             for (name, file) in &manifest.files {
@@ -183,15 +196,6 @@ fn dash<T: ToString>(value: Option<T>) -> String {
 fn list(items: impl Iterator<Item = String>) -> String {
     let items: Vec<_> = items.collect();
     if items.is_empty() { "-".into() } else { items.join(", ") }
-}
-
-fn metrics(version: &Version) -> String {
-    list(version.metrics.iter().map(|(key, value)| format!("{key}={}", digits(*value))))
-}
-
-/// Five significant digits at most.
-fn digits(value: f64) -> String {
-    format!("{value:.4e}").parse::<f64>().unwrap_or(value).to_string()
 }
 
 fn source(version: &Version) -> String {

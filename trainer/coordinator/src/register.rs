@@ -109,18 +109,25 @@ fn vae_of(pipeline: &Pipeline, stage: &StageName) -> Option<StageName> {
 }
 
 /// The metrics of every evaluation that looks at `model`. Of several evaluations (a student at one and at four steps, in latents and
-/// by an evaluator) each keeps its own as `stage.metric`; the plain name is the first one's that gives it.
+/// by an evaluator) each keeps its own as `stage.metric`; the plain name, with its interval, is the first one's that gives it.
 fn metrics_of(run: &Run, model: &str) -> BTreeMap<String, f64> {
     let stages = run.pipeline.stages.iter().zip(&run.stages);
     let looking = stages.filter(|(stage, _)| stage.settings.looks_at() == Some(model));
     let known: Vec<_> = looking.filter_map(|(stage, status)| Some((&stage.name, &status.known()?.metrics))).collect();
-    let mut all = BTreeMap::new();
-    for (stage, metrics) in &known {
+    together(&known)
+}
+
+fn together(known: &[(&StageName, &BTreeMap<String, f64>)]) -> BTreeMap<String, f64> {
+    let (mut all, mut first) = (BTreeMap::new(), BTreeMap::new());
+    for (stage, metrics) in known {
         for (metric, value) in *metrics {
             if known.len() > 1 {
                 all.insert(format!("{stage}.{metric}"), *value);
             }
-            all.entry(metric.clone()).or_insert(*value);
+            let measured = metric.split_once('.').map_or(metric.as_str(), |(measured, _)| measured);
+            if *first.entry(measured).or_insert(*stage) == *stage {
+                all.insert(metric.clone(), *value);
+            }
         }
     }
     all
@@ -150,4 +157,27 @@ fn best(from: &[String], metrics: &[BTreeMap<String, f64>], settings: &Register)
         }
     }
     best.map(|(i, _)| i).ok_or_else(|| "`from`: names no stage".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_plain_name_and_its_interval_are_of_one_evaluation() {
+        let metrics = |pairs: &[(&str, f64)]| -> BTreeMap<String, f64> {
+            pairs.iter().map(|(key, value)| ((*key).to_owned(), *value)).collect()
+        };
+        let (one, four) = (StageName::new("one"), StageName::new("four"));
+        let first = metrics(&[("fid", 0.3), ("latent_fid", 0.1)]);
+        let second =
+            metrics(&[("fid", 0.2), ("fid.lower", 0.1), ("fid.upper", 0.3), ("top1", 0.5), ("top1.upper", 0.6)]);
+        let all = together(&[(&one, &first), (&four, &second)]);
+        let plain: BTreeMap<_, _> =
+            all.iter().filter(|(key, _)| !key.starts_with("one.") && !key.starts_with("four.")).collect();
+        let expected = metrics(&[("fid", 0.3), ("latent_fid", 0.1), ("top1", 0.5), ("top1.upper", 0.6)]);
+        assert_eq!(plain, expected.iter().collect());
+        assert_eq!(all["four.fid.upper"], 0.3);
+        assert_eq!(together(&[(&four, &second)]), second);
+    }
 }

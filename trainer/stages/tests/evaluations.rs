@@ -175,9 +175,9 @@ fn latent_fid_is_the_same_however_the_samples_are_cut() {
             "latent_std_real",
             "match",
             "match_other_noise",
-            "r_precision_top1",
-            "r_precision_top3",
-            "r_precision_top3_test",
+            "latent_r_precision_top1",
+            "latent_r_precision_top3",
+            "latent_r_precision_top3_test",
         ] {
             assert!(metrics.get(name).is_some_and(|v| v.is_finite() && *v >= 0.0), "{name}: {metrics:?}");
         }

@@ -286,10 +286,10 @@ pub(super) fn merge(
         let mut put = |name, value| values.entry(name).or_default().push(value);
         put("latent_fid", found.latent_fid);
         put("latent_std", found.latent_std);
-        put("r_precision_top1", top(found.ranks.iter().copied(), 1));
-        put("r_precision_top3", top(found.ranks.iter().copied(), 3));
+        put("latent_r_precision_top1", top(found.ranks.iter().copied(), 1));
+        put("latent_r_precision_top3", top(found.ranks.iter().copied(), 3));
         if !test.is_empty() {
-            put("r_precision_top3_test", top(test.iter().copied(), 3));
+            put("latent_r_precision_top3_test", top(test.iter().copied(), 3));
         }
         if repeat == 0 && plan.matched {
             let teacher = if plan.teacher { of(Maker::Teacher, 0) } else { samples.clone() };
