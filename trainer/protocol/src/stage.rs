@@ -3,12 +3,16 @@
 //! A settings struct is the schema too: the pipeline reader learns the closed set of keys and their types from the
 //! serialised default, so a field is declared once. Fields that cannot change a stage's value (worker counts,
 //! checkpoint cadence) live in [`Placement`] and stay out of the stage's key.
+//!
+//! A store outlives the build that wrote it. Every struct that has a `Default` fills in what an older build did not write; a field that
+//! joins one that has none ([`Training`], [`Batch`]) brings `#[serde(default)]` along. What that means for keys stands in `later`.
 
 mod data;
 mod diffusion;
 mod evaluation;
 mod evaluator;
 mod identity;
+pub(crate) mod later;
 mod network;
 mod placement;
 mod register;
@@ -17,7 +21,7 @@ mod vae;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{ArtifactKind, Steps};
+use crate::{ArtifactKind, Digest, Steps};
 
 pub use data::{DataFormat, DataOpen, DataSynthetic, TextEmbed, TextEncoder};
 pub use diffusion::{Distance, DistillLcm, DistillPcm, Distillation, TrainMld};
@@ -165,6 +169,11 @@ impl StageSettings {
             Self::Register(s) => s.from.clear(),
         }
         settings
+    }
+
+    /// The digest of all that decides a value, references left out.
+    pub fn digest(&self) -> Digest {
+        crate::canonical::digest(&later::settings(&self.without_references()))
     }
 
     /// The name in YAML, such as `train.vae`.

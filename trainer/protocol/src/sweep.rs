@@ -37,6 +37,7 @@ impl SearchKind {
 
 /// Budgets at which ASHA compares trials: `first`, `first * factor`, ... below the stage's `steps`, and these.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct Rungs {
     /// Steps of the first rung.
     pub first: Steps,

@@ -18,7 +18,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::stage::{Backend, DataOpen, Keep, Placement, StageIdentity, StageSettings};
+use crate::stage::{Backend, DataOpen, Placement, StageIdentity, StageSettings};
 use crate::sweep::{Derived, Sweep};
 use crate::{ArtifactKind, Digest, Seed, StageName};
 
@@ -100,11 +100,7 @@ impl Pipeline {
                 _ => {}
             }
         }
-        let mut json = serde_json::to_value(&pipeline).expect("a pipeline serialises");
-        for stage in json["stages"].as_array_mut().into_iter().flatten() {
-            Keep::forget_defaults(&mut stage["placement"]["checkpoint"]["keep"]);
-        }
-        crate::canonical::digest(&json)
+        crate::canonical::digest(&crate::stage::later::pipeline(&pipeline))
     }
 
     /// Asks `folder_digest` for the content of every dataset folder and keeps the answers as `folder`.

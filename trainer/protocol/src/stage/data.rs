@@ -14,6 +14,7 @@ pub enum DataFormat {
 
 /// `dataset: {format: humanml3d, path: ...}`: a folder in the published layout.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct DataOpen {
     /// Which of the two formats.
     pub format: DataFormat,
@@ -29,6 +30,7 @@ impl Default for DataOpen {
 
 /// `dataset: {format: synthetic, clips: 400}`: procedural motion with captions, in the HumanML3D layout.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct DataSynthetic {
     /// Clips to make, before mirroring.
     pub clips: usize,
@@ -48,6 +50,7 @@ impl Default for DataSynthetic {
 
 /// `text: {encoder: hashed}`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct TextEmbed {
     /// `hashed`: n-grams hashed to signed coordinates, unit norm; needs no weights.
     pub encoder: TextEncoder,

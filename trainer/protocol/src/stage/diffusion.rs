@@ -6,6 +6,7 @@ use super::{Network, Optimizer, Training};
 
 /// `train.mld`: the latent-diffusion teacher. Source: MLD, MotionLCM v1/v2.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct TrainMld {
     /// Stage that gives the VAE; its latent shape must be that of `latents`.
     pub vae: String,
@@ -53,6 +54,7 @@ pub enum Distance {
 
 /// What both distillations share.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default = "Distillation::motion_lcm")]
 pub struct Distillation {
     /// Stage that gives the teacher.
     pub teacher: String,
@@ -80,6 +82,10 @@ pub struct Distillation {
 }
 
 impl Distillation {
+    fn motion_lcm() -> Self {
+        Self::published(192_000, 128)
+    }
+
     fn published(steps: u64, global: usize) -> Self {
         Self {
             teacher: "mld".into(),
@@ -99,6 +105,7 @@ impl Distillation {
 
 /// `distill.lcm`. Source: MotionLCM.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct DistillLcm {
     /// Everything.
     #[serde(flatten)]
@@ -107,12 +114,13 @@ pub struct DistillLcm {
 
 impl Default for DistillLcm {
     fn default() -> Self {
-        Self { distillation: Distillation::published(192_000, 128) }
+        Self { distillation: Distillation::motion_lcm() }
     }
 }
 
 /// `distill.pcm`. Source: MotionPCM, Algorithm 1.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct DistillPcm {
     /// M: phases, and sampling steps.
     pub phases: usize,

@@ -18,6 +18,7 @@ pub enum Split {
 
 /// `evaluate.reconstruction`: MPJPE in mm and feature error of a VAE.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct EvaluateReconstruction {
     /// Stage that gives the VAE.
     pub vae: String,
@@ -37,6 +38,7 @@ impl Default for EvaluateReconstruction {
 
 /// How motions are drawn from a denoiser.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct Sampler {
     /// Network evaluations. A PCM student has as many as phases.
     pub steps: usize,
@@ -54,6 +56,7 @@ impl Default for Sampler {
 
 /// `evaluate.latent_fid`: Frechet distance between sampled and real latents, as a share of the real variance.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct EvaluateLatentFid {
     /// Stage that gives the denoiser.
     pub model: String,

@@ -7,6 +7,7 @@ use crate::Steps;
 
 /// An evaluator's size. The published one: 512, 1024, 512, 512, dropout 0.2.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct EvaluatorNetwork {
     /// Width of a movement, and between the two convolutions that make it.
     pub movement: usize,
@@ -28,6 +29,7 @@ impl Default for EvaluatorNetwork {
 
 /// The first phase: movements learn to hold their frames.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct MovementPhase {
     /// Share of the steps that it takes.
     pub until: f64,
@@ -49,6 +51,7 @@ impl Default for MovementPhase {
 
 /// `train.evaluator`. Source: text-to-motion (Guo et al., CVPR 2022).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct TrainEvaluator {
     /// Stage that gives the clips.
     pub dataset: String,
@@ -97,6 +100,7 @@ impl Default for TrainEvaluator {
 
 /// `import.evaluator`: the published files.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct ImportEvaluator {
     /// Folder in the published layout: `text_mot_match/model/finest.tar` (or `finest.safetensors`) and, where there are several, the one
     /// folder `Comp_*/meta` with `mean.npy` and `std.npy`. Not part of the key: the content's digest is.
@@ -115,6 +119,7 @@ impl Default for ImportEvaluator {
 
 /// How different the motions of one caption are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct MultiModality {
     /// Captions per repeat; 0 leaves the metric out.
     pub captions: usize,
@@ -132,6 +137,7 @@ impl Default for MultiModality {
 
 /// `evaluate.t2m`: the papers' metrics, in an evaluator's space.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct EvaluateT2m {
     /// Stage that gives the denoiser.
     pub model: String,

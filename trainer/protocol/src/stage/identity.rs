@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::StageSettings;
+use super::{StageSettings, later};
 use crate::{Digest, Seed, StageName};
 
 /// Which backend computes. Part of a stage's key: other backends give other bits.
@@ -53,7 +53,12 @@ pub struct StageIdentity {
 
 impl StageIdentity {
     /// The stage's key.
+    ///
+    /// # Panics
+    /// Never: an identity is JSON.
     pub fn key(&self) -> Digest {
-        crate::canonical::digest(self)
+        let mut value = serde_json::to_value(self).expect("our types serialise to JSON");
+        value["settings"] = later::settings(&self.settings);
+        crate::canonical::digest(&value)
     }
 }

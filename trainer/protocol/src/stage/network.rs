@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 /// A model's size. The published networks: width 256, 9 layers, 4 heads, feed-forward 1024, dropout 0.1.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct Network {
     /// Width H of the tokens.
     pub width: usize,
@@ -39,6 +40,7 @@ pub enum Positions {
 
 /// Shape of a latent: `tokens` x `dim`. 1x256 is v1, 16x32 is v2.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct LatentShape {
     /// N latent tokens.
     pub tokens: usize,

@@ -3,13 +3,13 @@
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 
 use super::Mode;
 use crate::Steps;
 
 /// What cannot change a stage's value: where it runs and how often it saves.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
+#[serde(default)]
 pub struct Placement {
     /// How many workers a gang takes.
     pub workers: WorkerRange,
@@ -19,6 +19,7 @@ pub struct Placement {
 
 /// How many workers a gang takes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct WorkerRange {
     /// Below this many it yields and waits.
     pub min: usize,
@@ -34,6 +35,7 @@ impl Default for WorkerRange {
 
 /// When checkpoints are saved and which are kept.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct CheckpointPolicy {
     /// Saved after every so many steps; 0 saves only when the stage yields.
     pub every: Steps,
@@ -49,30 +51,21 @@ impl Default for CheckpointPolicy {
 
 /// Which checkpoints of a task are kept; the union.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct Keep {
     /// Newest.
     pub latest: usize,
     /// Best by `metric`.
     pub best: usize,
     /// One of the values that the stage saves with its checkpoints: means over the last hundred steps of what it records.
-    #[serde(default = "loss")]
     pub metric: String,
     /// Its direction.
-    #[serde(default = "smaller")]
     pub mode: Mode,
-}
-
-fn loss() -> String {
-    "loss".into()
-}
-
-fn smaller() -> Mode {
-    Mode::Min
 }
 
 impl Default for Keep {
     fn default() -> Self {
-        Self { latest: 2, best: 0, metric: loss(), mode: smaller() }
+        Self { latest: 2, best: 0, metric: "loss".into(), mode: Mode::Min }
     }
 }
 
@@ -109,18 +102,6 @@ impl Keep {
             self.metric,
             if saved.is_empty() { "nothing".to_owned() } else { saved.join(", ") }
         ))
-    }
-
-    /// Takes `metric` and `mode` out of a serialised policy where they are the defaults: names that were made before they existed stay.
-    pub(crate) fn forget_defaults(json: &mut Value) {
-        let default = Self::default();
-        let Some(keep) = json.as_object_mut() else { return };
-        if keep.get("metric").and_then(Value::as_str) == Some(&default.metric) {
-            keep.remove("metric");
-        }
-        if keep.get("mode").is_some_and(|mode| Mode::deserialize(mode).is_ok_and(|mode| mode == default.mode)) {
-            keep.remove("mode");
-        }
     }
 }
 
@@ -184,13 +165,6 @@ mod tests {
     fn a_policy_that_was_written_before_it_had_a_metric_reads() {
         let old: Keep = serde_json::from_str(r#"{"latest": 3, "best": 1}"#).expect("reads");
         assert_eq!(old, Keep { latest: 3, best: 1, ..Keep::default() });
-        let mut json = serde_json::to_value(&old).expect("serialises");
-        assert_eq!(json["metric"], "loss", "the reader of pipelines learns its keys from here");
-        Keep::forget_defaults(&mut json);
-        assert_eq!(json, serde_json::json!({"latest": 3, "best": 1}));
-        let mut json = serde_json::to_value(Keep { mode: Mode::Max, ..old }).expect("serialises");
-        Keep::forget_defaults(&mut json);
-        assert_eq!(json, serde_json::json!({"latest": 3, "best": 1, "mode": "max"}));
     }
 
     #[test]

@@ -14,6 +14,7 @@ pub enum Mode {
 
 /// `register`: model versions, and the best of them promoted.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct Register {
     /// Model name.
     pub model: String,
@@ -42,6 +43,7 @@ impl Default for Register {
 
 /// The promotion at the end of a `register` stage.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct Promote {
     /// Alias; empty promotes nothing.
     pub to: String,

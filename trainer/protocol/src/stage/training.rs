@@ -25,6 +25,7 @@ pub enum Decay {
 
 /// AdamW. Defaults are the papers' (betas 0.9/0.999, eps 1e-8, weight decay 0), not a library's.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct Optimizer {
     /// First moment's decay.
     pub beta1: f64,
@@ -56,6 +57,7 @@ pub struct Training {
     /// What follows the warm-up.
     pub decay: Decay,
     /// AdamW's constants.
+    #[serde(default)]
     pub optimizer: Optimizer,
     /// Gradients are scaled down to this global norm; 0 leaves them alone.
     pub max_grad_norm: f64,

@@ -6,6 +6,7 @@ use super::{LatentShape, Network, Training};
 
 /// Weights of the VAE loss. Source: MotionLCM v2 (feature 1, joint 1, velocity 0, KL 1e-4).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct VaeLoss {
     /// Smooth-L1 on normalised features.
     pub feature: f64,
@@ -29,6 +30,7 @@ impl Default for VaeLoss {
 
 /// Short crops for the first part of the training: most steps per second, best result per hour on small budgets.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct Windows {
     /// Shortest crop in frames.
     pub min: usize,
@@ -48,6 +50,7 @@ impl Default for Windows {
 
 /// `train.vae`. Source: MLD (v1, 1x256), MotionLCM v2 (16x32).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct TrainVae {
     /// Stage that gives the clips.
     pub dataset: String,
@@ -82,6 +85,7 @@ impl Default for TrainVae {
 
 /// `encode.latents`: posteriors of random crops, computed once.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct EncodeLatents {
     /// Stage that gives the clips.
     pub dataset: String,

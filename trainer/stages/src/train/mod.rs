@@ -18,7 +18,7 @@ use protocol::stage::Training;
 
 use crate::artifacts::Draft;
 use crate::context::{ContextError, Exchange, GangContext, Rendezvous, StageError};
-use protocol::{ArtifactKind, canonical};
+use protocol::ArtifactKind;
 use serde_json::json;
 
 pub use order::{Order, Pick};
@@ -88,7 +88,7 @@ pub fn train(
     let saved = objective.terms().iter().copied().chain([GRADIENT_NORM, LEARNING_RATE]);
     cx.task().checkpoint.keep.check(saved).map_err(StageError::Input)?;
     // Names of other stages say nothing about a state, which the key of the next rung rests on.
-    let config = canonical::digest(&cx.task().settings.without_references());
+    let config = cx.task().settings.digest();
     let mut state = TrainState::new(&objective.groups());
     let mut applied = None;
     let mut saved_at = None;
