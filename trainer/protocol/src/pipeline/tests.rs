@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use super::*;
-use crate::stage::Mode;
+use crate::stage::{Keep, Mode};
 
 /// A pipeline that is right; cases replace a part of it.
 const GOOD: &str = "name: p

@@ -94,8 +94,13 @@ impl<'a> Plan<'a> {
             return Err(no_entries(taken));
         }
         if entries.len() < POOL {
+            let instead = match taken {
+                Split::All => "there are no more in the dataset",
+                Split::Test => "set `split: all`, or `widen: true`",
+                Split::Train | Split::Val => "set `split: all`, `split: test` for a last look, or `widen: true`",
+            };
             return refuse(format!(
-                "the split `{}` has {} entries, R-precision ranks a motion among {POOL}; set `split: all`, `split: test` for a last look, or `widen: true`",
+                "the split `{}` has {} entries, R-precision ranks a motion among {POOL}; {instead}",
                 word(&taken),
                 entries.len()
             ));
