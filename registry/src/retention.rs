@@ -49,18 +49,18 @@ impl Store {
     }
 }
 
-/// Forgets a task's checkpoints but the newest `keep.latest` (one at least) and the best `keep.best` by the metric `loss`.
-pub(crate) async fn prune(conn: &mut SqliteConnection, task: &TaskId, keep: Keep) -> Result<Vec<Digest>, WriteError> {
-    let rows = query::checkpoints(conn, task).await?;
-    let mut ranked: Vec<_> = rows.iter().filter_map(|row| Some((row.metrics.get("loss").copied()?, row))).collect();
-    // What is no finite number is never best. Of equals the newer one; rows come newest first and the sort is stable.
-    ranked.retain(|(loss, _)| loss.is_finite());
-    ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let best = ranked.iter().take(keep.best).map(|(_, row)| (row.step, row.manifest));
-    let kept: BTreeSet<_> =
-        rows.iter().take(keep.latest.max(1)).map(|row| (row.step, row.manifest)).chain(best).collect();
+/// Forgets a task's checkpoints but those that `keep` names. A metric that none of them has is refused, and all of them stay.
+pub(crate) async fn prune(conn: &mut SqliteConnection, task: &TaskId, keep: &Keep) -> Result<Vec<Digest>, WriteError> {
+    let mut rows = query::checkpoints(conn, task).await?;
+    rows.reverse();
+    let metrics: Vec<_> = rows.iter().map(|row| &row.metrics).collect();
+    if !rows.is_empty() {
+        let saved: BTreeSet<&str> = metrics.iter().flat_map(|row| row.keys().map(String::as_str)).collect();
+        keep.check(saved).map_err(|why| WriteError::Conflict(format!("checkpoints of `{task}`: {why}")))?;
+    }
+    let kept = keep.kept(&metrics);
     let mut forgotten = Vec::new();
-    for row in rows.iter().filter(|row| !kept.contains(&(row.step, row.manifest))) {
+    for (row, _) in rows.iter().zip(kept).filter(|(_, kept)| !kept) {
         let forget = sqlx::query("DELETE FROM checkpoints WHERE task = ? AND step = ? AND manifest = ?");
         run(conn, forget.bind(task.as_str()).bind(int(row.step)).bind(row.manifest.to_string())).await?;
         forgotten.push(row.manifest);

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use common::{artifact, fence, grant, metrics, open};
 use proptest::prelude::*;
 use protocol::message::MetricRow;
-use protocol::stage::Keep;
+use protocol::stage::{Keep, Mode};
 use protocol::{ArtifactKind, Digest, Fence, RunId, StageName, TaskId};
 use registry::{Holder, OpenError, Store, Write, WriteError};
 use serde_json::json;
@@ -259,10 +259,27 @@ async fn checkpoints_are_pruned_by_policy_and_only_the_unneeded_is_collected() {
     store.write(vec![common::version("m", model, 0.1)]).await.unwrap();
     store.blobs().put(b"nobody needs this").unwrap();
 
-    let gone = store.prune_checkpoints(&task, Keep { latest: 2, best: 1 }).await.unwrap();
+    let joint = Keep { latest: 1, best: 1, metric: "joint".into(), ..Keep::default() };
+    let refused = store.prune_checkpoints(&task, joint).await.unwrap_err().to_string();
+    assert!(refused.contains("`joint`") && refused.contains("there is: loss"), "{refused}");
+    assert_eq!(store.checkpoints(&task).await.unwrap().len(), 5, "nothing is lost by a metric that nobody saved");
+    let gone = store.prune_checkpoints(&task, Keep { best: 1, ..Keep::default() }).await.unwrap();
     assert_eq!(gone.len(), 2);
     let steps: Vec<_> = store.checkpoints(&task).await.unwrap().iter().map(|c| c.step).collect();
     assert_eq!(steps, [5, 4, 2], "the two newest and the best; what is no number is never best");
+
+    let largest = Keep { latest: 1, best: 1, mode: Mode::Max, ..Keep::default() };
+    let other = TaskId::new("r/t");
+    store.write(vec![fence("r/t", 1)]).await.unwrap();
+    for (step, loss) in (1_u64..).zip(losses) {
+        let manifest = store.checkpoints(&task).await.unwrap()[0].manifest;
+        let metrics = metrics(&[("loss", loss)]);
+        store.write(vec![Write::Checkpoint { grant: grant("r/t", 1), step, manifest, metrics }]).await.unwrap();
+    }
+    store.prune_checkpoints(&other, largest).await.unwrap();
+    let steps: Vec<_> = store.checkpoints(&other).await.unwrap().iter().map(|c| c.step).collect();
+    assert_eq!(steps, [5, 1], "the newest and the largest");
+    store.prune_checkpoints(&other, Keep { latest: 1, ..Keep::default() }).await.unwrap();
 
     assert!(store.gc(60_000).await.unwrap().remove.is_empty(), "all is fresh");
     let plan = store.gc_plan(-1000).await.unwrap();
@@ -270,7 +287,7 @@ async fn checkpoints_are_pruned_by_policy_and_only_the_unneeded_is_collected() {
     assert_eq!(store.gc(-1000).await.unwrap(), plan);
     assert!(store.gc(-1000).await.unwrap().remove.is_empty());
     let report = store.fsck().await.unwrap();
-    assert_eq!((report.problems.as_slice(), report.blobs, report.references), (&[][..], 8, 4));
+    assert_eq!((report.problems.as_slice(), report.blobs, report.references), (&[][..], 8, 5));
 }
 
 #[tokio::test]

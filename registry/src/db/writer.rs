@@ -200,7 +200,7 @@ async fn run(conn: &mut SqliteConnection, blobs: &BlobStore, order: &Order) -> R
                 .await
                 .map(|p| Done::Promoted(Box::new(p)))
         }
-        Order::PruneCheckpoints { task, keep } => retention::prune(conn, task, *keep).await.map(Done::Pruned),
+        Order::PruneCheckpoints { task, keep } => retention::prune(conn, task, keep).await.map(Done::Pruned),
         Order::Pin { digest, reason } => {
             retention::pin(conn, blobs, *digest, reason.as_deref()).await.map(|()| Done::Nothing)
         }

@@ -163,6 +163,7 @@ fn pipeline(seed: u64) -> Pipeline {
             stage("vae", StageSettings::TrainVae(TrainVae::default())),
             stage("latents", StageSettings::EncodeLatents(EncodeLatents { shards: SHARDS, ..Default::default() })),
         ],
+        code_versions: BTreeMap::new(),
     }
 }
 

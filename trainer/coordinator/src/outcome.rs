@@ -39,10 +39,10 @@ impl Deciding<'_> {
             }
             Some(_) | None => {}
         }
-        let keep = work.placement.checkpoint.keep;
+        let keep = work.placement.checkpoint.keep.clone();
         let (key, i) = self.place(&grant.task)?;
         let saved = Saved { step, manifest, metrics: metrics.clone() };
-        let dropped = self.state.change(key, i, |task| task.save(saved, keep));
+        let dropped = self.state.change(key, i, |task| task.save(saved, &keep));
         if !dropped.is_empty() {
             self.effects.push(Effect::Prune { task: grant.task.clone(), keep });
         }
@@ -52,12 +52,11 @@ impl Deciding<'_> {
 
     pub(crate) fn outcome(&mut self, report: ReportOutcome) -> Result<bool, Rejected> {
         let grant = &report.grant;
-        let (work, task) = self.state.task(&grant.task)?;
+        let (_, task) = self.state.task(&grant.task)?;
         if task.reported.as_ref() == Some(&report) {
             return Ok(false);
         }
         let rank = task.check(grant)?;
-        let stage = work.stage.clone();
         let (key, i) = self.place(&grant.task)?;
         let worker = grant.worker.clone();
         match &report.outcome {
@@ -87,7 +86,7 @@ impl Deciding<'_> {
                     | FailureClass::OutOfMemory
                     | FailureClass::Storage => {
                         let own = *class != FailureClass::Storage;
-                        self.fail_work(key, format!("stage `{stage}`: {message}"), own);
+                        self.fail_work(key, message.clone(), own);
                         self.accepted(key, i, &report);
                         return Ok(true);
                     }
@@ -133,9 +132,9 @@ impl Deciding<'_> {
         work.state = WorkState::Done { known, cached: false };
         self.writes.push(write);
         // The value is there: what an interrupted try would have gone on from is of no use any more, but for the last way
-        // from one checkpoint to the next, which `trainer run --verify` walks again.
+        // from one checkpoint to the next, which `trainer run --verify` walks again, and the best, if they were asked for.
         if !self.state.change(key, i, |task| std::mem::take(&mut task.checkpoints)).is_empty() {
-            let keep = Keep { latest: 2, best: 0 };
+            let keep = Keep { latest: 2, ..self.state.works[&key].placement.checkpoint.keep.clone() };
             self.effects.push(Effect::Prune { task: report.grant.task.clone(), keep });
         }
         Ok(())

@@ -35,28 +35,30 @@ pub struct Registration {
 
 impl Registration {
     /// Gathers candidates and their metrics from the stages of `run`, which are all done.
-    pub fn gather(run: &Run, name: &StageName, settings: &Register) -> Result<Self, String> {
-        let at = |message: String| format!("stage `{name}`: {message}");
-        let model = settings.model.parse::<ModelName>().map_err(|e| at(format!("`model`: {e}")))?;
+    ///
+    /// # Errors
+    /// What is wrong, without the stage's name, which its reader has.
+    pub fn gather(run: &Run, settings: &Register) -> Result<Self, String> {
+        let model = settings.model.parse::<ModelName>().map_err(|e| format!("`model`: {e}"))?;
         let promote = match settings.promote.to.as_str() {
             "" => None,
             alias => {
-                let alias = alias.parse::<Alias>().map_err(|e| at(format!("`promote.to`: {e}")))?;
+                let alias = alias.parse::<Alias>().map_err(|e| format!("`promote.to`: {e}"))?;
                 Some((alias, settings.promote.require.clone()))
             }
         };
         let (mut candidates, mut metrics, mut keys) = (Vec::new(), Vec::new(), Vec::new());
         for from in &settings.from {
             let stage = StageName::new(from.as_str());
-            let denoiser = output(run, &stage).ok_or_else(|| at(format!("`from`: stage `{from}` has no output")))?;
+            let denoiser = output(run, &stage).ok_or_else(|| format!("`from`: stage `{from}` has no output"))?;
             let vae = vae_of(&run.pipeline, &stage)
                 .and_then(|vae| output(run, &vae))
-                .ok_or_else(|| at(format!("`from`: no VAE is found behind stage `{from}`")))?;
+                .ok_or_else(|| format!("`from`: no VAE is found behind stage `{from}`"))?;
             keys.extend(run.status(&stage).and_then(|status| status.key()));
             metrics.push(metrics_of(run, from));
             candidates.push(Candidate { stage, denoiser, vae });
         }
-        let best = best(&settings.from, &metrics, settings).map_err(at)?;
+        let best = best(&settings.from, &metrics, settings)?;
         let by = (settings.metric.clone(), settings.mode);
         Ok(Self { candidates, metrics, keys, best, model, by, promote })
     }
@@ -133,21 +135,32 @@ fn together(known: &[(&StageName, &BTreeMap<String, f64>)]) -> BTreeMap<String, 
     all
 }
 
-/// The candidate with the best value; the first of equals.
+/// The candidate with the best value; the first of equals. One that nobody evaluates is registered as it is, if it is the only one.
 fn best(from: &[String], metrics: &[BTreeMap<String, f64>], settings: &Register) -> Result<usize, String> {
-    if from.len() == 1 {
+    if from.len() == 1 && metrics[0].is_empty() {
         return Ok(0);
     }
+    let metric = &settings.metric;
     let mut best: Option<(usize, f64)> = None;
     for (i, stage) in from.iter().enumerate() {
-        let value = metrics[i].get(&settings.metric).copied().filter(|value| value.is_finite()).ok_or_else(|| {
-            let known: Vec<&str> = metrics[i].keys().map(String::as_str).collect();
-            format!(
-                "`metric`: no evaluation gives `{}` for `{stage}` (there is: {}); add an `evaluate.latent_fid` stage with `model: {stage}`",
-                settings.metric,
-                if known.is_empty() { "nothing".to_owned() } else { known.join(", ") }
-            )
-        })?;
+        let value = match metrics[i].get(metric) {
+            Some(value) if value.is_finite() => *value,
+            Some(value) => {
+                return Err(format!("`metric`: `{metric}` of `{stage}` is {value}, by which nothing is best"));
+            }
+            None if metrics[i].is_empty() => {
+                return Err(format!(
+                    "`metric`: no evaluation looks at `{stage}`; add an `evaluate.latent_fid` stage with `model: {stage}`"
+                ));
+            }
+            None => {
+                let known: Vec<&str> = metrics[i].keys().map(String::as_str).collect();
+                return Err(format!(
+                    "`metric`: no evaluation of `{stage}` gives `{metric}`; name one of those that there are: {}",
+                    known.join(", ")
+                ));
+            }
+        };
         let better = best.is_none_or(|(_, other)| match settings.mode {
             Mode::Min => value < other,
             Mode::Max => value > other,
@@ -179,5 +192,31 @@ mod tests {
         assert_eq!(plain, expected.iter().collect());
         assert_eq!(all["four.fid.upper"], 0.3);
         assert_eq!(together(&[(&four, &second)]), second);
+    }
+
+    fn pick(settings: &Register, candidates: &[&[(&str, f64)]]) -> Result<usize, String> {
+        let from: Vec<String> = (0..candidates.len()).map(|i| format!("s{i}")).collect();
+        let metrics = |all: &&[(&str, f64)]| all.iter().map(|(key, value)| ((*key).to_owned(), *value)).collect();
+        best(&from, &candidates.iter().map(metrics).collect::<Vec<_>>(), settings)
+    }
+
+    #[test]
+    fn the_best_is_picked_by_metric_and_direction() {
+        let by = |metric: &str, mode| Register { metric: metric.into(), mode, ..Register::default() };
+        let three: [&[(&str, f64)]; 3] =
+            [&[("fid", 0.3), ("r", 0.5)], &[("fid", 0.2), ("r", 0.9)], &[("fid", 0.2), ("r", 0.1)]];
+        assert_eq!(pick(&by("fid", Mode::Min), &three), Ok(1), "the first of equals");
+        assert_eq!(pick(&by("fid", Mode::Max), &three), Ok(0));
+        assert_eq!(pick(&by("r", Mode::Max), &three), Ok(1));
+        assert_eq!(pick(&by("fid", Mode::Min), &[&[]]), Ok(0), "the only one needs no judge");
+        // A metric that nobody reported, of several candidates and of one alone.
+        for candidates in [&three[..], &three[..1]] {
+            let refused = pick(&by("fdi", Mode::Min), candidates).unwrap_err();
+            assert!(refused.contains("`fdi`") && refused.contains("fid, r") && refused.contains("`s0`"), "{refused}");
+        }
+        let refused = pick(&by("fid", Mode::Min), &[&[("fid", 1.0)], &[("fid", f64::NAN)]]).unwrap_err();
+        assert!(refused.contains("`s1` is NaN"), "{refused}");
+        let refused = pick(&by("fid", Mode::Min), &[&[("fid", 1.0)], &[]]).unwrap_err();
+        assert!(refused.contains("no evaluation looks at `s1`"), "{refused}");
     }
 }

@@ -91,7 +91,7 @@ impl Deciding<'_> {
         let stage = &run.pipeline.stages[j];
         let key = run.pipeline.identity(stage, &inputs).key();
         let registration = match &stage.settings {
-            StageSettings::Register(settings) => match Registration::gather(&run, &stage.name, settings) {
+            StageSettings::Register(settings) => match Registration::gather(&run, settings) {
                 Ok(registration) => Some(registration),
                 Err(message) => return Status::Failed { key, message },
             },

@@ -103,6 +103,7 @@ fn pipeline() -> Pipeline {
             stage("dataset", StageSettings::DataSynthetic(DataSynthetic::default())),
             stage("vae", StageSettings::TrainVae(TrainVae::default())),
         ],
+        code_versions: BTreeMap::new(),
     }
 }
 

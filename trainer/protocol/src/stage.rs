@@ -198,7 +198,13 @@ impl StageSettings {
 
     /// Grows when a change of ours changes what the kind computes, so that an old result is not mistaken for a new one.
     pub fn code_version(&self) -> u32 {
-        1
+        match self {
+            // 2: PA-MPJPE, accelerations, sJPE, skating.
+            Self::EvaluateReconstruction(_) => 2,
+            // 2: retrieval among latents has names of its own.
+            Self::EvaluateLatentFid(_) => 2,
+            _ => 1,
+        }
     }
 
     /// How its work is laid over workers.

@@ -2,22 +2,19 @@
 
 use std::fmt;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
-use burn::tensor::Device;
-use checkpoint::{BlobError, Blobs};
 use clap::Args;
 use motion::{Skeleton, npy};
+use protocol::Seed;
 use protocol::stage::Sampler;
-use protocol::{Digest, Manifest, Seed};
-use registry::cli::{Command, Data};
 use stages::generate::{Generated, Generator};
 
+use super::model::{self, Found};
 use super::remote::check_parent;
 use crate::client::{Client, Target};
 use crate::print::{self, Output};
-use crate::problem::{Problem, Result, exit};
+use crate::problem::{Problem, Result};
 
 #[derive(Debug, Args)]
 pub(crate) struct GenerateArgs {
@@ -58,33 +55,6 @@ pub(crate) struct GenerateArgs {
     pub(super) report: Output,
 }
 
-/// A model's blobs, fetched once and verified.
-#[derive(Debug, Default)]
-struct Fetched(Mutex<std::collections::BTreeMap<Digest, Arc<[u8]>>>);
-
-impl Blobs for Fetched {
-    fn get(&self, digest: Digest) -> std::result::Result<Arc<[u8]>, BlobError> {
-        let blobs = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        blobs.get(&digest).cloned().ok_or(BlobError::NotFound(digest))
-    }
-
-    fn put(&self, _: Vec<u8>) -> std::result::Result<Digest, BlobError> {
-        Err(BlobError::Refused("a model is only read here".into()))
-    }
-}
-
-impl Fetched {
-    fn keep(&self, name: Digest, bytes: Vec<u8>) -> Result<()> {
-        let found = Digest::of(&bytes);
-        if found != name {
-            return Err(Problem::failed(BlobError::Corrupt { expected: name, found })
-                .hint("`trainer registry fsck` checks the store"));
-        }
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).insert(name, bytes.into());
-        Ok(())
-    }
-}
-
 pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
     let kind = |path: &Path| path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_lowercase();
     let ending = kind(&args.out);
@@ -99,8 +69,10 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
         check_parent(path)?;
     }
     let start = Instant::now();
-    let (manifest, blobs, label) = fetch(&args).await?;
-    let device = device(args.backend.as_deref())?;
+    let client = Client::connect(&args.target).await?;
+    let Found { manifest, blobs, label } = model::version(&client, &args.model).await?;
+    client.close().await;
+    let (device, _) = model::device(args.backend.as_deref())?;
     let generator = Generator::load(&manifest, &blobs, &device).map_err(Problem::failed)?;
     let loaded = start.elapsed();
 
@@ -110,10 +82,8 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
     let sampler = Sampler { steps, guidance: args.guidance.unwrap_or(own.guidance), timesteps };
     let mut motions = Vec::new();
     for prompt in &args.prompt {
-        let motion = generator.generate(prompt, args.frames, Some(&sampler), Seed(args.seed)).map_err(|error| {
-            let exit = if matches!(error, stages::context::StageError::Input(_)) { exit::USAGE } else { exit::FAILED };
-            Problem::new(exit, error)
-        })?;
+        let motion =
+            generator.generate(prompt, args.frames, Some(&sampler), Seed(args.seed)).map_err(model::refused)?;
         motions.push((prompt.clone(), motion));
     }
     let written = write(&args, &motions)?;
@@ -150,61 +120,6 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
         )),
     }
     Ok(0)
-}
-
-/// The first device of a backend.
-fn device(backend: Option<&str>) -> Result<Device> {
-    let all = models::device::available();
-    let found = match backend {
-        None => all.iter().find(|device| device.index.is_some()),
-        Some(name) => all.iter().find(|device| device.backend.name() == name),
-    };
-    let names: Vec<&str> = all.iter().map(|device| device.backend.name()).collect();
-    let found = found.ok_or_else(|| {
-        Problem::usage(format!("`--backend {}`: expected one of {}", backend.unwrap_or_default(), names.join(", ")))
-    })?;
-    models::device::open(found.backend, 0).map_err(|error| Problem::new(exit::USAGE, error))
-}
-
-/// Which version a name stood for.
-struct Label(String, u64);
-
-impl fmt::Display for Label {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} (version {})", self.0, self.1)
-    }
-}
-
-/// The model's manifest and blobs, from whoever holds the store.
-async fn fetch(args: &GenerateArgs) -> Result<(Manifest, Fetched, Label)> {
-    let client = Client::connect(&args.target).await?;
-    let answer = client.registry(&Command::Show { reference: args.model.clone() }).await?;
-    if let Some(error) = answer.error {
-        let mut problem = Problem::new(answer.exit, anyhow::anyhow!("{}", error.message));
-        problem.hint = error.hint;
-        return Err(problem);
-    }
-    let (version, manifest) = match answer.data {
-        Some(Data::Version { version, manifest }) => (version, manifest),
-        Some(Data::Model { model, .. }) => {
-            let aliases: Vec<String> = model.aliases.keys().map(|alias| format!("{}@{alias}", args.model)).collect();
-            let problem =
-                Problem::usage(format!("`{}` is a model; which of its {} versions?", args.model, model.versions));
-            return Err(problem.hint(format!("name one, such as {}@best {}", args.model, aliases.join(" "))));
-        }
-        _ => {
-            return Err(Problem::new(
-                exit::FAULT,
-                anyhow::anyhow!("the registry answered something else than a model"),
-            ));
-        }
-    };
-    let blobs = Fetched::default();
-    for file in manifest.files.values() {
-        blobs.keep(file.digest, client.blob(file.digest).await?)?;
-    }
-    client.close().await;
-    Ok((manifest, blobs, Label(args.model.clone(), version.version)))
 }
 
 /// Poses of one motion on a sheet.

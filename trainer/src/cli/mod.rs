@@ -2,9 +2,11 @@
 
 mod config;
 mod generate;
+mod model;
 mod remote;
 mod serve;
 pub(crate) mod sweep;
+mod time;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -51,6 +53,8 @@ enum Verb {
     Resume(ResumeArgs),
     /// Makes a motion from a sentence
     Generate(generate::GenerateArgs),
+    /// Measures how long models take for a sentence (AITS), side by side
+    Time(time::TimeArgs),
     /// Lists what this build and machine can compute on
     Devices(config::DevicesArgs),
     /// Pipeline files
@@ -194,6 +198,7 @@ impl Verb {
             Self::Sweep(verb) => verb.output(),
             Self::Resume(args) => args.output,
             Self::Generate(args) => args.report,
+            Self::Time(args) => args.output,
             Self::Devices(args) => args.output,
             Self::Worker(WorkerVerb::List(args)) => args.output,
             Self::Serve(_) | Self::Config(_) | Self::Worker(WorkerVerb::Join(_)) | Self::Registry(_) => Output::Table,
@@ -214,6 +219,7 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Pause(args) => remote::control(args, "pause").await,
         Verb::Resume(args) => resume(args).await,
         Verb::Generate(args) => generate::generate(args).await,
+        Verb::Time(args) => time::time(args).await,
         Verb::Devices(args) => Ok(config::devices(&args)),
         Verb::Config(verb) => config::config(&verb),
         Verb::Worker(WorkerVerb::List(args)) => remote::workers(args).await,

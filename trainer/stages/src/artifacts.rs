@@ -161,14 +161,15 @@ pub fn blob_error(error: BlobError) -> StageError {
 
 /// The digest and manifest of the input that the settings field `field` names; refused when it is of another kind.
 pub fn input(cx: &dyn AttemptContext, field: &str, kind: ArtifactKind) -> Result<(Digest, Manifest), StageError> {
-    let digest = *cx.task().inputs.get(field).ok_or_else(|| {
-        StageError::Fault(format!("stage `{}` was started without its input `{field}`", cx.task().name))
-    })?;
+    let digest = *cx
+        .task()
+        .inputs
+        .get(field)
+        .ok_or_else(|| StageError::Fault(format!("the stage was started without its input `{field}`")))?;
     let manifest = cx.manifest(digest)?;
     if manifest.kind != kind {
         return Err(StageError::Input(format!(
-            "stage `{}`: `{field}` is an artifact of kind {:?}, expected {kind:?}",
-            cx.task().name,
+            "`{field}` is an artifact of kind {:?}, expected {kind:?}",
             manifest.kind
         )));
     }

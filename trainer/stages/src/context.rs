@@ -28,7 +28,7 @@ pub enum ContextError {
     Corrupt(String),
 }
 
-/// Why a stage failed.
+/// Why a stage failed. The message does not name the stage: whoever shows it knows which one it was.
 #[derive(Debug, thiserror::Error)]
 pub enum StageError {
     /// The user's data or settings; the message names file, line or field, what was expected and what to do.

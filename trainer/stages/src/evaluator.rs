@@ -16,6 +16,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::artifacts::{self, Draft, MODEL_FILE, to_meta};
 use crate::context::{AttemptContext, ContextError, StageError};
+use crate::kinds::word;
 use crate::words::{CLASSES, WORD_WIDTH, WORDS, Words, WordsMeta};
 
 /// Frames of a movement.
@@ -142,9 +143,11 @@ impl Judge {
         let ours = self.meta.format;
         if dataset.format != ours {
             return Err(StageError::Input(format!(
-                "the evaluator was made for {ours:?} skeletons ({} features), the dataset has {:?} ({}); train one on this data",
+                "the evaluator was made for `{}` skeletons ({} features), the dataset has `{}` ({}); train one on this data, or import the one \
+                 that was published for it",
+                word(&ours),
                 self.meta.mean.len(),
-                dataset.format,
+                word(&dataset.format),
                 dataset.mean.len()
             )));
         }

@@ -3,7 +3,7 @@
 //! Not a stage: nothing is kept, and the clock is read, because the time per sentence is what few-step models are about. The
 //! motion is a function of (model, sentence, frames, sampler, seed).
 
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use burn::tensor::Device;
 use checkpoint::Blobs;
@@ -18,6 +18,7 @@ use crate::artifacts::{self, DenoiserMeta, VaeMeta};
 use crate::context::StageError;
 use crate::kinds::text::embed;
 use crate::networks::{Autoencoder, Conditions, Denoiser};
+use crate::timing::Timing;
 
 /// Length of a motion when nobody says: 6 seconds of HumanML3D, 9.6 of KIT-ML, near the mean length of their clips.
 pub const DEFAULT_FRAMES: usize = 120;
@@ -37,31 +38,6 @@ pub struct Generator {
     denoiser: Denoiser,
     sampler: Sampler,
     null: Vec<f32>,
-}
-
-/// Where the time of one sentence went.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Timing {
-    /// Embedding the sentence.
-    pub text: Duration,
-    /// Drawing the latent.
-    pub sampling: Duration,
-    /// Decoding it.
-    pub decoding: Duration,
-}
-
-impl Timing {
-    /// All three: what papers call the average inference time per sentence.
-    pub fn total(&self) -> Duration {
-        self.text + self.sampling + self.decoding
-    }
-}
-
-/// Average inference time per sentence (AITS), in seconds: sentences one by one, from the text to the decoded motion, loading and
-/// drawing left out. `None` of none. Of this machine alone, and so no value of a stage.
-pub fn aits(timings: &[Timing]) -> Option<f64> {
-    let seconds: f64 = timings.iter().map(|t| t.total().as_secs_f64()).sum();
-    (!timings.is_empty()).then(|| seconds / timings.len() as f64)
 }
 
 /// A motion.
@@ -96,6 +72,11 @@ impl Generator {
     /// How motions are drawn when nobody says.
     pub fn sampler(&self) -> &Sampler {
         &self.sampler
+    }
+
+    /// Refuses a sampler that the model does not have.
+    pub fn check_sampler(&self, sampler: &Sampler) -> Result<(), StageError> {
+        self.denoiser.check_sampler(sampler)
     }
 
     /// Which skeleton its motions have.
@@ -134,30 +115,14 @@ impl Generator {
         let z = self.denoiser.sample(&conditions, sampler, &mut |step| normal(1 + step as u64))?;
         let sampled = Instant::now();
         let mut features = self.vae.decode(z, frames);
+        self.vae.denormalise(&mut features);
         let decoded = Instant::now();
 
-        self.vae.denormalise(&mut features);
         if !features.iter().all(|v| v.is_finite()) {
             return Err(StageError::Input("the motion is not finite; the model has not been trained well".into()));
         }
         let joints = recover_joints(&features, Skeleton::of(self.format()));
         let timing = Timing { text: embedded - start, sampling: sampled - embedded, decoding: decoded - sampled };
         Ok(Generated { features, joints, frames, format: self.format(), timing })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_time_per_sentence_is_the_mean_of_all_three_parts() {
-        let timing = |ms| Timing {
-            text: Duration::from_millis(ms),
-            sampling: Duration::from_millis(10 * ms),
-            decoding: Duration::from_millis(100 * ms),
-        };
-        assert_eq!(aits(&[timing(1), timing(3)]), Some(0.222));
-        assert_eq!(aits(&[]), None);
     }
 }

@@ -10,6 +10,7 @@ pub mod generate;
 pub mod kinds;
 pub mod networks;
 pub mod testing;
+pub mod timing;
 pub mod train;
 pub mod verify;
 pub mod words;

@@ -17,6 +17,7 @@ use protocol::{Manifest, Seed};
 
 use crate::artifacts::{self, DenoiserMeta, Family, MODEL_FILE, VaeMeta};
 use crate::context::{ContextError, StageError};
+use crate::kinds::word;
 
 /// Width of the time sinusoid in every published denoiser.
 const TIME_DIM: usize = 768;
@@ -131,8 +132,8 @@ impl Autoencoder {
         if self.meta.format == format {
             return Ok(());
         }
-        let ours = self.meta.format;
-        Err(StageError::Input(format!("the VAE was trained on {ours:?} features, the dataset has {format:?} features")))
+        let (ours, theirs) = (word(&self.meta.format), word(&format));
+        Err(StageError::Input(format!("the VAE was trained on `{ours}` features, the dataset has `{theirs}` features")))
     }
 
     /// `(x - mean) / std` with the statistics of its training data.

@@ -7,13 +7,14 @@ use models::names::save;
 use models::networks::{Denoiser, Init, Vae};
 use protocol::artifact::FileEntry;
 use protocol::stage::{
-    DataFormat, DataSynthetic, EncodeLatents, EvaluateLatentFid, EvaluateReconstruction, LatentShape, Network,
-    Positions, Sampler, Split, StageSettings, TextEmbed,
+    Batch, CheckpointPolicy, DataFormat, DataSynthetic, EncodeLatents, EvaluateLatentFid, EvaluateReconstruction, Keep,
+    LatentShape, Network, Positions, Sampler, Split, StageSettings, TextEmbed, TrainVae, Training,
 };
-use protocol::{ArtifactKind, Digest, Manifest, Seed};
+use protocol::{ArtifactKind, Digest, Manifest, Seed, Steps};
 use stages::artifacts::{self, DenoiserMeta, Family, Latents, MODEL_FILE, VaeMeta, to_meta};
 use stages::generate::Generator;
 use stages::testing::Bench;
+use stages::timing::{Times, WARM_UP, sentences, time};
 
 const LATENT: LatentShape = LatentShape { tokens: 2, dim: 4 };
 
@@ -217,6 +218,51 @@ fn what_does_not_fit_is_refused_with_the_reason() {
 }
 
 #[test]
+fn an_empty_split_is_refused_by_its_name() {
+    let mut bench = bench();
+    let settings = DataSynthetic { clips: 12, val: 0.0, test: 0.25, mirror: false };
+    let dataset = bench.run("dataset", &StageSettings::DataSynthetic(settings), &[]).expect("the stage runs").output();
+    let text = StageSettings::TextEmbed(TextEmbed::default());
+    let text = bench.run("text", &text, &[("dataset", dataset)]).expect("the stage runs").output();
+    let vae = untrained_vae(&bench);
+    let latents = encode(&mut bench, 1, dataset, vae);
+    let model = untrained_denoiser(&bench, vae, Family::Mld, LATENT);
+    let reconstruction = EvaluateReconstruction { split: Split::Val, ..EvaluateReconstruction::default() };
+    let sampler = Sampler { steps: 1, guidance: 2.0, timesteps: vec![] };
+    let StageSettings::EvaluateLatentFid(fid) = latent_fid(1, sampler, false) else { unreachable!() };
+    let fid = EvaluateLatentFid { split: Split::Val, ..fid };
+    let inputs = [("dataset", dataset), ("vae", vae), ("model", model), ("latents", latents), ("text", text)];
+    for settings in [StageSettings::EvaluateReconstruction(reconstruction), StageSettings::EvaluateLatentFid(fid)] {
+        let refused = bench.run("eval", &settings, &inputs).unwrap_err();
+        assert!(refused.to_string().contains("the split `val` has no entries; set `split`"), "{refused}");
+        assert!(!refused.to_string().contains("stage `"), "whoever shows it names the stage: {refused}");
+        assert_eq!(refused.class(), protocol::message::FailureClass::Input, "{refused}");
+    }
+}
+
+#[test]
+fn a_metric_to_keep_checkpoints_by_that_is_not_saved_is_refused_before_a_step() {
+    let mut bench = bench();
+    let (dataset, ..) = data(&mut bench);
+    let batch = Batch { global: 4, slices: 2 };
+    let training = Training { steps: Steps(3), batch, warmup: Steps(0), ..TrainVae::default().training };
+    let vae = TrainVae { latent: LATENT, network: network(), training, ..TrainVae::default() };
+    let vae = StageSettings::TrainVae(vae);
+    let keep = Keep { best: 1, metric: "fid".into(), ..Keep::default() };
+    bench.checkpoint = CheckpointPolicy { every: Steps(1), keep: keep.clone() };
+    let refused = bench.run("vae", &vae, &[("dataset", dataset)]).expect_err("no such metric");
+    assert_eq!(refused.class(), protocol::message::FailureClass::Input, "{refused}");
+    let refused = refused.to_string();
+    for part in ["`checkpoint.keep.metric` is `fid`", "loss", "joint", "gradient_norm", "lr"] {
+        assert!(refused.contains(part), "`{part}` is missing: {refused}");
+    }
+    assert!(bench.checkpoints("vae").is_empty(), "nothing was saved, so nothing can be lost");
+    bench.checkpoint.keep = Keep { metric: "joint".into(), ..keep };
+    bench.run("vae", &vae, &[("dataset", dataset)]).expect("`joint` is saved");
+    assert_eq!(bench.checkpoints("vae").len(), 3);
+}
+
+#[test]
 fn a_bundled_model_generates_and_repeats_itself() {
     let bench = bench();
     let vae = untrained_vae(&bench);
@@ -241,4 +287,16 @@ fn a_bundled_model_generates_and_repeats_itself() {
     assert!(refused.contains("phases"), "{refused}");
     let meta: VaeMeta = artifacts::meta(&manifest(vae), "the VAE").unwrap();
     assert_eq!(generator.format(), meta.format);
+
+    // Timed beside itself: a time for every sentence and model, the warm-up made but not counted.
+    let own = generator.sampler();
+    let mut motions = 0;
+    let times = time(&[(&generator, own), (&generator, own)], &sentences(4), Some(40), &mut || motions += 1).unwrap();
+    assert_eq!(times.iter().map(Vec::len).collect::<Vec<_>>(), [4, 4]);
+    assert_eq!(motions, 2 * (4 + WARM_UP));
+    let times = Times::of(&times[0]).expect("four sentences");
+    assert!(times.sampling > 0.0 && times.decoding > 0.0 && times.median <= times.p95, "{times:?}");
+    assert!((times.text + times.sampling + times.decoding - times.mean).abs() < 1e-9, "{times:?}");
+    let refused = time(&[(&generator, &sampler)], &sentences(1), None, &mut || ()).expect_err("other phases");
+    assert!(refused.to_string().contains("phases"), "{refused}");
 }

@@ -310,12 +310,13 @@ fn what_an_evaluator_does_not_fit_is_refused_with_the_reason() {
         (store(&bench, &millimetres, data), evaluator, &test, "another scale"),
         (store(&bench, &nothing, data), evaluator, &test, "`test` has no entries"),
         (data, evaluator, &few, "ranks a motion among 32"),
-        (data, kit, &test, "Kit skeletons"),
+        (data, kit, &test, "`kit` skeletons"),
         (data, data, &test, "kind Dataset"),
     ] {
         let inputs = [("dataset", data), ("evaluator", evaluator)];
         let refused = bench.run("eval", &evaluate(2, settings.clone()), &inputs).expect_err(reason);
         assert!(refused.to_string().contains(reason), "{refused}");
+        assert!(!refused.to_string().contains("stage `"), "whoever shows it names the stage: {refused}");
         assert_eq!(refused.class(), FailureClass::Input, "{refused}");
     }
     let inputs = [("dataset", data), ("evaluator", evaluator)];

@@ -313,7 +313,13 @@ mod tests {
             sweep: None,
             derived: None,
         };
-        let pipeline = Pipeline { name: "p".into(), seed: Seed(1), backend: Backend::Flex, stages: vec![stage] };
+        let pipeline = Pipeline {
+            name: "p".into(),
+            seed: Seed(1),
+            backend: Backend::Flex,
+            stages: vec![stage],
+            code_versions: BTreeMap::new(),
+        };
         Run::new(1, Arc::new(pipeline), String::new(), None, None)
     }
 

@@ -249,22 +249,14 @@ impl Task {
     }
 
     /// Adds a checkpoint and drops those that `keep` does not keep; returns the dropped ones.
-    pub fn save(&mut self, saved: Saved, keep: Keep) -> Vec<Saved> {
+    pub fn save(&mut self, saved: Saved, keep: &Keep) -> Vec<Saved> {
         self.streak = 0;
         self.checkpoints.retain(|old| old.step < saved.step);
         self.checkpoints.push(saved);
-        let newest = self.checkpoints.len().saturating_sub(keep.latest.max(1));
-        let mut best: Vec<(f64, usize)> = self
-            .checkpoints
-            .iter()
-            .enumerate()
-            .filter_map(|(i, saved)| saved.metrics.get("loss").filter(|loss| loss.is_finite()).map(|loss| (*loss, i)))
-            .collect();
-        best.sort_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)));
-        best.truncate(keep.best);
+        let stay = keep.kept(&self.checkpoints.iter().map(|saved| &saved.metrics).collect::<Vec<_>>());
         let (mut kept, mut dropped) = (Vec::new(), Vec::new());
-        for (i, saved) in std::mem::take(&mut self.checkpoints).into_iter().enumerate() {
-            if i >= newest || best.iter().any(|(_, b)| *b == i) { kept.push(saved) } else { dropped.push(saved) }
+        for (saved, stays) in std::mem::take(&mut self.checkpoints).into_iter().zip(stay) {
+            if stays { kept.push(saved) } else { dropped.push(saved) }
         }
         self.checkpoints = kept;
         dropped
@@ -282,15 +274,18 @@ mod tests {
     #[test]
     fn the_newest_and_the_best_checkpoints_are_kept() {
         let mut task = Task::new("r/s".into(), Part::Gang);
-        let keep = Keep { latest: 2, best: 1 };
+        let keep = Keep { latest: 2, best: 1, ..Keep::default() };
         let dropped: Vec<u64> = [(1, 0.5), (2, 0.1), (3, 0.9), (4, 0.3), (5, 0.2)]
             .into_iter()
-            .flat_map(|(step, loss)| task.save(saved(step, loss), keep))
+            .flat_map(|(step, loss)| task.save(saved(step, loss), &keep))
             .map(|saved| saved.step)
             .collect();
         assert_eq!(task.checkpoints.iter().map(|s| s.step).collect::<Vec<_>>(), [2, 4, 5]);
         assert_eq!(dropped, [1, 3]);
-        assert!(task.save(saved(6, f64::NAN), Keep { latest: 0, best: 0 }).len() == 3, "the newest always stays");
+        assert!(
+            task.save(saved(6, f64::NAN), &Keep { latest: 0, ..Keep::default() }).len() == 3,
+            "the newest always stays"
+        );
     }
 
     #[test]

@@ -32,8 +32,10 @@ pub(crate) fn quickstart(seed: u64, workers: WorkerRange, require: &[&str]) -> P
         ("fid-pcm", evaluate("pcm")),
         ("release", register),
     ];
-    let placement =
-        Placement { workers, checkpoint: CheckpointPolicy { every: Steps(3), keep: Keep { latest: 2, best: 1 } } };
+    let placement = Placement {
+        workers,
+        checkpoint: CheckpointPolicy { every: Steps(3), keep: Keep { best: 1, ..Keep::default() } },
+    };
     let stages = stages.map(|(name, settings)| {
         let mut inputs: Vec<StageInput> = settings
             .inputs()
@@ -56,7 +58,8 @@ pub(crate) fn quickstart(seed: u64, workers: WorkerRange, require: &[&str]) -> P
             derived: None,
         }
     });
-    Pipeline { name: "quickstart".into(), seed: Seed(seed), backend: Backend::Flex, stages: stages.to_vec() }
+    let (name, stages) = ("quickstart".into(), stages.to_vec());
+    Pipeline { name, seed: Seed(seed), backend: Backend::Flex, stages, code_versions: BTreeMap::new() }
 }
 
 /// A sweep of `trials` trials with three rungs, and what goes on from its best.

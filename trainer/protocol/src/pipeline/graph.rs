@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::rules::Problems;
 use super::{PipelineStage, StageInput};
-use crate::stage::{Sampler, StageSettings, TrainVae};
+use crate::stage::{DataFormat, Sampler, StageSettings, TrainVae};
 use crate::{ArtifactKind, StageName};
 
 /// Problems by stage.
@@ -183,6 +183,17 @@ impl<'a> Lookup<'a> {
         }
     }
 
+    /// The skeleton of a dataset, or the one that an evaluator is for.
+    fn format(&self, stage: &str) -> Option<DataFormat> {
+        match self.0.get(stage)? {
+            StageSettings::DataOpen(s) => Some(s.format),
+            StageSettings::DataSynthetic(_) => Some(DataFormat::Humanml3d),
+            StageSettings::ImportEvaluator(s) => Some(s.format),
+            StageSettings::TrainEvaluator(s) if s.dataset != stage => self.format(&s.dataset),
+            _ => None,
+        }
+    }
+
     fn shape(&self, vae: &str) -> String {
         self.vae(vae).map_or_else(String::new, |s| format!(" ({}x{})", s.latent.tokens, s.latent.dim))
     }
@@ -208,8 +219,23 @@ pub(super) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
             | StageSettings::TrainEvaluator(_)
             | StageSettings::ImportEvaluator(_)
             | StageSettings::EncodeLatents(_) => {}
-            StageSettings::EvaluateT2m(s) if s.real => {}
             StageSettings::EvaluateT2m(s) => {
+                if let (Some(ours), Some(theirs)) = (lookup.format(&s.dataset), lookup.format(&s.evaluator))
+                    && ours != theirs
+                {
+                    let message = format!(
+                        "`{}` is an evaluator for skeletons of {}, but the clips of `{}` have {}",
+                        s.evaluator,
+                        skeleton(theirs),
+                        s.dataset,
+                        skeleton(ours)
+                    );
+                    let help = format!("add a `train.evaluator` stage with `dataset: {}`", s.dataset);
+                    p.add("evaluator", message, &help);
+                }
+                if s.real {
+                    continue;
+                }
                 if let Some(vae) = lookup.vae_of_denoiser(&s.model)
                     && vae != s.vae
                 {
@@ -253,6 +279,14 @@ pub(super) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
                 }
             }
         }
+    }
+}
+
+/// A skeleton in words.
+fn skeleton(format: DataFormat) -> &'static str {
+    match format {
+        DataFormat::Humanml3d => "22 joints (humanml3d)",
+        DataFormat::Kit => "21 joints (kit)",
     }
 }
 

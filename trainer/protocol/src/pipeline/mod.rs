@@ -41,6 +41,10 @@ pub struct Pipeline {
     pub backend: Backend,
     /// Stages in topological order.
     pub stages: Vec<PipelineStage>,
+    /// Code versions of its kinds at the time it was read, those beyond 1. They stand here so that a journal that is replayed by a later
+    /// program makes the keys that it made.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub code_versions: BTreeMap<String, u32>,
 }
 
 /// A node of a pipeline.
@@ -138,6 +142,15 @@ impl Pipeline {
         if !crate::id::is_name(&self.name) {
             wrong.push(format!("`{}` is not a pipeline name", self.name));
         }
+        for settings in StageSettings::all() {
+            let known = settings.code_version();
+            if let Some(newer) = self.code_versions.get(settings.kind()).filter(|version| **version > known) {
+                let kind = settings.kind();
+                wrong.push(format!(
+                    "it has `{kind}` at code version {newer}, this program computes {known}; use one build for both"
+                ));
+            }
+        }
         let mut found = graph::ByStage::new();
         for (i, stage) in self.stages.iter().enumerate() {
             if self.stages[..i].iter().any(|other| other.name == stage.name) {
@@ -175,30 +188,32 @@ impl Pipeline {
         if wrong.is_empty() { Ok(()) } else { Err(wrong.join("\n")) }
     }
 
-    /// The identity of `stage`, once the artifacts it reads are known.
+    /// The identity of `stage`, once the artifacts it reads are known: all that decides its value. `inputs` are artifacts by field; what the
+    /// stage reads from outside is added.
     pub fn identity(&self, stage: &PipelineStage, inputs: &BTreeMap<String, Digest>) -> StageIdentity {
-        identity(stage, inputs, self.seed, self.backend)
+        let mut all = stage.external.clone();
+        all.extend(inputs.iter().map(|(field, digest)| (field.clone(), *digest)));
+        StageIdentity {
+            settings: stage.settings.without_references(),
+            code_version: self.code_versions.get(stage.settings.kind()).copied().unwrap_or(FIRST_VERSION),
+            inputs: all,
+            seed: self.seed,
+            name: keyed_as(stage).clone(),
+            backend: self.backend,
+        }
+    }
+
+    /// Notes the code versions of its kinds, those that judge trials included.
+    pub(crate) fn note_code_versions(&mut self) {
+        let judges = self.stages.iter().filter_map(|stage| stage.sweep.as_ref()).map(|sweep| &*sweep.evaluate);
+        let kinds = self.stages.iter().map(|stage| &stage.settings).chain(judges);
+        let beyond = kinds.filter(|settings| settings.code_version() > FIRST_VERSION);
+        self.code_versions = beyond.map(|settings| (settings.kind().to_owned(), settings.code_version())).collect();
     }
 }
 
-/// All that decides the value of `stage`. `inputs` are artifacts by field; what the stage reads from outside is added.
-pub fn identity(
-    stage: &PipelineStage,
-    inputs: &BTreeMap<String, Digest>,
-    seed: Seed,
-    backend: Backend,
-) -> StageIdentity {
-    let mut all = stage.external.clone();
-    all.extend(inputs.iter().map(|(field, digest)| (field.clone(), *digest)));
-    StageIdentity {
-        settings: stage.settings.without_references(),
-        code_version: stage.settings.code_version(),
-        inputs: all,
-        seed,
-        name: keyed_as(stage).clone(),
-        backend,
-    }
-}
+/// The code version of every kind that has not changed yet.
+const FIRST_VERSION: u32 = 1;
 
 /// The name that keys a stage's randomness.
 pub fn keyed_as(stage: &PipelineStage) -> &StageName {

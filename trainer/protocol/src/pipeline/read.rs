@@ -93,7 +93,10 @@ impl Reader {
         let (written, stages) = self.stages(&root);
         let stages = self.connect(&root, &written, stages);
         let (head, stages) = (head?, stages?);
-        Some(Pipeline { name: head.name, seed: head.seed, backend: head.backend, stages })
+        let Head { name, seed, backend } = head;
+        let mut pipeline = Pipeline { name, seed, backend, stages, code_versions: BTreeMap::new() };
+        pipeline.note_code_versions();
+        Some(pipeline)
     }
 
     fn head(&mut self, root: &Node) -> Option<Head> {

@@ -4,7 +4,7 @@
 
 use crate::id::is_name;
 use crate::stage::{
-    Batch, Distance, Distillation, LatentShape, MultiModality, Network, Optimizer, Placement, Register, Sampler,
+    Batch, Distance, Distillation, Keep, LatentShape, MultiModality, Network, Optimizer, Placement, Register, Sampler,
     StageSettings, Training,
 };
 
@@ -320,7 +320,18 @@ fn workers(p: &mut Problems, placement: &Placement) {
         let message = format!("`workers.max` is {}, below `workers.min`, {}", w.max, w.min);
         p.add("workers.max", message, "0 sets no upper bound");
     }
-    p.positive("checkpoint.keep.latest", placement.checkpoint.keep.latest);
+    let keep = &placement.checkpoint.keep;
+    p.positive("checkpoint.keep.latest", keep.latest);
+    if keep.metric.trim().is_empty() {
+        p.add(
+            "checkpoint.keep.metric",
+            "`checkpoint.keep.metric` is empty; expected a value that the stage records",
+            "",
+        );
+    } else if keep.best == 0 && keep.metric != Keep::default().metric {
+        let message = format!("`checkpoint.keep.metric` is `{}`, but no best are kept", keep.metric);
+        p.add("checkpoint.keep.metric", message, "set `checkpoint.keep.best` to how many");
+    }
 }
 
 fn register(p: &mut Problems, s: &Register) {

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use super::*;
+use crate::stage::{Keep, Mode};
 
 /// A pipeline that is right; cases replace a part of it.
 const GOOD: &str = "name: p
@@ -138,8 +139,32 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
     ("from: pcm, ", "", "17:3", &["`from` is missing"]),
     ("model: m,", "model: 'a b',", "17:", &["is not a model name"]),
     ("latent_fid <= 1", "latent_fid = 1", "17:", &["is not a gate"]),
+    (
+        "    steps: 10\n",
+        "    steps: 10\n    checkpoint: {keep: {metrc: joint}}\n",
+        "",
+        &["unknown key `metrc`", "`metric`"],
+    ),
+    (
+        "    steps: 10\n",
+        "    steps: 10\n    checkpoint: {keep: {mode: least}}\n",
+        "",
+        &["the text `least`", "`min`, `max`"],
+    ),
+    (
+        "    steps: 10\n",
+        "    steps: 10\n    checkpoint: {keep: {metric: joint}}\n",
+        "",
+        &["no best are kept", "keep.best"],
+    ),
     ("to: staging, ", "", "17:", &["names no alias"]),
     // Two stages each fine alone.
+    (
+        "  recon: ",
+        "  judge: {kind: import.evaluator, format: kit, path: t2m}\n  real: {kind: evaluate.t2m, real: true, evaluator: judge}\n  recon: ",
+        "16:",
+        &["`judge` is an evaluator for skeletons of 21 joints (kit)", "`dataset` have 22", "train.evaluator"],
+    ),
     (
         "  mld: {kind: train.mld,",
         "  v1: {kind: train.vae, latent: {tokens: 1, dim: 256}}\n  mld: {kind: train.mld, vae: v1,",
@@ -390,4 +415,40 @@ fn every_shipped_pipeline_is_valid() {
         }
     }
     assert!(seen >= 7, "{seen}");
+}
+
+#[test]
+fn how_checkpoints_are_kept_is_no_part_of_a_stage_s_key() {
+    let kept = GOOD.replace(
+        "    steps: 10\n",
+        "    steps: 10\n    checkpoint: {every: 5, keep: {best: 2, metric: joint, mode: max}}\n",
+    );
+    let (plain, kept) = (read("p.yaml", GOOD, &[]).unwrap(), read("p.yaml", &kept, &[]).unwrap());
+    let vae = |pipeline: &Pipeline| pipeline.stage(&"vae".into()).unwrap().clone();
+    let expected = Keep { latest: 2, best: 2, metric: "joint".into(), mode: Mode::Max };
+    assert_eq!(vae(&kept).placement.checkpoint.keep, expected);
+    let inputs = BTreeMap::from([("dataset".to_owned(), Digest::of(b"d"))]);
+    assert_eq!(plain.identity(&vae(&plain), &inputs), kept.identity(&vae(&kept), &inputs));
+}
+
+#[test]
+fn a_pipeline_of_an_earlier_program_keeps_its_name_and_its_keys() {
+    let now = read("p.yaml", GOOD, &[]).unwrap();
+    let recon = now.stage(&"recon".into()).unwrap();
+    let version = |pipeline: &Pipeline| pipeline.identity(recon, &BTreeMap::new()).code_version;
+    assert_eq!(version(&now), recon.settings.code_version());
+    assert!(version(&now) > 1, "the kind has changed since");
+    // As it was written before: without code versions, and without what ranks checkpoints.
+    let mut before = serde_json::to_value(&now).unwrap();
+    before.as_object_mut().unwrap().remove("code_versions").expect("there are some");
+    for stage in before["stages"].as_array_mut().unwrap() {
+        let keep = stage["placement"]["checkpoint"]["keep"].as_object_mut().unwrap();
+        keep.remove("metric").zip(keep.remove("mode")).expect("both are written today");
+    }
+    let read: Pipeline = serde_json::from_value(before.clone()).unwrap();
+    read.check().unwrap();
+    assert_eq!(read.digest(), crate::canonical::digest(&before), "runs are named by it");
+    assert_eq!(version(&read), 1, "a journal that is replayed makes the keys that it made");
+    let newer = Pipeline { code_versions: BTreeMap::from([("train.vae".to_owned(), 99)]), ..now };
+    assert!(newer.check().unwrap_err().contains("`train.vae` at code version 99"));
 }

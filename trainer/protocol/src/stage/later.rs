@@ -10,7 +10,7 @@ use serde_json::Value;
 use super::{Placement, StageSettings};
 
 /// (a kind's name or [`PLACEMENT`], the field's path such as `sampler.order`).
-const LATER: &[(&str, &str)] = &[];
+const LATER: &[(&str, &str)] = &[(PLACEMENT, "checkpoint.keep.metric"), (PLACEMENT, "checkpoint.keep.mode")];
 
 /// What owns the fields of [`Placement`], which count for a pipeline's digest.
 const PLACEMENT: &str = "placement";

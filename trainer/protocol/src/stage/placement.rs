@@ -1,7 +1,10 @@
 //! What cannot change a stage's value: where it runs and how often it saves.
 
+use std::collections::BTreeMap;
+
 use serde::{Deserialize, Serialize};
 
+use super::Mode;
 use crate::Steps;
 
 /// What cannot change a stage's value: where it runs and how often it saves.
@@ -47,17 +50,129 @@ impl Default for CheckpointPolicy {
 }
 
 /// Which checkpoints of a task are kept; the union.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Keep {
     /// Newest.
     pub latest: usize,
-    /// Best by the stage's loss.
+    /// Best by `metric`.
     pub best: usize,
+    /// One of the values that the stage saves with its checkpoints: means over the last hundred steps of what it records.
+    pub metric: String,
+    /// Its direction.
+    pub mode: Mode,
 }
 
 impl Default for Keep {
     fn default() -> Self {
-        Self { latest: 2, best: 0 }
+        Self { latest: 2, best: 0, metric: "loss".into(), mode: Mode::Min }
+    }
+}
+
+impl Keep {
+    /// Which of a task's checkpoints stay, given their metrics, oldest first: the newest one at least, and of equally good ones the newer.
+    /// What is no finite number is never best. All stay where none has the metric, for nobody can say which is best.
+    pub fn kept(&self, oldest_first: &[&BTreeMap<String, f64>]) -> Vec<bool> {
+        let count = oldest_first.len();
+        if self.best > 0 && count > 0 && oldest_first.iter().all(|metrics| !metrics.contains_key(&self.metric)) {
+            return vec![true; count];
+        }
+        let sign = if self.mode == Mode::Max { -1.0 } else { 1.0 };
+        let value =
+            |metrics: &BTreeMap<String, f64>| metrics.get(&self.metric).filter(|v| v.is_finite()).map(|v| sign * v);
+        let mut ranked: Vec<(f64, usize)> =
+            oldest_first.iter().enumerate().filter_map(|(i, metrics)| Some((value(metrics)?, i))).collect();
+        ranked.sort_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)));
+        let mut kept: Vec<bool> = (0..count).map(|i| i + self.latest.max(1) >= count).collect();
+        ranked.iter().take(self.best).for_each(|(_, i)| kept[*i] = true);
+        kept
+    }
+
+    /// Refuses a metric that is not among `saved`, if the best are to be kept.
+    ///
+    /// # Errors
+    /// What there is.
+    pub fn check<'a>(&self, saved: impl IntoIterator<Item = &'a str>) -> Result<(), String> {
+        let saved: Vec<&str> = saved.into_iter().collect();
+        if self.best == 0 || saved.contains(&self.metric.as_str()) {
+            return Ok(());
+        }
+        Err(format!(
+            "`checkpoint.keep.metric` is `{}`, which is not saved with its checkpoints; there is: {}",
+            self.metric,
+            if saved.is_empty() { "nothing".to_owned() } else { saved.join(", ") }
+        ))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A small generator, so that the cases are the same everywhere.
+    fn dice(state: &mut u64) -> u64 {
+        *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        *state >> 33
+    }
+
+    #[test]
+    fn the_newest_and_the_best_by_any_metric_stay() {
+        let mut state = 7;
+        for _ in 0..4000 {
+            let count = dice(&mut state) as usize % 9;
+            let rows: Vec<BTreeMap<String, f64>> = (0..count)
+                .map(|_| {
+                    // Few values, so that some are equal; some are no numbers, some are missing.
+                    let value = match dice(&mut state) % 8 {
+                        0 => f64::NAN,
+                        1 => f64::INFINITY,
+                        2 => f64::NEG_INFINITY,
+                        n => n as f64,
+                    };
+                    let mut row = BTreeMap::from([("loss".to_owned(), dice(&mut state) as f64)]);
+                    if !dice(&mut state).is_multiple_of(5) {
+                        row.insert("joint".to_owned(), value);
+                    }
+                    row
+                })
+                .collect();
+            let mode = if dice(&mut state).is_multiple_of(2) { Mode::Min } else { Mode::Max };
+            let (latest, best) = (dice(&mut state) as usize % 4, dice(&mut state) as usize % 4);
+            let keep = Keep { latest, best, metric: "joint".into(), mode };
+            let kept = keep.kept(&rows.iter().collect::<Vec<_>>());
+            assert_eq!(kept.len(), count);
+            if best > 0 && rows.iter().all(|row| !row.contains_key("joint")) {
+                assert!(kept.iter().all(|kept| *kept), "nothing is lost by a metric that is not there");
+                continue;
+            }
+            let newest = count.saturating_sub(latest.max(1));
+            assert!(kept[newest..].iter().all(|kept| *kept), "{keep:?} {rows:?} {kept:?}");
+            // Slowly: a checkpoint is among the best if fewer than `best` are better, or as good and newer.
+            let finite = |i: usize| rows[i].get("joint").copied().filter(|v| v.is_finite());
+            let beats = |i: usize, j: usize| match (finite(i), finite(j)) {
+                (Some(a), Some(b)) if a == b => i > j,
+                (Some(a), Some(b)) => (a < b) == (mode == Mode::Min),
+                (a, _) => a.is_some(),
+            };
+            for i in 0..count {
+                let among = finite(i).is_some() && (0..count).filter(|j| beats(*j, i)).count() < best;
+                assert_eq!(kept[i], i >= newest || among, "{i} of {keep:?} {rows:?} {kept:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_policy_that_was_written_before_it_had_a_metric_reads() {
+        let old: Keep = serde_json::from_str(r#"{"latest": 3, "best": 1}"#).expect("reads");
+        assert_eq!(old, Keep { latest: 3, best: 1, ..Keep::default() });
+    }
+
+    #[test]
+    fn a_metric_that_is_not_saved_is_refused_with_those_that_are() {
+        let keep = Keep { best: 1, metric: "fid".into(), ..Keep::default() };
+        let refused = keep.check(["loss", "joint"]).expect_err("no `fid`");
+        assert!(refused.contains("`fid`") && refused.contains("loss, joint"), "{refused}");
+        assert_eq!(keep.check(["fid"]), Ok(()));
+        assert_eq!(Keep { best: 0, ..keep }.check(["loss"]), Ok(()), "nothing is ranked");
     }
 }

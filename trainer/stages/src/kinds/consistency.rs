@@ -58,16 +58,13 @@ impl Distiller {
         let blobs = cx.blobs();
         let (_, manifest) = artifacts::input(cx, "teacher", ArtifactKind::Denoiser)?;
         let teacher_meta: DenoiserMeta = artifacts::meta(&manifest, "the teacher")?;
-        let stage = &cx.task().name;
         if teacher_meta.family != Family::Mld {
-            return Err(StageError::Input(format!(
-                "stage `{stage}`: `teacher` is a student; name a `train.mld` stage"
-            )));
+            return Err(StageError::Input("`teacher` is a student; name a `train.mld` stage".into()));
         }
         if teacher_meta.vae != data.vae() {
-            return Err(StageError::Input(format!(
-                "stage `{stage}`: `latents` were made by another VAE than the teacher was trained on; name the teacher's latents"
-            )));
+            return Err(StageError::Input(
+                "`latents` were made by another VAE than the teacher was trained on; name the teacher's latents".into(),
+            ));
         }
         let device = cx.device();
         let weights = artifacts::file(&*blobs, &manifest, MODEL_FILE)?;

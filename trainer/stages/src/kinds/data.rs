@@ -37,7 +37,7 @@ fn log_report(cx: &mut dyn AttemptContext, report: &OpenReport) {
 /// Makes clips from nothing but the seed.
 pub(super) fn synthetic(cx: &mut dyn AttemptContext, settings: &DataSynthetic) -> Result<Outcome, StageError> {
     if settings.clips == 0 {
-        return Err(StageError::Input(format!("stage `{}`: `clips` is 0, expected at least 1", cx.task().name)));
+        return Err(StageError::Input("`clips` is 0, expected at least 1".into()));
     }
     let dataset = motion::synthetic::generate(settings, cx.task().seed);
     let text = format!("made by the program: {} clips, {} captions\n", dataset.clips.len(), dataset.captions.len());

@@ -39,7 +39,7 @@ pub(super) fn shard(
     let (vae_digest, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
     let (_, dataset) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
     if settings.crops == 0 {
-        return Err(StageError::Input(format!("stage `{}`: `crops` is 0, expected at least 1", cx.task().name)));
+        return Err(StageError::Input("`crops` is 0, expected at least 1".into()));
     }
     let dataset = artifacts::dataset(&*blobs, &dataset)?;
     let vae = Autoencoder::read(&*blobs, &vae, &cx.device())?;

@@ -21,7 +21,7 @@ use motion::dataset::{Dataset, crop, window};
 use protocol::stage::{Positions, Split, TrainEvaluator};
 use protocol::{ArtifactKind, Seed};
 
-use super::{dropout_seed, schedule};
+use super::{dropout_seed, no_clips, schedule};
 use crate::artifacts;
 use crate::context::{GangContext, Outcome, StageError};
 use crate::evaluator::{self, EvaluatorMeta, UNIT, normalise};
@@ -280,11 +280,11 @@ pub(super) fn run(cx: &mut dyn GangContext, settings: &TrainEvaluator) -> Result
     let steps = settings.training.steps.0;
     let turn = turning_point(settings);
     if train_entries.is_empty() {
-        return Err(StageError::Input(format!("stage `{stage}`: the training split has no clips")));
+        return Err(no_clips());
     }
     if turn == 0 || turn >= steps {
         return Err(StageError::Input(format!(
-            "stage `{stage}`: `movement.until` gives {turn} of {steps} steps to the movements; both phases need some"
+            "`movement.until` gives {turn} of {steps} steps to the movements; both phases need some"
         )));
     }
     let words = Words::open(&settings.words)?;

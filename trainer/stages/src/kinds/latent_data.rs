@@ -6,6 +6,7 @@ use motion::dataset::Split;
 use protocol::stage::Training;
 use protocol::{ArtifactKind, Digest, Seed, StageName};
 
+use super::no_clips;
 use crate::artifacts::{self, Embeddings, Latents};
 use crate::context::{AttemptContext, StageError};
 use crate::train::{Order, Pick};
@@ -48,13 +49,13 @@ impl LatentData {
         let stage = cx.task().name.clone();
         if captions > embeddings.meta.captions {
             return Err(StageError::Input(format!(
-                "stage `{stage}`: `latents` refers to {captions} captions, `text` embeds {}; both must come from one dataset",
+                "`latents` refers to {captions} captions, `text` embeds {}; both must come from one dataset",
                 embeddings.meta.captions
             )));
         }
         let train: Vec<usize> = (0..latents.entries()).filter(|e| latents.meta.splits[*e] == Split::Train).collect();
         if train.is_empty() {
-            return Err(StageError::Input(format!("stage `{stage}`: the training split has no clips")));
+            return Err(no_clips());
         }
         let seed = cx.task().seed;
         let order = Order::new(seed, stage.as_str(), train.len(), training.batch.global, 1);

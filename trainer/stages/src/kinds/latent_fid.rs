@@ -17,7 +17,7 @@ use protocol::{ArtifactKind, Digest, Manifest, Seed};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::publish_report;
+use super::{no_entries, publish_report};
 use crate::artifacts::{self, DenoiserMeta, Embeddings, Family, Latents, Tensors, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::latent_fid::{
@@ -67,8 +67,7 @@ struct Plan<'a> {
 impl<'a> Plan<'a> {
     fn read(cx: &dyn AttemptContext, settings: &'a EvaluateLatentFid) -> Result<(Self, Manifest), StageError> {
         let blobs = cx.blobs();
-        let name = &cx.task().name;
-        let refuse = |text: String| Err(StageError::Input(format!("stage `{name}`: {text}")));
+        let refuse = |text: String| Err(StageError::Input(text));
         let (model_digest, manifest) = artifacts::input(cx, "model", ArtifactKind::Denoiser)?;
         let model: DenoiserMeta = artifacts::meta(&manifest, "the denoiser")?;
         let latents = Latents::read(&*blobs, &artifacts::input(cx, "latents", ArtifactKind::Latents)?.1)?;
@@ -81,6 +80,9 @@ impl<'a> Plan<'a> {
             Wanted::Test => split == Split::Test,
         };
         let entries: Vec<usize> = (0..latents.entries()).filter(|&e| wanted(latents.meta.splits[e])).collect();
+        if entries.is_empty() {
+            return Err(no_entries(settings.split));
+        }
         if entries.len() * settings.samples < 2 || entries.len() * latents.meta.crops < 2 {
             return refuse(format!("{} entries of the split are too few to compare with", entries.len()));
         }

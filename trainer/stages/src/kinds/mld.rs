@@ -69,8 +69,7 @@ pub(super) fn run(cx: &mut dyn GangContext, settings: &TrainMld) -> Result<Outco
     let vae: VaeMeta = artifacts::meta(&vae, "the VAE")?;
     if data.vae() != vae_digest || data.meta().latent != vae.latent {
         return Err(StageError::Input(format!(
-            "stage `{}`: `latents` were made by another VAE ({} x {} latents) than `vae` ({} x {}); name the VAE that encoded them",
-            cx.task().name,
+            "`latents` were made by another VAE ({} x {} latents) than `vae` ({} x {}); name the VAE that encoded them",
             data.meta().latent.tokens,
             data.meta().latent.dim,
             vae.latent.tokens,

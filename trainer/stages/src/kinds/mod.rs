@@ -23,7 +23,7 @@ use models::flat::add_gradients;
 use models::optim::LrSchedule;
 use motion::Stream;
 use protocol::ArtifactKind;
-use protocol::stage::{StageSettings, Training};
+use protocol::stage::{Split, StageSettings, Training};
 use serde_json::{Value, json};
 
 use crate::artifacts;
@@ -93,6 +93,21 @@ fn slice_gradient<M: Module>(module: &M, loss: Tensor<1>) -> (Vec<f32>, f32) {
 /// What a stage's dropout is keyed by: the run's seed and the stage's name.
 fn dropout_seed(cx: &dyn AttemptContext) -> u64 {
     Stream::new(cx.task().seed, &format!("{}/dropout", cx.task().name), 0, 0).bits()
+}
+
+/// Settings' own word for one of them, such as `humanml3d` or `test`.
+pub(crate) fn word(setting: &impl serde::Serialize) -> String {
+    serde_json::to_value(setting).ok().and_then(|value| Some(value.as_str()?.to_owned())).unwrap_or_default()
+}
+
+/// A split that an evaluation cannot be of.
+fn no_entries(split: Split) -> StageError {
+    StageError::Input(format!("the split `{}` has no entries; set `split` to one that has", word(&split)))
+}
+
+/// Nothing to train on.
+fn no_clips() -> StageError {
+    StageError::Input("the training split has no clips; list some in the dataset's `train.txt`".into())
 }
 
 fn misplaced(settings: &StageSettings, how: &str) -> StageError {

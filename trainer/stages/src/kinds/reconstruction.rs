@@ -13,7 +13,7 @@ use protocol::{ArtifactKind, Digest};
 use serde::{Deserialize, Serialize};
 
 use super::encode::shard_range;
-use super::{REPORT_FILE, publish_report};
+use super::{REPORT_FILE, no_entries, publish_report};
 use crate::artifacts::{self, to_meta};
 use crate::context::{AttemptContext, ContextError, Outcome, StageError};
 use crate::evaluation::joints::time_mean;
@@ -52,8 +52,7 @@ pub(super) fn shard(
     vae.check_format(dataset.format)?;
     let entries = dataset.entries_of(settings.split);
     if entries.is_empty() {
-        let name = &cx.task().name;
-        return Err(StageError::Input(format!("stage `{name}`: the split {:?} has no entries", settings.split)));
+        return Err(no_entries(settings.split));
     }
 
     let range = shard_range(entries.len(), index, of);

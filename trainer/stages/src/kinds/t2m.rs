@@ -21,7 +21,7 @@ use protocol::{ArtifactKind, Digest, Seed};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
-use super::REPORT_FILE;
+use super::{REPORT_FILE, no_entries, word};
 use crate::artifacts::{self, DenoiserMeta, Embeddings, Tensors};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::frechet::{Gaussian, to_f64};
@@ -81,8 +81,7 @@ struct Plan<'a> {
 impl<'a> Plan<'a> {
     fn read(cx: &dyn AttemptContext, settings: &'a EvaluateT2m) -> Result<Self, StageError> {
         let blobs = cx.blobs();
-        let name = &cx.task().name;
-        let refuse = |text: String| Err(StageError::Input(format!("stage `{name}`: {text}")));
+        let refuse = |text: String| Err(StageError::Input(text));
         let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
         let dataset = artifacts::dataset(&*blobs, &manifest)?;
         let (evaluator, manifest) = artifacts::input(cx, "evaluator", ArtifactKind::Evaluator)?;
@@ -91,17 +90,22 @@ impl<'a> Plan<'a> {
         if settings.widen && entries.len() < POOL {
             (entries, taken) = (dataset.entries_of(Split::All), Split::All);
         }
-        let split = format!("{taken:?}").to_lowercase();
         if entries.is_empty() {
-            return refuse(format!("the split `{split}` has no entries; set `split` to one that has"));
+            return Err(no_entries(taken));
         }
         if entries.len() < POOL {
+            let instead = match taken {
+                Split::All => "there are no more in the dataset",
+                Split::Test => "set `split: all`, or `widen: true`",
+                Split::Train | Split::Val => "set `split: all`, `split: test` for a last look, or `widen: true`",
+            };
             return refuse(format!(
-                "the split `{split}` has {} entries, R-precision ranks a motion among {POOL}; set `split: all`, `split: test` for a last look, or `widen: true`",
+                "the split `{}` has {} entries, R-precision ranks a motion among {POOL}; {instead}",
+                word(&taken),
                 entries.len()
             ));
         }
-        judge.check(&dataset, &entries).map_err(|e| StageError::Input(format!("stage `{name}`: {e}")))?;
+        judge.check(&dataset, &entries)?;
         if settings.repeats == 0 {
             return refuse("`repeats` is 0, expected at least 1".into());
         }
@@ -160,8 +164,7 @@ struct Maker {
 impl Maker {
     fn read(cx: &dyn AttemptContext, plan: &Plan<'_>) -> Result<Self, StageError> {
         let blobs = cx.blobs();
-        let name = &cx.task().name;
-        let refuse = |text: String| Err(StageError::Input(format!("stage `{name}`: {text}")));
+        let refuse = |text: String| Err(StageError::Input(text));
         let (_, manifest) = artifacts::input(cx, "model", ArtifactKind::Denoiser)?;
         let meta: DenoiserMeta = artifacts::meta(&manifest, "the denoiser")?;
         let (vae_digest, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
@@ -428,8 +431,8 @@ pub(super) fn merge(
     }
     if plan.split != settings.split {
         cx.log(&format!(
-            "the split `{:?}` is too small for pools of {POOL}: measured on all {samples} entries",
-            settings.split
+            "the split `{}` is too small for pools of {POOL}: measured on all {samples} entries",
+            word(&settings.split)
         ));
     }
     metrics.insert("samples".to_owned(), samples as f64);

@@ -15,7 +15,7 @@ use motion::dataset::{Dataset, crop, window};
 use protocol::stage::{Split, TrainVae};
 use protocol::{ArtifactKind, Seed};
 
-use super::{schedule, slice_gradient};
+use super::{no_clips, schedule, slice_gradient};
 use crate::artifacts::{self, MODEL_FILE, VaeMeta, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::train::{GroupPlan, Objective, Order, Pick, SliceResult, TrainState, Trained, train};
@@ -131,7 +131,7 @@ impl Objective for VaeObjective {
         let part = |x: &Option<Tensor<1>>| x.clone().map_or(0.0, |x| x.inner().into_scalar::<f32>() / global as f32);
         let (feature, joint, kl) = (part(&terms.feature), part(&terms.joint), part(&terms.kl));
         let Some(loss) = terms.total() else {
-            return Err(StageError::Input(format!("stage `{}`: every weight in `loss` is 0", self.purpose)));
+            return Err(StageError::Input("every weight in `loss` is 0, so there is nothing to learn; set one".into()));
         };
         let (gradient, loss) = slice_gradient(&self.network, loss / global as f32);
         Ok(SliceResult { gradients: vec![gradient], terms: vec![loss, feature, joint, kl] })
@@ -145,7 +145,7 @@ pub(super) fn run(cx: &mut dyn GangContext, settings: &TrainVae) -> Result<Outco
     let train_entries = dataset.entries_of(Split::Train);
     let stage = cx.task().name.clone();
     if train_entries.is_empty() {
-        return Err(StageError::Input(format!("stage `{stage}`: the training split has no clips")));
+        return Err(no_clips());
     }
     let meta = VaeMeta {
         format: dataset.format,

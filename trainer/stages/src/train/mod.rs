@@ -27,6 +27,9 @@ pub use tree::tree_sum;
 
 /// The input that a rung of a sweep goes on from: the checkpoint that the rung before left.
 const STATE_INPUT: &str = protocol::sweep::STATE_OUTPUT;
+/// What every training records besides its own terms.
+const GRADIENT_NORM: &str = "gradient_norm";
+const LEARNING_RATE: &str = "lr";
 /// File of a checkpoint.
 pub(crate) const STATE_FILE: &str = "state.safetensors";
 
@@ -81,6 +84,9 @@ pub fn train(
     cx: &mut dyn GangContext,
 ) -> Result<Trained, StageError> {
     let (steps, slices) = (training.end().0, training.batch.slices);
+    // Before anything is computed: what is saved is known from the start.
+    let saved = objective.terms().iter().copied().chain([GRADIENT_NORM, LEARNING_RATE]);
+    cx.task().checkpoint.keep.check(saved).map_err(StageError::Input)?;
     // Names of other stages say nothing about a state, which the key of the next rung rests on.
     let config = cx.task().settings.digest();
     let mut state = TrainState::new(&objective.groups());
@@ -133,8 +139,8 @@ pub fn train(
         let mut values: Vec<(&str, f64)> =
             objective.terms().iter().copied().zip(terms.iter().map(|t| f64::from(*t))).collect();
         recent.push(&values);
-        values.push(("gradient_norm", report.norm));
-        values.push(("lr", report.lr));
+        values.push((GRADIENT_NORM, report.norm));
+        values.push((LEARNING_RATE, report.lr));
         if due(state.step, steps) {
             cx.record(state.step, &values);
         }

@@ -1,0 +1,159 @@
+//! Models to draw motions from: a registered version, or what a stage of a run gave.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use burn::tensor::Device;
+use checkpoint::bundle::{bundle, vae_of};
+use checkpoint::{BlobError, Blobs};
+use models::device::DeviceInfo;
+use protocol::message::RunView;
+use protocol::{Digest, Manifest};
+use registry::cli::{Command, Data};
+use stages::context::StageError;
+
+use crate::client::Client;
+use crate::problem::{Problem, Result, exit};
+
+/// A model with all that it needs.
+#[derive(Debug)]
+pub(super) struct Found {
+    pub(super) manifest: Manifest,
+    pub(super) blobs: Fetched,
+    pub(super) label: Label,
+}
+
+/// What a name stood for.
+#[derive(Debug)]
+pub(super) enum Label {
+    /// A name in the registry, and its version.
+    Version(String, u64),
+    /// A run, and its stage.
+    Stage(String, String),
+}
+
+impl fmt::Display for Label {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Version(name, version) => write!(f, "{name} (version {version})"),
+            Self::Stage(run, stage) => write!(f, "{stage} of {run}"),
+        }
+    }
+}
+
+/// A model's blobs, fetched once and verified.
+#[derive(Debug, Default)]
+pub(super) struct Fetched(Mutex<BTreeMap<Digest, Arc<[u8]>>>);
+
+impl Blobs for Fetched {
+    fn get(&self, digest: Digest) -> std::result::Result<Arc<[u8]>, BlobError> {
+        let blobs = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        blobs.get(&digest).cloned().ok_or(BlobError::NotFound(digest))
+    }
+
+    fn put(&self, _: Vec<u8>) -> std::result::Result<Digest, BlobError> {
+        Err(BlobError::Refused("a model is only read here".into()))
+    }
+}
+
+impl Fetched {
+    /// The files of a manifest.
+    async fn files(client: &Client, manifest: &Manifest) -> Result<Self> {
+        let blobs = Self::default();
+        for file in manifest.files.values() {
+            let bytes = verified(client, file.digest).await?;
+            blobs.0.lock().unwrap_or_else(PoisonError::into_inner).insert(file.digest, bytes.into());
+        }
+        Ok(blobs)
+    }
+}
+
+async fn verified(client: &Client, name: Digest) -> Result<Vec<u8>> {
+    let bytes = client.blob(name).await?;
+    let found = Digest::of(&bytes);
+    if found != name {
+        return Err(Problem::failed(BlobError::Corrupt { expected: name, found })
+            .hint("`trainer registry fsck` checks the store"));
+    }
+    Ok(bytes)
+}
+
+/// A version of the registry: MODEL@ALIAS, MODEL@best or MODEL:VERSION.
+pub(super) async fn version(client: &Client, name: &str) -> Result<Found> {
+    let answer = client.registry(&Command::Show { reference: name.to_owned() }).await?;
+    if let Some(error) = answer.error {
+        let mut problem = Problem::new(answer.exit, anyhow::anyhow!("{}", error.message));
+        problem.hint = error.hint;
+        return Err(problem);
+    }
+    let (version, manifest) = match answer.data {
+        Some(Data::Version { version, manifest }) => (version, manifest),
+        Some(Data::Model { model, .. }) => {
+            let aliases: Vec<String> = model.aliases.keys().map(|alias| format!("{name}@{alias}")).collect();
+            let problem = Problem::usage(format!("`{name}` is a model; which of its {} versions?", model.versions));
+            return Err(problem.hint(format!("name one, such as {name}@best {}", aliases.join(" "))));
+        }
+        _ => {
+            return Err(Problem::new(
+                exit::FAULT,
+                anyhow::anyhow!("the registry answered something else than a model"),
+            ));
+        }
+    };
+    let blobs = Fetched::files(client, &manifest).await?;
+    Ok(Found { manifest, blobs, label: Label::Version(name.to_owned(), version.version) })
+}
+
+/// The denoiser that a stage of `run` gave, with the VAE whose latents it makes.
+pub(super) async fn stage(client: &Client, run: &RunView, name: &str) -> Result<Found> {
+    let denoiser = run.stages.iter().find(|stage| stage.name.as_str() == name).map(|stage| stage.outputs.get(DENOISER));
+    let Some(Some(denoiser)) = denoiser else {
+        let have = run.stages.iter().filter(|stage| stage.of.is_none() && stage.outputs.contains_key(DENOISER));
+        let have: Vec<&str> = have.map(|stage| stage.name.as_str()).collect();
+        let why = if denoiser.is_none() { "has no stage" } else { "has no denoiser yet from stage" };
+        let problem = Problem::new(exit::NOT_FOUND, anyhow::anyhow!("run `{}` {why} `{name}`", run.run));
+        return Err(problem.hint(match have.as_slice() {
+            [] => "no stage of it gave one yet; `trainer status --all` lists other runs, --run takes one".to_owned(),
+            have => format!("stages of it that gave one: {}; --run names another run", have.join(", ")),
+        }));
+    };
+    let manifest = async |digest: Digest| -> Result<Manifest> {
+        let manifest: Manifest = serde_json::from_slice(&verified(client, digest).await?)
+            .map_err(|error| Problem::failed(format!("{digest} is no manifest: {error}")))?;
+        if manifest.format != Manifest::FORMAT {
+            let (found, known) = (manifest.format, Manifest::FORMAT);
+            return Err(Problem::failed(format!("{digest} has format {found}, this program knows {known}")));
+        }
+        Ok(manifest)
+    };
+    let denoiser = manifest(*denoiser).await?;
+    let vae = manifest(vae_of(&denoiser).map_err(Problem::failed)?).await?;
+    let model = bundle(&denoiser, &vae).map_err(|error| Problem::failed(format!("stage `{name}`: {error}")))?;
+    let blobs = Fetched::files(client, &model).await?;
+    Ok(Found { manifest: model, blobs, label: Label::Stage(run.run.to_string(), name.to_owned()) })
+}
+
+/// The output of stages that give a denoiser.
+const DENOISER: &str = "denoiser";
+
+/// The first device of a backend.
+pub(super) fn device(backend: Option<&str>) -> Result<(Device, DeviceInfo)> {
+    let all = models::device::available();
+    let names: Vec<&str> = all.iter().map(|device| device.backend.name()).collect();
+    let none =
+        || Problem::usage(format!("`--backend {}`: expected one of {}", backend.unwrap_or_default(), names.join(", ")));
+    let found = all.iter().find(|device| match backend {
+        None => device.index.is_some(),
+        Some(name) => device.backend.name() == name,
+    });
+    let found = found.ok_or_else(none)?;
+    let device = models::device::open(found.backend, 0).map_err(|error| Problem::new(exit::USAGE, error))?;
+    Ok((device, found.clone()))
+}
+
+/// A sampler or a length that the model does not have is the user's.
+pub(super) fn refused(error: StageError) -> Problem {
+    let exit = if matches!(error, StageError::Input(_)) { exit::USAGE } else { exit::FAILED };
+    Problem::new(exit, error)
+}

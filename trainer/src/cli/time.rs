@@ -1,0 +1,217 @@
+//! `trainer time`: how long models take for a sentence, side by side.
+
+use std::path::Path;
+
+use clap::Args;
+use models::device::DeviceInfo;
+use protocol::stage::Sampler;
+use serde_json::json;
+use stages::generate::{DEFAULT_FRAMES, Generator};
+use stages::timing::{self, Times, WARM_UP};
+
+use super::model;
+use crate::client::{Client, Target};
+use crate::print::{self, Output};
+use crate::problem::{Problem, Result};
+
+#[derive(Debug, Args)]
+pub(crate) struct TimeArgs {
+    /// MODEL@ALIAS, MODEL@best or MODEL:VERSION
+    #[arg(required_unless_present = "stage")]
+    model: Vec<String>,
+    /// What a stage of a run gave, such as the teacher; these come first in the table
+    #[arg(long, value_name = "STAGE")]
+    stage: Vec<String>,
+    /// The run of --stage: its name, a unique beginning of it, or `@last`
+    #[arg(long, default_value = "@last", requires = "stage")]
+    run: String,
+    /// Sampling steps, a row for each that the model has [default: the model's own]
+    #[arg(long, value_name = "N", value_delimiter = ',')]
+    steps: Vec<usize>,
+    /// Guidance: a teacher's scale g, a student's w = g - 1 [default: the model's own]
+    #[arg(long, value_name = "W")]
+    guidance: Option<f64>,
+    /// Sentences that are timed, after a warm-up
+    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    sentences: u32,
+    /// Length of each motion in frames [default: 120]
+    #[arg(long, value_name = "N")]
+    frames: Option<usize>,
+    /// Where to compute: flex, ndarray, wgpu or cuda [default: the first that this build and machine have]
+    #[arg(long)]
+    backend: Option<String>,
+    #[command(flatten)]
+    target: Target,
+    /// How the table is printed
+    #[arg(short, long, value_enum, default_value_t)]
+    pub(super) output: Output,
+}
+
+/// A line of the table.
+struct Row {
+    label: String,
+    sampler: Sampler,
+    times: Times,
+}
+
+pub(crate) async fn time(args: TimeArgs) -> Result<u8> {
+    let client = Client::connect(&args.target).await?;
+    let mut found = Vec::new();
+    if !args.stage.is_empty() {
+        let run = client.find(&args.run).await?;
+        for name in &args.stage {
+            found.push(model::stage(&client, &run, name).await?);
+        }
+    }
+    for name in &args.model {
+        found.push(model::version(&client, name).await?);
+    }
+    client.close().await;
+    let (device, info) = model::device(args.backend.as_deref())?;
+    let mut models: Vec<(String, Generator)> = Vec::new();
+    for found in &found {
+        let generator = Generator::load(&found.manifest, &found.blobs, &device).map_err(Problem::failed)?;
+        models.push((found.label.to_string(), generator));
+    }
+    let mut timed: Vec<(&str, &Generator, Sampler)> = Vec::new();
+    for (label, generator) in &models {
+        let samplers = samplers(label, generator, &args.steps, args.guidance).map_err(|why| {
+            Problem::usage(format!("{label}: {why}"))
+                .hint("leave --steps out for the steps that each model has by default")
+        })?;
+        timed.extend(samplers.into_iter().map(|sampler| (label.as_str(), generator, sampler)));
+    }
+
+    let sentences = timing::sentences(args.sentences as usize);
+    let progress = progress((sentences.len() + WARM_UP) * timed.len());
+    let pairs: Vec<(&Generator, &Sampler)> =
+        timed.iter().map(|(_, generator, sampler)| (*generator, sampler)).collect();
+    let all = timing::time(&pairs, &sentences, args.frames, &mut || progress.inc(1)).map_err(model::refused)?;
+    progress.finish_and_clear();
+    let row = |((label, _, sampler), timings): (&(&str, &Generator, Sampler), &Vec<timing::Timing>)| {
+        Times::of(timings).map(|times| Row { label: (*label).to_owned(), sampler: sampler.clone(), times })
+    };
+    let rows: Vec<Row> = timed.iter().zip(&all).filter_map(row).collect();
+    show(&rows, args.frames.unwrap_or(DEFAULT_FRAMES), &Machine::here(&info), args.output);
+    Ok(0)
+}
+
+/// The samplers to time a model with: its own, or one for each of `steps` that it has. Steps that only other models have are left out with a
+/// note; a model that has none of them is refused.
+fn samplers(
+    label: &str,
+    generator: &Generator,
+    steps: &[usize],
+    guidance: Option<f64>,
+) -> std::result::Result<Vec<Sampler>, String> {
+    let own = Sampler { guidance: guidance.unwrap_or(generator.sampler().guidance), ..generator.sampler().clone() };
+    if steps.is_empty() {
+        return Ok(vec![own]);
+    }
+    let with = |steps: usize| match steps == own.steps {
+        true => own.clone(),
+        false => Sampler { steps, timesteps: Vec::new(), ..own.clone() },
+    };
+    let mut refused = Vec::new();
+    let mut fits = Vec::new();
+    for sampler in steps.iter().map(|steps| with(*steps)) {
+        match generator.check_sampler(&sampler) {
+            Ok(()) => fits.push(sampler),
+            Err(why) => refused.push(why.to_string()),
+        }
+    }
+    if fits.is_empty() {
+        return Err(refused.join("; "));
+    }
+    refused.iter().for_each(|why| print::note(&format!("{label}: left out: {why}")));
+    Ok(fits)
+}
+
+/// What times hang on besides the models.
+struct Machine {
+    backend: &'static str,
+    device: String,
+    threads: usize,
+    instruction_set: &'static str,
+    processor: Option<String>,
+}
+
+impl Machine {
+    fn here(device: &DeviceInfo) -> Self {
+        let information = std::fs::read_to_string(Path::new("/proc/cpuinfo")).unwrap_or_default();
+        let processor = information.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
+        Self {
+            backend: device.backend.name(),
+            device: device.name.clone(),
+            threads: timing::threads(),
+            instruction_set: models::instruction_set(),
+            processor: processor.map(|(_, name)| name.trim().to_owned()),
+        }
+    }
+}
+
+fn show(rows: &[Row], frames: usize, machine: &Machine, output: Output) {
+    let Some(first) = rows.first() else { return };
+    let per_second = |row: &Row| frames as f64 / row.times.mean;
+    let ratio = |row: &Row| row.times.mean / first.times.mean;
+    match output {
+        Output::Json => {
+            let row = |row: &Row| {
+                json!({
+                    "model": row.label,
+                    "sampler": row.sampler,
+                    "sentences": row.times.sentences,
+                    "aits_s": row.times.mean,
+                    "median_s": row.times.median,
+                    "p95_s": row.times.p95,
+                    "text_s": row.times.text,
+                    "sampling_s": row.times.sampling,
+                    "decoding_s": row.times.decoding,
+                    "ratio": ratio(row),
+                    "frames_per_second": per_second(row),
+                })
+            };
+            print::json(&json!({
+                "schema_version": 1,
+                "frames": frames,
+                "warm_up": WARM_UP,
+                "machine": {
+                    "backend": machine.backend,
+                    "device": machine.device,
+                    "threads": machine.threads,
+                    "instruction_set": machine.instruction_set,
+                    "processor": machine.processor,
+                },
+                "rows": rows.iter().map(row).collect::<Vec<_>>(),
+            }));
+        }
+        Output::Table => {
+            let milliseconds = |seconds: f64| format!("{:.2}", seconds * 1e3);
+            let cells = rows.iter().map(|row| {
+                vec![
+                    row.label.clone(),
+                    row.sampler.steps.to_string(),
+                    milliseconds(row.times.mean),
+                    milliseconds(row.times.median),
+                    milliseconds(row.times.p95),
+                    format!("{:.3}", ratio(row)),
+                    format!("{:.0}", per_second(row)),
+                ]
+            });
+            let heads = ["MODEL", "STEPS", "AITS ms", "MEDIAN ms", "P95 ms", "RATIO", "FRAMES/s"];
+            let processor = machine.processor.as_deref().unwrap_or("processor unknown");
+            let Machine { backend, device, threads, instruction_set, .. } = machine;
+            print::out(&format!(
+                "{}\n\n{} sentences one by one after {WARM_UP} of warm-up, all models in turn, {frames} frames each; from the sentence to features\n\
+                 {backend} ({device}) with {threads} threads, {instruction_set}, {processor}",
+                print::table(&heads, cells.collect()),
+                first.times.sentences,
+            ));
+        }
+    }
+}
+
+/// A bar, where somebody sees it.
+fn progress(motions: usize) -> indicatif::ProgressBar {
+    if print::on_terminal() { indicatif::ProgressBar::new(motions as u64) } else { indicatif::ProgressBar::hidden() }
+}
