@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use cluster_tests::cluster::{Cluster, stage_of};
+use cluster_tests::cluster::{Cluster, TOKEN, stage_of};
+use cluster_tests::network::Network;
 use cluster_tests::{Bench, Running, digests, wait_for};
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
@@ -32,19 +33,26 @@ type Curves = BTreeMap<String, Vec<(u64, f64)>>;
 /// The undisturbed run of one worker: digests and every recorded value.
 fn reference() -> &'static (Value, Curves) {
     static REFERENCE: OnceLock<(Value, Curves)> = OnceLock::new();
-    REFERENCE.get_or_init(|| {
-        let mut cluster = Cluster::start(TRAINER);
-        cluster.join("w1");
-        let run = cluster.submit(&config(), &VAE);
-        let view = cluster.wait_end(&run);
-        (view.clone(), cluster.metrics(&run, "vae"))
-    })
+    REFERENCE.get_or_init(|| undisturbed(&VAE))
+}
+
+fn undisturbed(sets: &[&str]) -> (Value, Curves) {
+    let mut cluster = Cluster::start(TRAINER);
+    cluster.join("w1");
+    let run = cluster.submit(&config(), sets);
+    let view = cluster.wait_end(&run);
+    let curves = cluster.metrics(&run, "vae");
+    (view, curves)
 }
 
 /// The same values at the same steps, each once, none missing; and the same digests.
 #[track_caller]
 fn equals_reference(cluster: &Cluster, run: &str, view: &Value) {
-    let (expected, curves) = reference();
+    equals(cluster, run, view, reference());
+}
+
+#[track_caller]
+fn equals(cluster: &Cluster, run: &str, view: &Value, (expected, curves): &(Value, Curves)) {
     assert_eq!(digests(view), digests(expected), "digests");
     let found = cluster.metrics(run, "vae");
     assert_eq!(found.keys().collect::<Vec<_>>(), curves.keys().collect::<Vec<_>>());
@@ -108,6 +116,99 @@ fn p4_the_coordinator_is_killed_and_away_for_a_while() {
     } else {
         eprintln!("SKIPPED: 60 s without a coordinator (set STRIDE_LONG_TESTS=1)");
     }
+}
+
+/// One of three workers is cut off from everybody for `how_long`, in the middle of a training stage. The others go on after its lease; it
+/// comes back by itself. With `sets` under which the stage outlasts the cut, it comes back into the gang.
+fn network_cut(how_long: Duration, sets: &[&str], expected: &(Value, Curves), outlasts: bool) {
+    let Some(network) = Network::new(3) else { return };
+    let mut cluster = Cluster::listen(TRAINER, network.coordinator());
+    let names = ["w1", "w2", "w3"];
+    for (i, name) in names.into_iter().enumerate() {
+        cluster.join_by(name, &network.inside(i), &["--token", TOKEN]);
+    }
+    let run = cluster.submit(&config(), sets);
+    let is_in =
+        |stage: &Value, name: &str| stage["workers"].as_array().is_some_and(|all| all.iter().any(|w| w == name));
+    wait_for("all three to be in the gang", || {
+        let stage = cluster.stage(&run, "vae");
+        assert!(stage["state"] != "ran", "it was over before all were in");
+        names.iter().all(|name| is_in(&stage, name)).then_some(())
+    });
+    cluster.wait_step(&run, "vae", 20);
+    let pids = names.map(|name| cluster.pid(name));
+    let done = |stage: &Value| stage["progress"]["done"].as_u64().unwrap_or_default();
+
+    network.cut(2);
+    let cut = Instant::now();
+    let without = wait_for("the others to be a gang without the one that is cut off", || {
+        let stage = cluster.stage(&run, "vae");
+        (!is_in(&stage, "w3")).then_some(stage)
+    });
+    let noticed = cut.elapsed();
+    assert!(noticed < how_long, "the cut was to outlast the lease; it was noticed after {noticed:.1?}");
+    cluster.wait_step(&run, "vae", done(&without) + 10);
+    let stepped = cut.elapsed();
+    assert!(stepped < how_long, "the others took their next steps after {stepped:.1?}, during the cut");
+    wait_for("the cut to be over", || (cut.elapsed() >= how_long).then_some(()));
+    let during = cluster.stage(&run, "vae");
+    network.mend(2);
+    let mended = Instant::now();
+    wait_for("the worker to be heard again", || {
+        let workers = cluster.get("/v1/workers")?;
+        let worker = workers.as_array()?.iter().find(|worker| worker["worker"] == "w3")?.clone();
+        assert_eq!(worker["incarnation"], 1, "the same process: {worker}");
+        matches!(worker["state"].as_str(), Some("idle" | "working")).then_some(())
+    });
+    let heard = mended.elapsed();
+    if outlasts {
+        wait_for("the worker to be in the gang again", || {
+            let stage = cluster.stage(&run, "vae");
+            assert!(
+                stage["state"] != "ran",
+                "the stage was over {:.1?} after the cut, too early to tell",
+                mended.elapsed()
+            );
+            is_in(&stage, "w3").then_some(())
+        });
+        wait_for("it to take over a peer's state", || {
+            cluster
+                .said("w3")
+                .lines()
+                .any(|line| line.contains("met the gang") && line.contains("adopts=true"))
+                .then_some(())
+        });
+    }
+    eprintln!(
+        "cut for {how_long:?}: noticed after {noticed:.1?}, the others 10 steps further after {stepped:.1?}, from step {} to {} during the \
+         cut; heard again {heard:.1?} after it",
+        done(&without),
+        done(&during),
+    );
+    let view = cluster.wait_end(&run);
+    assert_eq!(stage_of(&view, "vae")["attempt"], 1, "the survivors went on from memory");
+    for (name, pid) in names.into_iter().zip(pids) {
+        assert!(cluster.alive(name) && cluster.pid(name) == pid, "worker {name} is the same process");
+        assert_eq!(cluster.said(name).matches(" joined").count(), 1, "worker {name} joined once");
+    }
+    equals(&cluster, &run, &view, expected);
+    cluster.fsck();
+}
+
+/// Sampled: a cut just longer than the lease; 30 s, in a stage that is not over by then, with `STRIDE_LONG_TESTS=1`.
+#[test]
+fn p4_a_worker_that_is_cut_off_is_gone_without_and_comes_back_by_itself() {
+    network_cut(Duration::from_secs(19), &VAE, reference(), false);
+    if std::env::var_os("STRIDE_LONG_TESTS").is_none() {
+        eprintln!("SKIPPED: a network cut of 30 s (set STRIDE_LONG_TESTS=1)");
+        return;
+    }
+    // Long enough for a gang of three, whatever this machine does in a second.
+    let seconds = stage_of(&reference().0, "vae")["wall_s"].as_f64().expect("a time");
+    let steps = format!("stages.vae.steps={}", (400.0 / seconds * 90.0).clamp(800.0, 20_000.0).round());
+    let mut sets = VAE;
+    sets[1] = &steps;
+    network_cut(Duration::from_secs(30), &sets, &undisturbed(&sets), true);
 }
 
 /// One worker, stopped past its lease in the middle of a training stage. Every kind of write is tried in its name, by the

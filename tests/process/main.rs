@@ -6,6 +6,7 @@ mod bad_input;
 mod cluster;
 mod determinism;
 mod failpoints;
+mod memory;
 mod registry;
 mod storage;
 mod sweeps;

@@ -5,8 +5,8 @@ use std::path::Path;
 use std::time::Duration;
 
 use coordinator::{Config, Coordinator, Handle, WorkerView};
-use protocol::message::{ApiError, RunView, Submit};
-use protocol::{Digest, RunId};
+use protocol::message::{ApiError, FailureClass, Orders, Poll, ReportOutcome, RunView, Submit, TaskOutcome};
+use protocol::{Digest, Incarnation, RunId, WorkerId};
 use registry::cli::{Answer, Command};
 use registry::{Holder, LogRow, OpenError, Store};
 use serde::Serialize;
@@ -152,6 +152,23 @@ impl Client {
 
     pub(crate) async fn workers(&self) -> Result<Vec<WorkerView>> {
         self.get("/v1/workers").await
+    }
+
+    /// Reports what a worker that has died can no longer report: how its work ended.
+    pub(crate) async fn fail_for(
+        &self,
+        worker: &WorkerId,
+        incarnation: Incarnation,
+        class: FailureClass,
+        message: &str,
+    ) -> Result<()> {
+        let poll = Poll { incarnation, doing: Vec::new(), version: 0 };
+        let orders: Orders = self.post(&format!("/v1/workers/{worker}/poll"), &poll).await?;
+        for assignment in orders.assignments {
+            let outcome = TaskOutcome::Failed { class, message: message.to_owned() };
+            self.post::<()>("/v1/outcomes", &ReportOutcome { grant: assignment.grant, outcome }).await?;
+        }
+        Ok(())
     }
 
     pub(crate) async fn registry(&self, command: &Command) -> Result<Answer> {

@@ -9,6 +9,7 @@ use protocol::stage::Backend;
 use tokio::process::{Child, Command};
 
 use crate::problem::{Problem, Result};
+use crate::starved::Watch;
 
 /// A worker that lives shorter than this has died at its start.
 const SHORT_LIFE: Duration = Duration::from_secs(5);
@@ -22,6 +23,8 @@ struct Member {
     device: usize,
     child: Option<Child>,
     since: Instant,
+    /// Where its words begin in the log, which is that of all its lives.
+    log_from: u64,
     early_deaths: u32,
     next_start: Instant,
 }
@@ -33,6 +36,15 @@ pub(crate) struct Fleet {
     url: String,
     backend: Backend,
     logs: PathBuf,
+    memory: Watch,
+}
+
+/// A worker's process that has ended.
+#[derive(Debug)]
+pub(crate) struct Death {
+    pub(crate) worker: WorkerId,
+    /// Why, if it was for want of memory.
+    pub(crate) starved: Option<String>,
 }
 
 impl Fleet {
@@ -47,10 +59,12 @@ impl Fleet {
             device: i % devices.max(1),
             child: None,
             since: now,
+            log_from: 0,
             early_deaths: 0,
             next_start: now,
         };
-        let mut fleet = Self { members: (0..count).map(member).collect(), url, backend, logs: logs.to_owned() };
+        let members = (0..count).map(member).collect();
+        let mut fleet = Self { members, url, backend, logs: logs.to_owned(), memory: Watch::new() };
         for i in 0..count {
             fleet.spawn(i)?;
         }
@@ -64,6 +78,7 @@ impl Fleet {
         let stderr =
             std::fs::OpenOptions::new().create(true).append(true).open(&log).map_or(Stdio::null(), Stdio::from);
         let member = &mut self.members[i];
+        member.log_from = std::fs::metadata(&log).map_or(0, |log| log.len());
         let child = Command::new(program)
             .args(["worker", "join", &self.url, "--name", member.name.as_str(), "--die-with-parent"])
             .args(["--backend", self.backend.name(), "--device", &member.device.to_string()])
@@ -84,9 +99,10 @@ impl Fleet {
         self.logs.join(format!("{worker}.log"))
     }
 
-    /// Collects workers that have died, and starts them again once their time has come. Gives the names of the dead.
-    pub(crate) fn tend(&mut self, restart: bool) -> Result<Vec<WorkerId>> {
+    /// Collects workers that have died, and starts them again once their time has come. Gives the dead.
+    pub(crate) fn tend(&mut self, restart: bool) -> Result<Vec<Death>> {
         let mut dead = Vec::new();
+        self.memory.look();
         let now = Instant::now();
         for i in 0..self.members.len() {
             let member = &mut self.members[i];
@@ -94,14 +110,16 @@ impl Fleet {
                 Some(child) => {
                     let Ok(Some(status)) = child.try_wait() else { continue };
                     member.child = None;
-                    dead.push(member.name.clone());
+                    let said = last_words(&self.logs.join(format!("{}.log", member.name)), member.log_from);
+                    let starved = self.memory.explain(status, &said);
+                    dead.push(Death { worker: member.name.clone(), starved });
                     let early = now - member.since < SHORT_LIFE;
                     member.early_deaths = if early { member.early_deaths + 1 } else { 0 };
                     member.next_start = now + if early { Duration::from_millis(500) } else { Duration::ZERO };
                     tracing::info!(worker = %member.name, %status, "worker ended");
                     if restart && member.early_deaths >= EARLY_DEATHS {
                         let (name, log) = (member.name.clone(), self.log(&self.members[i].name));
-                        let said = last_lines(&log, 5);
+                        let said = last_lines(&last_words(&log, 0), 5);
                         return Err(Problem::failed(format!(
                             "worker `{name}` died {EARLY_DEATHS} times right after its start ({status})\n{said}"
                         ))
@@ -134,9 +152,14 @@ impl Fleet {
     }
 }
 
-fn last_lines(path: &Path, count: usize) -> String {
+/// The end of what stands in the file behind `from`.
+fn last_words(path: &Path, from: u64) -> String {
     let bytes = std::fs::read(path).unwrap_or_default();
-    let text = String::from_utf8_lossy(&bytes[bytes.len().saturating_sub(8192)..]).into_owned();
+    let from = usize::try_from(from).unwrap_or(usize::MAX).clamp(bytes.len().saturating_sub(8192), bytes.len());
+    String::from_utf8_lossy(&bytes[from..]).into_owned()
+}
+
+fn last_lines(text: &str, count: usize) -> String {
     let lines: Vec<&str> = text.lines().collect();
     lines[lines.len().saturating_sub(count)..].join("\n")
 }

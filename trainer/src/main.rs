@@ -11,6 +11,7 @@ mod print;
 mod problem;
 mod progress;
 mod run;
+mod starved;
 mod summary;
 mod sweep_plot;
 mod verify;

@@ -3,14 +3,14 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use coordinator::{Config, Control, Coordinator, Handle};
-use protocol::message::{RunState, RunView, StageState, Submit};
+use coordinator::{Config, Control, Coordinator, Handle, WorkerView};
+use protocol::message::{FailureClass, RunState, RunView, StageState, Submit};
 use protocol::pipeline::Pipeline;
 use protocol::{RunId, StageName};
 use registry::{Holder, Store};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
-use crate::fleet::{self, Fleet};
+use crate::fleet::{self, Death, Fleet};
 use crate::pipeline_file::PipelineFile;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result, exit};
@@ -164,10 +164,10 @@ async fn watch(
             *fleet = Some(Fleet::start(count, handle.url(), pipeline.backend, &logs)?);
         }
         if let Some(fleet) = fleet {
-            for dead in fleet.tend(true)? {
-                progress.note(&format!("worker {dead} has died; starting it again"));
-                // A worker that never joined is not known; then there is nothing to take from it.
-                let _ = handle.worker_gone(&dead).await;
+            for death in fleet.tend(true)? {
+                let how = death.starved.as_deref().unwrap_or("has died");
+                progress.note(&format!("worker {} {how}; starting it again", death.worker));
+                bury(handle, &death).await;
             }
         }
         tokio::select! {
@@ -180,6 +180,27 @@ async fn watch(
             tokio::time::sleep(BEAT / 4).await;
         }
     }
+}
+
+/// Tells the coordinator that a worker has died, and what of.
+async fn bury(handle: &Handle, death: &Death) {
+    if let Some(why) = &death.starved {
+        // Said in the worker's own name, as it would have said it: with a grant that still holds, and never again with one that does not.
+        let held = handle.workers().into_iter().find(|view| view.worker == death.worker && view.task.is_some());
+        if let Some(view) = held
+            && let Err(problem) = fail_for(handle, &view, why).await
+        {
+            tracing::warn!(worker = %death.worker, "its work is tried again: {}", problem.error);
+        }
+    }
+    // A worker that never joined is not known; then there is nothing to take from it.
+    let _ = handle.worker_gone(&death.worker).await;
+}
+
+async fn fail_for(handle: &Handle, dead: &WorkerView, why: &str) -> Result<()> {
+    let client = client::Client::new(&handle.url(), None)?;
+    let message = format!("worker `{}` {why}", dead.worker);
+    client.fail_for(&dead.worker, dead.incarnation, FailureClass::OutOfMemory, &message).await
 }
 
 /// Whether a stage waits for somebody to do it. A run whose stages are all known needs no workers.
@@ -205,9 +226,8 @@ async fn wind_down(
         }
         let alive = match fleet {
             Some(fleet) => {
-                for dead in fleet.tend(false)? {
-                    // As above: it may be unknown.
-                    let _ = handle.worker_gone(&dead).await;
+                for death in fleet.tend(false)? {
+                    bury(handle, &death).await;
                 }
                 fleet.is_alive()
             }

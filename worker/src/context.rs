@@ -184,17 +184,23 @@ impl GangContext for HttpContext {
             let generation = mesh.terms.generation;
             match exchange::rendezvous(&mesh, applied, state, &|| held.halt(generation)) {
                 Ok(met) => {
+                    let adopted = match &met {
+                        Met::Adopt { bytes, took } => Some((bytes.len(), took.as_secs_f64())),
+                        Met::Keep => None,
+                    };
                     tracing::info!(
                         task = %mesh.terms.task,
                         %generation,
                         rank = mesh.terms.rank,
                         members = mesh.size(),
-                        adopts = matches!(met, Met::Adopt(_)),
+                        adopts = adopted.is_some(),
+                        bytes = adopted.map(|(bytes, _)| bytes),
+                        seconds = adopted.map(|(_, seconds)| seconds),
                         "met the gang"
                     );
                     return Ok(match met {
                         Met::Keep => Rendezvous::Keep,
-                        Met::Adopt(bytes) => Rendezvous::Adopt(bytes),
+                        Met::Adopt { bytes, .. } => Rendezvous::Adopt(bytes),
                     });
                 }
                 Err(Halt::Ended(reason)) => {

@@ -14,6 +14,7 @@
 //! members stop after the same step.
 
 use std::ops::Range;
+use std::time::{Duration, Instant};
 
 use bytemuck::cast_slice;
 
@@ -33,7 +34,11 @@ pub(crate) type Interrupt<'a> = &'a dyn Fn() -> Option<Halt>;
 #[derive(Debug)]
 pub(crate) enum Met {
     Keep,
-    Adopt(Vec<u8>),
+    /// A peer's state, and how long it took from the offer's being waited for to its last byte.
+    Adopt {
+        bytes: Vec<u8>,
+        took: Duration,
+    },
 }
 
 /// Finds the newest state among members and brings everybody to it.
@@ -78,6 +83,7 @@ pub(crate) fn rendezvous(
     if applied == Some(newest) {
         return Ok(Met::Keep);
     }
+    let begun = Instant::now();
     let length = expect(mesh.next(source, &barrier, interrupt)?, Kind::StateLength, mesh, source)?.step;
     if length > MAX_STATE {
         return Err(Halt::Disagree(format!(
@@ -94,7 +100,7 @@ pub(crate) fn rendezvous(
             )));
         }
     }
-    Ok(Met::Adopt(bytes))
+    Ok(Met::Adopt { bytes, took: begun.elapsed() })
 }
 
 /// What a member brings to an exchange.

@@ -6,20 +6,18 @@
 #![expect(clippy::print_stdout, reason = "a harness prints what it did and measured")]
 
 mod measure;
-mod network;
 
 use std::collections::BTreeMap;
-use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime};
 
 use cluster_tests::cluster::{Cluster, TOKEN};
-use cluster_tests::{Bench, digests, signal};
+use cluster_tests::network::Network;
+use cluster_tests::{Bench, digests, signal, wait_for};
 use nix::sys::signal::Signal;
 use serde_json::Value;
 
 use crate::measure::Kill;
-use crate::network::Network;
 
 /// The quickstart with fewer clips and steps, so that many seeds are affordable.
 const SETS: [&str; 14] = [
@@ -285,6 +283,38 @@ fn reference(trainer: &str) -> Value {
     said.json()
 }
 
+/// How long a worker takes to join a gang that trains about 20 M parameters: weights, both moments and a moving average come from a peer,
+/// over loopback.
+fn join_large(trainer: &str) {
+    const LARGE: [&str; 9] = [
+        "dataset.clips=8",
+        "stages.vae.network.width=512",
+        "stages.vae.network.layers=5",
+        "stages.vae.network.feed_forward=768",
+        "stages.vae.ema=0.99",
+        "stages.vae.windows.until=1",
+        "stages.vae.windows.batch=2",
+        "stages.vae.batch={global: 2, slices: 2}",
+        "stages.vae.steps=100000",
+    ];
+    let sets: Vec<&str> = LARGE.iter().flat_map(|set| ["--set", *set]).chain(["--until", "vae"]).collect();
+    let mut cluster = Cluster::start(trainer);
+    cluster.join("w1");
+    let run = cluster.submit(&config(), &sets);
+    cluster.wait_step(&run, "vae", 2);
+    let joined = Instant::now();
+    cluster.join("w2");
+    let transfer =
+        wait_for("the second worker to take over the state", || measure::transfers(&cluster.said("w2")).pop());
+    println!(
+        "a joiner of a gang of {:.1} M parameters took over {:.0} MB in {:.2} s; {:.1} s after its process was started it was a member",
+        transfer.bytes / 16e6,
+        transfer.bytes / 1e6,
+        transfer.seconds,
+        joined.elapsed().as_secs_f64(),
+    );
+}
+
 fn main() -> std::process::ExitCode {
     let mut arguments = std::env::args().skip(1);
     let trainer = arguments.next();
@@ -294,6 +324,7 @@ fn main() -> std::process::ExitCode {
         return 2.into();
     };
     let trainer = std::fs::canonicalize(&trainer).map_or(trainer, |path| path.display().to_string());
+    join_large(&trainer);
     let expected = reference(&trainer);
     let mut failed = Vec::new();
     for seed in &seeds {
@@ -308,9 +339,4 @@ fn main() -> std::process::ExitCode {
     }
     eprintln!("failed: {failed:?}");
     1.into()
-}
-
-/// Where the coordinator listens in a network of its own.
-fn address(octets: [u8; 4]) -> SocketAddr {
-    SocketAddr::from((octets, 7700))
 }

@@ -28,10 +28,35 @@ pub(crate) fn gang_of(view: &Value, worker: &str) -> Vec<String> {
     members.into_iter().find(|names| names.iter().any(|name| name == worker)).unwrap_or_default()
 }
 
-/// Lines that say that a member met its gang again: when, and whether it took over a peer's state.
-fn meetings(log: &str) -> Vec<(SystemTime, bool)> {
+/// A line that says that a member met its gang.
+#[derive(Debug)]
+struct Meeting {
+    at: SystemTime,
+    adopted: Option<Transfer>,
+}
+
+/// A peer's state that a member took over.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Transfer {
+    pub(crate) bytes: f64,
+    pub(crate) seconds: f64,
+}
+
+fn meetings(log: &str) -> Vec<Meeting> {
     let lines = log.lines().filter(|line| line.contains("met the gang"));
-    lines.filter_map(|line| Some((time(line.split_whitespace().next()?)?, line.contains("adopts=true")))).collect()
+    lines
+        .filter_map(|line| Some(Meeting { at: time(line.split_whitespace().next()?)?, adopted: transfer(line) }))
+        .collect()
+}
+
+fn transfer(line: &str) -> Option<Transfer> {
+    let number = |field: &str| line.split_whitespace().find_map(|word| word.strip_prefix(field))?.parse().ok();
+    Some(Transfer { bytes: number("bytes=")?, seconds: number("seconds=")? })
+}
+
+/// The states that a worker took over, by its log.
+pub(crate) fn transfers(log: &str) -> Vec<Transfer> {
+    meetings(log).into_iter().filter_map(|meeting| meeting.adopted).collect()
 }
 
 /// `2026-01-31T23:59:59.123456Z`.
@@ -64,7 +89,7 @@ pub(crate) fn print(kills: &[Kill], logs: &[(&str, String)]) {
     let mut recoveries = Vec::new();
     for kill in kills.iter().filter(|kill| kill.calm && kill.members.len() > 1) {
         let survivors = met.iter().filter(|(name, _)| *name != kill.worker && kill.members.iter().any(|m| m == name));
-        let first = survivors.flat_map(|(_, times)| times).map(|(at, _)| *at).filter(|at| *at > kill.at).min();
+        let first = survivors.flat_map(|(_, all)| all).map(|met| met.at).filter(|at| *at > kill.at).min();
         if let Some(first) = first
             && kill.disturbed.is_none_or(|disturbed| disturbed > first)
         {
@@ -72,6 +97,8 @@ pub(crate) fn print(kills: &[Kill], logs: &[(&str, String)]) {
         }
     }
     spread("survivors of a kill met again", recoveries);
-    let joins = met.iter().flat_map(|(_, times)| times).filter(|(_, adopts)| *adopts).count();
-    println!("  {joins} times a worker took over the state of a peer");
+    let joins: Vec<Transfer> = met.iter().flat_map(|(_, all)| all).filter_map(|met| met.adopted).collect();
+    let largest = joins.iter().map(|join| join.bytes).fold(0.0, f64::max) / 1e6;
+    let seconds = joins.iter().map(|join| join.seconds).collect();
+    spread(&format!("a joiner took over a peer's state, of {largest:.1} MB at most"), seconds);
 }

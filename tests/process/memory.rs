@@ -1,0 +1,88 @@
+//! A worker that runs out of memory: said once, and not tried again.
+
+use std::fs;
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use cluster_tests::cluster::stage_of;
+use cluster_tests::{Bench, Running, Said};
+use serde_json::Value;
+
+const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
+
+/// A feed-forward layer that no memory holds, or one that some gigabytes hold.
+fn run(bench: &Bench, feed_forward: &str, wrap: &[&str]) -> Said {
+    let width = format!("stages.vae.network.feed_forward={feed_forward}");
+    let config = Bench::config("smoke.yaml");
+    let trainer = bench.command(&["run", &config, "--until", "vae", "--workers", "1", "--set", &width, "-o", "json"]);
+    let mut command = Command::new(wrap[0]);
+    command.args(&wrap[1..]).arg(trainer.get_program()).args(trainer.get_args());
+    command.current_dir(bench.path()).env_remove("RUST_LOG").env("NO_COLOR", "1").process_group(0);
+    Running::start(command).wait()
+}
+
+/// Failed for good, for this reason, after one try.
+fn check(bench: &Bench, said: Said, reason: &str) {
+    let said = said.expect_code(1);
+    let report: Value = serde_json::from_str(&said.stdout).unwrap_or_else(|e| panic!("{e}: {}", said.stdout));
+    let message = stage_of(&report, "vae")["message"].as_str().unwrap_or_default().to_owned();
+    assert!(message.contains("out of memory") && message.contains(reason), "{message}\n{}", said.stderr);
+    assert!(message.contains("batch"), "it should say what to do: {message}");
+    let log = fs::read_to_string(bench.store().join("workers/w1.log")).expect("a log");
+    let begins = log.lines().filter(|line| line.contains(" begin ") && line.contains("/vae attempt=")).count();
+    assert_eq!(begins, 1, "tried once:\n{log}");
+}
+
+/// An allocation that is refused aborts the worker.
+#[test]
+fn p15_a_worker_whose_allocation_is_refused_is_final() {
+    if Command::new("prlimit").arg("--version").output().is_err() {
+        eprintln!("SKIPPED: `prlimit` bounds a worker's memory here and is not there");
+        return;
+    }
+    let bench = Bench::new(TRAINER);
+    // Far more than anything here needs, and far less than the layer's 500 GB.
+    let said = run(&bench, "4000000000", &["prlimit", "--as=68719476736"]);
+    check(&bench, said, "was refused");
+}
+
+/// A control group for memory; its processes are those of the command that it wraps.
+struct Group(PathBuf);
+
+impl Group {
+    /// `None`, loudly, where groups cannot be made.
+    fn new(bytes: u64) -> Option<Self> {
+        let name = format!("stride-{}", std::process::id());
+        let limits = [("/sys/fs/cgroup/memory", "memory.limit_in_bytes"), ("/sys/fs/cgroup", "memory.max")];
+        for (root, limit) in limits {
+            let group = Path::new(root).join(&name);
+            if fs::create_dir(&group).is_err() {
+                continue;
+            }
+            let group = Self(group);
+            if fs::write(group.0.join(limit), bytes.to_string()).is_ok() {
+                return Some(group);
+            }
+        }
+        eprintln!("SKIPPED: a worker that the kernel kills for want of memory needs root and control groups");
+        None
+    }
+}
+
+impl Drop for Group {
+    fn drop(&mut self) {
+        // Its processes have ended; if not, it stays, and that is all.
+        let _ = fs::remove_dir(&self.0);
+    }
+}
+
+/// The kernel kills the worker, as the largest process of a group that has used up its memory.
+#[test]
+fn p15_a_worker_that_the_kernel_kills_for_want_of_memory_is_final() {
+    let Some(group) = Group::new(600 << 20) else { return };
+    let bench = Bench::new(TRAINER);
+    let enter = format!("echo $$ > {}/cgroup.procs && exec \"$@\"", group.0.display());
+    let said = run(&bench, "40000000", &["sh", "-c", &enter, "sh"]);
+    check(&bench, said, "the kernel killed it");
+}
