@@ -11,9 +11,9 @@ use serde_json::Value;
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
-/// A feed-forward layer that no memory holds, or one that some gigabytes hold.
-fn run(bench: &Bench, feed_forward: &str, wrap: &[&str]) -> Said {
-    let width = format!("stages.vae.network.feed_forward={feed_forward}");
+/// The smoke pipeline's VAE at another width, by a command inside `wrap`.
+fn run(bench: &Bench, width: u32, wrap: &[&str]) -> Said {
+    let width = format!("stages.vae.network.width={width}");
     let config = Bench::config("smoke.yaml");
     let trainer = bench.command(&["run", &config, "--until", "vae", "--workers", "1", "--set", &width, "-o", "json"]);
     let mut command = Command::new(wrap[0]);
@@ -42,8 +42,8 @@ fn p15_a_worker_whose_allocation_is_refused_is_final() {
         return;
     }
     let bench = Bench::new(TRAINER);
-    // Far more than anything here needs, and far less than the layer's 500 GB.
-    let said = run(&bench, "4000000000", &["prlimit", "--as=68719476736"]);
+    // Far more than anything here needs, and less than the 17 GB of the first weights.
+    let said = run(&bench, 65_536, &["prlimit", "--as=8589934592"]);
     check(&bench, said, "was refused");
 }
 
@@ -83,6 +83,7 @@ fn p15_a_worker_that_the_kernel_kills_for_want_of_memory_is_final() {
     let Some(group) = Group::new(600 << 20) else { return };
     let bench = Bench::new(TRAINER);
     let enter = format!("echo $$ > {}/cgroup.procs && exec \"$@\"", group.0.display());
-    let said = run(&bench, "40000000", &["sh", "-c", &enter, "sh"]);
+    // Weights of one gigabyte each.
+    let said = run(&bench, 16_384, &["sh", "-c", &enter, "sh"]);
     check(&bench, said, "the kernel killed it");
 }

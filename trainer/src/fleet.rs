@@ -13,6 +13,8 @@ use crate::starved::Watch;
 
 /// A worker that lives shorter than this has died at its start.
 const SHORT_LIFE: Duration = Duration::from_secs(5);
+/// So much of what a dead worker said is looked at; a back trace may follow the words that count.
+const LAST_WORDS: usize = 256 << 10;
 /// So many early deaths in a row and the worker is given up.
 const EARLY_DEATHS: u32 = 5;
 
@@ -155,7 +157,7 @@ impl Fleet {
 /// The end of what stands in the file behind `from`.
 fn last_words(path: &Path, from: u64) -> String {
     let bytes = std::fs::read(path).unwrap_or_default();
-    let from = usize::try_from(from).unwrap_or(usize::MAX).clamp(bytes.len().saturating_sub(8192), bytes.len());
+    let from = usize::try_from(from).unwrap_or(usize::MAX).clamp(bytes.len().saturating_sub(LAST_WORDS), bytes.len());
     String::from_utf8_lossy(&bytes[from..]).into_owned()
 }
 

@@ -165,8 +165,8 @@ async fn watch(
         }
         if let Some(fleet) = fleet {
             for death in fleet.tend(true)? {
-                let how = death.starved.as_deref().unwrap_or("has died");
-                progress.note(&format!("worker {} {how}; starting it again", death.worker));
+                let how = death.starved.as_deref().unwrap_or("has died; starting it again");
+                progress.note(&format!("worker {} {how}", death.worker));
                 bury(handle, &death).await;
             }
         }

@@ -1,8 +1,8 @@
 //! Gangs of threads over loopback, with a coordinator of a few lines that does what the real one does about losses.
 
+mod strangers;
+
 use std::collections::BTreeMap;
-use std::io::Write as _;
-use std::net::TcpStream;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread;
@@ -19,7 +19,6 @@ use tokio::runtime::Runtime;
 use super::endpoint::Endpoint;
 use super::exchange;
 use super::frame::{self, Head, Kind};
-use super::handshake;
 use super::mesh::{Halt, Mesh, Terms, Timing};
 use super::tree;
 use crate::bell::{Bell, lock};
@@ -529,44 +528,6 @@ fn p18_each_barrier_has_a_name_and_a_time_and_lists_who_is_missing() {
             mesh.close(None);
         }
     }
-}
-
-#[test]
-fn a_peer_with_another_secret_never_gets_in() {
-    let gang = Gang::new(2, QUICK);
-    let (first, _) = mesh(&gang, &[0, 1], 0, "mine");
-    let (second, _) = mesh(&gang, &[0, 1], 1, "yours");
-    assert!(first.next(1, "barrier `test`", &|| None).is_err());
-    assert!(second.next(0, "barrier `test`", &|| None).is_err());
-    assert_eq!(first.lost().len(), 1);
-    first.close(None);
-    second.close(None);
-}
-
-/// Connects as rank 1 with the right secret, then sends `bytes`.
-fn misbehave(bytes: &[u8]) -> Arc<Mesh> {
-    let gang = Gang::new(2, QUICK);
-    let (mesh, _) = mesh(&gang, &[0, 1], 0, "s");
-    let mut stream = TcpStream::connect(gang.seats[0].endpoint.address()).expect("listening");
-    handshake::dial(&mut stream, &task(), Generation(7), 1, 0, "s").expect("welcome");
-    stream.write_all(bytes).expect("sent");
-    wait_until("the peer is given up", || !mesh.lost().is_empty());
-    mesh
-}
-
-#[test]
-fn a_corrupt_frame_ends_the_connection() {
-    let mut bytes = Vec::new();
-    frame::write(&mut bytes, Head::new(Kind::Applied, 3, 1, 0), b"payload").expect("memory");
-    *bytes.last_mut().expect("not empty") ^= 1;
-    misbehave(&bytes).close(None);
-}
-
-#[test]
-fn an_oversized_frame_ends_the_connection_without_being_read() {
-    let mut bytes = frame::header(Head::new(Kind::State, 0, 0, 0), &[]).to_vec();
-    bytes[24..28].copy_from_slice(&(frame::MAX_PAYLOAD as u32 + 1).to_le_bytes());
-    misbehave(&bytes).close(None);
 }
 
 #[test]
