@@ -288,9 +288,9 @@ fn reference(trainer: &str) -> Value {
 fn join_large(trainer: &str) {
     const LARGE: [&str; 9] = [
         "dataset.clips=8",
-        "stages.vae.network.width=512",
+        "stages.vae.network.width=448",
         "stages.vae.network.layers=5",
-        "stages.vae.network.feed_forward=768",
+        "stages.vae.network.feed_forward=672",
         "stages.vae.ema=0.99",
         "stages.vae.windows.until=1",
         "stages.vae.windows.batch=2",
