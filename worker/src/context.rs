@@ -166,11 +166,7 @@ impl GangContext for HttpContext {
         Ok(Some(manifest))
     }
 
-    fn rendezvous(
-        &mut self,
-        applied: Option<u64>,
-        state: &mut dyn FnMut() -> Vec<u8>,
-    ) -> Result<Rendezvous, ContextError> {
+    fn rendezvous(&mut self, applied: Option<u64>, state: &[&[u8]]) -> Result<Rendezvous, ContextError> {
         loop {
             self.check()?;
             if let Some(newer) = self.held.take_mesh() {

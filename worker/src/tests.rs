@@ -321,13 +321,13 @@ fn finished(context: &mut dyn GangContext) -> Result<Outcome, StageError> {
 
 /// Trains `steps` steps as a gang of whoever there is; a checkpoint every tenth.
 fn train(context: &mut dyn GangContext, steps: u64, pause: Duration) -> Result<Outcome, StageError> {
-    context.rendezvous(None, &mut Vec::new)?;
+    context.rendezvous(None, &[])?;
     let mut step = 0;
     while step < steps {
         let parts: Vec<_> = context.share(2).map(|slice| (slice, vec![1.0])).collect();
         match context.exchange(step, 2, &parts)? {
             Exchange::Regroup => {
-                context.rendezvous(Some(step), &mut Vec::new)?;
+                context.rendezvous(Some(step), &[])?;
             }
             Exchange::Sum { wind_down, .. } => {
                 step += 1;

@@ -135,12 +135,8 @@ pub trait GangContext: AttemptContext {
     fn latest_checkpoint(&self) -> Result<Option<Manifest>, ContextError>;
 
     /// Meets the other members of the current generation. `applied` is the number of steps in the caller's state, `None`
-    /// when it has only initialised itself; `state` gives its bytes and is called only if a peer needs them.
-    fn rendezvous(
-        &mut self,
-        applied: Option<u64>,
-        state: &mut dyn FnMut() -> Vec<u8>,
-    ) -> Result<Rendezvous, ContextError>;
+    /// when it has only initialised itself; `state` is its bytes, piece after piece, for a peer that needs them.
+    fn rendezvous(&mut self, applied: Option<u64>, state: &[&[u8]]) -> Result<Rendezvous, ContextError>;
 
     /// The slices of the coming step that are this worker's: a contiguous range of `0..slices`. Changes only with
     /// [`rendezvous`](Self::rendezvous).

@@ -124,7 +124,7 @@ impl GangContext for Solo {
         Ok(self.checkpoint.clone())
     }
 
-    fn rendezvous(&mut self, _: Option<u64>, _: &mut dyn FnMut() -> Vec<u8>) -> Result<Rendezvous, ContextError> {
+    fn rendezvous(&mut self, _: Option<u64>, _: &[&[u8]]) -> Result<Rendezvous, ContextError> {
         Ok(Rendezvous::Keep)
     }
 

@@ -45,7 +45,7 @@ pub(crate) enum Met {
 pub(crate) fn rendezvous(
     mesh: &Mesh,
     applied: Option<u64>,
-    state: &mut dyn FnMut() -> Vec<u8>,
+    state: &[&[u8]],
     interrupt: Interrupt<'_>,
 ) -> Result<Met, Halt> {
     let barrier = format!("barrier `rendezvous` of generation {}", mesh.terms.generation);
@@ -65,16 +65,11 @@ pub(crate) fn rendezvous(
     let behind: Vec<usize> = mesh.others().filter(|&peer| at[peer] != Some(newest)).collect();
 
     if own == source && !behind.is_empty() {
-        let bytes = state();
-        tracing::info!(
-            step = newest,
-            bytes = bytes.len(),
-            receivers = behind.len(),
-            "sending the state to members behind"
-        );
+        let bytes: usize = state.iter().map(|piece| piece.len()).sum();
+        tracing::info!(step = newest, bytes, receivers = behind.len(), "sending the state to members behind");
         for peer in behind {
-            mesh.send(peer, &barrier, Head::new(Kind::StateLength, bytes.len() as u64, 0, 0), &[], interrupt)?;
-            for piece in bytes.chunks(MAX_PAYLOAD) {
+            mesh.send(peer, &barrier, Head::new(Kind::StateLength, bytes as u64, 0, 0), &[], interrupt)?;
+            for piece in state.iter().flat_map(|piece| piece.chunks(MAX_PAYLOAD)) {
                 mesh.send(peer, &barrier, Head::new(Kind::State, newest, 0, 0), piece, interrupt)?;
             }
         }
@@ -92,6 +87,12 @@ pub(crate) fn rendezvous(
     }
     let mut bytes = Vec::new();
     while (bytes.len() as u64) < length {
+        if bytes.len() == bytes.capacity() {
+            // Twice what has come at most: a length alone takes no memory.
+            bytes.reserve_exact(
+                usize::try_from(length).unwrap_or(usize::MAX).min(2 * bytes.len() + (64 << 20)) - bytes.len(),
+            );
+        }
         let piece = expect(mesh.next(source, &barrier, interrupt)?, Kind::State, mesh, source)?;
         bytes.extend_from_slice(piece.bytes());
         if piece.bytes().is_empty() || bytes.len() as u64 > length {

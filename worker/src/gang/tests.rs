@@ -196,14 +196,8 @@ fn train(context: &mut HttpContext, plan: Plan, mut before: impl FnMut(u64)) -> 
     let mut met = false;
     while applied.unwrap_or(0) < plan.steps {
         if !met {
-            let bytes = |state: &[f32], at: u64| {
-                let mut bytes = at.to_le_bytes().to_vec();
-                bytes.extend_from_slice(bytemuck::cast_slice(state));
-                bytes
-            };
-            if let Rendezvous::Adopt(adopted) =
-                context.rendezvous(applied, &mut || bytes(&state, applied.unwrap_or(0)))?
-            {
+            let at = applied.unwrap_or(0).to_le_bytes();
+            if let Rendezvous::Adopt(adopted) = context.rendezvous(applied, &[&at, bytemuck::cast_slice(&state)])? {
                 let at = u64::from_le_bytes(adopted[..8].try_into().expect("8 bytes"));
                 state = adopted[8..].chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().expect("4"))).collect();
                 applied = Some(at);
@@ -385,7 +379,7 @@ fn one_wish_to_wind_down_is_heard_by_all_after_the_same_step() {
             .map(|mut context| {
                 let held = held.clone();
                 scope.spawn(move || {
-                    context.rendezvous(None, &mut Vec::new).expect("met");
+                    context.rendezvous(None, &[]).expect("met");
                     let mut stops = Vec::new();
                     for step in 0..4 {
                         let parts: Vec<_> = context.share(3).map(|s| (s, vec![1.0])).collect();
@@ -491,7 +485,7 @@ fn p18_each_barrier_has_a_name_and_a_time_and_lists_who_is_missing() {
                         if is_stopped && name == "rendezvous" {
                             return stop();
                         }
-                        let met = exchange::rendezvous(&mesh, Some(5), &mut Vec::new, &|| None);
+                        let met = exchange::rendezvous(&mesh, Some(5), &[], &|| None);
                         if name == "exchange" {
                             met.expect("all are there");
                             if is_stopped {
@@ -541,8 +535,8 @@ fn state_transfer() {
         let begun = Instant::now();
         thread::scope(|scope| {
             let (donor, state) = (gang.clone(), &state);
-            scope.spawn(move || donor.context(0).rendezvous(Some(9), &mut || state.clone()).expect("met"));
-            match gang.context(1).rendezvous(None, &mut Vec::new).expect("met") {
+            scope.spawn(move || donor.context(0).rendezvous(Some(9), &[state]).expect("met"));
+            match gang.context(1).rendezvous(None, &[]).expect("met") {
                 Rendezvous::Adopt(bytes) => assert!(bytes == *state),
                 Rendezvous::Keep => panic!("it had nothing to keep"),
             }
@@ -564,7 +558,7 @@ fn throughput() {
                 let (gang, begun, barrier) = (gang.clone(), &begun, &barrier);
                 scope.spawn(move || {
                     let mut context = gang.context(i);
-                    context.rendezvous(None, &mut Vec::new).expect("met");
+                    context.rendezvous(None, &[]).expect("met");
                     let parts: Vec<_> = context.share(8).map(|s| (s, vec![0.5f32; length])).collect();
                     barrier.wait();
                     lock(begun).get_or_insert_with(Instant::now);

@@ -210,11 +210,7 @@ impl GangContext for Member {
         Ok(lock(&self.gang.state).checkpoints.last().map(|(_, manifest)| manifest.clone()))
     }
 
-    fn rendezvous(
-        &mut self,
-        applied: Option<u64>,
-        bytes: &mut dyn FnMut() -> Vec<u8>,
-    ) -> Result<Rendezvous, ContextError> {
+    fn rendezvous(&mut self, applied: Option<u64>, bytes: &[&[u8]]) -> Result<Rendezvous, ContextError> {
         let gang = Arc::clone(&self.gang);
         let mut state = lock(&gang.state);
         loop {
@@ -238,7 +234,7 @@ impl GangContext for Member {
             }
             let donor = state.arrived.iter().find(|(_, a)| **a == newest).map(|(who, _)| *who);
             if donor == Some(self.me) {
-                state.donated = Some(bytes());
+                state.donated = Some(bytes.concat());
                 gang.changed.notify_all();
             }
             if applied == newest {
@@ -345,12 +341,11 @@ mod tests {
             None => (0, 1.0),
         };
         let mut applied = saved.is_some().then_some(step);
-        let meet = |cx: &mut dyn GangContext, applied: Option<u64>, state: (u64, f32)| {
-            let mut bytes = || serde_json::to_vec(&state).expect("numbers");
-            match cx.rendezvous(applied, &mut bytes)? {
-                Rendezvous::Keep => Ok(state),
-                Rendezvous::Adopt(bytes) => serde_json::from_slice(&bytes).map_err(fault),
-            }
+        let meet = |cx: &mut dyn GangContext, applied: Option<u64>, state: (u64, f32)| match cx
+            .rendezvous(applied, &[&serde_json::to_vec(&state).expect("numbers")])?
+        {
+            Rendezvous::Keep => Ok(state),
+            Rendezvous::Adopt(bytes) => serde_json::from_slice(&bytes).map_err(fault),
         };
         (step, value) = meet(cx, applied, (step, value))?;
         while step < STEPS {

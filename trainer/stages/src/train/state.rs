@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use bytemuck::{cast_slice, cast_slice_mut};
 use models::flat::Entry;
 use models::optim::{AdamW, LrSchedule, ema};
 
@@ -152,9 +153,80 @@ impl TrainState {
         Ok(())
     }
 
+    /// The state as it travels between members of a gang, who have the same plan: `step` (as little-endian bytes), then the buffers as they
+    /// lie in memory. Nothing is copied: with large models that is what takes the time.
+    pub fn pieces<'a>(&'a self, step: &'a [u8; 8]) -> Vec<&'a [u8]> {
+        let buffers = self.groups.iter().flat_map(|group| {
+            [&group.params, &group.m, &group.v].into_iter().chain(&group.average).map(|values| cast_slice(values))
+        });
+        std::iter::once(step.as_slice()).chain(buffers).collect()
+    }
+
+    /// Takes over what [`Self::pieces`] of another member gave, put together.
+    ///
+    /// # Errors
+    /// If it has another length; nothing is changed then.
+    pub fn adopt(&mut self, bytes: &[u8]) -> Result<(), String> {
+        let step = self.step.to_le_bytes();
+        let expected: usize = self.pieces(&step).iter().map(|piece| piece.len()).sum();
+        let (step, mut rest) = match bytes.split_first_chunk::<8>() {
+            Some(split) if bytes.len() == expected => split,
+            _ => return Err(format!("a peer's state has {} bytes, expected {expected}", bytes.len())),
+        };
+        self.step = u64::from_le_bytes(*step);
+        for group in &mut self.groups {
+            for values in [&mut group.params, &mut group.m, &mut group.v].into_iter().chain(&mut group.average) {
+                let (own, others) = rest.split_at(values.len() * size_of::<f32>());
+                cast_slice_mut(values).copy_from_slice(own);
+                rest = others;
+            }
+        }
+        Ok(())
+    }
+
     /// The parameters of group `index` as they should be used: their average where one is kept.
     pub fn result(&self, index: usize) -> &[f32] {
         let group = &self.groups[index];
         group.average.as_ref().unwrap_or(&group.params)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::stage::Decay;
+
+    use super::*;
+
+    #[test]
+    fn a_member_takes_over_a_peers_state_bit_for_bit_or_not_at_all() {
+        let plan = |ema| GroupPlan {
+            name: "model",
+            entries: Vec::new(),
+            params: vec![1.0, -2.0, 0.5],
+            optimizer: AdamW { beta1: 0.9, beta2: 0.999, eps: 1e-8, weight_decay: 0.0 },
+            lr: LrSchedule { peak: 1e-2, warmup: 0, steps: 10, decay: Decay::Constant },
+            ema,
+            active: None,
+        };
+        let plans = [plan(Some(0.9)), plan(None)];
+        let mut donor = TrainState::new(&plans);
+        for step in 0..3 {
+            donor.groups.iter_mut().for_each(|group| group.update(step, &[0.1, 0.2, -0.3], 1.0));
+            donor.step = step + 1;
+        }
+        let step = donor.step.to_le_bytes();
+        let mut joiner = TrainState::new(&plans);
+        let before = joiner.clone();
+        let bytes = donor.pieces(&step).concat();
+        for wrong in [&bytes[..bytes.len() - 4], &[bytes.clone(), vec![0; 4]].concat(), &[]] {
+            assert!(joiner.adopt(wrong).unwrap_err().contains("expected 92"), "{}", wrong.len());
+            assert_eq!(joiner, before);
+        }
+        joiner.adopt(&bytes).unwrap();
+        assert_eq!(joiner, donor);
+        // What is saved says the same.
+        let mut saved = before;
+        saved.restore(&donor.to_bytes()).unwrap();
+        assert_eq!(saved, donor);
     }
 }
