@@ -181,7 +181,9 @@ impl GangContext for HttpContext {
             match exchange::rendezvous(&mesh, applied, state, &|| held.halt(generation)) {
                 Ok(met) => {
                     let adopted = match &met {
-                        Met::Adopt { bytes, took } => Some((bytes.len(), took.as_secs_f64())),
+                        Met::Adopt { pieces, took } => {
+                            Some((pieces.iter().map(Vec::len).sum::<usize>(), took.as_secs_f64()))
+                        }
                         Met::Keep => None,
                     };
                     tracing::info!(
@@ -196,7 +198,7 @@ impl GangContext for HttpContext {
                     );
                     return Ok(match met {
                         Met::Keep => Rendezvous::Keep,
-                        Met::Adopt { bytes, .. } => Rendezvous::Adopt(bytes),
+                        Met::Adopt { pieces, .. } => Rendezvous::Adopt(pieces),
                     });
                 }
                 Err(Halt::Ended(reason)) => {

@@ -149,19 +149,23 @@ impl Gate {
                 Err(why) => return result(Some(value), None, false, format!("the version at `{alias}` has {why}")),
             },
             (Bound::Alias { alias, .. }, None) => {
-                let message = format!("{} is {value}; `{alias}` points at nothing yet", self.metric);
+                let message = format!("{} is {}; `{alias}` points at nothing yet", self.metric, digits(value));
                 return result(Some(value), None, value.is_finite(), message);
             }
         };
         // A value that is no number compares as false with everything.
         let holds = self.op.holds(value, bound);
-        let message = if holds {
-            format!("{} is {value}, bound {bound}", self.metric)
-        } else {
-            format!("{} is {value}, bound {bound}: it misses by {}", self.metric, short((value - bound).abs()))
-        };
+        let mut message = format!("{} is {}, bound {}", self.metric, digits(value), digits(bound));
+        if !holds {
+            message += &format!(": it misses by {}", short((value - bound).abs()));
+        }
         result(Some(value), Some(bound), holds, message)
     }
+}
+
+/// Six digits: who needs more reads the JSON.
+fn digits(number: f64) -> f64 {
+    format!("{number:.5e}").parse().unwrap_or(number)
 }
 
 /// Enough digits to see a difference.

@@ -102,9 +102,10 @@ pub(crate) async fn promote(conn: &mut SqliteConnection, order: &PromoteOrder) -
     let gates = judge(conn, order, &candidate).await?;
     if current == Some(candidate.version) {
         let log = read::history(conn, model, Some(alias)).await.map_err(write_error)?;
-        return log
-            .into_iter()
-            .next_back()
+        // As it was moved, with what its gates say now.
+        let moved = log.into_iter().next_back();
+        return moved
+            .map(|moved| Promotion { gates, ..moved })
             .ok_or_else(|| WriteError::Internal(format!("alias `{alias}` has no history")));
     }
     set_alias(conn, model, alias, Action::Promote, current, candidate.version, gates, &order.reason, &order.actor).await

@@ -88,8 +88,8 @@ pub enum Outcome {
 pub enum Rendezvous {
     /// Nobody is ahead: go on from the state you have.
     Keep,
-    /// A peer is ahead, or you have just started: replace your state by these bytes.
-    Adopt(Vec<u8>),
+    /// A peer is ahead, or you have just started: replace your state by its bytes, cut anyhow.
+    Adopt(Vec<Vec<u8>>),
 }
 
 /// What an exchange gave.

@@ -36,7 +36,7 @@ pub(crate) enum Met {
     Keep,
     /// A peer's state, and how long it took from the offer's being waited for to its last byte.
     Adopt {
-        bytes: Vec<u8>,
+        pieces: Vec<Vec<u8>>,
         took: Duration,
     },
 }
@@ -85,23 +85,20 @@ pub(crate) fn rendezvous(
             "{barrier}: a state of {length} bytes is offered, at most {MAX_STATE} are taken"
         )));
     }
-    let mut bytes = Vec::new();
-    while (bytes.len() as u64) < length {
-        if bytes.len() == bytes.capacity() {
-            // Twice what has come at most: a length alone takes no memory.
-            bytes.reserve_exact(
-                usize::try_from(length).unwrap_or(usize::MAX).min(2 * bytes.len() + (64 << 20)) - bytes.len(),
-            );
-        }
-        let piece = expect(mesh.next(source, &barrier, interrupt)?, Kind::State, mesh, source)?;
-        bytes.extend_from_slice(piece.bytes());
-        if piece.bytes().is_empty() || bytes.len() as u64 > length {
+    // Pieces stay as they came: to put a large state together would take memory for it once more.
+    let (mut pieces, mut there) = (Vec::new(), 0);
+    while there < length {
+        let frame = expect(mesh.next(source, &barrier, interrupt)?, Kind::State, mesh, source)?;
+        there += frame.bytes().len() as u64;
+        let Payload::Bytes(piece) = frame.payload else { unreachable!("a state's frames carry bytes") };
+        if piece.is_empty() || there > length {
             return Err(Halt::Disagree(format!(
                 "{barrier}: a state of {length} bytes arrives in pieces of another length"
             )));
         }
+        pieces.push(piece);
     }
-    Ok(Met::Adopt { bytes, took: begun.elapsed() })
+    Ok(Met::Adopt { pieces, took: begun.elapsed() })
 }
 
 /// What a member brings to an exchange.

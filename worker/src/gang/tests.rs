@@ -198,6 +198,7 @@ fn train(context: &mut HttpContext, plan: Plan, mut before: impl FnMut(u64)) -> 
         if !met {
             let at = applied.unwrap_or(0).to_le_bytes();
             if let Rendezvous::Adopt(adopted) = context.rendezvous(applied, &[&at, bytemuck::cast_slice(&state)])? {
+                let adopted = adopted.concat();
                 let at = u64::from_le_bytes(adopted[..8].try_into().expect("8 bytes"));
                 state = adopted[8..].chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().expect("4"))).collect();
                 applied = Some(at);
@@ -537,7 +538,7 @@ fn state_transfer() {
             let (donor, state) = (gang.clone(), &state);
             scope.spawn(move || donor.context(0).rendezvous(Some(9), &[state]).expect("met"));
             match gang.context(1).rendezvous(None, &[]).expect("met") {
-                Rendezvous::Adopt(bytes) => assert!(bytes == *state),
+                Rendezvous::Adopt(pieces) => assert!(pieces.concat() == *state),
                 Rendezvous::Keep => panic!("it had nothing to keep"),
             }
         });

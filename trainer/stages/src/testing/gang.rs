@@ -244,7 +244,7 @@ impl GangContext for Member {
                 state = gang.changed.wait(state).unwrap_or_else(std::sync::PoisonError::into_inner);
             }
             if let (true, Some(donated)) = (state.generation == self.generation, &state.donated) {
-                return Ok(Rendezvous::Adopt(donated.clone()));
+                return Ok(Rendezvous::Adopt(vec![donated.clone()]));
             }
         }
     }
@@ -345,7 +345,7 @@ mod tests {
             .rendezvous(applied, &[&serde_json::to_vec(&state).expect("numbers")])?
         {
             Rendezvous::Keep => Ok(state),
-            Rendezvous::Adopt(bytes) => serde_json::from_slice(&bytes).map_err(fault),
+            Rendezvous::Adopt(pieces) => serde_json::from_slice(&pieces.concat()).map_err(fault),
         };
         (step, value) = meet(cx, applied, (step, value))?;
         while step < STEPS {

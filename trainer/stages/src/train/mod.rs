@@ -171,8 +171,8 @@ fn restore(state: &mut TrainState, manifest: &protocol::Manifest, cx: &dyn GangC
 /// Meets the others, and takes over a peer's state where one is ahead or this member has none (`applied` is `None`); true if so.
 fn meet(state: &mut TrainState, applied: Option<u64>, cx: &mut dyn GangContext) -> Result<bool, StageError> {
     let step = state.step.to_le_bytes();
-    let Rendezvous::Adopt(bytes) = cx.rendezvous(applied, &state.pieces(&step))? else { return Ok(false) };
-    state.adopt(&bytes).map_err(StageError::Fault)?;
+    let Rendezvous::Adopt(pieces) = cx.rendezvous(applied, &state.pieces(&step))? else { return Ok(false) };
+    state.adopt(&pieces).map_err(StageError::Fault)?;
     cx.log(&format!("took over the state after step {} from a peer", state.step));
     Ok(true)
 }

@@ -162,23 +162,35 @@ impl TrainState {
         std::iter::once(step.as_slice()).chain(buffers).collect()
     }
 
-    /// Takes over what [`Self::pieces`] of another member gave, put together.
+    /// Takes over what [`Self::pieces`] of another member gave, however it was cut on the way.
     ///
     /// # Errors
     /// If it has another length; nothing is changed then.
-    pub fn adopt(&mut self, bytes: &[u8]) -> Result<(), String> {
-        let step = self.step.to_le_bytes();
+    pub fn adopt(&mut self, pieces: &[Vec<u8>]) -> Result<(), String> {
+        let mut step = self.step.to_le_bytes();
         let expected: usize = self.pieces(&step).iter().map(|piece| piece.len()).sum();
-        let (step, mut rest) = match bytes.split_first_chunk::<8>() {
-            Some(split) if bytes.len() == expected => split,
-            _ => return Err(format!("a peer's state has {} bytes, expected {expected}", bytes.len())),
+        let found: usize = pieces.iter().map(Vec::len).sum();
+        if found != expected {
+            return Err(format!("a peer's state has {found} bytes, expected {expected}"));
+        }
+        let mut pieces = pieces.iter().map(Vec::as_slice);
+        let mut piece: &[u8] = &[];
+        let mut fill = |mut into: &mut [u8]| {
+            while !into.is_empty() {
+                if piece.is_empty() {
+                    piece = pieces.next().expect("as many bytes as there is room for");
+                    continue;
+                }
+                let (now, later) = into.split_at_mut(piece.len().min(into.len()));
+                now.copy_from_slice(&piece[..now.len()]);
+                (piece, into) = (&piece[now.len()..], later);
+            }
         };
-        self.step = u64::from_le_bytes(*step);
+        fill(&mut step);
+        self.step = u64::from_le_bytes(step);
         for group in &mut self.groups {
             for values in [&mut group.params, &mut group.m, &mut group.v].into_iter().chain(&mut group.average) {
-                let (own, others) = rest.split_at(values.len() * size_of::<f32>());
-                cast_slice_mut(values).copy_from_slice(own);
-                rest = others;
+                fill(cast_slice_mut(values));
             }
         }
         Ok(())
@@ -219,11 +231,14 @@ mod tests {
         let before = joiner.clone();
         let bytes = donor.pieces(&step).concat();
         for wrong in [&bytes[..bytes.len() - 4], &[bytes.clone(), vec![0; 4]].concat(), &[]] {
-            assert!(joiner.adopt(wrong).unwrap_err().contains("expected 92"), "{}", wrong.len());
+            assert!(joiner.adopt(&[wrong.to_vec()]).unwrap_err().contains("expected 92"), "{}", wrong.len());
             assert_eq!(joiner, before);
         }
-        joiner.adopt(&bytes).unwrap();
-        assert_eq!(joiner, donor);
+        for cut in [3, 8, 50, bytes.len()] {
+            joiner.clone_from(&before);
+            joiner.adopt(&bytes.chunks(cut).map(<[u8]>::to_vec).collect::<Vec<_>>()).unwrap();
+            assert_eq!(joiner, donor, "in pieces of {cut} bytes");
+        }
         // What is saved says the same.
         let mut saved = before;
         saved.restore(&donor.to_bytes()).unwrap();
