@@ -211,8 +211,8 @@ mod tests {
 
     #[test]
     fn a_member_takes_over_a_peers_state_bit_for_bit_or_not_at_all() {
-        let plan = |ema| GroupPlan {
-            name: "model",
+        let plan = |name, ema| GroupPlan {
+            name,
             entries: Vec::new(),
             params: vec![1.0, -2.0, 0.5],
             optimizer: AdamW { beta1: 0.9, beta2: 0.999, eps: 1e-8, weight_decay: 0.0 },
@@ -220,7 +220,7 @@ mod tests {
             ema,
             active: None,
         };
-        let plans = [plan(Some(0.9)), plan(None)];
+        let plans = [plan("model", Some(0.9)), plan("heads", None)];
         let mut donor = TrainState::new(&plans);
         for step in 0..3 {
             donor.groups.iter_mut().for_each(|group| group.update(step, &[0.1, 0.2, -0.3], 1.0));
