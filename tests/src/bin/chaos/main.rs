@@ -40,7 +40,7 @@ const WORKERS: [&str; 3] = ["w1", "w2", "w3"];
 /// Mean time between two disturbances.
 const MEAN: f64 = 5.0;
 /// A run that takes longer has hung.
-const LIMIT: Duration = Duration::from_secs(1200);
+const LIMIT: Duration = Duration::from_secs(3600);
 
 fn sets() -> Vec<&'static str> {
     SETS.iter().flat_map(|set| ["--set", *set]).collect()
