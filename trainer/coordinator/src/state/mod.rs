@@ -34,8 +34,8 @@ pub struct Heard {
 
 /// All that the coordinator knows. What may be large is shared between copies until one changes it, so a copy is cheap.
 ///
-/// A task is changed by [`State::change`] alone, which keeps what is known twice, for speed, in step: who waits and who is
-/// held in a work ([`tasks::Tasks`]), what a worker holds, and which workers hold nothing.
+/// A task is changed by `State::change` alone, which keeps what is known twice, for speed, in step: who waits and who is
+/// held in a work (`tasks::Tasks`), what a worker holds, and which workers hold nothing.
 #[derive(Debug, Clone, Default)]
 pub struct State {
     /// Times and budgets.

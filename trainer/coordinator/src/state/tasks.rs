@@ -1,6 +1,6 @@
 //! The tasks of one work, by place, and who of them is held or waits: with thousands of tasks one decision must not look at all.
 //!
-//! Read as a slice. [`Tasks::change`] is the only way to change a task, so that the index cannot be wrong; invariant C14.
+//! Read as a slice. `Tasks::change` is the only way to change a task, so that the index cannot be wrong; invariant C14.
 
 use std::collections::BTreeSet;
 use std::ops::Deref;
