@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Breaks training runs on purpose: tests/chaos.sh SEED...
-# Three workers, a coordinator, all stages of the quickstart at reduced sizes; what it does is in tests/src/bin/chaos/main.rs.
+# Breaks training runs on purpose: tests/chaos.sh [--full] SEED...
+# Three workers, a coordinator, all stages of the quickstart at reduced sizes (--full: as it is); what it does is in tests/src/bin/chaos/main.rs.
 # TRAINER=path takes a trainer that is built already.
 set -euo pipefail
 if [ $# -eq 0 ]; then
-    echo "usage: tests/chaos.sh SEED..., for example tests/chaos.sh \$(seq 1 20)" >&2
+    echo "usage: tests/chaos.sh [--full] SEED..., for example tests/chaos.sh \$(seq 1 20)" >&2
     exit 2
 fi
 root=$(cd "$(dirname "$0")/.." && pwd)

@@ -81,8 +81,6 @@ pub const FORMATS: [&str; 2] = ["humanml3d", "kit"];
 
 /// Columns of the papers' text-to-motion table: the first ones.
 const PAPER_COLUMNS: usize = 8;
-/// What only an evaluation as in the papers measures.
-const TELLING: &str = "fid";
 
 fn better(key: &str) -> Better {
     COLUMNS.iter().find(|column| column.key == key).map_or(Better::Neither, |column| column.better)

@@ -4,7 +4,7 @@ use clap::ValueEnum;
 use comfy_table::{ContentArrangement, Table, presets};
 use serde::{Deserialize, Serialize};
 
-use super::{Better, COLUMNS, Column, Comparison, Leaderboard, Measure, PAPER_COLUMNS, Row, TELLING, Verdict};
+use super::{Better, COLUMNS, Column, Comparison, Leaderboard, Measure, PAPER_COLUMNS, Row, Verdict};
 
 /// How a table is written.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
@@ -20,11 +20,10 @@ pub enum Style {
 }
 
 impl Leaderboard {
-    /// The columns that any row has; the papers' all together as soon as the one that tells a table of theirs has a value, so that
-    /// rows can be pasted.
+    /// The columns that a row of ours has; the papers' all together beside a published row, whatever of them we measured.
     fn columns(&self) -> Vec<&'static Column> {
         let has = |column: &Column| self.rows.iter().any(|row| !row.published && row.measures.contains_key(column.key));
-        let paper = self.rows.iter().any(|row| row.published || row.measures.contains_key(TELLING));
+        let paper = self.rows.iter().any(|row| row.published);
         COLUMNS
             .iter()
             .enumerate()

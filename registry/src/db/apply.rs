@@ -124,7 +124,8 @@ async fn insert<T>(
     Ok(())
 }
 
-/// The values of `value` by `task` in `table`, for those of `tasks` that have one.
+/// What `select` says of those of `tasks` that it finds, by task. `select` gives two columns, the task first, and ends in an open
+/// list: `... WHERE task IN (`.
 async fn by_task<T>(conn: &mut SqliteConnection, select: &'static str, tasks: &[&TaskId]) -> Result<BTreeMap<TaskId, T>>
 where
     T: for<'r> sqlx::Decode<'r, Sqlite> + sqlx::Type<Sqlite>,

@@ -8,7 +8,7 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use protocol::message::{Join, PROTOCOL_VERSION, RunState};
+use protocol::message::{Join, RunState};
 use protocol::pipeline::Pipeline;
 use protocol::{Digest, Fence, RunId, StageName, TaskId, WorkerId};
 use registry::Write;
@@ -213,12 +213,6 @@ impl Deciding<'_> {
     }
 
     fn join(&mut self, join: Join) -> Result<(), Rejected> {
-        if join.protocol != PROTOCOL_VERSION {
-            return Err(Rejected::Invalid(format!(
-                "worker `{}` speaks version {} of the protocol, this coordinator speaks {PROTOCOL_VERSION}; use one build for both",
-                join.worker, join.protocol
-            )));
-        }
         if !protocol::id::is_name(join.worker.as_str()) {
             return Err(Rejected::Invalid(format!("`{}` is not a worker name", join.worker)));
         }

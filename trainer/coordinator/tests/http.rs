@@ -260,6 +260,18 @@ async fn p2_a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestR
     let request = request.header("x-stride-grant", serde_json::to_string(&lost)?).body(Body::from("late"))?;
     assert_eq!(client.send(request).await?.0, StatusCode::CONFLICT);
 
+    // Another build's worker is told so, and is nobody here.
+    let other = Join {
+        protocol: PROTOCOL_VERSION + 1,
+        worker: "c".into(),
+        pid: 8,
+        backend: Backend::Flex,
+        peer_address: "127.0.0.1:1".into(),
+    };
+    let (status, error) = client.refused("/v1/workers", other).await?;
+    assert_eq!((status, error.code.as_str()), (400, "invalid"));
+    assert!(error.message.contains("use one build for both"), "{}", error.message);
+
     // A process that joins under the name replaces the old one, whose polls are refused.
     join(&client, "b").await?;
     let poll = Poll { incarnation: second.incarnation, doing: vec![], version: 0 };

@@ -10,7 +10,8 @@ use coordinator::{
     Control, Effect, Event, Millis, Moment, Observation, Policy, Rejected, State, decide, invariants, journal, observe,
 };
 use protocol::message::{
-    Assignment, FailureClass, Join, PROTOCOL_VERSION, Poll, ReportOutcome, RunState, StageState, TaskOutcome,
+    Assignment, Doing, FailureClass, Join, PROTOCOL_VERSION, Poll, Progress, ReportOutcome, RunState, StageState,
+    TaskOutcome,
 };
 use protocol::stage::{Backend, WorkerRange};
 use protocol::{Digest, Incarnation, RunId, WorkerId};
@@ -159,6 +160,46 @@ fn p3_the_task_of_a_dead_worker_is_another_s_within_16_seconds() {
         let refused = desk.happen(Event::Outcome { report: refused });
         assert!(matches!(refused, Err(Rejected::StaleFence { .. })), "{refused:?}");
     }
+}
+
+/// Sampled: one gang of three. Its first member is silent past its lease, wakes with its old grant, tells its progress and that it lost the
+/// others; then the same as an event, as if it had been heard before the gang went on without it.
+#[test]
+fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
+    let mut desk = Desk::new(Policy::default());
+    let run = desk.submit("vae", WorkerRange { min: 1, max: 3 });
+    let a = desk.join("a");
+    let dataset = desk.assignment("a").expect("the only worker gets it");
+    desk.report(&dataset, TaskOutcome::Finished { output: Digest::of(b"clips"), metrics: Default::default() });
+    let [b, c] = ["b", "c"].map(|name| desk.join(name));
+    let old = desk.assignment("a").expect("it trains").grant;
+    let gang = |desk: &Desk| {
+        let (_, task) = desk.state.task(&old.task).expect("known");
+        task.holders().iter().map(|member| member.worker.clone()).collect::<Vec<_>>()
+    };
+    assert_eq!(gang(&desk), ["a", "b", "c"].map(WorkerId::from));
+    for _ in 0..16 {
+        desk.now += 1000;
+        desk.poll("b", b);
+        desk.poll("c", c);
+        desk.hear(Observation::Tick);
+    }
+    assert_eq!(gang(&desk), ["b", "c"].map(WorkerId::from));
+
+    let lost = vec!["b".into(), "c".into()];
+    let progress = Progress { done: 999, total: 1000, ..Progress::default() };
+    let doing = vec![Doing { grant: old.clone(), progress, lost: lost.clone() }];
+    let poll = Poll { incarnation: a, doing, version: 0 };
+    let heard = observe(&mut desk.state, Millis(desk.now), Observation::Poll { worker: "a".into(), poll });
+    let heard = heard.expect("it is known");
+    assert!(matches!(&heard[..], [Event::WorkerBack { worker }] if worker.as_str() == "a"), "{heard:?}");
+    let view = desk.state.view(desk.state.run(&run).expect("known"), Millis(desk.now));
+    let told: Vec<u64> = view.stages.iter().map(|stage| stage.progress.done).collect();
+    assert!(!told.contains(&999), "{told:?}");
+
+    let refused = desk.happen(Event::PeersLost { grant: old.clone(), lost });
+    assert!(matches!(refused, Err(Rejected::StaleFence { .. })), "{refused:?}");
+    assert_eq!(gang(&desk), ["b", "c"].map(WorkerId::from));
 }
 
 /// One restart after a simulated hour, with workers that come back at once, late within the lease, and never.

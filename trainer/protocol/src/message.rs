@@ -16,7 +16,7 @@ use crate::sweep::{SearchKind, Values};
 use crate::{Attempt, Digest, Fence, Generation, Incarnation, RunId, Seed, StageName, TaskId, WorkerId};
 
 /// The version of these messages; a worker of another version is turned away.
-pub const PROTOCOL_VERSION: u32 = 1;
+pub const PROTOCOL_VERSION: u32 = 2;
 
 /// `POST /v1/workers`: a process offers itself.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -4,7 +4,7 @@
 //!
 //! | at | bytes | what |
 //! |---|---|---|
-//! | 0 | 4 | magic `STRF` |
+//! | 0 | 4 | magic `STR2`: its last byte is the version of these frames and of what travels in them |
 //! | 4 | 1 | kind |
 //! | 5 | 3 | zero |
 //! | 8 | 8 | `step`: the training step, or what the kind says |
@@ -18,7 +18,7 @@
 
 use std::io::{self, Read, Write};
 
-const MAGIC: [u8; 4] = *b"STRF";
+const MAGIC: [u8; 4] = *b"STR2";
 const HEADER: usize = 32;
 
 /// Longest payload. Small enough that on a slow network too every frame is a timely sign of life.
@@ -143,7 +143,7 @@ pub(crate) enum FrameError {
     Closed,
     #[error("the connection failed: {0}")]
     Io(#[source] io::Error),
-    #[error("not a frame: it begins with {0:02x?}, expected `STRF`")]
+    #[error("not a frame of this build: it begins with `{}`, expected `STR2`; do both sides run the same build?", .0.escape_ascii())]
     Magic([u8; 4]),
     #[error("a frame of unknown kind {0}; do both sides run the same build?")]
     Kind(u8),

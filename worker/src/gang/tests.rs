@@ -526,27 +526,6 @@ fn p18_each_barrier_has_a_name_and_a_time_and_lists_who_is_missing() {
 }
 
 #[test]
-#[ignore = "a measurement: cargo test --release -p worker state_transfer -- --ignored --nocapture"]
-fn state_transfer() {
-    // 20 M parameters with two moments and a moving average, as bytes.
-    let state = vec![7u8; 20_000_000 * 4 * 4];
-    for _ in 0..3 {
-        let gang = Gang::new(2, Timing::default());
-        gang.regroup(&[0, 1], false);
-        let begun = Instant::now();
-        thread::scope(|scope| {
-            let (donor, state) = (gang.clone(), &state);
-            scope.spawn(move || donor.context(0).rendezvous(Some(9), &[state]).expect("met"));
-            match gang.context(1).rendezvous(None, &[]).expect("met") {
-                Rendezvous::Adopt(pieces) => assert!(pieces.concat() == *state),
-                Rendezvous::Keep => panic!("it had nothing to keep"),
-            }
-        });
-        eprintln!("{} MB taken over from a peer in {:.2?}", state.len() / 1_000_000, begun.elapsed());
-    }
-}
-
-#[test]
 #[ignore = "a measurement: cargo test --release -p worker throughput -- --ignored --nocapture"]
 fn throughput() {
     for (members, length) in [(1, 20_000_000), (2, 2_000_000), (2, 20_000_000), (3, 20_000_000)] {

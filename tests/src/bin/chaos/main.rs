@@ -42,8 +42,10 @@ const MEAN: f64 = 5.0;
 /// A run that takes longer has hung.
 const LIMIT: Duration = Duration::from_secs(3600);
 
-fn sets() -> Vec<&'static str> {
-    SETS.iter().flat_map(|set| ["--set", *set]).collect()
+/// What is run: the quickstart, smaller unless `full`.
+fn sets(full: bool) -> Vec<&'static str> {
+    let sets: &[&str] = if full { &[] } else { &SETS };
+    sets.iter().flat_map(|set| ["--set", *set]).collect()
 }
 
 fn config() -> PathBuf {
@@ -212,8 +214,8 @@ impl Chaos {
     }
 
     /// Disturbs until the run is over.
-    fn run(&mut self) -> Result<Value, String> {
-        let run = self.cluster.submit(&config(), &sets());
+    fn run(&mut self, sets: &[&str]) -> Result<Value, String> {
+        let run = self.cluster.submit(&config(), sets);
         let mut next = Instant::now() + self.random.wait();
         let mut view = None;
         loop {
@@ -246,10 +248,10 @@ impl Chaos {
     }
 }
 
-fn one(trainer: &str, seed: u64, expected: &Value) -> Result<(), String> {
+fn one(trainer: &str, sets: &[&str], seed: u64, expected: &Value) -> Result<(), String> {
     println!("seed {seed}");
     let mut chaos = Chaos::start(trainer, seed);
-    let view = chaos.run()?;
+    let view = chaos.run(sets)?;
     let took = chaos.begun.elapsed();
     let (found, expected) = (digests(&view), digests(expected));
     let different: Vec<&String> = expected.keys().filter(|stage| found.get(*stage) != expected.get(*stage)).collect();
@@ -275,10 +277,10 @@ fn one(trainer: &str, seed: u64, expected: &Value) -> Result<(), String> {
     Ok(())
 }
 
-fn reference(trainer: &str) -> Value {
+fn reference(trainer: &str, sets: &[&str]) -> Value {
     let bench = Bench::new(trainer);
     let config = config().display().to_string();
-    let said = bench.run(&[&["run", &config, "--workers", "1", "-o", "json"][..], &sets()[..]].concat()).expect_code(0);
+    let said = bench.run(&[&["run", &config, "--workers", "1", "-o", "json"][..], sets].concat()).expect_code(0);
     println!("undisturbed, one worker: {:.0} s", said.took.as_secs_f64());
     said.json()
 }
@@ -316,19 +318,21 @@ fn join_large(trainer: &str) {
 }
 
 fn main() -> std::process::ExitCode {
-    let mut arguments = std::env::args().skip(1);
+    let mut arguments = std::env::args().skip(1).peekable();
     let trainer = arguments.next();
+    let full = arguments.next_if(|argument| argument == "--full").is_some();
     let seeds: Result<Vec<u64>, _> = arguments.map(|seed| seed.parse()).collect();
     let (Some(trainer), Ok(seeds)) = (trainer, seeds) else {
-        eprintln!("usage: chaos TRAINER SEED...; `tests/chaos.sh SEED...` builds the trainer first");
+        eprintln!("usage: chaos TRAINER [--full] SEED...; `tests/chaos.sh [--full] SEED...` builds the trainer first");
         return 2.into();
     };
+    let sets = sets(full);
     let trainer = std::fs::canonicalize(&trainer).map_or(trainer, |path| path.display().to_string());
     join_large(&trainer);
-    let expected = reference(&trainer);
+    let expected = reference(&trainer, &sets);
     let mut failed = Vec::new();
     for seed in &seeds {
-        if let Err(message) = one(&trainer, *seed, &expected) {
+        if let Err(message) = one(&trainer, &sets, *seed, &expected) {
             eprintln!("{message}");
             failed.push(*seed);
         }

@@ -6,13 +6,21 @@ use std::time::Duration;
 use axum::Json;
 use axum::extract::{Path, State};
 use protocol::WorkerId;
-use protocol::message::{Join, Joined, Orders, Poll};
+use protocol::message::{Join, Joined, Orders, PROTOCOL_VERSION, Poll};
 
 use super::actor::{Desk, Refused};
 use super::api::Failure;
-use crate::event::{Effect, Event, Observation};
+use crate::event::{Effect, Event, Observation, Rejected};
 
 pub(crate) async fn join(State(desk): State<Arc<Desk>>, Json(join): Json<Join>) -> Result<Json<Joined>, Failure> {
+    // Here and not in `decide`: the journal keeps the joins of earlier versions, and must replay.
+    if join.protocol != PROTOCOL_VERSION {
+        let message = format!(
+            "worker `{}` speaks version {} of the protocol, this coordinator speaks {PROTOCOL_VERSION}; use one build for both",
+            join.worker, join.protocol
+        );
+        return Err(Rejected::Invalid(message).into());
+    }
     let effects = desk.decide(Event::Join { join }).await?;
     let incarnation = effects.into_iter().find_map(|effect| match effect {
         Effect::Joined(incarnation) => Some(incarnation),

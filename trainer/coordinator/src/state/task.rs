@@ -289,6 +289,37 @@ mod tests {
     }
 
     #[test]
+    fn a_grant_counts_only_as_a_whole() {
+        let member =
+            |name: &str| Member { worker: name.into(), incarnation: Incarnation(4), peer_address: String::new() };
+        let mut task = Task::new("r/s".into(), Part::Gang);
+        task.grant(vec![member("a"), member("b")], |_| String::new());
+        task.regroup(vec![member("b"), member("a")], |_| String::new());
+        let grant = task.grant_of(&"a".into(), Incarnation(4));
+        assert_eq!(task.check(&grant), Ok(1), "its rank");
+        let superseded = [
+            Grant { fence: Fence(grant.fence.0 - 1), ..grant.clone() },
+            Grant { fence: grant.fence.next(), ..grant.clone() },
+            Grant { attempt: Attempt(0), ..grant.clone() },
+            Grant { attempt: grant.attempt.next(), ..grant.clone() },
+        ];
+        for other in superseded {
+            assert!(matches!(task.check(&other), Err(Rejected::StaleFence { .. })), "{other:?}");
+            assert!(task.check_fence(&other).is_err(), "{other:?}");
+        }
+        let another_s = [
+            Grant { worker: "c".into(), ..grant.clone() },
+            Grant { incarnation: Incarnation(3), ..grant.clone() },
+            Grant { incarnation: Incarnation(5), ..grant.clone() },
+        ];
+        for other in another_s {
+            assert!(matches!(task.check(&other), Err(Rejected::Conflict(_))), "{other:?}");
+        }
+        task.release(None);
+        assert!(matches!(task.check(&grant), Err(Rejected::StaleFence { .. })), "from the moment it is lost");
+    }
+
+    #[test]
     fn the_table_in_the_header_is_what_the_code_does() {
         let holder = Member { worker: "w".into(), incarnation: Incarnation(1), peer_address: String::new() };
         let waiting = Task::new("r/s".into(), Part::Gang);

@@ -7,8 +7,9 @@ use coordinator::state::run::Status;
 use coordinator::{Event, Millis, Moment, Policy, State, decide};
 use protocol::message::{RunState, StageState, TrialState};
 
+use crate::pipelines;
 use crate::worker::FakeWorker;
-use crate::{CHAOS_MS, World, pipelines};
+use crate::world::{CHAOS_MS, World};
 
 const TRIALS: u64 = 50;
 

@@ -23,11 +23,10 @@ pub(crate) fn events(state: &State) -> Vec<Event> {
     let nobody: WorkerId = "nobody".into();
     for worker in state.workers.keys().chain([&nobody]) {
         let incarnation = state.workers.get(worker).map_or(Incarnation(9), |worker| worker.incarnation);
-        for protocol in [PROTOCOL_VERSION, 0] {
-            let join =
-                Join { protocol, worker: worker.clone(), pid: 1, backend: Backend::Flex, peer_address: "x:1".into() };
-            events.push(Event::Join { join });
-        }
+        let (worker_name, peer_address) = (worker.clone(), "x:1".into());
+        let join =
+            Join { protocol: PROTOCOL_VERSION, worker: worker_name, pid: 1, backend: Backend::Flex, peer_address };
+        events.push(Event::Join { join });
         events.push(Event::WorkerBack { worker: worker.clone() });
         events.push(Event::LeaseExpired { worker: worker.clone(), incarnation });
         events.push(Event::LeaseExpired { worker: worker.clone(), incarnation: Incarnation(0) });
