@@ -14,8 +14,8 @@ use models::networks::{Denoiser, Init, guidance_embedding};
 use protocol::stage::{Distance, Distillation, Positions};
 use protocol::{ArtifactKind, Seed};
 
+use super::group;
 use super::latent_data::{LatentData, LatentSlice};
-use super::schedule;
 use crate::artifacts::{self, DenoiserMeta, Family, MODEL_FILE};
 use crate::context::{ContextError, GangContext, StageError};
 use crate::train::{GroupPlan, TrainState};
@@ -93,15 +93,8 @@ impl Distiller {
 
     /// The student as a group of parameters.
     pub(super) fn group(&self) -> GroupPlan {
-        GroupPlan {
-            name: "model",
-            entries: flat::layout(&self.student),
-            params: flat::read(&self.student),
-            optimizer: (&self.settings.training.optimizer).into(),
-            lr: schedule(&self.settings.training, self.settings.training.lr),
-            ema: Some(self.settings.ema),
-            active: None,
-        }
+        // The target network is the average, whatever its decay.
+        GroupPlan { ema: Some(self.settings.ema), ..group("model", &self.student, &self.settings.training, 0.0) }
     }
 
     /// Takes over student and target.

@@ -21,7 +21,7 @@ use motion::dataset::{Dataset, crop, window};
 use protocol::stage::{Positions, Split, TrainEvaluator};
 use protocol::{ArtifactKind, Seed};
 
-use super::{dropout_seed, no_clips, schedule};
+use super::{dropout_seed, group, no_clips};
 use crate::artifacts;
 use crate::context::{GangContext, Outcome, StageError};
 use crate::evaluator::{self, EvaluatorMeta, UNIT, normalise};
@@ -225,21 +225,16 @@ fn apart(sentences: &[&str]) -> Vec<f32> {
 impl Objective for EvaluatorObjective {
     fn groups(&mut self) -> Vec<GroupPlan> {
         let (turn, training) = (self.turning_point(), &self.settings.training);
-        let ema = (self.settings.ema > 0.0).then_some(self.settings.ema);
-        let group = |name, entries, params, active: std::ops::Range<u64>| GroupPlan {
-            name,
-            entries,
-            params,
-            optimizer: (&training.optimizer).into(),
-            lr: LrSchedule { steps: active.end - active.start, ..schedule(training, training.lr) },
-            ema,
-            active: Some(active),
+        let during = |steps: std::ops::Range<u64>, group: GroupPlan| GroupPlan {
+            lr: LrSchedule { steps: steps.end - steps.start, ..group.lr },
+            active: Some(steps),
+            ..group
         };
-        let matching = turn..training.steps.0;
+        let (matching, ema) = (turn..training.steps.0, self.settings.ema);
         vec![
-            group("text", flat::layout(&self.text), flat::read(&self.text), matching.clone()),
-            group("motion", flat::layout(&self.motion), flat::read(&self.motion), matching),
-            group("movements", flat::layout(&self.movements), flat::read(&self.movements), 0..turn),
+            during(matching.clone(), group("text", &self.text, training, ema)),
+            during(matching, group("motion", &self.motion, training, ema)),
+            during(0..turn, group("movements", &self.movements, training, ema)),
         ]
     }
 

@@ -13,7 +13,7 @@ use protocol::ArtifactKind;
 use protocol::stage::TrainMld;
 
 use super::latent_data::LatentData;
-use super::{schedule, slice_gradient};
+use super::{group, slice_gradient};
 use crate::artifacts::{self, DenoiserMeta, Family, MODEL_FILE, VaeMeta, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, train};
@@ -28,15 +28,7 @@ struct Mld {
 
 impl Objective for Mld {
     fn groups(&mut self) -> Vec<GroupPlan> {
-        vec![GroupPlan {
-            name: "model",
-            entries: flat::layout(&self.network),
-            params: flat::read(&self.network),
-            optimizer: (&self.settings.training.optimizer).into(),
-            lr: schedule(&self.settings.training, self.settings.training.lr),
-            ema: (self.settings.ema > 0.0).then_some(self.settings.ema),
-            active: None,
-        }]
+        vec![group("model", &self.network, &self.settings.training, self.settings.ema)]
     }
 
     fn terms(&self) -> &'static [&'static str] {

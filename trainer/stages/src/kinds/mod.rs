@@ -19,8 +19,7 @@ use std::collections::BTreeMap;
 
 use burn::module::Module;
 use burn::tensor::Tensor;
-use models::flat::add_gradients;
-use models::optim::LrSchedule;
+use models::flat::{self, add_gradients};
 use motion::Stream;
 use protocol::ArtifactKind;
 use protocol::stage::{Split, StageSettings, Training};
@@ -28,6 +27,7 @@ use serde_json::{Value, json};
 
 use crate::artifacts;
 use crate::context::{AttemptContext, GangContext, Outcome, Part, StageError};
+use crate::train::GroupPlan;
 
 /// Where a report's details are.
 pub const REPORT_FILE: &str = "report.json";
@@ -76,9 +76,18 @@ pub fn run_gang(cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
     }
 }
 
-/// The stage's learning rates with `lr` as the peak.
-fn schedule(training: &Training, lr: f64) -> LrSchedule {
-    LrSchedule::from(&Training { lr, ..training.clone() })
+/// All parameters of `module` as one group that every step trains as `training` says, with a moving average of decay `ema` beside them
+/// unless that is 0.
+fn group<M: Module>(name: &'static str, module: &M, training: &Training, ema: f64) -> GroupPlan {
+    GroupPlan {
+        name,
+        entries: flat::layout(module),
+        params: flat::read(module),
+        optimizer: (&training.optimizer).into(),
+        lr: training.into(),
+        ema: (ema > 0.0).then_some(ema),
+        active: None,
+    }
 }
 
 /// The gradient of a slice's loss for all parameters of `module`, and the loss.

@@ -17,10 +17,10 @@ use models::losses;
 use models::names::to_bytes;
 use models::networks::{Discriminator, Init};
 use protocol::ArtifactKind;
-use protocol::stage::DistillPcm;
+use protocol::stage::{DistillPcm, Training};
 
 use super::consistency::{Distiller, SolverStep};
-use super::{schedule, slice_gradient};
+use super::{group, slice_gradient};
 use crate::artifacts::{self, Family, MODEL_FILE, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, train};
@@ -40,13 +40,8 @@ impl Objective for Pcm {
             let training = &self.settings.distillation.training;
             let lr = if self.settings.discriminator_lr > 0.0 { self.settings.discriminator_lr } else { training.lr };
             groups.push(GroupPlan {
-                name: "heads",
-                entries: flat::layout(heads),
-                params: flat::read(heads),
                 optimizer: (&self.settings.discriminator_optimizer).into(),
-                lr: schedule(training, lr),
-                ema: None,
-                active: None,
+                ..group("heads", heads, &Training { lr, ..training.clone() }, 0.0)
             });
         }
         groups

@@ -15,7 +15,7 @@ use motion::dataset::{Dataset, crop, window};
 use protocol::stage::{Split, TrainVae};
 use protocol::{ArtifactKind, Seed};
 
-use super::{no_clips, schedule, slice_gradient};
+use super::{group, no_clips, slice_gradient};
 use crate::artifacts::{self, MODEL_FILE, VaeMeta, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::train::{GroupPlan, Objective, Order, Pick, SliceResult, TrainState, Trained, train};
@@ -77,15 +77,7 @@ impl VaeObjective {
 
 impl Objective for VaeObjective {
     fn groups(&mut self) -> Vec<GroupPlan> {
-        vec![GroupPlan {
-            name: "model",
-            entries: flat::layout(&self.network),
-            params: flat::read(&self.network),
-            optimizer: (&self.settings.training.optimizer).into(),
-            lr: schedule(&self.settings.training, self.settings.training.lr),
-            ema: (self.settings.ema > 0.0).then_some(self.settings.ema),
-            active: None,
-        }]
+        vec![group("model", &self.network, &self.settings.training, self.settings.ema)]
     }
 
     fn terms(&self) -> &'static [&'static str] {
