@@ -10,8 +10,8 @@ use coordinator::{
     Control, Effect, Event, Millis, Moment, Observation, Policy, Rejected, State, decide, invariants, journal, observe,
 };
 use protocol::message::{
-    Assignment, Doing, FailureClass, Join, PROTOCOL_VERSION, Poll, Progress, ReportOutcome, RunState, StageState,
-    TaskOutcome,
+    Assignment, CommitCheckpoint, Doing, FailureClass, Grant, Join, PROTOCOL_VERSION, Poll, Progress, ReportOutcome,
+    RunState, StageState, TaskOutcome,
 };
 use protocol::stage::{Backend, WorkerRange};
 use protocol::{Digest, Incarnation, RunId, WorkerId};
@@ -162,16 +162,44 @@ fn p3_the_task_of_a_dead_worker_is_another_s_within_16_seconds() {
     }
 }
 
-/// Sampled: one gang of three. Its first member is silent past its lease, wakes with its old grant, tells its progress and that it lost the
-/// others; then the same as an event, as if it had been heard before the gang went on without it.
-#[test]
-fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
-    let mut desk = Desk::new(Policy::default());
+/// A gang trains: its task's members by rank.
+fn gang_of_three(desk: &mut Desk) -> (RunId, [Incarnation; 3]) {
     let run = desk.submit("vae", WorkerRange { min: 1, max: 3 });
     let a = desk.join("a");
     let dataset = desk.assignment("a").expect("the only worker gets it");
     desk.report(&dataset, TaskOutcome::Finished { output: Digest::of(b"clips"), metrics: Default::default() });
     let [b, c] = ["b", "c"].map(|name| desk.join(name));
+    (run, [a, b, c])
+}
+
+#[test]
+fn only_the_first_member_of_a_gang_commits_and_reports_the_end() {
+    let mut desk = Desk::new(Policy::default());
+    let (run, _) = gang_of_three(&mut desk);
+    let [first, second] = ["a", "b"].map(|name| desk.assignment(name).expect("it trains").grant);
+    let events = |grant: &Grant| {
+        let (manifest, output) = (Digest::of(b"step 1"), Digest::of(b"vae"));
+        let commit = CommitCheckpoint { grant: grant.clone(), step: 1, manifest, metrics: Default::default() };
+        let finished = TaskOutcome::Finished { output, metrics: Default::default() };
+        let report = |outcome| Event::Outcome { report: ReportOutcome { grant: grant.clone(), outcome } };
+        [Event::Checkpoint { commit }, report(TaskOutcome::Yielded { at: 1 }), report(finished)]
+    };
+    for event in events(&second) {
+        let refused = desk.happen(event.clone());
+        assert!(matches!(refused, Err(Rejected::Conflict(_))), "{event:?}: {refused:?}");
+    }
+    let [commit, _, finished] = events(&first);
+    desk.happen(commit).expect("saved");
+    desk.happen(finished).expect("done");
+    assert_eq!(desk.run_state(&run), RunState::Finished);
+}
+
+/// Sampled: one gang of three. Its first member is silent past its lease, wakes with its old grant, tells its progress and that it lost the
+/// others; then the same as an event, as if it had been heard before the gang went on without it.
+#[test]
+fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
+    let mut desk = Desk::new(Policy::default());
+    let (run, [a, b, c]) = gang_of_three(&mut desk);
     let old = desk.assignment("a").expect("it trains").grant;
     let gang = |desk: &Desk| {
         let (_, task) = desk.state.task(&old.task).expect("known");
