@@ -20,6 +20,12 @@ pub fn observe(state: &mut State, now: Millis, observation: Observation) -> Resu
     }
 }
 
+/// Whether `poll` says no more than that its worker lives and how far it is: no fact follows from it.
+pub fn is_quiet(state: &State, worker: &WorkerId, poll: &Poll) -> Result<bool, Rejected> {
+    let known = state.process(worker, poll.incarnation)?;
+    Ok(known.presence == Presence::Here && poll.doing.iter().all(|doing| doing.lost.is_empty()))
+}
+
 fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result<Vec<Event>, Rejected> {
     let known = state.process(&worker, poll.incarnation)?;
     let mut events = Vec::new();

@@ -7,8 +7,8 @@ use axum::body::Body;
 use axum::http::{Request, StatusCode};
 use coordinator::{Config, Control, Coordinator, Handle, Policy, StartError};
 use protocol::message::{
-    ApiError, CommitCheckpoint, Grant, Join, Joined, LogBatch, MetricBatch, MetricRow, Orders, PROTOCOL_VERSION, Poll,
-    ReportOutcome, RunState, StageState, Submit, TaskOutcome,
+    ApiError, CommitCheckpoint, Doing, Grant, Join, Joined, LogBatch, MetricBatch, MetricRow, Orders, PROTOCOL_VERSION,
+    Poll, Progress, ReportOutcome, RunState, StageState, Submit, TaskOutcome,
 };
 use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::stage::{Backend, DataSynthetic, Placement, StageSettings, TrainVae};
@@ -277,6 +277,36 @@ async fn p2_a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestR
     let poll = Poll { incarnation: second.incarnation, doing: vec![], version: 0 };
     assert_eq!(client.refused("/v1/workers/b/poll", poll.clone()).await?.0, 409);
     assert_eq!(client.refused("/v1/workers/c/poll", poll).await?.0, 404);
+    handle.shutdown().await;
+    Ok(())
+}
+
+/// Two workers and one task for three leases: who polls keeps it, though nothing else is heard and decided meanwhile.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn polls_alone_keep_a_lease_and_show_progress() -> TestResult {
+    let dir = tempfile::tempdir()?;
+    let (handle, client) = start(dir.path()).await?;
+    let run = handle.submit(submission(None)?).await?;
+    let first = join(&client, "a").await?;
+    let held = assignment(&client, "a", &first, "dataset").await?.grant;
+    let second = join(&client, "b").await?;
+    let begun = std::time::Instant::now();
+    let (mut version, mut done) = ([0, 0], 0);
+    while begun.elapsed() < Duration::from_secs(3) {
+        for (i, (name, joined)) in [("a", &first), ("b", &second)].into_iter().enumerate() {
+            done += 1;
+            let progress = Progress { done, total: 100, ..Progress::default() };
+            let doing = Doing { grant: held.clone(), progress, lost: vec![] };
+            let doing = if name == "a" { vec![doing] } else { vec![] };
+            let poll = Poll { incarnation: joined.incarnation, doing, version: version[i] };
+            let orders: Orders = client.call("POST", &format!("/v1/workers/{name}/poll"), poll).await?;
+            version[i] = orders.version;
+            let grants: Vec<&Grant> = orders.assignments.iter().map(|assignment| &assignment.grant).collect();
+            assert_eq!(grants, if name == "a" { vec![&held] } else { vec![] }, "worker {name}");
+        }
+    }
+    let view = handle.run_view(&run).ok_or("no such run")?;
+    assert!(view.stages[0].progress.done > done / 4, "{:?} of {done}", view.stages[0].progress);
     handle.shutdown().await;
     Ok(())
 }

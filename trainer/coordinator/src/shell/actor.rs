@@ -3,13 +3,17 @@
 //! What has gathered in the queue while the disk was busy is decided together: one event after the other on one copy, and
 //! all that they write in one transaction. Nobody is answered before it is stored. If the store refuses it, none of it has
 //! happened, and each is tried alone, so that only the one at fault is refused.
+//!
+//! Polls from which nothing follows, nearly all, do not queue behind the disk: they are noted beside the queue and answered at once,
+//! and the actor takes the notes up before it decides anything.
 
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError, RwLock};
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
-use protocol::message::{FailureClass, ReportOutcome, Submit, TaskOutcome};
+use protocol::message::{FailureClass, Poll, ReportOutcome, Submit, TaskOutcome};
 use protocol::pipeline::Pipeline;
-use protocol::{Digest, RunId};
+use protocol::{Digest, RunId, WorkerId};
 use registry::{Store, Write, WriteError};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
@@ -18,7 +22,7 @@ use super::{answer, effects};
 use crate::decide::decide;
 use crate::event::{Effect, Event, Millis, Moment, Observation, Rejected};
 use crate::invariants;
-use crate::observe::observe;
+use crate::observe::{is_quiet, observe};
 use crate::state::State;
 
 /// How many events are decided together at most.
@@ -49,6 +53,8 @@ enum Ask {
 #[derive(Debug)]
 pub(crate) struct Desk {
     asks: mpsc::Sender<Ask>,
+    /// The newest quiet poll of each worker that the actor has not taken up yet, and when it came.
+    polls: Mutex<BTreeMap<WorkerId, (Millis, Poll)>>,
     published: RwLock<Arc<State>>,
     changed: watch::Sender<u64>,
     trouble: Mutex<Option<String>>,
@@ -70,6 +76,15 @@ impl Desk {
         let (reply, receiver) = oneshot::channel();
         self.asks.send(Ask::Observation(observation, reply)).await.map_err(|_| Refused::Stopped)?;
         answer(receiver).await
+    }
+
+    /// Takes note of a poll; returns once what follows from it is stored.
+    pub(crate) async fn poll(&self, worker: WorkerId, poll: Poll) -> Result<(), Refused> {
+        if is_quiet(&self.state(), &worker, &poll)? {
+            self.polls.lock().unwrap_or_else(PoisonError::into_inner).insert(worker, (self.now(), poll));
+            return Ok(());
+        }
+        self.observe(Observation::Poll { worker, poll }).await
     }
 
     /// Submits a pipeline.
@@ -187,6 +202,7 @@ pub(crate) fn start(store: Store, state: State) -> (Arc<Desk>, JoinHandle<()>) {
     let state = Arc::new(state);
     let desk = Arc::new(Desk {
         asks,
+        polls: Mutex::default(),
         published: RwLock::new(Arc::clone(&state)),
         changed: watch::Sender::new(0),
         trouble: Mutex::new(None),
@@ -220,6 +236,7 @@ impl Actor {
             {
                 asks.push(more);
             }
+            self.take_up_polls();
             if asks.len() > 1 && self.all_happen(&mut asks).await {
                 continue;
             }
@@ -229,6 +246,18 @@ impl Actor {
                     Ask::Event(event, reply) => drop(reply.send(self.happen(*event).await)),
                     Ask::Observation(observation, reply) => drop(reply.send(self.hear(observation).await)),
                 }
+            }
+        }
+    }
+
+    /// Takes the noted polls for heard, each at its own time.
+    fn take_up_polls(&mut self) {
+        let polls = std::mem::take(&mut *self.desk.polls.lock().unwrap_or_else(PoisonError::into_inner));
+        for (worker, (at, poll)) in polls {
+            // What has changed since it was noted makes it moot; the worker polls again within a second.
+            if matches!(is_quiet(&self.state, &worker, &poll), Ok(true)) {
+                let heard = observe(Arc::make_mut(&mut self.state), at, Observation::Poll { worker, poll });
+                debug_assert!(matches!(&heard, Ok(events) if events.is_empty()), "{heard:?}");
             }
         }
     }

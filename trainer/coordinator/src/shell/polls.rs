@@ -10,7 +10,7 @@ use protocol::message::{Join, Joined, Orders, PROTOCOL_VERSION, Poll};
 
 use super::actor::{Desk, Refused};
 use super::api::Failure;
-use crate::event::{Effect, Event, Observation, Rejected};
+use crate::event::{Effect, Event, Rejected};
 
 pub(crate) async fn join(State(desk): State<Arc<Desk>>, Json(join): Json<Join>) -> Result<Json<Joined>, Failure> {
     // Here and not in `decide`: the journal keeps the joins of earlier versions, and must replay.
@@ -41,7 +41,7 @@ pub(crate) async fn poll(
     let mut changes = desk.changes();
     let mut stopped = desk.stopped();
     let deadline = tokio::time::Instant::now() + Duration::from_millis(desk.state().policy.poll_ms);
-    desk.observe(Observation::Poll { worker: worker.clone(), poll }).await?;
+    desk.poll(worker.clone(), poll).await?;
     loop {
         changes.mark_unchanged();
         let orders = desk.state().orders(&worker, incarnation)?;

@@ -4,6 +4,7 @@ mod steps;
 
 use std::collections::BTreeMap;
 
+use coordinator::observe::is_quiet;
 use coordinator::{Effect, Event, Millis, Moment, Observation, Policy, Rejected, State};
 use coordinator::{decide, invariants, journal, observe};
 use protocol::message::RunState;
@@ -168,7 +169,12 @@ impl World {
     }
 
     fn hear(&mut self, observation: Observation) -> Result<(), Refused> {
+        let quiet = match &observation {
+            Observation::Poll { worker, poll } => is_quiet(&self.state, worker, poll) == Ok(true),
+            Observation::Tick => false,
+        };
         let events = observe(&mut self.state, self.now, observation).map_err(Refused::Rejected)?;
+        assert!(!quiet || events.is_empty(), "a poll from which nothing follows gave {events:?}");
         for event in events {
             match self.happen(event) {
                 Ok(_) => {}
