@@ -178,8 +178,16 @@ impl GangContext for HttpContext {
             };
             let held = self.held.clone();
             let generation = mesh.terms.generation;
-            match exchange::rendezvous(&mesh, applied, state, &|| held.halt(generation)) {
-                Ok(met) => {
+            // The rows that are not known to be stored travel behind the state, and their length behind them.
+            let kept = self.spool.kept();
+            let length = (kept.len() as u64).to_le_bytes();
+            let offered: Vec<&[u8]> = state.iter().copied().chain([&kept[..], &length[..]]).collect();
+            match exchange::rendezvous(&mesh, applied, &offered, &|| held.halt(generation)) {
+                Ok(mut met) => {
+                    if let Met::Adopt { pieces, .. } = &mut met {
+                        let rows = split_rows(pieces).ok_or_else(|| malformed("is cut short"))?;
+                        self.spool.take_over(&rows, applied).map_err(|e| malformed(&e.to_string()))?;
+                    }
                     let adopted = match &met {
                         Met::Adopt { pieces, took } => {
                             Some((pieces.iter().map(Vec::len).sum::<usize>(), took.as_secs_f64()))
@@ -285,6 +293,23 @@ impl GangContext for HttpContext {
     }
 }
 
+/// Takes the kept rows off the end of a state that came from a peer; frames never span two of the pieces that were offered.
+fn split_rows(pieces: &mut Vec<Vec<u8>>) -> Option<Vec<u8>> {
+    let length = u64::from_le_bytes(pieces.pop()?.try_into().ok()?);
+    let (mut chunks, mut there) = (Vec::new(), 0);
+    while there < length {
+        let chunk = pieces.pop()?;
+        there += chunk.len() as u64;
+        chunks.push(chunk);
+    }
+    chunks.reverse();
+    (there == length).then(|| chunks.concat())
+}
+
+fn malformed(why: &str) -> ContextError {
+    ContextError::Unavailable(format!("a peer's list of recorded values {why}; is it the same build?"))
+}
+
 fn given_up(gave_up: GaveUp) -> ContextError {
     match gave_up {
         GaveUp::Ended(reason) | GaveUp::Answer(CallError::Stale(reason)) => ContextError::GrantEnded(reason),
@@ -299,5 +324,21 @@ fn blob_error(error: BlobError) -> ContextError {
         BlobError::Storage(message) => ContextError::Storage(message),
         BlobError::Unavailable(message) => ContextError::Unavailable(message),
         error @ (BlobError::NotFound(_) | BlobError::Corrupt { .. }) => ContextError::Corrupt(error.to_string()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_come_off_the_end_of_a_state_however_they_were_cut() {
+        let length = 5u64.to_le_bytes().to_vec();
+        let mut pieces = vec![vec![1, 2], vec![3], vec![10, 11, 12], vec![13, 14], length.clone()];
+        assert_eq!(split_rows(&mut pieces), Some(vec![10, 11, 12, 13, 14]));
+        assert_eq!(pieces, [vec![1, 2], vec![3]], "the state");
+        for mut broken in [vec![], vec![vec![1, 2]], vec![vec![1; 3], length.clone()], vec![vec![1; 6], length]] {
+            assert_eq!(split_rows(&mut broken), None, "{broken:?}");
+        }
     }
 }

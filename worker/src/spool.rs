@@ -5,7 +5,8 @@
 //!
 //! In a gang every member keeps the rows and only rank 0 sends them. Rank 0 tells the others with every exchange up to which
 //! step all is stored; they forget that. So when rank 0 dies, the next one has what had not arrived: no hole, and no
-//! double, since both computed the same numbers.
+//! double, since both computed the same numbers. Who takes over a peer's state takes over the rows that the peer keeps: those of the
+//! steps that it did not apply itself, which it would lack if it is rank 0 or becomes it.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -45,6 +46,17 @@ struct State {
     newest_step: u64,
     dropped: u64,
     failed: Option<CallError>,
+}
+
+impl State {
+    /// Takes over those of a peer's rows, oldest first, that are of steps after `applied`; all, if none was applied here.
+    fn take_over(&mut self, rows: Vec<MetricRow>, applied: Option<u64>) {
+        let missed = rows.into_iter().filter(|row| applied.is_none_or(|applied| row.step > applied));
+        for row in missed {
+            self.newest_step = self.newest_step.max(row.step);
+            self.rows.push_back(row);
+        }
+    }
 }
 
 /// What is on its way for one assignment.
@@ -94,6 +106,22 @@ impl Spool {
                 );
             }
         }
+    }
+
+    /// All rows that are kept here, for a peer that takes over this member's state; see [`Self::take_over`].
+    pub(crate) fn kept(&self) -> Vec<u8> {
+        let rows: Vec<MetricRow> = lock(&self.state).rows.iter().cloned().collect();
+        serde_json::to_vec(&rows).expect("rows serialise")
+    }
+
+    /// Takes over what a peer keeps of the steps after `applied`, which are in the state that came with it.
+    ///
+    /// # Errors
+    /// If `kept` is not what [`Self::kept`] gives; nothing is changed then.
+    pub(crate) fn take_over(&self, kept: &[u8], applied: Option<u64>) -> Result<(), serde_json::Error> {
+        let rows = serde_json::from_slice(kept)?;
+        lock(&self.state).take_over(rows, applied);
+        Ok(())
     }
 
     /// Takes a log line.
@@ -254,5 +282,29 @@ impl Drop for Sender {
         {
             tracing::error!("the thread that sends metrics has panicked");
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn steps(state: &State) -> Vec<u64> {
+        state.rows.iter().map(|row| row.step).collect()
+    }
+
+    #[test]
+    fn who_takes_over_a_state_takes_over_the_rows_that_it_lacks() {
+        let rows = |steps: std::ops::Range<u64>| -> Vec<MetricRow> {
+            steps.map(|step| MetricRow { step, key: "loss".to_owned(), value: 1.0 }).collect()
+        };
+        // Rank 0 applied 5, has stored up to 3, and missed the sixth step, which a peer applied.
+        let mut lead = State { rows: rows(4..6).into(), newest_step: 5, ..State::default() };
+        lead.take_over(rows(2..7), Some(5));
+        assert_eq!((steps(&lead), lead.newest_step), (vec![4, 5, 6], 6));
+        // A joiner has nothing yet.
+        let mut joiner = State::default();
+        joiner.take_over(rows(4..7), None);
+        assert_eq!((steps(&joiner), joiner.newest_step), (vec![4, 5, 6], 6));
     }
 }
