@@ -7,13 +7,13 @@
 //! Not its job: who works on what (the coordinator), what tensors mean (the stages).
 
 pub mod blob;
-pub mod board;
 pub mod catalog;
 pub mod cli;
 mod clock;
 mod db;
 pub mod failpoints;
 pub mod fsck;
+pub mod leaderboard;
 mod lock;
 mod metrics;
 pub mod query;

@@ -47,8 +47,8 @@ async fn models_are_compared_and_ranked_in_tables_to_paste() {
 
     let compared = stdout(&registry(store, &["compare", "quickstart:1", "quickstart"]));
     assert!(compared.contains("noise not measured") && compared.contains("-0.100"), "{compared}");
-    let board = stdout(&registry(store, &["leaderboard", "quickstart", "--style", "markdown"]));
-    let rows: Vec<&str> = board.lines().skip(2).collect();
+    let leaderboard = stdout(&registry(store, &["leaderboard", "quickstart", "--style", "markdown"]));
+    let rows: Vec<&str> = leaderboard.lines().skip(2).collect();
     assert_eq!(rows, ["| quickstart:2 | **0.200** |", "| quickstart:1 | 0.300 |"], "best first, the best in bold");
     let kit = stdout(&registry(store, &["leaderboard", "kit", "--style", "latex"]));
     assert!(kit.contains("MotionPCM, 1 step [MotionPCM] & $0.031$ & $0.433^{\\pm0.007}$"), "{kit}");

@@ -5,7 +5,9 @@ use std::path::Path;
 use std::time::Duration;
 
 use coordinator::{Config, Coordinator, Handle, WorkerView};
-use protocol::message::{ApiError, FailureClass, Orders, Poll, ReportOutcome, RunView, Submit, TaskOutcome};
+use protocol::message::{
+    ApiError, DesiredAssignments, FailureClass, Poll, ReportOutcome, RunView, Submit, TaskOutcome,
+};
 use protocol::{Digest, Incarnation, RunId, WorkerId};
 use registry::cli::{Answer, Command};
 use registry::{Holder, LogRow, OpenError, Store};
@@ -163,8 +165,8 @@ impl Client {
         message: &str,
     ) -> Result<()> {
         let poll = Poll { incarnation, doing: Vec::new(), version: 0 };
-        let orders: Orders = self.post(&format!("/v1/workers/{worker}/poll"), &poll).await?;
-        for assignment in orders.assignments {
+        let desired: DesiredAssignments = self.post(&format!("/v1/workers/{worker}/poll"), &poll).await?;
+        for assignment in desired.assignments {
             let outcome = TaskOutcome::Failed { class, message: message.to_owned() };
             self.post::<()>("/v1/outcomes", &ReportOutcome { grant: assignment.grant, outcome }).await?;
         }

@@ -8,8 +8,8 @@ use protocol::WorkerId;
 use protocol::stage::Backend;
 use tokio::process::{Child, Command};
 
+use crate::out_of_memory::Watch;
 use crate::problem::{Problem, Result};
-use crate::starved::Watch;
 
 /// A worker that lives shorter than this has died at its start.
 const SHORT_LIFE: Duration = Duration::from_secs(5);
@@ -46,7 +46,7 @@ pub(crate) struct Fleet {
 pub(crate) struct Death {
     pub(crate) worker: WorkerId,
     /// Why, if it was for want of memory.
-    pub(crate) starved: Option<String>,
+    pub(crate) out_of_memory: Option<String>,
 }
 
 impl Fleet {
@@ -102,7 +102,7 @@ impl Fleet {
     }
 
     /// Collects workers that have died, and starts them again once their time has come. Gives the dead.
-    pub(crate) fn tend(&mut self, restart: bool) -> Result<Vec<Death>> {
+    pub(crate) fn reap(&mut self, restart: bool) -> Result<Vec<Death>> {
         let mut dead = Vec::new();
         self.memory.look();
         let now = Instant::now();
@@ -113,8 +113,8 @@ impl Fleet {
                     let Ok(Some(status)) = child.try_wait() else { continue };
                     member.child = None;
                     let said = last_words(&self.logs.join(format!("{}.log", member.name)), member.log_from);
-                    let starved = self.memory.explain(status, &said);
-                    dead.push(Death { worker: member.name.clone(), starved });
+                    let out_of_memory = self.memory.explain(status, &said);
+                    dead.push(Death { worker: member.name.clone(), out_of_memory });
                     let early = now - member.since < SHORT_LIFE;
                     member.early_deaths = if early { member.early_deaths + 1 } else { 0 };
                     member.next_start = now + if early { Duration::from_millis(500) } else { Duration::ZERO };

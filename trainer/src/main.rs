@@ -5,13 +5,13 @@
 mod cli;
 mod client;
 mod fleet;
+mod out_of_memory;
 mod pipeline_file;
 mod plan;
 mod print;
 mod problem;
 mod progress;
 mod run;
-mod starved;
 mod summary;
 mod sweep_plot;
 mod verify;

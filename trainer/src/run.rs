@@ -164,16 +164,16 @@ async fn watch(
             *fleet = Some(Fleet::start(count, handle.url(), pipeline.backend, &logs)?);
         }
         if let Some(fleet) = fleet {
-            for death in fleet.tend(true)? {
-                let how = death.starved.as_deref().unwrap_or("has died; starting it again");
+            for death in fleet.reap(true)? {
+                let how = death.out_of_memory.as_deref().unwrap_or("has died; starting it again");
                 progress.note(&format!("worker {} {how}", death.worker));
-                bury(handle, &death).await;
+                report_death(handle, &death).await;
             }
         }
         tokio::select! {
             _ = changes.changed() => {}
             () = tokio::time::sleep(BEAT) => {}
-            () = stop.asked() => return wind_down(handle, run, progress, fleet, stop).await,
+            () = stop.asked() => return drain(handle, run, progress, fleet, stop).await,
         }
         // A training step may change something ten times a second; nobody reads so fast.
         if fleet.is_some() {
@@ -183,8 +183,8 @@ async fn watch(
 }
 
 /// Tells the coordinator that a worker has died, and what of.
-async fn bury(handle: &Handle, death: &Death) {
-    if let Some(why) = &death.starved {
+async fn report_death(handle: &Handle, death: &Death) {
+    if let Some(why) = &death.out_of_memory {
         // Said in the worker's own name, as it would have said it: with a grant that still holds, and never again with one that does not.
         let held = handle.workers().into_iter().find(|view| view.worker == death.worker && view.task.is_some());
         if let Some(view) = held
@@ -209,7 +209,7 @@ fn wants_workers(view: &RunView) -> bool {
     view.state == RunState::Running && view.stages.iter().any(waits)
 }
 
-async fn wind_down(
+async fn drain(
     handle: &Handle,
     run: &RunId,
     progress: &mut Progress,
@@ -226,8 +226,8 @@ async fn wind_down(
         }
         let alive = match fleet {
             Some(fleet) => {
-                for death in fleet.tend(false)? {
-                    bury(handle, &death).await;
+                for death in fleet.reap(false)? {
+                    report_death(handle, &death).await;
                 }
                 fleet.is_alive()
             }

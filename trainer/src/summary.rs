@@ -136,10 +136,10 @@ pub(crate) fn evaluations(run: &RunView) -> String {
     let of_kind = |kind: &&str| {
         let stages = run.stages.iter().filter(|stage| stage.kind == *kind && !stage.metrics.is_empty());
         let all: Vec<_> = stages.map(|stage| (stage.name.to_string(), stage.metrics.clone())).collect();
-        if all.len() < 2 { None } else { registry::board::evaluations(kind, all) }
+        if all.len() < 2 { None } else { registry::leaderboard::evaluations(kind, all) }
     };
     let tables =
-        kinds.iter().filter_map(of_kind).map(|table| format!("\n{}", table.render(registry::board::Style::Text)));
+        kinds.iter().filter_map(of_kind).map(|table| format!("\n{}", table.render(registry::leaderboard::Style::Text)));
     tables.collect()
 }
 

@@ -6,16 +6,16 @@ use bytes::Bytes;
 use checkpoint::{BlobError, Blobs};
 use protocol::Digest;
 
+use crate::active_assignment::ActiveAssignment;
 use crate::cache::Cache;
 use crate::client::{CallError, Client};
 use crate::failpoints;
-use crate::held::Held;
 use crate::retry::{self, GaveUp};
 
 /// [`Blobs`] of an attempt. Writes carry its grant; reads are verified and cached.
 #[derive(Debug)]
 pub(crate) struct HttpBlobs {
-    pub(crate) held: Arc<Held>,
+    pub(crate) held: Arc<ActiveAssignment>,
     pub(crate) client: Client,
     pub(crate) cache: Arc<Cache>,
     /// Whether the fail points of checkpoints are passed: in gangs.

@@ -12,7 +12,7 @@ use std::time::SystemTime;
 
 use protocol::Digest;
 
-use crate::bell::lock;
+use crate::event_count::lock;
 
 /// Bounds, in bytes.
 #[derive(Debug, Clone, Copy)]

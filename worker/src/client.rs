@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use protocol::Digest;
-use protocol::message::{ApiError, Grant, Join, Joined, Orders, Poll};
+use protocol::message::{ApiError, DesiredAssignments, Grant, Join, Joined, Poll};
 use reqwest::{RequestBuilder, Response, StatusCode};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -80,7 +80,7 @@ impl Client {
     }
 
     /// Waits as long as the coordinator does, and somewhat longer.
-    pub(crate) async fn poll(&self, path: &str, poll: &Poll, waits: Duration) -> Result<Orders, CallError> {
+    pub(crate) async fn poll(&self, path: &str, poll: &Poll, waits: Duration) -> Result<DesiredAssignments, CallError> {
         answer(self.post(path, poll, waits + Duration::from_secs(10)).await?).await
     }
 

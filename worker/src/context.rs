@@ -11,50 +11,50 @@ use protocol::message::{CommitCheckpoint, Progress, StageTask};
 use protocol::{ArtifactKind, Digest, Manifest};
 use stages::context::{AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
 
+use crate::active_assignment::ActiveAssignment;
 use crate::blobs::HttpBlobs;
 use crate::cache::Cache;
 use crate::client::{CallError, Client};
 use crate::failpoints;
-use crate::gang::exchange::{self, Bring, Met};
+use crate::gang::exchange::{self, Contribution, Met};
 use crate::gang::mesh::{Halt, Mesh};
 use crate::gang::tree;
-use crate::held::Held;
 use crate::retry::{self, GaveUp};
-use crate::spool::{Sender, Spool};
+use crate::telemetry_buffer::{Sender, TelemetryBuffer};
 
 /// One attempt's view of the coordinator and, in a gang, of its peers.
 #[derive(Debug)]
 pub(crate) struct HttpContext {
     task: StageTask,
     device: Device,
-    held: Arc<Held>,
+    held: Arc<ActiveAssignment>,
     client: Client,
     blobs: Arc<HttpBlobs>,
-    spool: Arc<Spool>,
+    telemetry: Arc<TelemetryBuffer>,
     mesh: Option<Arc<Mesh>>,
     gang: bool,
     _sender: Sender,
 }
 
 impl HttpContext {
-    pub(crate) fn new(held: Arc<Held>, client: Client, cache: Arc<Cache>, device: Device) -> Self {
+    pub(crate) fn new(held: Arc<ActiveAssignment>, client: Client, cache: Arc<Cache>, device: Device) -> Self {
         let assignment = held.assignment();
         let gang = matches!(assignment.role, protocol::message::Role::Member { .. });
         let blobs = Arc::new(HttpBlobs { held: held.clone(), client: client.clone(), cache, gang });
-        let (spool, sender) = Spool::open(held.clone(), client.clone());
-        Self { task: assignment.stage, device, held, client, blobs, spool, mesh: None, gang, _sender: sender }
+        let (telemetry, sender) = TelemetryBuffer::open(held.clone(), client.clone());
+        Self { task: assignment.stage, device, held, client, blobs, telemetry, mesh: None, gang, _sender: sender }
     }
 
     /// Waits until everything recorded and logged is stored.
     pub(crate) fn flush(&self) -> Result<(), ContextError> {
-        self.spool.flush().map_err(given_up)
+        self.telemetry.flush().map_err(given_up)
     }
 
     /// Lets the peers go, saying goodbye: to the next generation, or for good.
     fn part(&mut self) {
         if let Some(mesh) = self.mesh.take() {
             let next = match &self.held.assignment().role {
-                protocol::message::Role::Member { generation, .. } if *generation > mesh.terms.generation => {
+                protocol::message::Role::Member { generation, .. } if *generation > mesh.config.generation => {
                     Some(*generation)
                 }
                 _ => None,
@@ -68,8 +68,8 @@ impl HttpContext {
         let begun = Instant::now();
         let mut warned = begun;
         loop {
-            let ticket = self.held.bell().ticket();
-            match self.held.halt(mesh.terms.generation) {
+            let ticket = self.held.event_count().ticket();
+            match self.held.halt(mesh.config.generation) {
                 Some(Halt::Ended(reason)) => {
                     self.part();
                     return Err(ContextError::GrantEnded(reason));
@@ -83,15 +83,15 @@ impl HttpContext {
             if warned.elapsed() > Duration::from_secs(20) {
                 let lost = mesh.missing();
                 tracing::warn!(
-                    task = %mesh.terms.task,
+                    task = %mesh.config.task,
                     "waiting for a generation after {} for {:.0} s; missing: {}",
-                    mesh.terms.generation,
+                    mesh.config.generation,
                     begun.elapsed().as_secs_f64(),
                     if lost.is_empty() { "nobody".to_owned() } else { lost.join("; ") },
                 );
                 warned = Instant::now();
             }
-            self.held.bell().wait(ticket, Duration::from_secs(1));
+            self.held.event_count().wait(ticket, Duration::from_secs(1));
         }
     }
 
@@ -142,17 +142,17 @@ impl AttemptContext for HttpContext {
     }
 
     fn record(&mut self, step: u64, metrics: &[(&str, f64)]) {
-        self.spool.record(step, metrics);
+        self.telemetry.record(step, metrics);
     }
 
     fn log(&mut self, line: &str) {
         tracing::info!(target: "stage", task = %self.held.grant().task, "{line}");
-        self.spool.log(line);
+        self.telemetry.log(line);
     }
 
     /// In a gang a wish to stop is not said here: all members must hear it after the same step, from an exchange.
     fn interrupted(&self) -> bool {
-        self.held.ended().is_some() || (!self.gang && self.held.wind_down())
+        self.held.ended().is_some() || (!self.gang && self.held.drain())
     }
 }
 
@@ -177,16 +177,16 @@ impl GangContext for HttpContext {
                 return Err(ContextError::Unavailable("a rendezvous of a stage that is not a gang's".to_owned()));
             };
             let held = self.held.clone();
-            let generation = mesh.terms.generation;
+            let generation = mesh.config.generation;
             // The rows that are not known to be stored travel behind the state, and their length behind them.
-            let kept = self.spool.kept();
+            let kept = self.telemetry.kept();
             let length = (kept.len() as u64).to_le_bytes();
             let offered: Vec<&[u8]> = state.iter().copied().chain([&kept[..], &length[..]]).collect();
             match exchange::rendezvous(&mesh, applied, &offered, &|| held.halt(generation)) {
                 Ok(mut met) => {
                     if let Met::Adopt { pieces, .. } = &mut met {
                         let rows = split_rows(pieces).ok_or_else(|| malformed("is cut short"))?;
-                        self.spool.take_over(&rows, applied).map_err(|e| malformed(&e.to_string()))?;
+                        self.telemetry.take_over(&rows, applied).map_err(|e| malformed(&e.to_string()))?;
                     }
                     let adopted = match &met {
                         Met::Adopt { pieces, took } => {
@@ -195,9 +195,9 @@ impl GangContext for HttpContext {
                         Met::Keep => None,
                     };
                     tracing::info!(
-                        task = %mesh.terms.task,
+                        task = %mesh.config.task,
                         %generation,
-                        rank = mesh.terms.rank,
+                        rank = mesh.config.rank,
                         members = mesh.size(),
                         adopts = adopted.is_some(),
                         bytes = adopted.map(|(bytes, _)| bytes),
@@ -220,13 +220,13 @@ impl GangContext for HttpContext {
     }
 
     fn share(&self, slices: usize) -> Range<usize> {
-        self.mesh.as_ref().map_or(0..0, |mesh| tree::share(slices, mesh.terms.rank, mesh.size()))
+        self.mesh.as_ref().map_or(0..0, |mesh| tree::share(slices, mesh.config.rank, mesh.size()))
     }
 
     fn exchange(&mut self, step: u64, slices: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError> {
         self.check()?;
         let Some(mesh) = self.mesh.clone() else { return Ok(Exchange::Regroup) };
-        let generation = mesh.terms.generation;
+        let generation = mesh.config.generation;
         if self.held.halt(generation).is_some() {
             self.part();
             return Ok(Exchange::Regroup);
@@ -243,12 +243,13 @@ impl GangContext for HttpContext {
             };
             own.push((slice..slice + 1, part));
         }
-        let bring = Bring { step, slices, parts: own, wind_down: self.held.wind_down(), durable: self.spool.durable() };
+        let contribution =
+            Contribution { step, slices, parts: own, drain: self.held.drain(), durable: self.telemetry.durable() };
         let held = self.held.clone();
-        match exchange::exchange(&mesh, &bring, &|| held.halt(generation)) {
+        match exchange::exchange(&mesh, &contribution, &|| held.halt(generation)) {
             Ok(total) => {
-                self.spool.forget(total.durable);
-                Ok(Exchange::Sum { sum: total.sum, wind_down: total.wind_down })
+                self.telemetry.forget(total.durable);
+                Ok(Exchange::Sum { sum: total.sum, drain: total.drain })
             }
             Err(Halt::Ended(reason)) => {
                 self.part();
@@ -263,7 +264,7 @@ impl GangContext for HttpContext {
     }
 
     fn leads(&self) -> bool {
-        self.mesh.as_ref().map_or_else(|| self.held.leads(), |mesh| mesh.terms.rank == 0)
+        self.mesh.as_ref().map_or_else(|| self.held.leads(), |mesh| mesh.config.rank == 0)
     }
 
     fn can_save(&self) -> bool {

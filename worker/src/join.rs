@@ -13,11 +13,11 @@ use protocol::stage::Backend;
 use tokio::runtime;
 use tokio::signal::unix::{SignalKind, signal};
 
+use crate::assignments::{self, End, Shared};
 use crate::cache::{Bounds, Cache};
 use crate::client::Client;
 use crate::gang::endpoint::Endpoint;
 use crate::gang::mesh::Timing;
-use crate::orders::{self, End, Shared};
 use crate::stage_thread::{self, Bench, Kinds};
 use crate::{failpoints, kinds, process};
 
@@ -139,7 +139,7 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
         backend: options.backend,
         peer_address: advertised.unwrap_or_else(|| endpoint.address().to_string()),
     };
-    let end = runtime.block_on(orders::follow(&client, &offer, &shared));
+    let end = runtime.block_on(assignments::follow(&client, &offer, &shared));
     shared.end("this worker leaves");
     stage.join().map_err(|_| JoinError::Fault)?;
     match end {

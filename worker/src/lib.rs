@@ -1,27 +1,27 @@
 //! The data plane: a process that takes assignments from a coordinator, runs their stages and uploads what they make.
 //!
 //! Its threads: one computes (`stage_thread`), one drives all HTTP, on which the poll (`orders`) lives, one a running
-//! attempt sends metrics and logs (`spool`), and a few short-stacked ones serve the connections of a gang (`gang::mesh`). What
-//! binds them is `held::Held`: an assignment, its newest grant, and whether it has ended.
+//! attempt sends metrics and logs (`telemetry`), and a few short-stacked ones serve the connections of a gang (`gang::mesh`). What
+//! binds them is `held::ActiveAssignment`: an assignment, its newest grant, and whether it has ended.
 //!
 //! Not its job: what a stage computes (`stages`), and every decision about who does what (the coordinator's).
 
-mod bell;
+mod active_assignment;
+mod assignments;
 mod blobs;
 mod cache;
 mod cli;
 mod client;
 mod context;
+mod event_count;
 pub mod failpoints;
 mod gang;
-mod held;
 mod join;
 mod kinds;
-mod orders;
 pub mod process;
 mod retry;
-mod spool;
 mod stage_thread;
+mod telemetry_buffer;
 #[cfg(test)]
 mod tests;
 

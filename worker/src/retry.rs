@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 use protocol::message::Grant;
 
+use crate::active_assignment::ActiveAssignment;
 use crate::client::CallError;
-use crate::held::Held;
 
 /// Why a call in the name of a grant was given up.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -24,7 +24,7 @@ const LONGEST: Duration = Duration::from_secs(1);
 
 /// Calls until it succeeds, is refused for good, or the grant has ended. `call` is given the newest grant each time.
 pub(crate) fn until_ended<T>(
-    held: &Held,
+    held: &ActiveAssignment,
     what: &str,
     mut call: impl FnMut(&Grant) -> Result<T, CallError>,
 ) -> Result<T, GaveUp> {

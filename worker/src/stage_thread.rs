@@ -11,12 +11,12 @@ use burn::tensor::Device;
 use protocol::message::{FailureClass, ReportOutcome, Role, TaskOutcome};
 use stages::context::{AttemptContext, ContextError, GangContext, Outcome, Part, StageError};
 
+use crate::active_assignment::ActiveAssignment;
+use crate::assignments::Shared;
 use crate::cache::Cache;
 use crate::client::Client;
 use crate::context::HttpContext;
 use crate::failpoints;
-use crate::held::Held;
-use crate::orders::Shared;
 use crate::retry::{self, GaveUp};
 
 /// The stage kinds, as far as a worker knows them. Tests bring their own.
@@ -49,7 +49,7 @@ pub(crate) fn run(shared: &Shared, bench: &Bench) {
     }
 }
 
-fn attempt(held: &Arc<Held>, bench: &Bench) {
+fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
     let assignment = held.assignment();
     let grant = &assignment.grant;
     tracing::info!(task = %grant.task, attempt = %grant.attempt, fence = %grant.fence, kind = assignment.stage.settings.kind(), "begin");
@@ -79,7 +79,7 @@ fn attempt(held: &Arc<Held>, bench: &Bench) {
 }
 
 /// What to report; nothing if the grant has ended, or if it is for rank 0 to say.
-fn outcome(result: Result<Outcome, StageError>, held: &Held, context: &HttpContext) -> Option<TaskOutcome> {
+fn outcome(result: Result<Outcome, StageError>, held: &ActiveAssignment, context: &HttpContext) -> Option<TaskOutcome> {
     let task = held.grant().task;
     let result = match result {
         // What was recorded belongs to the outcome; without it the outcome is not reported.

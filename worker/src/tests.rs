@@ -15,8 +15,8 @@ use axum::routing::{get, post, put};
 use burn::tensor::Device;
 use checkpoint::BlobError;
 use protocol::message::{
-    ApiError, Assignment, CommitCheckpoint, FailureClass, Grant, Join, Joined, LogBatch, Member, MetricBatch, Orders,
-    PROTOCOL_VERSION, Poll, ReportOutcome, Role, StageTask, TaskOutcome,
+    ApiError, Assignment, CommitCheckpoint, DesiredAssignments, FailureClass, Grant, Join, Joined, LogBatch, Member,
+    MetricBatch, PROTOCOL_VERSION, Poll, ReportOutcome, Role, StageTask, TaskOutcome,
 };
 use protocol::stage::{Backend, CheckpointPolicy, DataSynthetic, StageSettings};
 use protocol::{
@@ -25,18 +25,18 @@ use protocol::{
 use stages::context::{AttemptContext, ContextError, Exchange, GangContext, Outcome, Part, StageError};
 use tokio::runtime::Runtime;
 
-use crate::bell::lock;
+use crate::assignments::{self, End, Shared};
 use crate::cache::{Bounds, Cache};
 use crate::client::Client;
+use crate::event_count::lock;
 use crate::gang::endpoint::Endpoint;
 use crate::gang::mesh::Timing;
-use crate::orders::{self, End, Shared};
 use crate::stage_thread::{self, Bench, Kinds};
 
 type Metrics = BTreeMap<(u64, String), f64>;
 
 #[derive(Debug, Default)]
-struct Desk {
+struct ActorHandle {
     assignments: Vec<Assignment>,
     version: u64,
     leave: bool,
@@ -57,7 +57,7 @@ struct Desk {
 /// The coordinator.
 #[derive(Debug, Default)]
 struct Fake {
-    desk: Mutex<Desk>,
+    coordinator: Mutex<ActorHandle>,
     /// Answers 503 to everything.
     away: AtomicBool,
     /// Every third write is done, and then its answer is lost.
@@ -71,24 +71,24 @@ fn refuse(status: StatusCode, code: &str) -> Response {
 }
 
 impl Fake {
-    fn orders(&self, change: impl FnOnce(&mut Desk)) {
-        let mut desk = lock(&self.desk);
-        change(&mut desk);
-        desk.version += 1;
+    fn desired(&self, change: impl FnOnce(&mut ActorHandle)) {
+        let mut coordinator = lock(&self.coordinator);
+        change(&mut coordinator);
+        coordinator.version += 1;
     }
 
     /// A write: checked, done, and answered unless the answer is to be lost.
-    fn write(&self, grant: &Grant, work: impl FnOnce(&mut Desk)) -> Response {
+    fn write(&self, grant: &Grant, work: impl FnOnce(&mut ActorHandle)) -> Response {
         if self.away.load(Ordering::SeqCst) {
             return refuse(StatusCode::SERVICE_UNAVAILABLE, "internal");
         }
-        let mut desk = lock(&self.desk);
-        if grant.fence.0 != desk.fence {
+        let mut coordinator = lock(&self.coordinator);
+        if grant.fence.0 != coordinator.fence {
             return refuse(StatusCode::CONFLICT, "stale-fence");
         }
-        work(&mut desk);
-        desk.calls += 1;
-        if self.lossy.load(Ordering::SeqCst) && desk.calls.is_multiple_of(3) {
+        work(&mut coordinator);
+        coordinator.calls += 1;
+        if self.lossy.load(Ordering::SeqCst) && coordinator.calls.is_multiple_of(3) {
             return refuse(StatusCode::BAD_GATEWAY, "internal");
         }
         Json(()).into_response()
@@ -97,9 +97,9 @@ impl Fake {
 
 async fn join(State(fake): State<Arc<Fake>>, Json(join): Json<Join>) -> Response {
     assert_eq!(join.protocol, PROTOCOL_VERSION);
-    let mut desk = lock(&fake.desk);
-    desk.joins += 1;
-    Json(Joined { incarnation: Incarnation(desk.joins), lease_ms: 1000, poll_ms: 100 }).into_response()
+    let mut coordinator = lock(&fake.coordinator);
+    coordinator.joins += 1;
+    Json(Joined { incarnation: Incarnation(coordinator.joins), lease_ms: 1000, poll_ms: 100 }).into_response()
 }
 
 async fn poll(State(fake): State<Arc<Fake>>, Path(worker): Path<String>, Json(poll): Json<Poll>) -> Response {
@@ -109,55 +109,64 @@ async fn poll(State(fake): State<Arc<Fake>>, Path(worker): Path<String>, Json(po
     }
     let version = poll.version;
     {
-        let mut desk = lock(&fake.desk);
-        if std::mem::take(&mut desk.forget) {
+        let mut coordinator = lock(&fake.coordinator);
+        if std::mem::take(&mut coordinator.forget) {
             return refuse(StatusCode::NOT_FOUND, "not-found");
         }
-        desk.polls += 1;
-        desk.last_poll = Some(poll);
+        coordinator.polls += 1;
+        coordinator.last_poll = Some(poll);
     }
     for _ in 0..20 {
-        if lock(&fake.desk).version != version {
+        if lock(&fake.coordinator).version != version {
             break;
         }
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
-    let desk = lock(&fake.desk);
-    Json(Orders { version: desk.version, assignments: desk.assignments.clone(), leave: desk.leave }).into_response()
+    let coordinator = lock(&fake.coordinator);
+    Json(DesiredAssignments {
+        version: coordinator.version,
+        assignments: coordinator.assignments.clone(),
+        leave: coordinator.leave,
+    })
+    .into_response()
 }
 
 async fn metrics(State(fake): State<Arc<Fake>>, Json(batch): Json<MetricBatch>) -> Response {
-    fake.write(&batch.grant, |desk| {
+    fake.write(&batch.grant, |coordinator| {
         for row in batch.rows {
-            let before = desk.metrics.insert((row.step, row.key.clone()), row.value);
+            let before = coordinator.metrics.insert((row.step, row.key.clone()), row.value);
             assert!(before.is_none_or(|v| v == row.value), "a row changed its value");
         }
     })
 }
 
 async fn logs(State(fake): State<Arc<Fake>>, Json(batch): Json<LogBatch>) -> Response {
-    fake.write(&batch.grant, |desk| {
+    fake.write(&batch.grant, |coordinator| {
         for (i, line) in batch.lines.into_iter().enumerate() {
-            desk.logs.insert(batch.first + i as u64, line);
+            coordinator.logs.insert(batch.first + i as u64, line);
         }
     })
 }
 
 async fn checkpoint(State(fake): State<Arc<Fake>>, Json(commit): Json<CommitCheckpoint>) -> Response {
-    fake.write(&commit.grant.clone(), |desk| {
-        assert!(desk.blobs.contains_key(&commit.manifest), "a manifest is uploaded before it is committed");
+    fake.write(&commit.grant.clone(), |coordinator| {
+        assert!(coordinator.blobs.contains_key(&commit.manifest), "a manifest is uploaded before it is committed");
         // What was recorded up to here must have arrived before.
-        assert!((1..=commit.step).all(|s| desk.metrics.contains_key(&(s, "loss".to_owned()))), "{:?}", desk.metrics);
-        desk.checkpoints.push(commit);
+        assert!(
+            (1..=commit.step).all(|s| coordinator.metrics.contains_key(&(s, "loss".to_owned()))),
+            "{:?}",
+            coordinator.metrics
+        );
+        coordinator.checkpoints.push(commit);
     })
 }
 
 async fn outcome(State(fake): State<Arc<Fake>>, Json(report): Json<ReportOutcome>) -> Response {
-    fake.write(&report.grant.clone(), |desk| {
-        if !desk.outcomes.contains(&report) {
-            desk.assignments.retain(|a| a.grant.task != report.grant.task);
-            desk.version += 1;
-            desk.outcomes.push(report);
+    fake.write(&report.grant.clone(), |coordinator| {
+        if !coordinator.outcomes.contains(&report) {
+            coordinator.assignments.retain(|a| a.grant.task != report.grant.task);
+            coordinator.version += 1;
+            coordinator.outcomes.push(report);
         }
     })
 }
@@ -166,7 +175,7 @@ async fn put_blob(State(fake): State<Arc<Fake>>, headers: axum::http::HeaderMap,
     let grant: Grant = serde_json::from_slice(headers["x-stride-grant"].as_bytes()).expect("a grant");
     assert_eq!(headers["authorization"], "Bearer token");
     let digest = Digest::of(&body);
-    let response = fake.write(&grant, |desk| drop(desk.blobs.insert(digest, body.to_vec())));
+    let response = fake.write(&grant, |coordinator| drop(coordinator.blobs.insert(digest, body.to_vec())));
     if response.status().is_success() {
         Json(serde_json::json!({ "digest": digest })).into_response()
     } else {
@@ -179,7 +188,7 @@ async fn get_blob(State(fake): State<Arc<Fake>>, Path(digest): Path<String>) -> 
         return refuse(StatusCode::SERVICE_UNAVAILABLE, "internal");
     }
     let digest: Digest = digest.parse().expect("a digest");
-    let Some(mut bytes) = lock(&fake.desk).blobs.get(&digest).cloned() else {
+    let Some(mut bytes) = lock(&fake.coordinator).blobs.get(&digest).cloned() else {
         return refuse(StatusCode::NOT_FOUND, "not-found");
     };
     if fake.damage.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok() {
@@ -253,7 +262,7 @@ impl Worker {
         let poll = {
             let (shared, handle) = (shared.clone(), server.handle().clone());
             thread::spawn(move || {
-                let end = handle.block_on(orders::follow(&client, &offer, &shared));
+                let end = handle.block_on(assignments::follow(&client, &offer, &shared));
                 shared.end("the worker leaves");
                 end
             })
@@ -264,26 +273,26 @@ impl Worker {
     /// Grants the task anew under the next fence.
     fn grant(&self, attempt: u64) {
         let member = self.member.clone();
-        self.fake.orders(|desk| {
-            desk.fence += 1;
-            desk.assignments = vec![assignment(&member, attempt, desk.fence)];
+        self.fake.desired(|coordinator| {
+            coordinator.fence += 1;
+            coordinator.assignments = vec![assignment(&member, attempt, coordinator.fence)];
         });
     }
 
-    fn wait(&self, what: &str, mut holds: impl FnMut(&Desk) -> bool) {
+    fn wait(&self, what: &str, mut holds: impl FnMut(&ActorHandle) -> bool) {
         let begun = Instant::now();
-        while !holds(&lock(&self.fake.desk)) {
-            assert!(begun.elapsed() < Duration::from_secs(30), "{what}: {:?}", lock(&self.fake.desk));
+        while !holds(&lock(&self.fake.coordinator)) {
+            assert!(begun.elapsed() < Duration::from_secs(30), "{what}: {:?}", lock(&self.fake.coordinator));
             thread::sleep(Duration::from_millis(5));
         }
     }
 
     /// Lets the worker go and returns all that the coordinator was told.
-    fn leave(self) -> Desk {
-        self.fake.orders(|desk| desk.leave = true);
+    fn leave(self) -> ActorHandle {
+        self.fake.desired(|coordinator| coordinator.leave = true);
         assert_eq!(self.poll.join().expect("no panic"), End::Left);
         self.stage.join().expect("no panic");
-        std::mem::take(&mut *lock(&self.fake.desk))
+        std::mem::take(&mut *lock(&self.fake.coordinator))
     }
 }
 
@@ -310,7 +319,7 @@ fn assignment(member: &Member, attempt: u64, fence: u64) -> Assignment {
             secret: "secret".to_owned(),
         },
         resume: None,
-        wind_down: false,
+        drain: false,
     }
 }
 
@@ -329,18 +338,18 @@ fn train(context: &mut dyn GangContext, steps: u64, pause: Duration) -> Result<O
             Exchange::Regroup => {
                 context.rendezvous(Some(step), &[])?;
             }
-            Exchange::Sum { wind_down, .. } => {
+            Exchange::Sum { drain, .. } => {
                 step += 1;
                 context.record(step, &[("loss", 1.0 / step as f64), ("bad", f64::NAN)]);
                 context.progress(step, steps, "steps", &[]);
-                if step.is_multiple_of(10) || wind_down {
+                if step.is_multiple_of(10) || drain {
                     context.log(&format!("saving at {step}"));
                     let blob = context.blobs().put(step.to_le_bytes().to_vec()).expect("stored");
                     let manifest = Manifest::new(ArtifactKind::Checkpoint, serde_json::json!({"blob": blob}));
                     context.put_manifest(&manifest)?;
                     context.commit_checkpoint(step, &manifest, &BTreeMap::new())?;
                 }
-                if wind_down {
+                if drain {
                     return Ok(Outcome::Yielded { at: step });
                 }
                 thread::sleep(pause);
@@ -356,44 +365,46 @@ fn p9_everything_arrives_once_though_answers_are_lost() {
     let worker = Worker::start(Box::new(|context| train(context, 100, Duration::ZERO)));
     worker.fake.lossy.store(true, Ordering::SeqCst);
     worker.grant(1);
-    worker.wait("an outcome", |desk| !desk.outcomes.is_empty());
-    let desk = worker.leave();
-    let steps: Vec<u64> = desk.metrics.keys().filter(|(_, key)| key == "loss").map(|(step, _)| *step).collect();
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    let coordinator = worker.leave();
+    let steps: Vec<u64> = coordinator.metrics.keys().filter(|(_, key)| key == "loss").map(|(step, _)| *step).collect();
     assert_eq!(steps, (1..=100).collect::<Vec<_>>());
-    assert_eq!(desk.metrics.len(), 100, "what is not a number is left out");
+    assert_eq!(coordinator.metrics.len(), 100, "what is not a number is left out");
     assert_eq!(
-        desk.logs.values().cloned().collect::<Vec<_>>(),
+        coordinator.logs.values().cloned().collect::<Vec<_>>(),
         (1..=10).map(|i| format!("saving at {}", i * 10)).collect::<Vec<_>>()
     );
-    assert!(matches!(desk.outcomes[..], [ReportOutcome { outcome: TaskOutcome::Finished { .. }, .. }]));
-    assert_eq!(desk.joins, 1);
+    assert!(matches!(coordinator.outcomes[..], [ReportOutcome { outcome: TaskOutcome::Finished { .. }, .. }]));
+    assert_eq!(coordinator.joins, 1);
 }
 
 #[test]
 fn a_coordinator_that_goes_away_and_forgets_is_waited_for() {
     let worker = Worker::start(Box::new(|context| train(context, 200, Duration::from_millis(5))));
     worker.grant(1);
-    worker.wait("some steps", |desk| desk.metrics.len() > 10);
+    worker.wait("some steps", |coordinator| coordinator.metrics.len() > 10);
     worker.fake.away.store(true, Ordering::SeqCst);
     thread::sleep(Duration::from_millis(2500));
     worker.fake.away.store(false, Ordering::SeqCst);
-    worker.wait("an outcome", |desk| !desk.outcomes.is_empty());
-    lock(&worker.fake.desk).forget = true;
-    worker.wait("a second join", |desk| desk.joins == 2);
-    let desk = worker.leave();
-    assert_eq!(desk.metrics.len(), 200);
-    assert!(matches!(desk.outcomes[..], [ReportOutcome { outcome: TaskOutcome::Finished { .. }, .. }]));
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    lock(&worker.fake.coordinator).forget = true;
+    worker.wait("a second join", |coordinator| coordinator.joins == 2);
+    let coordinator = worker.leave();
+    assert_eq!(coordinator.metrics.len(), 200);
+    assert!(matches!(coordinator.outcomes[..], [ReportOutcome { outcome: TaskOutcome::Finished { .. }, .. }]));
 }
 
 #[test]
 fn work_that_is_taken_back_is_dropped_without_a_word() {
     let worker = Worker::start(Box::new(|context| train(context, u64::MAX, Duration::from_millis(1))));
     worker.grant(1);
-    worker.wait("some steps", |desk| desk.metrics.len() > 3);
-    worker.fake.orders(|desk| desk.assignments.clear());
-    worker.wait("nothing is done", |desk| desk.last_poll.as_ref().is_some_and(|poll| poll.doing.is_empty()));
-    let desk = worker.leave();
-    assert_eq!(desk.outcomes, []);
+    worker.wait("some steps", |coordinator| coordinator.metrics.len() > 3);
+    worker.fake.desired(|coordinator| coordinator.assignments.clear());
+    worker.wait("nothing is done", |coordinator| {
+        coordinator.last_poll.as_ref().is_some_and(|poll| poll.doing.is_empty())
+    });
+    let coordinator = worker.leave();
+    assert_eq!(coordinator.outcomes, []);
 }
 
 #[test]
@@ -405,14 +416,14 @@ fn a_newer_generation_is_taken_on_by_the_same_attempt() {
         train(context, 150, Duration::from_millis(5))
     }));
     worker.grant(1);
-    worker.wait("some steps", |desk| desk.metrics.len() > 3);
+    worker.wait("some steps", |coordinator| coordinator.metrics.len() > 3);
     // The fence moves first: writes under the old one are refused until the next orders say why.
     worker.grant(1);
-    worker.wait("an outcome", |desk| !desk.outcomes.is_empty());
-    let desk = worker.leave();
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    let coordinator = worker.leave();
     assert_eq!(starts.load(Ordering::SeqCst), 1);
-    assert_eq!(desk.outcomes[0].grant.fence, Fence(2));
-    assert_eq!(desk.metrics.len(), 150);
+    assert_eq!(coordinator.outcomes[0].grant.fence, Fence(2));
+    assert_eq!(coordinator.metrics.len(), 150);
 }
 
 #[test]
@@ -424,27 +435,27 @@ fn another_attempt_begins_anew() {
         train(context, if first { u64::MAX } else { 5 }, Duration::from_millis(1))
     }));
     worker.grant(1);
-    worker.wait("some steps", |desk| desk.metrics.len() > 3);
+    worker.wait("some steps", |coordinator| coordinator.metrics.len() > 3);
     worker.grant(2);
-    worker.wait("an outcome", |desk| !desk.outcomes.is_empty());
-    let desk = worker.leave();
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    let coordinator = worker.leave();
     assert_eq!(starts.load(Ordering::SeqCst), 2);
-    assert_eq!((desk.outcomes.len(), desk.outcomes[0].grant.attempt), (1, Attempt(2)));
+    assert_eq!((coordinator.outcomes.len(), coordinator.outcomes[0].grant.attempt), (1, Attempt(2)));
 }
 
 #[test]
 fn a_write_under_an_old_fence_ends_the_attempt_once_orders_say_so() {
     let worker = Worker::start(Box::new(|context| train(context, u64::MAX, Duration::from_millis(1))));
     worker.grant(1);
-    worker.wait("some steps", |desk| desk.metrics.len() > 3);
+    worker.wait("some steps", |coordinator| coordinator.metrics.len() > 3);
     // Somebody else holds the task now: the store knows, this worker does not yet.
-    lock(&worker.fake.desk).fence = 9;
+    lock(&worker.fake.coordinator).fence = 9;
     thread::sleep(Duration::from_millis(700));
-    let stored = lock(&worker.fake.desk).metrics.len();
-    worker.fake.orders(|desk| desk.assignments.clear());
-    let desk = worker.leave();
-    assert_eq!(desk.metrics.len(), stored, "nothing is written under an old fence");
-    assert_eq!(desk.outcomes, []);
+    let stored = lock(&worker.fake.coordinator).metrics.len();
+    worker.fake.desired(|coordinator| coordinator.assignments.clear());
+    let coordinator = worker.leave();
+    assert_eq!(coordinator.metrics.len(), stored, "nothing is written under an old fence");
+    assert_eq!(coordinator.outcomes, []);
 }
 
 #[test]
@@ -455,26 +466,28 @@ fn a_panic_is_a_fault_with_its_place() {
         panic!("the tensor {} is upside down", 3)
     }));
     worker.grant(1);
-    worker.wait("an outcome", |desk| !desk.outcomes.is_empty());
-    let desk = worker.leave();
-    let TaskOutcome::Failed { class, message } = &desk.outcomes[0].outcome else { panic!("{:?}", desk.outcomes) };
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    let coordinator = worker.leave();
+    let TaskOutcome::Failed { class, message } = &coordinator.outcomes[0].outcome else {
+        panic!("{:?}", coordinator.outcomes)
+    };
     assert_eq!(*class, FailureClass::Fault);
     assert!(message.contains("tests.rs") && message.ends_with("the tensor 3 is upside down"), "{message}");
-    assert_eq!(desk.logs.values().collect::<Vec<_>>(), ["about to fail"]);
+    assert_eq!(coordinator.logs.values().collect::<Vec<_>>(), ["about to fail"]);
 }
 
 #[test]
 fn leaving_saves_and_yields() {
     let worker = Worker::start(Box::new(|context| train(context, u64::MAX, Duration::from_millis(1))));
     worker.grant(1);
-    worker.wait("some steps", |desk| desk.metrics.len() > 3);
+    worker.wait("some steps", |coordinator| coordinator.metrics.len() > 3);
     worker.shared.leave();
     let (poll, stage, fake) = (worker.poll, worker.stage, worker.fake);
     assert_eq!(poll.join().expect("no panic"), End::Left);
     stage.join().expect("no panic");
-    let desk = lock(&fake.desk);
-    let TaskOutcome::Yielded { at } = desk.outcomes[0].outcome else { panic!("{:?}", desk.outcomes) };
-    assert_eq!(desk.checkpoints.last().map(|c| c.step), Some(at));
+    let coordinator = lock(&fake.coordinator);
+    let TaskOutcome::Yielded { at } = coordinator.outcomes[0].outcome else { panic!("{:?}", coordinator.outcomes) };
+    assert_eq!(coordinator.checkpoints.last().map(|c| c.step), Some(at));
 }
 
 #[test]
@@ -487,12 +500,12 @@ fn blobs_are_verified() {
         assert!(matches!(context.manifest(good), Err(ContextError::Corrupt(_))), "not a manifest");
         finished(context)
     }));
-    lock(&worker.fake.desk).blobs.insert(good, b"good".to_vec());
+    lock(&worker.fake.coordinator).blobs.insert(good, b"good".to_vec());
     worker.fake.damage.store(2, Ordering::SeqCst);
     worker.grant(1);
-    worker.wait("an outcome", |desk| !desk.outcomes.is_empty());
-    let desk = worker.leave();
-    assert!(matches!(desk.outcomes[0].outcome, TaskOutcome::Finished { .. }), "{:?}", desk.outcomes);
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    let coordinator = worker.leave();
+    assert!(matches!(coordinator.outcomes[0].outcome, TaskOutcome::Finished { .. }), "{:?}", coordinator.outcomes);
 }
 
 #[test]
@@ -502,9 +515,9 @@ fn a_blob_that_stays_damaged_is_an_error() {
         assert!(matches!(context.blobs().get(good), Err(BlobError::Corrupt { expected, .. }) if expected == good));
         finished(context)
     }));
-    lock(&worker.fake.desk).blobs.insert(good, b"good".to_vec());
+    lock(&worker.fake.coordinator).blobs.insert(good, b"good".to_vec());
     worker.fake.damage.store(100, Ordering::SeqCst);
     worker.grant(1);
-    worker.wait("an outcome", |desk| !desk.outcomes.is_empty());
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
     assert!(matches!(worker.leave().outcomes[0].outcome, TaskOutcome::Finished { .. }));
 }

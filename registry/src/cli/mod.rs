@@ -19,8 +19,8 @@ pub use args::{Output, Verb};
 pub use client::{ask, execute};
 pub use print::{render, show_error};
 
-use crate::board::{self, Comparison, Leaderboard, Style};
 use crate::catalog::{BEST, Expect, Gate, LATEST, Model, ModelRef, Promotion, Version};
+use crate::leaderboard::{self, Comparison, Leaderboard, Style};
 use crate::retention::{GRACE_MS, Plan};
 use crate::{LineageNode, OpenError, QueryError, Store, WriteError, fsck};
 
@@ -273,7 +273,7 @@ async fn answer(command: Command, store: &Store) -> Result<Answer, Refused> {
             Data::Promotion { promotion }
         }
         Command::Compare { left, right, style } => {
-            let comparison = board::compare(&one(store, &left).await?, &one(store, &right).await?);
+            let comparison = leaderboard::compare(&one(store, &left).await?, &one(store, &right).await?);
             Data::Comparison { comparison, style }
         }
         Command::Leaderboard { of, published, style } => {
@@ -333,18 +333,18 @@ fn format_of(store: &Store, version: &Version) -> Option<String> {
 }
 
 async fn leaderboard(store: &Store, of: &str, published: bool) -> Result<Leaderboard, Refused> {
-    if board::FORMATS.contains(&of) {
+    if leaderboard::FORMATS.contains(&of) {
         let mut all = Vec::new();
         for model in store.models().await? {
             all.extend(store.versions(&model.model).await?);
         }
         all.retain(|version| format_of(store, version).as_deref() == Some(of));
-        return Ok(board::leaderboard(of.to_owned(), &all, None, published.then_some(of)));
+        return Ok(leaderboard::leaderboard(of.to_owned(), &all, None, published.then_some(of)));
     }
     let model = known(store, of).await?;
     let versions = store.versions(&model.model).await?;
     let format = versions.first().and_then(|version| format_of(store, version)).filter(|_| published);
-    Ok(board::leaderboard(of.to_owned(), &versions, model.metric.as_deref(), format.as_deref()))
+    Ok(leaderboard::leaderboard(of.to_owned(), &versions, model.metric.as_deref(), format.as_deref()))
 }
 
 async fn known(store: &Store, name: &str) -> Result<Model, Refused> {

@@ -7,9 +7,9 @@ use protocol::message::ApiError;
 use serde_json::json;
 
 use super::{Answer, Data, Output};
-use crate::board;
 use crate::catalog::{Action, Promotion, Version};
 use crate::clock::format_ms;
+use crate::leaderboard;
 
 /// Prints an answer.
 pub(super) fn show(answer: &Answer, output: Output) -> io::Result<()> {
@@ -65,9 +65,9 @@ pub fn render(data: &Data) -> String {
                     version.version.to_string(),
                     list(best.into_iter().chain(version.aliases.iter().cloned())),
                     list(
-                        board::in_brief(version, model.metric.as_deref())
+                        leaderboard::in_brief(version, model.metric.as_deref())
                             .into_iter()
-                            .map(|(metric, measure)| format!("{metric}={}", board::in_words(measure))),
+                            .map(|(metric, measure)| format!("{metric}={}", leaderboard::in_words(measure))),
                     ),
                     source(version),
                     format_ms(version.created_ms),
@@ -87,9 +87,9 @@ pub fn render(data: &Data) -> String {
                 text += &format!("  {name:<11} {value}\n");
             }
             let mut values = table(&["EVALUATION", "METRIC", "VALUE, ± HALF THE 95 % INTERVAL"]);
-            for (stage, measures) in board::measured(version) {
-                for (metric, measure) in board::in_order(&measures) {
-                    values.add_row([dash(stage.as_ref()), metric.clone(), board::in_words(measure)]);
+            for (stage, measures) in leaderboard::measured(version) {
+                for (metric, measure) in leaderboard::in_order(&measures) {
+                    values.add_row([dash(stage.as_ref()), metric.clone(), leaderboard::in_words(measure)]);
                 }
             }
             if !version.metrics.is_empty() {

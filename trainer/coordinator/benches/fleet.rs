@@ -12,8 +12,8 @@ use std::time::{Duration, Instant};
 
 use coordinator::{Config, Coordinator};
 use protocol::message::{
-    Assignment, Grant, Join, Joined, MetricBatch, MetricRow, Orders, PROTOCOL_VERSION, Poll, ReportOutcome, Submit,
-    TaskOutcome,
+    Assignment, DesiredAssignments, Grant, Join, Joined, MetricBatch, MetricRow, PROTOCOL_VERSION, Poll, ReportOutcome,
+    Submit, TaskOutcome,
 };
 use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::stage::{Backend, DataSynthetic, EncodeLatents, Placement, StageSettings, TrainVae, WorkerRange};
@@ -114,8 +114,9 @@ impl Worker {
     /// A heartbeat that is answered at once.
     async fn poll(&mut self) -> Result<Option<Assignment>> {
         let poll = Poll { incarnation: self.incarnation, doing: vec![], version: 0 };
-        let orders: Orders = self.connection.post(&format!("/v1/workers/{}/poll", self.name), &poll).await?;
-        Ok(orders.assignments.into_iter().next())
+        let desired: DesiredAssignments =
+            self.connection.post(&format!("/v1/workers/{}/poll", self.name), &poll).await?;
+        Ok(desired.assignments.into_iter().next())
     }
 
     /// Something of the right kind, uploaded once by each worker.

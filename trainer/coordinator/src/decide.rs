@@ -15,10 +15,10 @@ use registry::Write;
 
 use crate::event::{Control, Effect, Event, Known, Millis, Moment, Rejected};
 use crate::state::State;
+use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::gang::{self, Change};
 use crate::state::run::Run;
-use crate::state::task::{Hold, Part, Task};
-use crate::state::work::{Work, WorkState};
+use crate::state::task::{Lease, Part, Task};
 use crate::state::worker::{Sign, Worker};
 use crate::{journal, schedule};
 
@@ -32,8 +32,8 @@ pub fn decide(state: &mut State, moment: Moment, event: Event) -> Result<Vec<Eff
         return Ok(cx.effects);
     }
     cx.state.now = moment.now;
-    cx.settle();
-    cx.wind();
+    cx.reconcile();
+    cx.drain();
     cx.count_time();
     schedule::schedule(&mut cx);
     cx.count_time();
@@ -119,12 +119,12 @@ impl Deciding<'_> {
             }
             Event::BackoffOver { task } => {
                 let (key, i) = self.place(&task)?;
-                let over = self.state.change(key, i, |task| match &mut task.hold {
-                    Hold::Waiting { not_before } if not_before.is_some_and(|time| time <= now) => {
+                let over = self.state.change(key, i, |task| match &mut task.lease {
+                    Lease::Waiting { not_before } if not_before.is_some_and(|time| time <= now) => {
                         *not_before = None;
                         true
                     }
-                    Hold::Waiting { .. } | Hold::Held { .. } | Hold::Done { .. } => false,
+                    Lease::Waiting { .. } | Lease::Held { .. } | Lease::Done { .. } => false,
                 });
                 return Ok(over);
             }
@@ -132,10 +132,10 @@ impl Deciding<'_> {
             Event::LookedUp { key, known } => return Ok(self.looked_up(key, known)),
             Event::Bundled { key, bundles } => return self.bundled(key, &bundles),
             Event::RegisterRefused { key, message } => {
-                if self.state.works.get(&key).is_none_or(|work| work.state != WorkState::Bundling) {
+                if self.state.executions.get(&key).is_none_or(|execution| execution.state != ExecutionState::Bundling) {
                     return Ok(false);
                 }
-                self.fail_work(key, message, true);
+                self.fail_execution(key, message, true);
             }
         }
         Ok(true)
@@ -145,23 +145,23 @@ impl Deciding<'_> {
         let (now, before) = (self.now(), self.state.now);
         self.state.draining = false;
         for key in self.keys() {
-            let work = self.state.work_mut(key);
+            let execution = self.state.execution_mut(key);
             // The time during which no coordinator ran is nobody's work.
-            if let Some(since) = work.busy_since.take() {
-                work.wall_ms += before.since(since);
+            if let Some(since) = execution.busy_since.take() {
+                execution.wall_ms += before.since(since);
             }
             // Whoever is still at work goes on as if nothing had been.
-            if work.state == WorkState::Open && work.has_something() && (alone || !work.is_busy()) {
-                work.resumed = true;
+            if execution.state == ExecutionState::Open && execution.has_something() && (alone || !execution.is_busy()) {
+                execution.resumed = true;
             }
-            match work.state {
-                WorkState::Looking => self.effects.push(Effect::Lookup { key }),
-                WorkState::Bundling => {
-                    let registration = work.registration.as_ref().expect("bundling is registering");
+            match execution.state {
+                ExecutionState::Looking => self.effects.push(Effect::Lookup { key }),
+                ExecutionState::Bundling => {
+                    let registration = execution.registration.as_ref().expect("bundling is registering");
                     let candidates = registration.candidates.clone();
                     self.effects.push(Effect::Register { key, candidates });
                 }
-                WorkState::Open | WorkState::Done { .. } | WorkState::Failed { .. } => {}
+                ExecutionState::Open | ExecutionState::Done { .. } | ExecutionState::Failed { .. } => {}
             }
         }
         let names: Vec<WorkerId> = self.state.workers.keys().cloned().collect();
@@ -248,20 +248,20 @@ impl Deciding<'_> {
     }
 
     fn looked_up(&mut self, key: Digest, known: Option<Known>) -> bool {
-        if self.state.works.get(&key).is_none_or(|work| work.state != WorkState::Looking) {
+        if self.state.executions.get(&key).is_none_or(|execution| execution.state != ExecutionState::Looking) {
             return false;
         }
-        let work = self.state.work_mut(key);
-        match (known, &work.registration) {
-            (Some(known), _) => work.state = WorkState::Done { known, cached: true },
+        let execution = self.state.execution_mut(key);
+        match (known, &execution.registration) {
+            (Some(known), _) => execution.state = ExecutionState::Done { known, cached: true },
             (None, Some(registration)) => {
                 let candidates = registration.candidates.clone();
-                work.state = WorkState::Bundling;
+                execution.state = ExecutionState::Bundling;
                 self.effects.push(Effect::Register { key, candidates });
             }
             (None, None) => {
-                work.open();
-                let tasks: Vec<TaskId> = work.tasks.iter().map(|task| task.id.clone()).collect();
+                execution.open();
+                let tasks: Vec<TaskId> = execution.tasks.iter().map(|task| task.id.clone()).collect();
                 let places = tasks.into_iter().enumerate().map(|(i, task)| (task, (key, i)));
                 Arc::make_mut(&mut self.state.tasks).extend(places);
             }
@@ -270,18 +270,18 @@ impl Deciding<'_> {
     }
 
     fn bundled(&mut self, key: Digest, bundles: &[Digest]) -> Result<bool, Rejected> {
-        if self.state.works.get(&key).is_none_or(|work| work.state != WorkState::Bundling) {
+        if self.state.executions.get(&key).is_none_or(|execution| execution.state != ExecutionState::Bundling) {
             return Ok(false);
         }
         let now = self.now();
-        let work = self.state.work_mut(key);
-        let registration = work.registration.as_ref().expect("bundling is registering");
+        let execution = self.state.execution_mut(key);
+        let registration = execution.registration.as_ref().expect("bundling is registering");
         if bundles.len() != registration.candidates.len() {
-            return Err(Rejected::Invalid(format!("stage `{}` needs a bundle for each candidate", work.stage)));
+            return Err(Rejected::Invalid(format!("stage `{}` needs a bundle for each candidate", execution.stage)));
         }
-        let (known, mut writes) = registration.writes(&work.run, &work.stage, bundles);
-        writes.push(result(work, None, &known, now));
-        work.state = WorkState::Done { known, cached: false };
+        let (known, mut writes) = registration.writes(&execution.run, &execution.stage, bundles);
+        writes.push(result(execution, None, &known, now));
+        execution.state = ExecutionState::Done { known, cached: false };
         self.writes.append(&mut writes);
         Ok(true)
     }
@@ -289,10 +289,10 @@ impl Deciding<'_> {
     fn grace_over(&mut self, task: &TaskId, fence: Fence) -> Result<bool, Rejected> {
         let now = self.now();
         let (key, i) = self.place(task)?;
-        let task = &self.state.works[&key].tasks[i];
-        let over = match task.hold {
-            Hold::Held { winding, .. } => winding.is_some_and(|deadline| deadline <= now) && task.fence == fence,
-            Hold::Waiting { .. } | Hold::Done { .. } => false,
+        let task = &self.state.executions[&key].tasks[i];
+        let over = match task.lease {
+            Lease::Held { drain_by, .. } => drain_by.is_some_and(|deadline| deadline <= now) && task.fence == fence,
+            Lease::Waiting { .. } | Lease::Done { .. } => false,
         };
         if over {
             let fence = self.state.change(key, i, |task| task.release(None));
@@ -335,10 +335,10 @@ impl Deciding<'_> {
     }
 
     fn take_from(&mut self, key: Digest, i: usize, lost: &[WorkerId], loss: Loss) {
-        let work = &self.state.works[&key];
-        let task = &work.tasks[i];
+        let execution = &self.state.executions[&key];
+        let task = &execution.tasks[i];
         let change = match task.part {
-            Part::Gang => gang::without(task.holders(), lost, work.placement.workers),
+            Part::Gang => gang::without(task.holders(), lost, execution.placement.workers),
             Part::Alone | Part::Shard { .. } | Part::Merge => Change::Disband,
         };
         match change {
@@ -359,29 +359,29 @@ impl Deciding<'_> {
     pub(crate) fn try_again(&mut self, key: Digest, i: usize, why: &str, fault: bool) {
         let (now, policy) = (self.now(), self.state.policy.clone());
         let tried = self.state.change(key, i, |task| {
-            let winding = matches!(task.hold, Hold::Held { winding: Some(_), .. });
+            let drain_by = matches!(task.lease, Lease::Held { drain_by: Some(_), .. });
             task.streak += 1;
             let (count, budget, what) = if fault {
                 (&mut task.faults, policy.fault_budget, "faults")
             } else {
                 (&mut task.losses, policy.infrastructure_budget, "lost workers and network errors")
             };
-            *count += u32::from(!winding);
+            *count += u32::from(!drain_by);
             if *count > budget {
                 return Err(format!("gave up after {count} {what}; the last: {why}"));
             }
-            Ok(task.release((!winding).then(|| now.after(policy.backoff(task.streak)))))
+            Ok(task.release((!drain_by).then(|| now.after(policy.backoff(task.streak)))))
         });
         match tried {
             Ok(fence) => self.fences.push(fence),
-            Err(message) => self.fail_work(key, message, fault),
+            Err(message) => self.fail_execution(key, message, fault),
         }
     }
 
-    pub(crate) fn fail_work(&mut self, key: Digest, message: String, own: bool) {
-        self.state.work_mut(key).state = WorkState::Failed { message, own };
+    pub(crate) fn fail_execution(&mut self, key: Digest, message: String, own: bool) {
+        self.state.execution_mut(key).state = ExecutionState::Failed { message, own };
         // Whoever still works on it can write no more.
-        let held: Vec<usize> = self.state.works[&key].tasks.held().collect();
+        let held: Vec<usize> = self.state.executions[&key].tasks.held().collect();
         for i in held {
             let fence = self.state.change(key, i, |task| task.release(None));
             self.fences.push(fence);
@@ -389,7 +389,7 @@ impl Deciding<'_> {
     }
 
     pub(crate) fn regroup(&mut self, key: Digest, i: usize, members: Vec<protocol::message::Member>) {
-        let secret = self.secret(&self.state.works[&key].tasks[i]);
+        let secret = self.secret(&self.state.executions[&key].tasks[i]);
         let fence = self.state.change(key, i, |task| task.regroup(members, secret));
         self.fences.push(fence);
     }
@@ -405,7 +405,7 @@ impl Deciding<'_> {
     }
 
     pub(crate) fn keys(&self) -> Vec<Digest> {
-        self.state.works.keys().copied().collect()
+        self.state.executions.keys().copied().collect()
     }
 
     pub(crate) fn set_run_state(&mut self, i: usize, state: RunState) {
@@ -427,17 +427,22 @@ impl Deciding<'_> {
 }
 
 /// The write that makes a stage's value known under its key.
-pub(crate) fn result(work: &Work, grant: Option<protocol::message::Grant>, known: &Known, now: Millis) -> Write {
+pub(crate) fn result(
+    execution: &StageExecution,
+    grant: Option<protocol::message::Grant>,
+    known: &Known,
+    now: Millis,
+) -> Write {
     Write::StageResult {
         grant,
-        key: work.key,
-        run: work.run.clone(),
-        stage: work.stage.clone(),
-        kind: work.settings.kind().to_owned(),
+        key: execution.key,
+        run: execution.run.clone(),
+        stage: execution.stage.clone(),
+        kind: execution.settings.kind().to_owned(),
         outputs: known.outputs.clone(),
         metrics: known.metrics.clone(),
-        inputs: work.inputs.clone(),
-        wall_s: work.wall_s(now),
+        inputs: execution.inputs.clone(),
+        wall_s: execution.wall_s(now),
     }
 }
 

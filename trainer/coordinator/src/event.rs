@@ -44,7 +44,7 @@ pub struct Moment {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Control {
-    /// Hold back; work yields.
+    /// Lease back; work yields.
     Pause,
     /// Go on: after a pause, a failure or a cancellation.
     Resume,

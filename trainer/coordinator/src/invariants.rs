@@ -10,7 +10,7 @@
 //! | C5 | Fences, attempts and incarnations never go down; whoever gains or loses a task sees the fence go up. |
 //! | C6 | An accepted artifact of a task, and a done stage of a run, never change. |
 //! | C7 | A merge is held only once all shards are there. |
-//! | C8 | Work that no running run waits for is winding down. |
+//! | C8 | StageExecution that no running run waits for is drain_by down. |
 //! | C9 | A stage is active or done only if everything it reads is done; an active stage has work that is not over. |
 //! | C10 | A run is finished exactly if all that was asked for is done, and failed only with a failed stage. |
 //! | C11 | While a small task is ready and not backing off, no worker of its backend is idle. |
@@ -24,9 +24,9 @@ use protocol::message::RunState;
 
 use crate::schedule;
 use crate::state::State;
+use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::run::Status;
-use crate::state::task::{Hold, Part, Task};
-use crate::state::work::{Work, WorkState};
+use crate::state::task::{Lease, Part, Task};
 use crate::state::worker::Presence;
 
 /// Which invariants `state` breaks, each with its number; empty if all is well.
@@ -34,24 +34,25 @@ pub fn check(state: &State) -> Vec<String> {
     let mut broken = check_index(state);
     let mut busy = BTreeSet::new();
     let wanted: BTreeSet<_> = state.wanted().into_iter().collect();
-    for work in state.works.values() {
-        for task in &work.tasks {
-            check_task(state, work, task, &mut broken);
+    for execution in state.executions.values() {
+        for task in &execution.tasks {
+            check_task(state, execution, task, &mut broken);
             for member in task.holders() {
                 if !busy.insert(&member.worker) {
                     broken.push(format!("C1: worker `{}` holds `{}` and another task", member.worker, task.id));
                 }
             }
-            let winding = match task.hold {
-                Hold::Held { winding, .. } => winding.is_some(),
-                Hold::Waiting { .. } | Hold::Done { .. } => true,
+            let drain_by = match task.lease {
+                Lease::Held { drain_by, .. } => drain_by.is_some(),
+                Lease::Waiting { .. } | Lease::Done { .. } => true,
             };
-            if !winding && (!wanted.contains(&work.key) || state.draining) {
-                broken.push(format!("C8: nobody waits for `{}`, which is not winding down", task.id));
+            if !drain_by && (!wanted.contains(&execution.key) || state.draining) {
+                broken.push(format!("C8: nobody waits for `{}`, which is not drain_by down", task.id));
             }
-            let small = task.part != Part::Gang && work.state == WorkState::Open && wanted.contains(&work.key);
-            if small && !state.draining && task.is_free(state.now) && work.is_ready(task) {
-                let idle: Vec<_> = schedule::idle(state, work.backend).collect();
+            let small =
+                task.part != Part::Gang && execution.state == ExecutionState::Open && wanted.contains(&execution.key);
+            if small && !state.draining && task.is_free(state.now) && execution.is_ready(task) {
+                let idle: Vec<_> = schedule::idle(state, execution.backend).collect();
                 if !idle.is_empty() {
                     broken.push(format!("C11: `{}` is ready and {idle:?} idle", task.id));
                 }
@@ -64,9 +65,9 @@ pub fn check(state: &State) -> Vec<String> {
                 broken.push(format!("C9: stage {i} of `{}` runs without its inputs", run.id));
             }
             if let Status::Active { key } = status
-                && state.works.get(key).is_none_or(|work| work.is_over())
+                && state.executions.get(key).is_none_or(|execution| execution.is_over())
             {
-                broken.push(format!("C9: stage {i} of `{}` is active and its work is over", run.id));
+                broken.push(format!("C9: stage {i} of `{}` is active and its execution is over", run.id));
             }
         }
         let failed = run.failed().is_some();
@@ -97,11 +98,11 @@ pub fn check(state: &State) -> Vec<String> {
 fn check_index(state: &State) -> Vec<String> {
     let mut broken = Vec::new();
     let (mut places, mut holds) = (BTreeMap::new(), BTreeMap::new());
-    for (key, work) in &state.works {
-        if !work.tasks.is_indexed() {
-            broken.push(format!("C14: the index of work {key} is not that of {:?}", work.tasks));
+    for (key, execution) in &state.executions {
+        if !execution.tasks.is_indexed() {
+            broken.push(format!("C14: the index of execution {key} is not that of {:?}", execution.tasks));
         }
-        for (i, task) in work.tasks.iter().enumerate() {
+        for (i, task) in execution.tasks.iter().enumerate() {
             places.insert(&task.id, (*key, i));
             holds.extend(task.holders().iter().map(|member| (&member.worker, (*key, i))));
         }
@@ -118,7 +119,7 @@ fn check_index(state: &State) -> Vec<String> {
     broken
 }
 
-fn check_task(state: &State, work: &Work, task: &Task, broken: &mut Vec<String>) {
+fn check_task(state: &State, execution: &StageExecution, task: &Task, broken: &mut Vec<String>) {
     if !task.checkpoints.is_sorted_by(|a, b| a.step < b.step) {
         broken.push(format!("C12: checkpoints of `{}` are {:?}", task.id, task.checkpoints));
     }
@@ -130,30 +131,30 @@ fn check_task(state: &State, work: &Work, task: &Task, broken: &mut Vec<String>)
         let good = state.workers.get(&member.worker).is_some_and(|worker| {
             worker.incarnation == member.incarnation
                 && worker.presence == Presence::Here
-                && worker.backend == work.backend
+                && worker.backend == execution.backend
         });
         if !good {
             broken.push(format!("C2: `{}` is held by {member:?}", task.id));
         }
     }
-    if work.state != WorkState::Open || task.attempt.0 == 0 || task.fence.0 == 0 {
-        broken.push(format!("C3: `{}` is held while its work is {:?}", task.id, work.state));
+    if execution.state != ExecutionState::Open || task.attempt.0 == 0 || task.fence.0 == 0 {
+        broken.push(format!("C3: `{}` is held while its execution is {:?}", task.id, execution.state));
     }
     let names: BTreeSet<_> = holders.iter().map(|member| &member.worker).collect();
-    let range = work.placement.workers;
+    let range = execution.placement.workers;
     let fits = match task.part {
         // Who winds down keeps its members, even if the run that asks has changed, and with it the bounds.
         Part::Gang => {
-            let winding = matches!(task.hold, Hold::Held { winding: Some(_), .. });
+            let drain_by = matches!(task.lease, Lease::Held { drain_by: Some(_), .. });
             let fits = range.max == 0 || holders.len() <= range.max.max(range.min);
-            !holders.is_empty() && (fits || winding || state.draining)
+            !holders.is_empty() && (fits || drain_by || state.draining)
         }
         Part::Alone | Part::Shard { .. } | Part::Merge => holders.len() == 1,
     };
     if !fits || names.len() != holders.len() {
         broken.push(format!("C4: `{}` is held by {holders:?}, with room for {range:?}", task.id));
     }
-    if task.part == Part::Merge && work.shards().is_none() {
+    if task.part == Part::Merge && execution.shards().is_none() {
         broken.push(format!("C7: `{}` is held before its shards are there", task.id));
     }
 }
@@ -166,12 +167,12 @@ pub fn check_change(before: &State, after: &State) -> Vec<String> {
             broken.push(format!("C5: worker `{name}` lost its incarnation {}", worker.incarnation));
         }
     }
-    for (key, work) in &before.works {
-        let Some(now) = after.works.get(key) else {
-            broken.push(format!("C5: work {key} is forgotten"));
+    for (key, execution) in &before.executions {
+        let Some(now) = after.executions.get(key) else {
+            broken.push(format!("C5: execution {key} is forgotten"));
             continue;
         };
-        for task in &work.tasks {
+        for task in &execution.tasks {
             let Some(now) = now.tasks.iter().find(|t| t.id == task.id) else {
                 broken.push(format!("C5: task `{}` is forgotten", task.id));
                 continue;
@@ -184,8 +185,8 @@ pub fn check_change(before: &State, after: &State) -> Vec<String> {
                 broken.push(format!("C5: `{}` changed hands under fence {}", task.id, task.fence));
             }
         }
-        if let (WorkState::Open, WorkState::Open) = (&work.state, &now.state) {
-            for task in work.tasks.iter().filter(|task| task.output().is_some()) {
+        if let (ExecutionState::Open, ExecutionState::Open) = (&execution.state, &now.state) {
+            for task in execution.tasks.iter().filter(|task| task.output().is_some()) {
                 if now.tasks.iter().any(|t| t.id == task.id && t.output() != task.output()) {
                     broken.push(format!("C6: the artifact of `{}` changed", task.id));
                 }

@@ -8,7 +8,7 @@ use protocol::message::Poll;
 
 use crate::event::{Event, Millis, Observation, Rejected};
 use crate::state::State;
-use crate::state::task::Hold;
+use crate::state::task::Lease;
 use crate::state::worker::Presence;
 
 /// Takes note of `observation` and says which facts follow from it.
@@ -47,10 +47,10 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
     }
     Arc::make_mut(&mut state.heard.workers).insert(worker, now);
     for doing in poll.doing {
-        let Ok((work, task)) = state.task(&doing.grant.task) else { continue };
+        let Ok((execution, task)) = state.task(&doing.grant.task) else { continue };
         let Ok(rank) = task.check(&doing.grant) else { continue };
         // Shards are counted, not looked into.
-        if rank == 0 && work.tasks.len() == 1 {
+        if rank == 0 && execution.tasks.len() == 1 {
             let progress = Arc::new(doing.progress);
             Arc::make_mut(&mut state.heard.progress).insert(doing.grant.task.clone(), progress);
         }
@@ -62,11 +62,12 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
 }
 
 fn tick(state: &mut State, now: Millis) -> Vec<Event> {
-    // When the clock was not looked at for long, nobody was listening either: that is not the workers' fault.
+    // When the clock was not looked at for long, nobody was listening either: that is not the workers' fault. Who was heard
+    // meanwhile all the same gets no more than a lease from now.
     let late = state.heard.ticked.map_or(0, |before| now.since(before));
     if late > state.policy.lease_ms / 3 {
         for heard in Arc::make_mut(&mut state.heard.workers).values_mut() {
-            *heard = heard.after(late);
+            *heard = heard.after(late).min(now);
         }
     }
     state.heard.ticked = Some(now);
@@ -87,17 +88,19 @@ fn tick(state: &mut State, now: Millis) -> Vec<Event> {
             Presence::Silent | Presence::Gone => {}
         }
     }
-    let open =
-        state.works.values().flat_map(|work| work.tasks.held().chain(work.tasks.waiting()).map(|i| &work.tasks[i]));
+    let open = state
+        .executions
+        .values()
+        .flat_map(|execution| execution.tasks.held().chain(execution.tasks.waiting()).map(|i| &execution.tasks[i]));
     for task in open {
-        match task.hold {
-            Hold::Waiting { not_before: Some(time) } if time <= now => {
+        match task.lease {
+            Lease::Waiting { not_before: Some(time) } if time <= now => {
                 events.push(Event::BackoffOver { task: task.id.clone() });
             }
-            Hold::Held { winding: Some(deadline), .. } if deadline <= now => {
+            Lease::Held { drain_by: Some(deadline), .. } if deadline <= now => {
                 events.push(Event::GraceOver { task: task.id.clone(), fence: task.fence });
             }
-            Hold::Waiting { .. } | Hold::Held { .. } | Hold::Done { .. } => {}
+            Lease::Waiting { .. } | Lease::Held { .. } | Lease::Done { .. } => {}
         }
     }
     events

@@ -19,13 +19,13 @@ use registry::Write;
 
 use crate::decide::{Deciding, result};
 use crate::event::{Effect, Known, Rejected};
-use crate::state::task::{Hold, Part, Saved, Task};
-use crate::state::work::WorkState;
+use crate::state::execution::ExecutionState;
+use crate::state::task::{Lease, Part, Saved, Task};
 
 impl Deciding<'_> {
     pub(crate) fn checkpoint(&mut self, commit: CommitCheckpoint) -> Result<bool, Rejected> {
         let CommitCheckpoint { grant, step, manifest, metrics } = commit;
-        let (work, task) = self.state.task(&grant.task)?;
+        let (execution, task) = self.state.task(&grant.task)?;
         if task.check(&grant)? != 0 {
             return Err(only_rank_0(&grant.worker, "commits checkpoints"));
         }
@@ -39,7 +39,7 @@ impl Deciding<'_> {
             }
             Some(_) | None => {}
         }
-        let keep = work.placement.checkpoint.keep.clone();
+        let keep = execution.placement.checkpoint.keep.clone();
         let (key, i) = self.place(&grant.task)?;
         let saved = Saved { step, manifest, metrics: metrics.clone() };
         let dropped = self.state.change(key, i, |task| task.save(saved, &keep));
@@ -73,7 +73,7 @@ impl Deciding<'_> {
                 let now = self.now();
                 let soon = now.after(self.state.policy.backoff_ms);
                 self.state.change(key, i, |task| {
-                    let asked = matches!(task.hold, Hold::Held { winding: Some(_), .. });
+                    let asked = matches!(task.lease, Lease::Held { drain_by: Some(_), .. });
                     task.give_back((!asked).then_some(soon));
                 });
             }
@@ -86,7 +86,7 @@ impl Deciding<'_> {
                     | FailureClass::OutOfMemory
                     | FailureClass::Storage => {
                         let own = *class != FailureClass::Storage;
-                        self.fail_work(key, message.clone(), own);
+                        self.fail_execution(key, message.clone(), own);
                         self.accepted(key, i, &report);
                         return Ok(true);
                     }
@@ -116,25 +116,25 @@ impl Deciding<'_> {
     ) -> Result<(), Rejected> {
         let now = self.now();
         let grant = report.grant.clone();
-        let work = &self.state.works[&key];
-        let state = left_state(&work.settings, &work.tasks[i])?;
+        let execution = &self.state.executions[&key];
+        let state = left_state(&execution.settings, &execution.tasks[i])?;
         self.state.change(key, i, |task| task.finish(output));
-        let work = self.state.work_mut(key);
-        if let Part::Shard { .. } = work.tasks[i].part {
+        let execution = self.state.execution_mut(key);
+        if let Part::Shard { .. } = execution.tasks[i].part {
             self.writes.push(Write::Shard { grant, output });
             return Ok(());
         }
-        let (name, _) = work.settings.output();
+        let (name, _) = execution.settings.output();
         let mut outputs = BTreeMap::from([(name.to_owned(), output)]);
         outputs.extend(state.map(|state| (STATE_OUTPUT.to_owned(), state)));
         let known = Known { outputs, metrics };
-        let write = result(work, Some(grant), &known, now);
-        work.state = WorkState::Done { known, cached: false };
+        let write = result(execution, Some(grant), &known, now);
+        execution.state = ExecutionState::Done { known, cached: false };
         self.writes.push(write);
         // The value is there: what an interrupted try would have gone on from is of no use any more, but for the last way
         // from one checkpoint to the next, which `trainer run --verify` walks again, and the best, if they were asked for.
         if !self.state.change(key, i, |task| std::mem::take(&mut task.checkpoints)).is_empty() {
-            let keep = Keep { latest: 2, ..self.state.works[&key].placement.checkpoint.keep.clone() };
+            let keep = Keep { latest: 2, ..self.state.executions[&key].placement.checkpoint.keep.clone() };
             self.effects.push(Effect::Prune { task: report.grant.task.clone(), keep });
         }
         Ok(())

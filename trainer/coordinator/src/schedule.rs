@@ -13,9 +13,9 @@ use protocol::stage::Backend;
 
 use crate::decide::Deciding;
 use crate::state::State;
+use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::gang::{self, Change};
-use crate::state::task::{Hold, Part};
-use crate::state::work::{Work, WorkState};
+use crate::state::task::{Lease, Part};
 use crate::state::worker::Presence;
 
 /// Gives idle workers what is ready.
@@ -23,7 +23,7 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
     if cx.state.draining {
         return;
     }
-    let is_open = |key: &Digest| cx.state.works[key].state == WorkState::Open;
+    let is_open = |key: &Digest| cx.state.executions[key].state == ExecutionState::Open;
     let wanted: Vec<Digest> = cx.state.wanted().into_iter().filter(is_open).collect();
     for key in &wanted {
         change_gangs(cx, *key, |_, _| Vec::new());
@@ -32,7 +32,7 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
         small_tasks(cx, *key);
     }
     // With a thousand workers at work one does not look for an idle one again for each gang.
-    let some_idle = |key: &Digest| idle(cx.state, cx.state.works[key].backend).next().is_some();
+    let some_idle = |key: &Digest| idle(cx.state, cx.state.executions[key].backend).next().is_some();
     let left: Vec<Digest> = wanted.into_iter().filter(some_idle).collect();
     for key in &left {
         change_gangs(cx, *key, |state, backend| idle(state, backend).collect());
@@ -51,34 +51,34 @@ pub(crate) fn idle(state: &State, backend: Backend) -> impl Iterator<Item = Memb
 
 fn small_tasks(cx: &mut Deciding<'_>, key: Digest) {
     let now = cx.now();
-    if is_gang(&cx.state.works[&key]) || idle(cx.state, cx.state.works[&key].backend).next().is_none() {
+    if is_gang(&cx.state.executions[&key]) || idle(cx.state, cx.state.executions[&key].backend).next().is_none() {
         return;
     }
-    let waiting: Vec<usize> = cx.state.works[&key].tasks.waiting().collect();
+    let waiting: Vec<usize> = cx.state.executions[&key].tasks.waiting().collect();
     for i in waiting {
-        let work = &cx.state.works[&key];
-        let task = &work.tasks[i];
-        if !task.is_free(now) || !work.is_ready(task) {
+        let execution = &cx.state.executions[&key];
+        let task = &execution.tasks[i];
+        if !task.is_free(now) || !execution.is_ready(task) {
             continue;
         }
-        let Some(worker) = idle(cx.state, work.backend).next() else { return };
+        let Some(worker) = idle(cx.state, execution.backend).next() else { return };
         grant(cx, key, i, vec![worker]);
     }
 }
 
-fn is_gang(work: &Work) -> bool {
-    work.tasks.first().is_some_and(|task| task.part == Part::Gang)
+fn is_gang(execution: &StageExecution) -> bool {
+    execution.tasks.first().is_some_and(|task| task.part == Part::Gang)
 }
 
 fn change_gangs(cx: &mut Deciding<'_>, key: Digest, joiners: impl Fn(&State, Backend) -> Vec<Member>) {
-    if !is_gang(&cx.state.works[&key]) {
+    if !is_gang(&cx.state.executions[&key]) {
         return;
     }
-    for i in 0..cx.state.works[&key].tasks.len() {
-        let work = &cx.state.works[&key];
-        let task = &work.tasks[i];
-        if matches!(task.hold, Hold::Held { winding: None, .. }) {
-            match gang::with(task.holders(), &joiners(cx.state, work.backend), work.placement.workers) {
+    for i in 0..cx.state.executions[&key].tasks.len() {
+        let execution = &cx.state.executions[&key];
+        let task = &execution.tasks[i];
+        if matches!(task.lease, Lease::Held { drain_by: None, .. }) {
+            match gang::with(task.holders(), &joiners(cx.state, execution.backend), execution.placement.workers) {
                 Change::Keep | Change::Disband => {}
                 Change::Regroup(members) => cx.regroup(key, i, members),
             }
@@ -88,16 +88,16 @@ fn change_gangs(cx: &mut Deciding<'_>, key: Digest, joiners: impl Fn(&State, Bac
 
 fn start_gangs(cx: &mut Deciding<'_>, key: Digest) {
     let now = cx.now();
-    if !is_gang(&cx.state.works[&key]) {
+    if !is_gang(&cx.state.executions[&key]) {
         return;
     }
-    for i in 0..cx.state.works[&key].tasks.len() {
-        let work = &cx.state.works[&key];
-        let task = &work.tasks[i];
+    for i in 0..cx.state.executions[&key].tasks.len() {
+        let execution = &cx.state.executions[&key];
+        let task = &execution.tasks[i];
         if task.is_free(now)
-            && (work.placement.workers.max == 1 || !merge_is_near(cx.state, work.backend))
+            && (execution.placement.workers.max == 1 || !merge_is_near(cx.state, execution.backend))
             && let Some(members) =
-                gang::start(&idle(cx.state, work.backend).collect::<Vec<_>>(), work.placement.workers)
+                gang::start(&idle(cx.state, execution.backend).collect::<Vec<_>>(), execution.placement.workers)
         {
             grant(cx, key, i, members);
         }
@@ -106,14 +106,17 @@ fn start_gangs(cx: &mut Deciding<'_>, key: Digest) {
 
 /// Whether some map stage has only shards out that are being done.
 fn merge_is_near(state: &State, backend: Backend) -> bool {
-    let works = state.wanted().into_iter().map(|key| &state.works[&key]).filter(|work| work.backend == backend);
-    works.flat_map(|work| work.tasks.held().map(|i| &work.tasks[i])).any(|task| matches!(task.part, Part::Shard { .. }))
+    let executions =
+        state.wanted().into_iter().map(|key| &state.executions[&key]).filter(|execution| execution.backend == backend);
+    executions
+        .flat_map(|execution| execution.tasks.held().map(|i| &execution.tasks[i]))
+        .any(|task| matches!(task.part, Part::Shard { .. }))
 }
 
 fn grant(cx: &mut Deciding<'_>, key: Digest, i: usize, holders: Vec<Member>) {
-    let secret = cx.secret(&cx.state.works[&key].tasks[i]);
-    let resumed = cx.state.works[&key].tasks[i].newest().is_some();
-    cx.state.work_mut(key).resumed |= resumed;
+    let secret = cx.secret(&cx.state.executions[&key].tasks[i]);
+    let resumed = cx.state.executions[&key].tasks[i].newest().is_some();
+    cx.state.execution_mut(key).resumed |= resumed;
     let fence = cx.state.change(key, i, |task| task.grant(holders, secret));
     cx.fences.push(fence);
 }

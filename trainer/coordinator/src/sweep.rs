@@ -21,8 +21,8 @@ use crate::decide::Deciding;
 use crate::event::Known;
 use crate::search::{Score, Search, Ticket};
 use crate::state::State;
+use crate::state::execution::ExecutionState;
 use crate::state::run::{Run, Status, Sweeping, value};
-use crate::state::work::WorkState;
 
 /// What became of a ticket.
 enum Found {
@@ -126,8 +126,10 @@ fn found(state: &State, run: &Run, sweep: &Sweeping, place: usize) -> Option<Fou
         Status::Failed { key, message } => Some((*key, message.clone())),
         _ => None,
     }) {
-        let others =
-            matches!(state.works.get(&key).map(|work| &work.state), Some(WorkState::Failed { own: false, .. }));
+        let others = matches!(
+            state.executions.get(&key).map(|execution| &execution.state),
+            Some(ExecutionState::Failed { own: false, .. })
+        );
         return Some(if others {
             Found::End {
                 key,
@@ -216,7 +218,7 @@ impl State {
             view.steps += match place.filter(|_| !trained).and_then(|place| run.stages[place].key()) {
                 _ if trained => search.steps(rung),
                 Some(key) => {
-                    let done = self.works.get(&key).map_or(0, |work| self.progress(work).done);
+                    let done = self.executions.get(&key).map_or(0, |execution| self.progress(execution).done);
                     done.saturating_sub(search.rungs()[rung] - search.steps(rung)).min(search.steps(rung))
                 }
                 None => 0,

@@ -1,15 +1,17 @@
 //! What workers and clients are told. Read-only.
 
-use protocol::message::{Assignment, Orders, Progress, Role, RunState, RunView, StageState, StageTask, StageView};
+use protocol::message::{
+    Assignment, DesiredAssignments, Progress, Role, RunState, RunView, StageState, StageTask, StageView,
+};
 use protocol::stage::Backend;
 use protocol::{Generation, Incarnation, TaskId, WorkerId, canonical};
 use serde::{Deserialize, Serialize};
 
 use crate::event::{Millis, Rejected};
 use crate::state::State;
+use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::run::{Run, Status};
-use crate::state::task::{Hold, Part, Task};
-use crate::state::work::{Work, WorkState};
+use crate::state::task::{Lease, Part, Task};
 use crate::state::worker::{Presence, Worker};
 
 /// A worker as clients see it: `GET /v1/workers`.
@@ -54,9 +56,9 @@ impl State {
     }
 
     /// All that a worker process should be doing.
-    pub fn orders(&self, worker: &WorkerId, incarnation: Incarnation) -> Result<Orders, Rejected> {
+    pub fn desired(&self, worker: &WorkerId, incarnation: Incarnation) -> Result<DesiredAssignments, Rejected> {
         self.process(worker, incarnation)?;
-        let held = self.held_by(worker).and_then(|(work, task)| assignment(work, task, worker, incarnation));
+        let held = self.held_by(worker).and_then(|(execution, task)| assignment(execution, task, worker, incarnation));
         let assignments: Vec<Assignment> = held.into_iter().collect();
         let leave = self.draining && assignments.is_empty();
         // A new checkpoint is not news for whoever made it, so it does not end a wait.
@@ -65,7 +67,7 @@ impl State {
         let digest = canonical::digest(&(&news, leave));
         // 53 bits, so that no JSON reader rounds it.
         let version = digest.as_bytes()[..8].iter().fold(0, |number, byte| number << 8 | u64::from(*byte)) >> 11;
-        Ok(Orders { version, assignments, leave })
+        Ok(DesiredAssignments { version, assignments, leave })
     }
 
     /// A run as clients see it at `now`.
@@ -77,7 +79,7 @@ impl State {
 
     fn stage_view(&self, run: &Run, i: usize, now: Millis) -> StageView {
         let (stage, status) = (&run.pipeline.stages[i], &run.stages[i]);
-        let work = self.work_of(run, &stage.name).map(|work| &**work);
+        let execution = self.execution_of(run, &stage.name).map(|execution| &**execution);
         let mut view = StageView {
             name: stage.name.clone(),
             kind: stage.settings.kind().to_owned(),
@@ -86,8 +88,8 @@ impl State {
             outputs: Default::default(),
             metrics: Default::default(),
             progress: Progress::default(),
-            wall_s: work.map_or(0.0, |work| work.wall_s(now)),
-            attempt: work.map(Work::attempt).unwrap_or_default(),
+            wall_s: execution.map_or(0.0, |execution| execution.wall_s(now)),
+            attempt: execution.map(StageExecution::attempt).unwrap_or_default(),
             workers: Vec::new(),
             message: None,
             of: stage.derived.as_ref().map(|derived| derived.of.clone()),
@@ -108,11 +110,11 @@ impl State {
                 }
             }
             Status::Active { .. } => {
-                if let Some(work) = work {
-                    view.workers = workers(work);
-                    view.progress = self.progress(work);
+                if let Some(execution) = execution {
+                    view.workers = workers(execution);
+                    view.progress = self.progress(execution);
                     view.metrics = view.progress.metrics.clone();
-                    (view.state, view.message) = self.active(run, work);
+                    (view.state, view.message) = self.active(run, execution);
                 }
             }
             Status::Done { how, known, wall_s, attempt, .. } => {
@@ -120,7 +122,7 @@ impl State {
                 view.outputs = known.outputs.clone();
                 view.metrics = known.metrics.clone();
                 (view.wall_s, view.attempt) = (*wall_s, *attempt);
-                view.progress = work.map(|work| self.progress(work)).unwrap_or_default();
+                view.progress = execution.map(|execution| self.progress(execution)).unwrap_or_default();
             }
             Status::Failed { message, .. } => {
                 view.state = StageState::Failed;
@@ -134,34 +136,35 @@ impl State {
         view
     }
 
-    fn active(&self, run: &Run, work: &Work) -> (StageState, Option<String>) {
-        let held = work.is_busy();
-        match work.state {
-            WorkState::Looking => (StageState::Ready, None),
-            WorkState::Bundling => (StageState::Running, None),
-            WorkState::Open if held => (StageState::Running, None),
-            WorkState::Open if run.state == RunState::Paused => (StageState::Ready, Some("paused".to_owned())),
-            WorkState::Open => {
+    fn active(&self, run: &Run, execution: &StageExecution) -> (StageState, Option<String>) {
+        let held = execution.is_busy();
+        match execution.state {
+            ExecutionState::Looking => (StageState::Ready, None),
+            ExecutionState::Bundling => (StageState::Running, None),
+            ExecutionState::Open if held => (StageState::Running, None),
+            ExecutionState::Open if run.state == RunState::Paused => (StageState::Ready, Some("paused".to_owned())),
+            ExecutionState::Open => {
                 let backing_off =
-                    work.tasks.iter().any(|task| matches!(task.hold, Hold::Waiting { not_before: Some(_) }));
+                    execution.tasks.iter().any(|task| matches!(task.lease, Lease::Waiting { not_before: Some(_) }));
                 let waits_for = if backing_off {
-                    format!("tries again soon (attempt {} failed)", work.attempt())
+                    format!("tries again soon (attempt {} failed)", execution.attempt())
                 } else {
-                    let min = work.placement.workers.min.max(1);
-                    format!("waits for {min} idle `{}` worker(s)", work.backend.name())
+                    let min = execution.placement.workers.min.max(1);
+                    format!("waits for {min} idle `{}` worker(s)", execution.backend.name())
                 };
                 (StageState::Ready, Some(waits_for))
             }
-            WorkState::Done { .. } | WorkState::Failed { .. } => (StageState::Running, None),
+            ExecutionState::Done { .. } | ExecutionState::Failed { .. } => (StageState::Running, None),
         }
     }
 
     /// How far a work is: its one task, or the sum over its shards while they are done.
-    pub fn progress(&self, work: &Work) -> Progress {
+    pub fn progress(&self, execution: &StageExecution) -> Progress {
         let of = |task: &Task| self.heard.progress.get(&task.id).map(|progress| Progress::clone(progress));
-        let shards = work.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. })).count();
-        let done = work.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. }) && task.output().is_some());
-        match &*work.tasks {
+        let shards = execution.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. })).count();
+        let done =
+            execution.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. }) && task.output().is_some());
+        match &*execution.tasks {
             [] => Progress::default(),
             [task] => of(task).unwrap_or_default(),
             _ => Progress {
@@ -174,19 +177,24 @@ impl State {
     }
 }
 
-fn workers(work: &Work) -> Vec<WorkerId> {
-    work.tasks.iter().flat_map(Task::holders).map(|member| member.worker.clone()).collect()
+fn workers(execution: &StageExecution) -> Vec<WorkerId> {
+    execution.tasks.iter().flat_map(Task::holders).map(|member| member.worker.clone()).collect()
 }
 
-fn assignment(work: &Work, task: &Task, worker: &WorkerId, incarnation: Incarnation) -> Option<Assignment> {
-    let Hold::Held { holders, secret, winding } = &task.hold else { return None };
+fn assignment(
+    execution: &StageExecution,
+    task: &Task,
+    worker: &WorkerId,
+    incarnation: Incarnation,
+) -> Option<Assignment> {
+    let Lease::Held { holders, secret, drain_by } = &task.lease else { return None };
     if !holders.iter().any(|member| member.worker == *worker && member.incarnation == incarnation) {
         return None;
     }
     let role = match task.part {
         Part::Alone => Role::Alone,
         Part::Shard { index, of } => Role::Shard { index, of },
-        Part::Merge => Role::Merge { shards: work.shards().unwrap_or_default() },
+        Part::Merge => Role::Merge { shards: execution.shards().unwrap_or_default() },
         Part::Gang => {
             Role::Member { generation: Generation(task.fence.0), members: holders.clone(), secret: secret.clone() }
         }
@@ -194,15 +202,15 @@ fn assignment(work: &Work, task: &Task, worker: &WorkerId, incarnation: Incarnat
     Some(Assignment {
         grant: task.grant_of(worker, incarnation),
         stage: StageTask {
-            run: work.run.clone(),
-            name: work.keyed_as.clone(),
-            settings: work.settings.clone(),
-            inputs: work.inputs.clone(),
-            seed: work.seed,
-            checkpoint: work.placement.checkpoint.clone(),
+            run: execution.run.clone(),
+            name: execution.keyed_as.clone(),
+            settings: execution.settings.clone(),
+            inputs: execution.inputs.clone(),
+            seed: execution.seed,
+            checkpoint: execution.placement.checkpoint.clone(),
         },
         role,
         resume: task.newest().map(|saved| saved.manifest),
-        wind_down: winding.is_some(),
+        drain: drain_by.is_some(),
     })
 }

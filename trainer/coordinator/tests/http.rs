@@ -7,8 +7,8 @@ use axum::body::Body;
 use axum::http::{Request, StatusCode};
 use coordinator::{Config, Control, Coordinator, Handle, Policy, StartError};
 use protocol::message::{
-    ApiError, CommitCheckpoint, Doing, Grant, Join, Joined, LogBatch, MetricBatch, MetricRow, Orders, PROTOCOL_VERSION,
-    Poll, Progress, ReportOutcome, RunState, StageState, Submit, TaskOutcome,
+    ApiError, CommitCheckpoint, DesiredAssignments, Doing, Grant, Join, Joined, LogBatch, MetricBatch, MetricRow,
+    PROTOCOL_VERSION, Poll, Progress, ReportOutcome, RunState, StageState, Submit, TaskOutcome,
 };
 use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::stage::{Backend, DataSynthetic, Placement, StageSettings, TrainVae};
@@ -146,9 +146,9 @@ async fn assignment(
     let mut version = 0;
     loop {
         let poll = Poll { incarnation: joined.incarnation, doing: vec![], version };
-        let orders: Orders = client.call("POST", &format!("/v1/workers/{name}/poll"), poll).await?;
-        version = orders.version;
-        if let Some(assignment) = orders.assignments.into_iter().find(|a| a.stage.name.as_str() == stage) {
+        let desired: DesiredAssignments = client.call("POST", &format!("/v1/workers/{name}/poll"), poll).await?;
+        version = desired.version;
+        if let Some(assignment) = desired.assignments.into_iter().find(|a| a.stage.name.as_str() == stage) {
             return Ok(assignment);
         }
     }
@@ -299,9 +299,9 @@ async fn polls_alone_keep_a_lease_and_show_progress() -> TestResult {
             let doing = Doing { grant: held.clone(), progress, lost: vec![] };
             let doing = if name == "a" { vec![doing] } else { vec![] };
             let poll = Poll { incarnation: joined.incarnation, doing, version: version[i] };
-            let orders: Orders = client.call("POST", &format!("/v1/workers/{name}/poll"), poll).await?;
-            version[i] = orders.version;
-            let grants: Vec<&Grant> = orders.assignments.iter().map(|assignment| &assignment.grant).collect();
+            let desired: DesiredAssignments = client.call("POST", &format!("/v1/workers/{name}/poll"), poll).await?;
+            version[i] = desired.version;
+            let grants: Vec<&Grant> = desired.assignments.iter().map(|assignment| &assignment.grant).collect();
             assert_eq!(grants, if name == "a" { vec![&held] } else { vec![] }, "worker {name}");
         }
     }

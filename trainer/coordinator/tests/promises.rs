@@ -5,7 +5,7 @@
 #[path = "simulation/pipelines.rs"]
 mod pipelines;
 
-use coordinator::state::task::Hold;
+use coordinator::state::task::Lease;
 use coordinator::{
     Control, Effect, Event, Millis, Moment, Observation, Policy, Rejected, State, decide, invariants, journal, observe,
 };
@@ -18,13 +18,13 @@ use protocol::{Digest, Incarnation, RunId, WorkerId};
 use serde_json::Value;
 
 /// A coordinator without a shell: one call after the other, at the times that the test says.
-struct Desk {
+struct ActorHandle {
     state: State,
     journal: Vec<Value>,
     now: u64,
 }
 
-impl Desk {
+impl ActorHandle {
     fn new(policy: Policy) -> Self {
         Self { state: State::new(policy), journal: Vec::new(), now: 1_000_000 }
     }
@@ -101,7 +101,7 @@ impl Desk {
     fn assignment(&self, name: &str) -> Option<Assignment> {
         let worker: WorkerId = name.into();
         let incarnation = self.state.workers[&worker].incarnation;
-        self.state.orders(&worker, incarnation).expect("known").assignments.into_iter().next()
+        self.state.desired(&worker, incarnation).expect("known").assignments.into_iter().next()
     }
 
     fn report(&mut self, assignment: &Assignment, outcome: TaskOutcome) {
@@ -114,7 +114,7 @@ impl Desk {
     }
 
     fn is_held(&self) -> bool {
-        self.state.works.values().any(|work| work.is_busy())
+        self.state.executions.values().any(|execution| execution.is_busy())
     }
 }
 
@@ -128,28 +128,28 @@ fn p3_the_task_of_a_dead_worker_is_another_s_within_16_seconds() {
     let policy = Policy::default();
     assert_eq!((policy.lease_ms, policy.tick_ms), (15_000, 1_000), "what is promised is 15 s and 1 s");
     for offset in (0..policy.tick_ms).step_by(25) {
-        let mut desk = Desk::new(Policy::default());
-        desk.submit("dataset", WorkerRange::default());
-        let a = desk.join("a");
-        let lost = desk.assignment("a").expect("the only worker gets it").grant;
-        let b = desk.join("b");
+        let mut actor_handle = ActorHandle::new(Policy::default());
+        actor_handle.submit("dataset", WorkerRange::default());
+        let a = actor_handle.join("a");
+        let lost = actor_handle.assignment("a").expect("the only worker gets it").grant;
+        let b = actor_handle.join("b");
         // The clock is looked at every second, from a moment that has nothing to do with when `a` was last heard.
-        let first = desk.now;
-        desk.now += offset;
-        desk.poll("a", a);
-        let heard = desk.now;
+        let first = actor_handle.now;
+        actor_handle.now += offset;
+        actor_handle.poll("a", a);
+        let heard = actor_handle.now;
         let mut tick = first;
         let taken = loop {
             tick += policy.tick_ms;
-            desk.now = tick;
-            desk.poll("b", b);
-            desk.hear(Observation::Tick);
-            if let Some(taken) = desk.assignment("b") {
+            actor_handle.now = tick;
+            actor_handle.poll("b", b);
+            actor_handle.hear(Observation::Tick);
+            if let Some(taken) = actor_handle.assignment("b") {
                 break taken.grant;
             }
             assert!(tick < heard + 60_000, "never taken");
         };
-        let after = desk.now - heard;
+        let after = actor_handle.now - heard;
         // The loss may be followed by a first back-off of half a second.
         let bound = policy.lease_ms + policy.tick_ms;
         assert!(after > policy.lease_ms, "a lease of {} ms ended after {after} ms", policy.lease_ms);
@@ -157,26 +157,26 @@ fn p3_the_task_of_a_dead_worker_is_another_s_within_16_seconds() {
         assert!(after <= bound + backoff, "offset {offset}: taken after {after} ms");
         assert!(taken.fence > lost.fence && taken.attempt > lost.attempt);
         let refused = ReportOutcome { grant: lost, outcome: failed(FailureClass::Fault) };
-        let refused = desk.happen(Event::Outcome { report: refused });
+        let refused = actor_handle.happen(Event::Outcome { report: refused });
         assert!(matches!(refused, Err(Rejected::StaleFence { .. })), "{refused:?}");
     }
 }
 
 /// A gang trains: its task's members by rank.
-fn gang_of_three(desk: &mut Desk) -> (RunId, [Incarnation; 3]) {
-    let run = desk.submit("vae", WorkerRange { min: 1, max: 3 });
-    let a = desk.join("a");
-    let dataset = desk.assignment("a").expect("the only worker gets it");
-    desk.report(&dataset, TaskOutcome::Finished { output: Digest::of(b"clips"), metrics: Default::default() });
-    let [b, c] = ["b", "c"].map(|name| desk.join(name));
+fn gang_of_three(actor_handle: &mut ActorHandle) -> (RunId, [Incarnation; 3]) {
+    let run = actor_handle.submit("vae", WorkerRange { min: 1, max: 3 });
+    let a = actor_handle.join("a");
+    let dataset = actor_handle.assignment("a").expect("the only worker gets it");
+    actor_handle.report(&dataset, TaskOutcome::Finished { output: Digest::of(b"clips"), metrics: Default::default() });
+    let [b, c] = ["b", "c"].map(|name| actor_handle.join(name));
     (run, [a, b, c])
 }
 
 #[test]
 fn only_the_first_member_of_a_gang_commits_and_reports_the_end() {
-    let mut desk = Desk::new(Policy::default());
-    let (run, _) = gang_of_three(&mut desk);
-    let [first, second] = ["a", "b"].map(|name| desk.assignment(name).expect("it trains").grant);
+    let mut actor_handle = ActorHandle::new(Policy::default());
+    let (run, _) = gang_of_three(&mut actor_handle);
+    let [first, second] = ["a", "b"].map(|name| actor_handle.assignment(name).expect("it trains").grant);
     let events = |grant: &Grant| {
         let (manifest, output) = (Digest::of(b"step 1"), Digest::of(b"vae"));
         let commit = CommitCheckpoint { grant: grant.clone(), step: 1, manifest, metrics: Default::default() };
@@ -185,74 +185,98 @@ fn only_the_first_member_of_a_gang_commits_and_reports_the_end() {
         [Event::Checkpoint { commit }, report(TaskOutcome::Yielded { at: 1 }), report(finished)]
     };
     for event in events(&second) {
-        let refused = desk.happen(event.clone());
+        let refused = actor_handle.happen(event.clone());
         assert!(matches!(refused, Err(Rejected::Conflict(_))), "{event:?}: {refused:?}");
     }
     let [commit, _, finished] = events(&first);
-    desk.happen(commit).expect("saved");
-    desk.happen(finished).expect("done");
-    assert_eq!(desk.run_state(&run), RunState::Finished);
+    actor_handle.happen(commit).expect("saved");
+    actor_handle.happen(finished).expect("done");
+    assert_eq!(actor_handle.run_state(&run), RunState::Finished);
 }
 
 /// Sampled: one gang of three. Its first member is silent past its lease, wakes with its old grant, tells its progress and that it lost the
 /// others; then the same as an event, as if it had been heard before the gang went on without it.
 #[test]
 fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
-    let mut desk = Desk::new(Policy::default());
-    let (run, [a, b, c]) = gang_of_three(&mut desk);
-    let old = desk.assignment("a").expect("it trains").grant;
-    let gang = |desk: &Desk| {
-        let (_, task) = desk.state.task(&old.task).expect("known");
+    let mut actor_handle = ActorHandle::new(Policy::default());
+    let (run, [a, b, c]) = gang_of_three(&mut actor_handle);
+    let old = actor_handle.assignment("a").expect("it trains").grant;
+    let gang = |actor_handle: &ActorHandle| {
+        let (_, task) = actor_handle.state.task(&old.task).expect("known");
         task.holders().iter().map(|member| member.worker.clone()).collect::<Vec<_>>()
     };
-    assert_eq!(gang(&desk), ["a", "b", "c"].map(WorkerId::from));
+    assert_eq!(gang(&actor_handle), ["a", "b", "c"].map(WorkerId::from));
     for _ in 0..16 {
-        desk.now += 1000;
-        desk.poll("b", b);
-        desk.poll("c", c);
-        desk.hear(Observation::Tick);
+        actor_handle.now += 1000;
+        actor_handle.poll("b", b);
+        actor_handle.poll("c", c);
+        actor_handle.hear(Observation::Tick);
     }
-    assert_eq!(gang(&desk), ["b", "c"].map(WorkerId::from));
+    assert_eq!(gang(&actor_handle), ["b", "c"].map(WorkerId::from));
 
     let lost = vec!["b".into(), "c".into()];
     let progress = Progress { done: 999, total: 1000, ..Progress::default() };
     let doing = vec![Doing { grant: old.clone(), progress, lost: lost.clone() }];
     let poll = Poll { incarnation: a, doing, version: 0 };
-    let heard = observe(&mut desk.state, Millis(desk.now), Observation::Poll { worker: "a".into(), poll });
+    let heard =
+        observe(&mut actor_handle.state, Millis(actor_handle.now), Observation::Poll { worker: "a".into(), poll });
     let heard = heard.expect("it is known");
     assert!(matches!(&heard[..], [Event::WorkerBack { worker }] if worker.as_str() == "a"), "{heard:?}");
-    let view = desk.state.view(desk.state.run(&run).expect("known"), Millis(desk.now));
+    let view = actor_handle.state.view(actor_handle.state.run(&run).expect("known"), Millis(actor_handle.now));
     let told: Vec<u64> = view.stages.iter().map(|stage| stage.progress.done).collect();
     assert!(!told.contains(&999), "{told:?}");
 
-    let refused = desk.happen(Event::PeersLost { grant: old.clone(), lost });
+    let refused = actor_handle.happen(Event::PeersLost { grant: old.clone(), lost });
     assert!(matches!(refused, Err(Rejected::StaleFence { .. })), "{refused:?}");
-    assert_eq!(gang(&desk), ["b", "c"].map(WorkerId::from));
+    assert_eq!(gang(&actor_handle), ["b", "c"].map(WorkerId::from));
+}
+
+/// One gap of 8 s between two looks at the clock, as behind a slow disk: who was heard in it has a lease from then on, not a lease and 8 s.
+#[test]
+fn p3_a_late_clock_gives_nobody_more_than_a_lease_from_now() {
+    let mut actor_handle = ActorHandle::new(Policy::default());
+    actor_handle.submit("dataset", WorkerRange::default());
+    let a = actor_handle.join("a");
+    actor_handle.hear(Observation::Tick);
+    actor_handle.now += 8000;
+    actor_handle.poll("a", a);
+    actor_handle.hear(Observation::Tick);
+    let heard = actor_handle.now;
+    while actor_handle.is_held() {
+        actor_handle.now += 1000;
+        actor_handle.hear(Observation::Tick);
+        assert!(
+            actor_handle.now - heard <= 16_000,
+            "still held {} ms after it was last heard",
+            actor_handle.now - heard
+        );
+    }
+    assert!(actor_handle.now - heard > 15_000, "its lease was cut short");
 }
 
 /// One restart after a simulated hour, with workers that come back at once, late within the lease, and never.
 #[test]
 fn p3_after_an_hour_without_a_coordinator_leases_get_one_interval_of_grace() {
     for back_after in [0, 14_000] {
-        let mut desk = Desk::new(Policy::default());
-        desk.submit("dataset", WorkerRange::default());
-        let a = desk.join("a");
-        let held = desk.assignment("a").expect("held").grant;
-        desk.now += 3_600_000;
-        desk.restart(false);
+        let mut actor_handle = ActorHandle::new(Policy::default());
+        actor_handle.submit("dataset", WorkerRange::default());
+        let a = actor_handle.join("a");
+        let held = actor_handle.assignment("a").expect("held").grant;
+        actor_handle.now += 3_600_000;
+        actor_handle.restart(false);
         for _ in 0..back_after / 1000 {
-            desk.hear(Observation::Tick);
-            desk.now += 1000;
+            actor_handle.hear(Observation::Tick);
+            actor_handle.now += 1000;
         }
-        desk.poll("a", a);
-        desk.hear(Observation::Tick);
-        assert_eq!(desk.assignment("a").expect("still its own").grant, held, "back after {back_after} ms");
+        actor_handle.poll("a", a);
+        actor_handle.hear(Observation::Tick);
+        assert_eq!(actor_handle.assignment("a").expect("still its own").grant, held, "back after {back_after} ms");
         // Then silent for good: nothing stays with it.
         for _ in 0..17 {
-            desk.now += 1000;
-            desk.hear(Observation::Tick);
+            actor_handle.now += 1000;
+            actor_handle.hear(Observation::Tick);
         }
-        assert!(!desk.is_held(), "an orphan");
+        assert!(!actor_handle.is_held(), "an orphan");
     }
 }
 
@@ -266,14 +290,14 @@ fn p15_each_budget_allows_exactly_one_try_more_than_it_says() {
                 FailureClass::Fault => (faults, losses),
                 _ => (losses, faults),
             };
-            let mut desk = Desk::new(policy.clone());
-            let run = desk.submit("dataset", WorkerRange::default());
+            let mut actor_handle = ActorHandle::new(policy.clone());
+            let run = actor_handle.submit("dataset", WorkerRange::default());
             let mut others = 0;
             let mut attempts = 0;
             let mut streak = 0;
-            let a = desk.join("a");
+            let a = actor_handle.join("a");
             loop {
-                let assignment = desk.assignment("a").expect("granted once the back-off is over");
+                let assignment = actor_handle.assignment("a").expect("granted once the back-off is over");
                 attempts += 1;
                 // The other budget is used up on the way, to its end and no further.
                 let class = if others < other && attempts % 2 == 0 {
@@ -282,24 +306,24 @@ fn p15_each_budget_allows_exactly_one_try_more_than_it_says() {
                 } else {
                     class
                 };
-                desk.report(&assignment, failed(class));
+                actor_handle.report(&assignment, failed(class));
                 streak += 1;
-                desk.restart(false);
-                if desk.run_state(&run) == RunState::Failed {
+                actor_handle.restart(false);
+                if actor_handle.run_state(&run) == RunState::Failed {
                     break;
                 }
                 let backoff = policy.backoff(streak);
                 assert!(backoff <= policy.backoff_max_ms);
-                desk.now += backoff - 1;
-                desk.poll("a", a);
-                desk.hear(Observation::Tick);
-                assert!(desk.assignment("a").is_none(), "granted before {backoff} ms were over");
-                desk.now += 1;
-                desk.hear(Observation::Tick);
+                actor_handle.now += backoff - 1;
+                actor_handle.poll("a", a);
+                actor_handle.hear(Observation::Tick);
+                assert!(actor_handle.assignment("a").is_none(), "granted before {backoff} ms were over");
+                actor_handle.now += 1;
+                actor_handle.hear(Observation::Tick);
                 assert!(attempts < 50, "never given up");
             }
             assert_eq!(attempts - others, own + 1, "budgets {faults} and {losses}, failing by {class:?}");
-            let view = desk.state.view(desk.state.run(&run).expect("known"), Millis(desk.now));
+            let view = actor_handle.state.view(actor_handle.state.run(&run).expect("known"), Millis(actor_handle.now));
             let message = view.stages[0].message.clone().unwrap_or_default();
             assert!(message.contains("gave up after") && message.contains("made up"), "{message}");
         }
@@ -311,54 +335,56 @@ fn p15_each_budget_allows_exactly_one_try_more_than_it_says() {
 fn p15_a_final_failure_is_not_tried_again() {
     for class in [FailureClass::Input, FailureClass::Diverged, FailureClass::OutOfMemory, FailureClass::Storage] {
         for before in [0, 2] {
-            let mut desk = Desk::new(Policy::default());
-            let run = desk.submit("dataset", WorkerRange::default());
-            let a = desk.join("a");
+            let mut actor_handle = ActorHandle::new(Policy::default());
+            let run = actor_handle.submit("dataset", WorkerRange::default());
+            let a = actor_handle.join("a");
             for _ in 0..before {
-                let assignment = desk.assignment("a").expect("granted");
-                desk.report(&assignment, failed(FailureClass::Fault));
-                desk.now += desk.state.policy.backoff_max_ms;
-                desk.poll("a", a);
-                desk.hear(Observation::Tick);
+                let assignment = actor_handle.assignment("a").expect("granted");
+                actor_handle.report(&assignment, failed(FailureClass::Fault));
+                actor_handle.now += actor_handle.state.policy.backoff_max_ms;
+                actor_handle.poll("a", a);
+                actor_handle.hear(Observation::Tick);
             }
-            let assignment = desk.assignment("a").expect("granted");
-            desk.report(&assignment, failed(class));
-            assert_eq!(desk.run_state(&run), RunState::Failed, "{class:?}");
-            let view = desk.state.view(desk.state.run(&run).expect("known"), Millis(desk.now));
+            let assignment = actor_handle.assignment("a").expect("granted");
+            actor_handle.report(&assignment, failed(class));
+            assert_eq!(actor_handle.run_state(&run), RunState::Failed, "{class:?}");
+            let view = actor_handle.state.view(actor_handle.state.run(&run).expect("known"), Millis(actor_handle.now));
             assert_eq!(view.stages[0].state, StageState::Failed);
             assert_eq!(view.stages[0].attempt.0, before + 1);
-            assert!(desk.assignment("a").is_none());
+            assert!(actor_handle.assignment("a").is_none());
             // Asked for again, it begins again.
-            desk.happen(Event::Control { run: run.clone(), action: Control::Resume }).expect("taken up");
-            assert!(desk.assignment("a").is_some());
+            actor_handle.happen(Event::Control { run: run.clone(), action: Control::Resume }).expect("taken up");
+            assert!(actor_handle.assignment("a").is_some());
         }
     }
 }
 
 /// A run in each of its states, made as a run gets there.
-fn in_state(state: RunState, held: bool) -> (Desk, RunId) {
-    let mut desk = Desk::new(Policy::default());
-    let run = desk.submit("dataset", WorkerRange::default());
-    let control = |desk: &mut Desk, action| desk.happen(Event::Control { run: run.clone(), action }).expect("taken");
+fn in_state(state: RunState, held: bool) -> (ActorHandle, RunId) {
+    let mut actor_handle = ActorHandle::new(Policy::default());
+    let run = actor_handle.submit("dataset", WorkerRange::default());
+    let control = |actor_handle: &mut ActorHandle, action| {
+        actor_handle.happen(Event::Control { run: run.clone(), action }).expect("taken")
+    };
     if held || matches!(state, RunState::Finished | RunState::Failed) {
-        desk.join("a");
+        actor_handle.join("a");
     }
     match state {
         RunState::Running => {}
-        RunState::Paused => drop(control(&mut desk, Control::Pause)),
-        RunState::Cancelled => drop(control(&mut desk, Control::Cancel)),
+        RunState::Paused => drop(control(&mut actor_handle, Control::Pause)),
+        RunState::Cancelled => drop(control(&mut actor_handle, Control::Cancel)),
         RunState::Failed => {
-            let assignment = desk.assignment("a").expect("granted");
-            desk.report(&assignment, failed(FailureClass::Input));
+            let assignment = actor_handle.assignment("a").expect("granted");
+            actor_handle.report(&assignment, failed(FailureClass::Input));
         }
         RunState::Finished => {
-            let assignment = desk.assignment("a").expect("granted");
+            let assignment = actor_handle.assignment("a").expect("granted");
             let output = Digest::of(b"clips");
-            desk.report(&assignment, TaskOutcome::Finished { output, metrics: Default::default() });
+            actor_handle.report(&assignment, TaskOutcome::Finished { output, metrics: Default::default() });
         }
     }
-    assert_eq!(desk.run_state(&run), state);
-    (desk, run)
+    assert_eq!(actor_handle.run_state(&run), state);
+    (actor_handle, run)
 }
 
 /// The whole table: each state, idle and with a worker that never answers, asked for each action, with the coordinator
@@ -379,31 +405,31 @@ fn p14_pause_resume_and_cancel_end_where_the_table_says_whoever_is_killed() {
             for held in [false, true] {
                 for killed in ["never", "before", "after"] {
                     let case = format!("{state:?}, held: {held}, {action:?}, killed {killed}");
-                    let (mut desk, run) = in_state(state, held);
+                    let (mut actor_handle, run) = in_state(state, held);
                     if killed == "before" {
                         // Nobody was answered, so the client asks again.
-                        desk.restart(false);
+                        actor_handle.restart(false);
                     }
-                    let asked = desk.happen(Event::Control { run: run.clone(), action });
+                    let asked = actor_handle.happen(Event::Control { run: run.clone(), action });
                     assert_eq!(asked.is_ok(), expected.is_some(), "{case}: {asked:?}");
                     if killed == "after" {
-                        desk.restart(false);
+                        actor_handle.restart(false);
                     }
                     let expected = expected.unwrap_or(state);
-                    assert_eq!(desk.run_state(&run), expected, "{case}");
-                    let begun = desk.now;
-                    let worker = desk.state.workers.contains_key(&"a".into());
-                    while desk.is_held() && expected != Running {
-                        desk.now += 1000;
+                    assert_eq!(actor_handle.run_state(&run), expected, "{case}");
+                    let begun = actor_handle.now;
+                    let worker = actor_handle.state.workers.contains_key(&"a".into());
+                    while actor_handle.is_held() && expected != Running {
+                        actor_handle.now += 1000;
                         if worker {
                             // It lives and polls, and does not do what it is told.
-                            desk.poll("a", desk.state.workers[&"a".into()].incarnation);
+                            actor_handle.poll("a", actor_handle.state.workers[&"a".into()].incarnation);
                         }
-                        desk.hear(Observation::Tick);
-                        let limit = desk.state.policy.grace_ms + 5000;
-                        assert!(desk.now - begun <= limit, "{case}: still held after {limit} ms");
+                        actor_handle.hear(Observation::Tick);
+                        let limit = actor_handle.state.policy.grace_ms + 5000;
+                        assert!(actor_handle.now - begun <= limit, "{case}: still held after {limit} ms");
                     }
-                    assert_eq!(desk.run_state(&run), expected, "{case}");
+                    assert_eq!(actor_handle.run_state(&run), expected, "{case}");
                 }
             }
         }
@@ -413,23 +439,23 @@ fn p14_pause_resume_and_cancel_end_where_the_table_says_whoever_is_killed() {
 /// Draining with a worker that does not answer; then a new start gives the work out again.
 #[test]
 fn p14_a_drain_ends_though_a_worker_ignores_it() {
-    let (mut desk, run) = in_state(RunState::Running, true);
-    let a = desk.state.workers[&"a".into()].incarnation;
-    desk.happen(Event::Drain).expect("taken");
-    assert!(desk.assignment("a").is_some_and(|assignment| assignment.wind_down));
-    for _ in 0..(desk.state.policy.grace_ms / 1000 + 1) {
-        desk.now += 1000;
-        desk.poll("a", a);
-        desk.hear(Observation::Tick);
+    let (mut actor_handle, run) = in_state(RunState::Running, true);
+    let a = actor_handle.state.workers[&"a".into()].incarnation;
+    actor_handle.happen(Event::Drain).expect("taken");
+    assert!(actor_handle.assignment("a").is_some_and(|assignment| assignment.drain));
+    for _ in 0..(actor_handle.state.policy.grace_ms / 1000 + 1) {
+        actor_handle.now += 1000;
+        actor_handle.poll("a", a);
+        actor_handle.hear(Observation::Tick);
     }
-    let waits = |desk: &Desk| {
-        let mut tasks = desk.state.works.values().flat_map(|work| &work.tasks);
-        tasks.all(|task| matches!(task.hold, Hold::Waiting { .. }))
+    let waits = |actor_handle: &ActorHandle| {
+        let mut tasks = actor_handle.state.executions.values().flat_map(|execution| &execution.tasks);
+        tasks.all(|task| matches!(task.lease, Lease::Waiting { .. }))
     };
-    assert!(waits(&desk), "released by force");
-    assert_eq!(desk.run_state(&run), RunState::Running, "the run itself was not asked to stop");
-    assert!(desk.state.orders(&"a".into(), a).expect("known").leave);
-    desk.restart(false);
-    desk.poll("a", a);
-    assert!(desk.assignment("a").is_some(), "a new start gives it out again");
+    assert!(waits(&actor_handle), "released by force");
+    assert_eq!(actor_handle.run_state(&run), RunState::Running, "the run itself was not asked to stop");
+    assert!(actor_handle.state.desired(&"a".into(), a).expect("known").leave);
+    actor_handle.restart(false);
+    actor_handle.poll("a", a);
+    assert!(actor_handle.assignment("a").is_some(), "a new start gives it out again");
 }

@@ -119,57 +119,57 @@ fn an_entry_that_cannot_be_read_is_named() {
 #[test]
 #[ignore = "writes the sample: cargo test -p coordinator --test stored_journal -- --ignored"]
 fn make_the_sample() {
-    let mut desk = Desk { state: State::new(Policy::default()), journal: Vec::new(), now: 1_000_000 };
+    let mut actor_handle = ActorHandle { state: State::new(Policy::default()), journal: Vec::new(), now: 1_000_000 };
     let pipeline = protocol::pipeline::read("stored.yaml", PIPELINE, &[]).unwrap_or_else(|e| panic!("{e}"));
-    desk.happen(Event::Started { alone: false, park: false });
+    actor_handle.happen(Event::Started { alone: false, park: false });
     let submit = Event::Submit {
         pipeline: Box::new(pipeline),
         source: PIPELINE.into(),
         idempotency_key: Some("once".into()),
         until: None,
     };
-    desk.happen(submit);
-    desk.join();
+    actor_handle.happen(submit);
+    actor_handle.join();
     let mut lost = false;
-    while !desk.state.runs[0].state.is_final() {
-        desk.now += 1000;
-        desk.poll();
-        let Some(assignment) = desk.assignment() else { continue };
+    while !actor_handle.state.runs[0].state.is_final() {
+        actor_handle.now += 1000;
+        actor_handle.poll();
+        let Some(assignment) = actor_handle.assignment() else { continue };
         let grant = assignment.grant.clone();
         if matches!(assignment.role, Role::Member { .. }) && assignment.resume.is_none() {
             let manifest = Digest::of(format!("{} at 20", grant.task).as_bytes());
             let metrics = BTreeMap::from([("loss".to_owned(), 0.5)]);
-            desk.happen(Event::Checkpoint {
+            actor_handle.happen(Event::Checkpoint {
                 commit: CommitCheckpoint { grant: grant.clone(), step: 20, manifest, metrics },
             });
         }
         if assignment.stage.name.as_str() == "vae" && !lost {
             lost = true;
-            desk.now += 400;
-            desk.happen(Event::WorkerGone { worker: "w".into() });
-            desk.now += 10_000;
-            desk.join();
+            actor_handle.now += 400;
+            actor_handle.happen(Event::WorkerGone { worker: "w".into() });
+            actor_handle.now += 10_000;
+            actor_handle.join();
             continue;
         }
         let output = Digest::of(grant.task.as_str().as_bytes());
         let metrics = BTreeMap::from([("latent_fid".to_owned(), 0.1)]);
-        desk.happen(Event::Outcome {
+        actor_handle.happen(Event::Outcome {
             report: ReportOutcome { grant, outcome: TaskOutcome::Finished { output, metrics } },
         });
     }
-    let text: String = desk.journal.iter().map(|entry| format!("{entry}\n")).collect();
+    let text: String = actor_handle.journal.iter().map(|entry| format!("{entry}\n")).collect();
     std::fs::create_dir_all(sample().parent().expect("a folder")).expect("a folder");
     std::fs::write(sample(), text).expect("written");
 }
 
 /// A coordinator without a shell, for the sample.
-struct Desk {
+struct ActorHandle {
     state: State,
     journal: Vec<Value>,
     now: u64,
 }
 
-impl Desk {
+impl ActorHandle {
     fn happen(&mut self, event: Event) {
         let moment = Moment { now: Millis(self.now), entropy: Digest::of(b"entropy") };
         for effect in decide(&mut self.state, moment, event).expect("taken") {
@@ -212,6 +212,6 @@ impl Desk {
 
     fn assignment(&self) -> Option<Assignment> {
         let incarnation = self.state.workers[&"w".into()].incarnation;
-        self.state.orders(&"w".into(), incarnation).expect("known").assignments.into_iter().next()
+        self.state.desired(&"w".into(), incarnation).expect("known").assignments.into_iter().next()
     }
 }

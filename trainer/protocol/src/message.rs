@@ -51,7 +51,7 @@ pub struct Poll {
     pub incarnation: Incarnation,
     /// What the worker does now, one for each assignment it holds.
     pub doing: Vec<Doing>,
-    /// Digest-like number of the assignments the worker knows ([`Orders::version`]); the coordinator answers at once
+    /// Digest-like number of the assignments the worker knows ([`DesiredAssignments::version`]); the coordinator answers at once
     /// when it has others, else within `poll_ms`.
     pub version: u64,
 }
@@ -82,7 +82,7 @@ pub struct Progress {
 
 /// The answer to [`Poll`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Orders {
+pub struct DesiredAssignments {
     /// Changes with the assignments.
     pub version: u64,
     /// All that the worker should be doing; what is missing here it must stop and forget.
@@ -118,7 +118,7 @@ pub struct Assignment {
     /// Newest committed checkpoint of the task: a manifest's digest.
     pub resume: Option<Digest>,
     /// Stop between two steps: save, report `Yielded`.
-    pub wind_down: bool,
+    pub drain: bool,
 }
 
 /// A stage's work as a worker sees it.

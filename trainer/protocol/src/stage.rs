@@ -260,7 +260,7 @@ impl StageSettings {
     }
 
     /// The model that an evaluation measures.
-    pub fn looks_at(&self) -> Option<&str> {
+    pub fn evaluated_model(&self) -> Option<&str> {
         match self {
             Self::EvaluateLatentFid(s) => Some(&s.model),
             // Shuffled captions say nothing of the model.

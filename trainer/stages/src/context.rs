@@ -100,7 +100,7 @@ pub enum Exchange {
         /// Element-wise sum.
         sum: Vec<f32>,
         /// The same for all members: stop after applying this step (save, then yield).
-        wind_down: bool,
+        drain: bool,
     },
     /// The membership changed before the sum was complete. Call [`GangContext::rendezvous`], then compute what is yours and
     /// was not computed yet.

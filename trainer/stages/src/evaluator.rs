@@ -77,14 +77,14 @@ pub fn normalise(rows: &mut [f32], mean: &[f32], std: &[f32]) {
 
 /// A trained evaluator.
 #[derive(Debug)]
-pub struct Judge {
+pub struct TrainedEvaluator {
     network: Evaluator,
     meta: EvaluatorMeta,
     words: Words,
     device: Device,
 }
 
-impl Judge {
+impl TrainedEvaluator {
     /// Reads an artifact of kind `evaluator`.
     pub fn read(blobs: &dyn Blobs, manifest: &Manifest, device: &Device) -> Result<Self, StageError> {
         let meta: EvaluatorMeta = artifacts::meta(manifest, "the evaluator")?;

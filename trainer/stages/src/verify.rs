@@ -134,7 +134,7 @@ impl GangContext for Solo {
 
     fn exchange(&mut self, step: u64, _: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError> {
         let parts: Vec<Vec<f32>> = parts.iter().map(|(_, part)| part.clone()).collect();
-        Ok(Exchange::Sum { sum: tree_sum(&parts), wind_down: step + 1 >= self.until })
+        Ok(Exchange::Sum { sum: tree_sum(&parts), drain: step + 1 >= self.until })
     }
 
     fn leads(&self) -> bool {

@@ -17,7 +17,7 @@ use protocol::stage::{
 use protocol::{ArtifactKind, Digest, Manifest, Seed, Steps};
 use stages::artifacts::{self, DenoiserMeta, Family, MODEL_FILE, VaeMeta, to_meta};
 use stages::context::Outcome;
-use stages::evaluator::{EvaluatorMeta, Judge};
+use stages::evaluator::{EvaluatorMeta, TrainedEvaluator};
 use stages::kinds::REPORT_FILE;
 use stages::testing::{Bench, Script};
 use stages::words::WordsMeta;
@@ -58,7 +58,7 @@ fn an_evaluator_is_the_same_bytes_with_any_members_and_after_any_stop() {
 
     let mut three = bench(3);
     assert_eq!(dataset(&mut three, 30), data);
-    three.script = Script { lost: vec![(0, 3)], joins: vec![(5, 5)], wind_down: None };
+    three.script = Script { lost: vec![(0, 3)], joins: vec![(5, 5)], drain: None };
     let ran = three.run("evaluator", &small(), &[("dataset", data)]).expect("the stage runs");
     assert_eq!(ran.output(), expected.output(), "three members, of which the leader is lost and a fourth joins");
 
@@ -66,7 +66,7 @@ fn an_evaluator_is_the_same_bytes_with_any_members_and_after_any_stop() {
     for stop in [1, 3, 6] {
         let mut cut = bench(2);
         dataset(&mut cut, 30);
-        cut.script = Script { wind_down: Some(stop), ..Script::default() };
+        cut.script = Script { drain: Some(stop), ..Script::default() };
         let ran = cut.run("evaluator", &small(), &[("dataset", data)]).expect("the stage runs");
         assert_eq!(ran.outcome, Outcome::Yielded { at: stop + 1 });
         cut.script = Script::default();
@@ -239,12 +239,12 @@ fn a_published_evaluator_is_read_from_its_pickle() {
         }
         assert_eq!(outputs["finest.tar"], outputs["weights.safetensors"], "{fixture}: pickle and safetensors");
         let manifest = bench.manifest(outputs["finest.tar"]).unwrap();
-        let judge = Judge::read(&*bench.blobs(), &manifest, &bench.device()).unwrap();
-        assert_eq!((judge.meta().origin.as_str(), &judge.meta().words), ("imported", &WordsMeta::Hashed));
-        assert_eq!(judge.meta().mean, vec![0.25; features]);
+        let evaluator = TrainedEvaluator::read(&*bench.blobs(), &manifest, &bench.device()).unwrap();
+        assert_eq!((evaluator.meta().origin.as_str(), &evaluator.meta().words), ("imported", &WordsMeta::Hashed));
+        assert_eq!(evaluator.meta().mean, vec![0.25; features]);
         // What is read is what the published file holds.
         let stored = std::fs::read(root.join(fixture).join("weights.safetensors")).unwrap();
-        let (stored, ours) = (safetensors::SafeTensors::deserialize(&stored).unwrap(), judge.weights());
+        let (stored, ours) = (safetensors::SafeTensors::deserialize(&stored).unwrap(), evaluator.weights());
         let ours = safetensors::SafeTensors::deserialize(&ours).unwrap();
         assert_eq!(stored.names().len(), ours.names().len());
         for (name, view) in stored.iter() {
@@ -354,9 +354,10 @@ fn a_vocabulary_is_kept_with_the_evaluator_and_named() {
     let settings = StageSettings::TrainEvaluator(settings);
     let ours = bench.run("evaluator", &settings, &[("dataset", data)]).expect("the stage runs").output();
     let hashed = bench.run("evaluator-2", &small(), &[("dataset", data)]).expect("the stage runs").output();
-    let judge = |digest| Judge::read(&*bench.blobs(), &bench.manifest(digest).unwrap(), &bench.device()).unwrap();
-    assert!(matches!(judge(ours).meta().words, WordsMeta::Vocabulary { words: 4, .. }));
-    assert_eq!(judge(hashed).meta().words, WordsMeta::Hashed);
+    let evaluator =
+        |digest| TrainedEvaluator::read(&*bench.blobs(), &bench.manifest(digest).unwrap(), &bench.device()).unwrap();
+    assert!(matches!(evaluator(ours).meta().words, WordsMeta::Vocabulary { words: 4, .. }));
+    assert_eq!(evaluator(hashed).meta().words, WordsMeta::Hashed);
 
     std::fs::write(&index, pickled(&rows[..2])).unwrap();
     let refused = bench.run("evaluator-3", &settings, &[("dataset", data)]).unwrap_err().to_string();

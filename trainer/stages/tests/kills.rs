@@ -71,7 +71,7 @@ fn p5_a_kill_at_every_step_changes_no_byte() {
             case.bench.script = Script { lost: vec![(0, step)], ..Script::default() };
             assert!(case.bench.run(name, &case.settings, &case.inputs).is_err(), "{name}: over before step {step}");
             let next = *whole.range(step + 1..).next().expect("the last is one").0;
-            case.bench.script = Script { wind_down: Some(next - 1), ..Script::default() };
+            case.bench.script = Script { drain: Some(next - 1), ..Script::default() };
             let ran = case.bench.run(name, &case.settings, &case.inputs);
             let ran = ran.unwrap_or_else(|e| panic!("{name} killed at step {step}: {e}"));
             let (at, saved) = case.bench.newest(name).expect("it has saved");
@@ -108,7 +108,7 @@ fn p6_members_1_to_3_to_2_to_1_change_no_byte() {
         case.bench.forget(name);
         case.bench.members = 1;
         let lost = if name == "vae" { vec![(0, 13), (2, 19)] } else { vec![(2, 13), (0, 19)] };
-        case.bench.script = Script { joins: vec![(1, 5), (2, 5)], lost, wind_down: None };
+        case.bench.script = Script { joins: vec![(1, 5), (2, 5)], lost, drain: None };
         let ran = case.bench.run(name, &case.settings, &case.inputs).unwrap_or_else(|e| panic!("{name}: {e}"));
         assert_eq!(ran.output(), case.expected, "{name}");
     }

@@ -40,7 +40,7 @@ fn p6_every_digest_is_the_same_with_any_number_of_members_and_shards() {
     assert_eq!(alone, pair, "1 member and 1 shard against 2 and 3");
     let mut three = bench(3);
     // One is lost in each training stage, the leader, and another joins.
-    three.script = Script { lost: vec![(0, 3)], joins: vec![(5, 1)], wind_down: None };
+    three.script = Script { lost: vec![(0, 3)], joins: vec![(5, 1)], drain: None };
     assert_eq!(alone, run(&mut three, 4), "1 member against 3 of which the leader is lost and a fourth joins");
 }
 
@@ -54,7 +54,7 @@ fn a_stage_that_yields_and_goes_on_gives_the_same_bytes() {
         let inputs: Vec<_> = inputs.iter().map(|(field, stage)| (*field, outputs[stage])).collect();
         let expected = whole.run(name, &settings, &inputs).unwrap_or_else(|e| panic!("{name}: {e}")).output();
         if settings.shape() == Shape::Gang {
-            cut.script = Script { wind_down: Some(3), ..Script::default() };
+            cut.script = Script { drain: Some(3), ..Script::default() };
             let ran = cut.run(name, &settings, &inputs).unwrap_or_else(|e| panic!("{name}: {e}"));
             assert_eq!(ran.outcome, Outcome::Yielded { at: 4 }, "{name}");
             assert_eq!(cut.checkpoints(name), [4], "{name}");

@@ -12,7 +12,7 @@ use protocol::{Generation, TaskId};
 
 use super::handshake::{self, HandshakeError};
 use super::mesh::{Mesh, Timing, spawn};
-use crate::bell::lock;
+use crate::event_count::lock;
 
 /// Where this process is dialled, for all its gangs.
 #[derive(Debug)]
@@ -45,7 +45,7 @@ impl Endpoint {
     pub(super) fn announce(&self, mesh: &Arc<Mesh>) {
         let mut meshes = lock(&self.meshes);
         meshes.retain(|_, mesh| mesh.strong_count() > 0);
-        meshes.insert((mesh.terms.task.clone(), mesh.terms.generation), Arc::downgrade(mesh));
+        meshes.insert((mesh.config.task.clone(), mesh.config.generation), Arc::downgrade(mesh));
     }
 
     fn welcome(&self, mut stream: TcpStream) -> Result<(), HandshakeError> {
@@ -54,10 +54,10 @@ impl Endpoint {
         let key = (dial.task.clone(), dial.generation);
         let mesh =
             lock(&self.meshes).get(&key).and_then(Weak::upgrade).filter(|m| !m.is_closed()).ok_or_else(unknown)?;
-        if dial.to != mesh.terms.rank || dial.from <= dial.to || dial.from >= mesh.size() {
+        if dial.to != mesh.config.rank || dial.from <= dial.to || dial.from >= mesh.size() {
             return Err(HandshakeError::Ranks { from: dial.from, to: dial.to });
         }
-        handshake::accept(&mut stream, &dial, &mesh.terms.secret)?;
+        handshake::accept(&mut stream, &dial, &mesh.config.secret)?;
         mesh.attach(dial.from, stream);
         Ok(())
     }

@@ -48,8 +48,8 @@ pub(crate) fn rendezvous(
     state: &[&[u8]],
     interrupt: Interrupt<'_>,
 ) -> Result<Met, Halt> {
-    let barrier = format!("barrier `rendezvous` of generation {}", mesh.terms.generation);
-    let own = mesh.terms.rank;
+    let barrier = format!("barrier `rendezvous` of generation {}", mesh.config.generation);
+    let own = mesh.config.rank;
     let head = Head::new(Kind::Applied, applied.unwrap_or(0), u32::from(applied.is_some()), 0);
     for peer in mesh.others() {
         mesh.send(peer, &barrier, head, &[], interrupt)?;
@@ -103,12 +103,12 @@ pub(crate) fn rendezvous(
 
 /// What a member brings to an exchange.
 #[derive(Debug)]
-pub(crate) struct Bring<'a> {
+pub(crate) struct Contribution<'a> {
     pub(crate) step: u64,
     pub(crate) slices: usize,
     /// The gradients of this member's share, slice by slice; all of one length.
     pub(crate) parts: Vec<(Node, &'a [f32])>,
-    pub(crate) wind_down: bool,
+    pub(crate) drain: bool,
     /// The last step of which the lead knows that everything recorded is stored.
     pub(crate) durable: u64,
 }
@@ -117,69 +117,69 @@ pub(crate) struct Bring<'a> {
 #[derive(Debug)]
 pub(crate) struct Total {
     pub(crate) sum: Vec<f32>,
-    pub(crate) wind_down: bool,
-    /// The lead's [`Bring::durable`].
+    pub(crate) drain: bool,
+    /// The lead's [`Contribution::durable`].
     pub(crate) durable: u64,
 }
 
 /// Sums over all slices of a step.
-pub(crate) fn exchange(mesh: &Mesh, bring: &Bring<'_>, interrupt: Interrupt<'_>) -> Result<Total, Halt> {
-    let (own, size) = (mesh.terms.rank, mesh.size());
-    let root = 0..bring.slices;
-    let mut length = bring.parts.first().map(|(_, part)| part.len());
+pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: Interrupt<'_>) -> Result<Total, Halt> {
+    let (own, size) = (mesh.config.rank, mesh.size());
+    let root = 0..contribution.slices;
+    let mut length = contribution.parts.first().map(|(_, part)| part.len());
     if size == 1 {
         let mut sum = vec![0.0; length.unwrap_or(0)];
-        tree::sum(&root, &bring.parts, &mut sum);
-        return Ok(Total { sum, wind_down: bring.wind_down, durable: bring.durable });
+        tree::sum(&root, &contribution.parts, &mut sum);
+        return Ok(Total { sum, drain: contribution.drain, durable: contribution.durable });
     }
-    let barrier = format!("barrier `exchange` of step {} in generation {}", bring.step, mesh.terms.generation);
+    let barrier = format!("barrier `exchange` of step {} in generation {}", contribution.step, mesh.config.generation);
     let disagree = |peer: usize, what: String| {
-        Halt::Disagree(format!("{barrier}: `{}` {what}; is it the same build?", mesh.terms.members[peer].worker))
+        Halt::Disagree(format!("{barrier}: `{}` {what}; is it the same build?", mesh.config.members[peer].worker))
     };
 
     // Reduce-scatter, our half: everybody's chunk of our nodes.
-    let flags = if bring.wind_down { WIND_DOWN } else { 0 };
-    let own_nodes = tree::cover(bring.slices, &tree::share(bring.slices, own, size));
+    let flags = if contribution.drain { WIND_DOWN } else { 0 };
+    let own_nodes = tree::cover(contribution.slices, &tree::share(contribution.slices, own, size));
     let mut piece = vec![0.0f32; PIECE];
     for peer in mesh.others() {
         let mut greeting = [0u8; 16];
         greeting[..8].copy_from_slice(&(length.unwrap_or(0) as u64).to_le_bytes());
-        greeting[8..].copy_from_slice(&bring.durable.to_le_bytes());
-        let head = Head::new(Kind::Begin, bring.step, number(bring.slices), flags);
+        greeting[8..].copy_from_slice(&contribution.durable.to_le_bytes());
+        let head = Head::new(Kind::Begin, contribution.step, number(contribution.slices), flags);
         mesh.send(peer, &barrier, head, &greeting, interrupt)?;
         let chunk = length.map_or(0..0, |length| tree::share(length, peer, size));
         for (n, node) in own_nodes.iter().enumerate() {
             for (p, range) in pieces(&chunk).enumerate() {
-                let leaves: Vec<(Node, &[f32])> = bring.parts[within(&bring.parts, node)]
+                let leaves: Vec<(Node, &[f32])> = contribution.parts[within(&contribution.parts, node)]
                     .iter()
                     .map(|(slice, part)| (slice.clone(), &part[range.clone()]))
                     .collect();
                 let out = &mut piece[..range.len()];
                 tree::sum(node, &leaves, out);
-                let head = Head::new(Kind::Part, bring.step, number(n), number(p));
+                let head = Head::new(Kind::Part, contribution.step, number(n), number(p));
                 mesh.send(peer, &barrier, head, cast_slice(out), interrupt)?;
             }
         }
     }
 
     // Reduce-scatter, their half: our chunk of their nodes.
-    let mut wind_down = bring.wind_down;
-    let mut durable = if own == 0 { bring.durable } else { 0 };
+    let mut drain = contribution.drain;
+    let mut durable = if own == 0 { contribution.durable } else { 0 };
     let mut theirs: Vec<(Node, Vec<f32>)> = Vec::new();
     for peer in mesh.others() {
         let begin = expect(mesh.next(peer, &barrier, interrupt)?, Kind::Begin, mesh, peer)?;
-        if begin.step != bring.step || begin.a != number(bring.slices) {
+        if begin.step != contribution.step || begin.a != number(contribution.slices) {
             return Err(disagree(
                 peer,
-                format!("is at step {} with {} slices, not {}", begin.step, begin.a, bring.slices),
+                format!("is at step {} with {} slices, not {}", begin.step, begin.a, contribution.slices),
             ));
         }
         let (at, stored) = numbers(&begin).ok_or_else(|| disagree(peer, "sends a malformed greeting".to_owned()))?;
-        wind_down |= begin.b & WIND_DOWN != 0;
+        drain |= begin.b & WIND_DOWN != 0;
         if peer == 0 {
             durable = stored;
         }
-        let nodes = tree::cover(bring.slices, &tree::share(bring.slices, peer, size));
+        let nodes = tree::cover(contribution.slices, &tree::share(contribution.slices, peer, size));
         if nodes.is_empty() {
             continue;
         }
@@ -207,7 +207,7 @@ pub(crate) fn exchange(mesh: &Mesh, bring: &Bring<'_>, interrupt: Interrupt<'_>)
     // Our chunk, to the root of the tree.
     let chunk = tree::share(length, own, size);
     let mut known: Vec<(Node, &[f32])> =
-        bring.parts.iter().map(|(slice, part)| (slice.clone(), &part[chunk.clone()])).collect();
+        contribution.parts.iter().map(|(slice, part)| (slice.clone(), &part[chunk.clone()])).collect();
     known.extend(theirs.iter().map(|(node, sum)| (node.clone(), sum.as_slice())));
     known.sort_by_key(|(node, _)| node.start);
     let mut sum = vec![0.0; length];
@@ -216,21 +216,21 @@ pub(crate) fn exchange(mesh: &Mesh, bring: &Bring<'_>, interrupt: Interrupt<'_>)
     // All-gather.
     for peer in mesh.others() {
         for (p, range) in pieces(&chunk).enumerate() {
-            let head = Head::new(Kind::Sum, bring.step, 0, number(p));
+            let head = Head::new(Kind::Sum, contribution.step, 0, number(p));
             mesh.send(peer, &barrier, head, cast_slice(&sum[range]), interrupt)?;
         }
     }
     for peer in mesh.others() {
         for (p, range) in pieces(&tree::share(length, peer, size)).enumerate() {
             let frame = expect(mesh.next(peer, &barrier, interrupt)?, Kind::Sum, mesh, peer)?;
-            let place = frame.b == number(p) && frame.step == bring.step;
+            let place = frame.b == number(p) && frame.step == contribution.step;
             let Some(part) = floats(frame).filter(|part| place && part.len() == range.len()) else {
                 return Err(disagree(peer, format!("sends its sum out of place at piece {p}")));
             };
             sum[range].copy_from_slice(&part);
         }
     }
-    Ok(Total { sum, wind_down, durable })
+    Ok(Total { sum, drain, durable })
 }
 
 fn number(n: usize) -> u32 {
@@ -265,6 +265,6 @@ fn expect(frame: Frame, kind: Kind, mesh: &Mesh, peer: usize) -> Result<Frame, H
     if frame.kind == kind {
         return Ok(frame);
     }
-    let (who, found) = (&mesh.terms.members[peer].worker, frame.kind);
+    let (who, found) = (&mesh.config.members[peer].worker, frame.kind);
     Err(Halt::Disagree(format!("`{who}` sent a frame of kind {found:?} where {kind:?} was due; is it the same build?")))
 }

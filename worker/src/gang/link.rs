@@ -8,7 +8,7 @@ use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use super::frame::{self, Head};
-use crate::bell::lock;
+use crate::event_count::lock;
 
 /// The write timeout of a link's socket.
 pub(super) const BLINK: Duration = Duration::from_millis(200);

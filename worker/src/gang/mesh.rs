@@ -23,7 +23,7 @@ use super::endpoint::Endpoint;
 use super::frame::{self, Frame, FrameError, Head, Kind, MAX_PAYLOAD};
 use super::handshake::{self, HandshakeError};
 use super::link::{BLINK, Link, send};
-use crate::bell::{Bell, lock};
+use crate::event_count::{EventCount, lock};
 
 /// How patient members are with each other.
 #[derive(Debug, Clone, Copy)]
@@ -63,7 +63,7 @@ pub(crate) enum Halt {
 }
 
 #[derive(Debug, Clone, PartialEq)]
-enum Fate {
+enum Standing {
     /// Not connected yet; why the last try failed.
     Unmet(Option<String>),
     Up,
@@ -79,12 +79,12 @@ struct Peer {
     link: Option<Arc<Link>>,
     inbox: VecDeque<Frame>,
     heard: Instant,
-    fate: Fate,
+    standing: Standing,
 }
 
 /// All that a mesh needs to know.
 #[derive(Debug, Clone)]
-pub(crate) struct Terms {
+pub(crate) struct MeshConfig {
     pub(crate) task: TaskId,
     pub(crate) generation: Generation,
     pub(crate) rank: usize,
@@ -95,10 +95,10 @@ pub(crate) struct Terms {
 /// The connections of one generation.
 #[derive(Debug)]
 pub(crate) struct Mesh {
-    pub(crate) terms: Terms,
+    pub(crate) config: MeshConfig,
     timing: Timing,
     peers: Mutex<Vec<Peer>>,
-    bell: Arc<Bell>,
+    event_count: Arc<EventCount>,
     /// Wakes the poll, which reports what is lost.
     wake: Arc<Notify>,
     closed: AtomicBool,
@@ -106,15 +106,24 @@ pub(crate) struct Mesh {
 
 impl Mesh {
     /// Begins to connect, in the background.
-    pub(crate) fn open(terms: Terms, endpoint: &Arc<Endpoint>, bell: Arc<Bell>, wake: Arc<Notify>) -> Arc<Self> {
-        let peer =
-            |_: &Member| Peer { link: None, inbox: VecDeque::new(), heard: Instant::now(), fate: Fate::Unmet(None) };
-        let peers = Mutex::new(terms.members.iter().map(peer).collect());
+    pub(crate) fn open(
+        config: MeshConfig,
+        endpoint: &Arc<Endpoint>,
+        event_count: Arc<EventCount>,
+        wake: Arc<Notify>,
+    ) -> Arc<Self> {
+        let peer = |_: &Member| Peer {
+            link: None,
+            inbox: VecDeque::new(),
+            heard: Instant::now(),
+            standing: Standing::Unmet(None),
+        };
+        let peers = Mutex::new(config.members.iter().map(peer).collect());
         let timing = endpoint.timing;
-        let mesh = Arc::new(Self { terms, timing, peers, bell, wake, closed: AtomicBool::new(false) });
+        let mesh = Arc::new(Self { config, timing, peers, event_count, wake, closed: AtomicBool::new(false) });
         if mesh.size() > 1 {
             endpoint.announce(&mesh);
-            for rank in 0..mesh.terms.rank {
+            for rank in 0..mesh.config.rank {
                 let mesh = mesh.clone();
                 spawn("gang-dial", move || mesh.dial(rank));
             }
@@ -126,28 +135,29 @@ impl Mesh {
 
     /// How many members.
     pub(crate) fn size(&self) -> usize {
-        self.terms.members.len()
+        self.config.members.len()
     }
 
     /// Ranks of the others, beginning after ours, so that not all send to the same one first.
     pub(crate) fn others(&self) -> impl Iterator<Item = usize> + use<> {
-        let (rank, size) = (self.terms.rank, self.size());
+        let (rank, size) = (self.config.rank, self.size());
         (1..size).map(move |i| (rank + i) % size)
     }
 
     /// Who could not be reached in this generation.
     pub(crate) fn lost(&self) -> BTreeSet<WorkerId> {
         let peers = lock(&self.peers);
-        let lost = peers.iter().zip(&self.terms.members).filter(|(peer, _)| matches!(peer.fate, Fate::Lost(_)));
+        let lost =
+            peers.iter().zip(&self.config.members).filter(|(peer, _)| matches!(peer.standing, Standing::Lost(_)));
         lost.map(|(_, member)| member.worker.clone()).collect()
     }
 
     /// Who is missing, each with the barrier at which and the reason for which it was given up.
     pub(crate) fn missing(&self) -> Vec<String> {
         let peers = lock(&self.peers);
-        let missing = peers.iter().enumerate().filter_map(|(rank, peer)| match &peer.fate {
-            Fate::Lost(reason) => Some(format!("{} (rank {rank}): {reason}", self.name(rank))),
-            Fate::Unmet(_) | Fate::Up | Fate::Left | Fate::Moved => None,
+        let missing = peers.iter().enumerate().filter_map(|(rank, peer)| match &peer.standing {
+            Standing::Lost(reason) => Some(format!("{} (rank {rank}): {reason}", self.name(rank))),
+            Standing::Unmet(_) | Standing::Up | Standing::Left | Standing::Moved => None,
         });
         missing.collect()
     }
@@ -158,7 +168,7 @@ impl Mesh {
         let silent: Vec<usize> = {
             let peers = lock(&self.peers);
             let silent = |(rank, peer): (usize, &Peer)| {
-                let waits = matches!(peer.fate, Fate::Unmet(_) | Fate::Up) && rank != self.terms.rank;
+                let waits = matches!(peer.standing, Standing::Unmet(_) | Standing::Up) && rank != self.config.rank;
                 (waits && now.duration_since(peer.heard.max(awake)) > self.timing.patience).then_some(rank)
             };
             peers.iter().enumerate().filter_map(silent).collect()
@@ -199,11 +209,11 @@ impl Mesh {
                 let _ = link.socket.shutdown(Shutdown::Both);
             }
         }
-        self.bell.ring();
+        self.event_count.notify();
     }
 
     fn name(&self, rank: usize) -> &WorkerId {
-        &self.terms.members[rank].worker
+        &self.config.members[rank].worker
     }
 
     /// Gives a peer up and has the next poll say so.
@@ -213,18 +223,18 @@ impl Mesh {
         }
         {
             let peer = &mut lock(&self.peers)[rank];
-            if matches!(peer.fate, Fate::Lost(_) | Fate::Moved) {
+            if matches!(peer.standing, Standing::Lost(_) | Standing::Moved) {
                 return;
             }
-            peer.fate = Fate::Lost(reason.clone());
+            peer.standing = Standing::Lost(reason.clone());
             if let Some(link) = peer.link.take() {
                 let _ = link.socket.shutdown(Shutdown::Write);
             }
         }
-        let (task, generation) = (&self.terms.task, self.terms.generation);
+        let (task, generation) = (&self.config.task, self.config.generation);
         tracing::warn!(%task, %generation, peer = %self.name(rank), "lost a gang member: {reason}");
         self.wake.notify_one();
-        self.bell.ring();
+        self.event_count.notify();
     }
 
     fn dial(self: Arc<Self>, rank: usize) {
@@ -240,13 +250,13 @@ impl Mesh {
                     let since =
                         if error.is_refused() { *refused.get_or_insert_with(Instant::now) } else { Instant::now() };
                     if since.elapsed() > self.timing.refused {
-                        self.lose(rank, format!("nothing listens at {}", self.terms.members[rank].peer_address));
+                        self.lose(rank, format!("nothing listens at {}", self.config.members[rank].peer_address));
                         return;
                     }
                     if !error.is_refused() {
                         refused = None;
                     }
-                    if let Fate::Unmet(last) = &mut lock(&self.peers)[rank].fate {
+                    if let Standing::Unmet(last) = &mut lock(&self.peers)[rank].standing {
                         *last = Some(error.to_string());
                     }
                 }
@@ -257,12 +267,12 @@ impl Mesh {
     }
 
     fn connect(&self, rank: usize) -> Result<TcpStream, HandshakeError> {
-        let address = &self.terms.members[rank].peer_address;
+        let address = &self.config.members[rank].peer_address;
         let mut last = io::Error::new(io::ErrorKind::AddrNotAvailable, format!("`{address}` names no address"));
         for socket in address.to_socket_addrs()? {
             match TcpStream::connect_timeout(&socket, Duration::from_secs(5)) {
                 Ok(mut stream) => {
-                    let Terms { task, generation, rank: from, secret, .. } = &self.terms;
+                    let MeshConfig { task, generation, rank: from, secret, .. } = &self.config;
                     handshake::dial(&mut stream, task, *generation, *from, rank, secret)?;
                     return Ok(stream);
                 }
@@ -286,15 +296,15 @@ impl Mesh {
         };
         {
             let mut peers = lock(&self.peers);
-            if self.is_closed() || !matches!(peers[rank].fate, Fate::Unmet(_)) {
+            if self.is_closed() || !matches!(peers[rank].standing, Standing::Unmet(_)) {
                 return;
             }
             let peer = &mut peers[rank];
             peer.link = Some(Arc::new(link));
             peer.heard = Instant::now();
-            peer.fate = Fate::Up;
+            peer.standing = Standing::Up;
         }
-        self.bell.ring();
+        self.event_count.notify();
         let mesh = Arc::downgrade(self);
         spawn("gang-read", move || read(&mesh, rank, reader));
     }
@@ -309,11 +319,11 @@ impl Mesh {
             peer.heard = Instant::now();
             match frame.kind {
                 Kind::KeepAlive => return,
-                Kind::Bye => peer.fate = if frame.step == 0 { Fate::Left } else { Fate::Moved },
+                Kind::Bye => peer.standing = if frame.step == 0 { Standing::Left } else { Standing::Moved },
                 _ => peer.inbox.push_back(frame),
             }
         }
-        self.bell.ring();
+        self.event_count.notify();
     }
 
     /// Waits for a link to `rank` and sends over it. `interrupt` says whether to give up.
@@ -353,7 +363,7 @@ impl Mesh {
         let mut awake = begun;
         let mut looked = begun;
         loop {
-            let ticket = self.bell.ticket();
+            let ticket = self.event_count.ticket();
             let now = Instant::now();
             if now.duration_since(looked) > GLANCE * 8 {
                 awake = now;
@@ -365,20 +375,20 @@ impl Mesh {
                     return Ok(taken);
                 }
                 let silent = now.duration_since(peer.heard.max(awake));
-                match &peer.fate {
-                    Fate::Lost(_) | Fate::Moved => return Err(interrupt().unwrap_or(Halt::Peer)),
-                    Fate::Left => Some(format!("{barrier}: it has left")),
-                    Fate::Unmet(why) if silent > self.timing.patience => {
+                match &peer.standing {
+                    Standing::Lost(_) | Standing::Moved => return Err(interrupt().unwrap_or(Halt::Peer)),
+                    Standing::Left => Some(format!("{barrier}: it has left")),
+                    Standing::Unmet(why) if silent > self.timing.patience => {
                         let why = why.as_deref().unwrap_or("it did not call");
                         Some(format!("{barrier}: not met within {} s: {why}", self.timing.patience.as_secs_f32()))
                     }
-                    Fate::Up if silent > self.timing.patience => {
+                    Standing::Up if silent > self.timing.patience => {
                         Some(format!("{barrier}: no sign of life for {} s", self.timing.patience.as_secs_f32()))
                     }
-                    Fate::Up if now.duration_since(begun) > self.timing.stall => {
+                    Standing::Up if now.duration_since(begun) > self.timing.stall => {
                         Some(format!("{barrier}: alive, but not there after {} s", self.timing.stall.as_secs_f32()))
                     }
-                    Fate::Unmet(_) | Fate::Up => None,
+                    Standing::Unmet(_) | Standing::Up => None,
                 }
             };
             if let Some(halt) = interrupt() {
@@ -389,7 +399,7 @@ impl Mesh {
                 self.lose_the_silent(barrier, awake);
                 return Err(Halt::Peer);
             }
-            self.bell.wait(ticket, GLANCE);
+            self.event_count.wait(ticket, GLANCE);
         }
     }
 }
@@ -414,7 +424,7 @@ fn read(mesh: &Weak<Mesh>, rank: usize, mut stream: TcpStream) {
         match frame {
             Ok(frame) => mesh.receive(rank, frame),
             Err(error) => {
-                let parted = matches!(lock(&mesh.peers)[rank].fate, Fate::Left | Fate::Moved);
+                let parted = matches!(lock(&mesh.peers)[rank].standing, Standing::Left | Standing::Moved);
                 if !parted {
                     mesh.lose(rank, error.to_string());
                 }

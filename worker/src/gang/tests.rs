@@ -19,13 +19,13 @@ use tokio::runtime::Runtime;
 use super::endpoint::Endpoint;
 use super::exchange;
 use super::frame::{self, Head, Kind};
-use super::mesh::{Halt, Mesh, Terms, Timing};
+use super::mesh::{Halt, Mesh, MeshConfig, Timing};
 use super::tree;
-use crate::bell::{Bell, lock};
+use crate::active_assignment::ActiveAssignment;
 use crate::cache::{Bounds, Cache};
 use crate::client::Client;
 use crate::context::HttpContext;
-use crate::held::Held;
+use crate::event_count::{EventCount, lock};
 
 /// Short, so that losses by silence are found within a test.
 const QUICK: Timing = Timing {
@@ -57,7 +57,7 @@ pub(crate) fn assignment(worker: &WorkerId, generation: u64, members: &[Member],
     };
     let role =
         Role::Member { generation: Generation(generation), members: members.to_vec(), secret: secret.to_owned() };
-    Assignment { grant, stage, role, resume: None, wind_down: false }
+    Assignment { grant, stage, role, resume: None, drain: false }
 }
 
 /// One worker: where it is dialled, and what it holds once it is a member.
@@ -65,7 +65,7 @@ pub(crate) fn assignment(worker: &WorkerId, generation: u64, members: &[Member],
 struct Seat {
     member: Member,
     endpoint: Arc<Endpoint>,
-    held: Mutex<Option<Arc<Held>>>,
+    held: Mutex<Option<Arc<ActiveAssignment>>>,
     dead: AtomicBool,
 }
 
@@ -93,7 +93,7 @@ impl Gang {
     }
 
     /// Starts a generation of these seats; others that were members are told that it is over.
-    fn regroup(&self, seats: &[usize], wind_down: bool) {
+    fn regroup(&self, seats: &[usize], drain: bool) {
         let generation = self.generation.fetch_add(1, Ordering::SeqCst) + 1;
         let members: Vec<Member> = seats.iter().map(|&i| self.seats[i].member.clone()).collect();
         for (i, seat) in self.seats.iter().enumerate() {
@@ -104,18 +104,18 @@ impl Gang {
                 }
                 continue;
             }
-            let mut orders = assignment(&seat.member.worker, generation, &members, &format!("secret {generation}"));
-            orders.wind_down = wind_down;
+            let mut desired = assignment(&seat.member.worker, generation, &members, &format!("secret {generation}"));
+            desired.drain = drain;
             match &*held {
-                Some(held) => held.update(orders),
+                Some(held) => held.update(desired),
                 None => {
-                    *held = Some(Held::new(orders, seat.endpoint.clone(), Arc::default(), Arc::default()));
+                    *held = Some(ActiveAssignment::new(desired, seat.endpoint.clone(), Arc::default(), Arc::default()));
                 }
             }
         }
     }
 
-    fn held(&self, seat: usize) -> Option<Arc<Held>> {
+    fn held(&self, seat: usize) -> Option<Arc<ActiveAssignment>> {
         lock(&self.seats[seat].held).clone()
     }
 
@@ -385,14 +385,14 @@ fn one_wish_to_wind_down_is_heard_by_all_after_the_same_step() {
                     for step in 0..4 {
                         let parts: Vec<_> = context.share(3).map(|s| (s, vec![1.0])).collect();
                         if step == 2 {
-                            let mut orders = held.assignment();
-                            orders.wind_down = true;
-                            held.update(orders);
+                            let mut desired = held.assignment();
+                            desired.drain = true;
+                            held.update(desired);
                         }
                         match context.exchange(step, 3, &parts).expect("summed") {
-                            Exchange::Sum { wind_down, sum } => {
+                            Exchange::Sum { drain, sum } => {
                                 assert_eq!(sum, [3.0]);
-                                stops.push(wind_down);
+                                stops.push(drain);
                             }
                             Exchange::Regroup => panic!("nothing happened"),
                         }
@@ -407,11 +407,11 @@ fn one_wish_to_wind_down_is_heard_by_all_after_the_same_step() {
     assert!(stops[0][3]);
 }
 
-fn mesh(gang: &Gang, seats: &[usize], own: usize, secret: &str) -> (Arc<Mesh>, Arc<Bell>) {
+fn mesh(gang: &Gang, seats: &[usize], own: usize, secret: &str) -> (Arc<Mesh>, Arc<EventCount>) {
     let members = seats.iter().map(|&i| gang.seats[i].member.clone()).collect();
-    let terms = Terms { task: task(), generation: Generation(7), rank: own, members, secret: secret.to_owned() };
-    let bell: Arc<Bell> = Arc::default();
-    (Mesh::open(terms, &gang.seats[seats[own]].endpoint, bell.clone(), Arc::default()), bell)
+    let config = MeshConfig { task: task(), generation: Generation(7), rank: own, members, secret: secret.to_owned() };
+    let event_count: Arc<EventCount> = Arc::default();
+    (Mesh::open(config, &gang.seats[seats[own]].endpoint, event_count.clone(), Arc::default()), event_count)
 }
 
 fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
@@ -494,8 +494,9 @@ fn p18_each_barrier_has_a_name_and_a_time_and_lists_who_is_missing() {
                             }
                             let numbers = [1.0f32; 10];
                             let parts = vec![(own..own + 1, &numbers[..])];
-                            let bring = exchange::Bring { step: 5, slices: 4, parts, wind_down: false, durable: 0 };
-                            assert!(matches!(exchange::exchange(&mesh, &bring, &|| None), Err(Halt::Peer)));
+                            let contribution =
+                                exchange::Contribution { step: 5, slices: 4, parts, drain: false, durable: 0 };
+                            assert!(matches!(exchange::exchange(&mesh, &contribution, &|| None), Err(Halt::Peer)));
                         } else {
                             assert!(matches!(met, Err(Halt::Peer)));
                         }

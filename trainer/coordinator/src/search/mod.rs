@@ -1,6 +1,6 @@
 //! Who is tried next: a sweep's searcher as a pure fold over its results.
 //!
-//! Work is handed out as numbered tickets, one rung of one trial each. Results come in any order, but they are folded in the order of the
+//! StageExecution is handed out as numbered tickets, one rung of one trial each. Results come in any order, but they are folded in the order of the
 //! tickets, and ticket `n` is issued as a function of the results of tickets `0..=n - parallel` alone. So neither the number of workers nor
 //! who is fast, who is killed and who starts again can change a trial, a rung or the best: the decisions are a function of the sweep and the
 //! seed. The price is that a slow ticket holds up those `parallel` behind it.

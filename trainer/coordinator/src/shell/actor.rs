@@ -51,7 +51,7 @@ enum Ask {
 
 /// What is shared between the actor and those who ask it.
 #[derive(Debug)]
-pub(crate) struct Desk {
+pub(crate) struct ActorHandle {
     asks: mpsc::Sender<Ask>,
     /// The newest quiet poll of each worker that the actor has not taken up yet, and when it came.
     polls: Mutex<BTreeMap<WorkerId, (Millis, Poll)>>,
@@ -63,7 +63,7 @@ pub(crate) struct Desk {
     pub(crate) store: Store,
 }
 
-impl Desk {
+impl ActorHandle {
     /// Decides an event; returns once it is stored.
     pub(crate) async fn decide(&self, event: Event) -> Result<Vec<Effect>, Refused> {
         let (reply, receiver) = oneshot::channel();
@@ -197,10 +197,10 @@ impl Entropy {
 }
 
 /// Starts the actor on a recovered state.
-pub(crate) fn start(store: Store, state: State) -> (Arc<Desk>, JoinHandle<()>) {
+pub(crate) fn start(store: Store, state: State) -> (Arc<ActorHandle>, JoinHandle<()>) {
     let (asks, queue) = mpsc::channel(1024);
     let state = Arc::new(state);
-    let desk = Arc::new(Desk {
+    let actor_handle = Arc::new(ActorHandle {
         asks,
         polls: Mutex::default(),
         published: RwLock::new(Arc::clone(&state)),
@@ -210,19 +210,19 @@ pub(crate) fn start(store: Store, state: State) -> (Arc<Desk>, JoinHandle<()>) {
         clock: Clock::new(state.now),
         store,
     });
-    let actor = Actor { desk: Arc::clone(&desk), state, entropy: Entropy::new() };
-    (desk, tokio::spawn(actor.run(queue)))
+    let actor = Actor { actor_handle: Arc::clone(&actor_handle), state, entropy: Entropy::new() };
+    (actor_handle, tokio::spawn(actor.run(queue)))
 }
 
 struct Actor {
-    desk: Arc<Desk>,
+    actor_handle: Arc<ActorHandle>,
     state: Arc<State>,
     entropy: Entropy,
 }
 
 impl Actor {
     async fn run(mut self, mut queue: mpsc::Receiver<Ask>) {
-        let mut stopped = self.desk.stopped();
+        let mut stopped = self.actor_handle.stopped();
         loop {
             let ask = tokio::select! {
                 biased;
@@ -252,7 +252,7 @@ impl Actor {
 
     /// Takes the noted polls for heard, each at its own time.
     fn take_up_polls(&mut self) {
-        let polls = std::mem::take(&mut *self.desk.polls.lock().unwrap_or_else(PoisonError::into_inner));
+        let polls = std::mem::take(&mut *self.actor_handle.polls.lock().unwrap_or_else(PoisonError::into_inner));
         for (worker, (at, poll)) in polls {
             // What has changed since it was noted makes it moot; the worker polls again within a second.
             if matches!(is_quiet(&self.state, &worker, &poll), Ok(true)) {
@@ -270,8 +270,8 @@ impl Actor {
         for ask in asks.iter() {
             decided.push(match ask {
                 Ask::Event(event, _) => self.decide_on(&mut next, (**event).clone(), &mut writes),
-                Ask::Observation(observation, _) => {
-                    observe(&mut next, self.desk.now(), observation.clone()).map(|events| {
+                Ask::Observation(observation, _) => observe(&mut next, self.actor_handle.now(), observation.clone())
+                    .map(|events| {
                         let mut follow = Vec::new();
                         for event in events {
                             match self.decide_on(&mut next, event, &mut writes) {
@@ -280,20 +280,19 @@ impl Actor {
                             }
                         }
                         follow
-                    })
-                }
+                    }),
             });
         }
         let durable = !writes.is_empty();
         if durable {
-            let written = self.desk.store.write(writes).await;
-            self.desk.wrote(&written);
+            let written = self.actor_handle.store.write(writes).await;
+            self.actor_handle.wrote(&written);
             if written.is_err() {
                 return false;
             }
         }
         self.state = Arc::new(next);
-        self.desk.publish(&self.state, durable);
+        self.actor_handle.publish(&self.state, durable);
         for (ask, decided) in asks.drain(..).zip(decided) {
             if let Ok(done) = &decided {
                 effects.extend(done.iter().cloned());
@@ -304,7 +303,7 @@ impl Actor {
             }
         }
         for effect in &effects {
-            effects::perform(&self.desk, effect);
+            effects::perform(&self.actor_handle, effect);
         }
         true
     }
@@ -312,7 +311,7 @@ impl Actor {
     /// One event on `next`; what it writes is added to `writes`.
     fn decide_on(&mut self, next: &mut State, event: Event, writes: &mut Vec<Write>) -> Result<Vec<Effect>, Rejected> {
         let before = cfg!(debug_assertions).then(|| next.clone());
-        let moment = Moment { now: self.desk.now(), entropy: self.entropy.next() };
+        let moment = Moment { now: self.actor_handle.now(), entropy: self.entropy.next() };
         tracing::debug!(?event, "event");
         let mut effects = decide(next, moment, event)?;
         if let Some(before) = before {
@@ -328,7 +327,7 @@ impl Actor {
     }
 
     async fn hear(&mut self, observation: Observation) -> Result<(), Refused> {
-        let events = observe(Arc::make_mut(&mut self.state), self.desk.now(), observation)?;
+        let events = observe(Arc::make_mut(&mut self.state), self.actor_handle.now(), observation)?;
         for event in events {
             match self.happen(event).await {
                 Ok(_) => {}
@@ -337,7 +336,7 @@ impl Actor {
                 Err(refused) => return Err(refused),
             }
         }
-        self.desk.publish(&self.state, false);
+        self.actor_handle.publish(&self.state, false);
         Ok(())
     }
 
@@ -355,7 +354,7 @@ impl Actor {
 
     async fn try_happen(&mut self, event: Event) -> Result<Vec<Effect>, Refused> {
         let mut next = State::clone(&self.state);
-        let moment = Moment { now: self.desk.now(), entropy: self.entropy.next() };
+        let moment = Moment { now: self.actor_handle.now(), entropy: self.entropy.next() };
         tracing::debug!(?event, "event");
         let mut effects = decide(&mut next, moment, event)?;
         let position = effects.iter().position(|effect| matches!(effect, Effect::Store(_)));
@@ -364,13 +363,13 @@ impl Actor {
             let broken = invariants::check_change(&self.state, &next);
             assert!(broken.is_empty(), "broken invariants: {broken:#?}");
         }
-        let written = self.desk.store.write(writes).await;
-        self.desk.wrote(&written);
+        let written = self.actor_handle.store.write(writes).await;
+        self.actor_handle.wrote(&written);
         written?;
         self.state = Arc::new(next);
-        self.desk.publish(&self.state, true);
+        self.actor_handle.publish(&self.state, true);
         for effect in &effects {
-            effects::perform(&self.desk, effect);
+            effects::perform(&self.actor_handle, effect);
         }
         Ok(effects)
     }

@@ -12,7 +12,7 @@ use protocol::Digest;
 use protocol::message::ApiError;
 use registry::{QueryError, WriteError};
 
-use super::actor::{Desk, Refused};
+use super::actor::{ActorHandle, Refused};
 use super::{auth, polls, queries, uploads};
 use crate::event::Rejected;
 
@@ -22,7 +22,7 @@ const MESSAGE_BYTES: usize = 64 << 20;
 const BLOB_BYTES: usize = 8 << 30;
 
 /// All routes.
-pub(crate) fn router(desk: Arc<Desk>, token: Option<&str>) -> Router {
+pub(crate) fn router(actor_handle: Arc<ActorHandle>, token: Option<&str>) -> Router {
     let token = token.filter(|token| !token.is_empty()).map(|token| Digest::of(token.trim().as_bytes()));
     let blobs = Router::new()
         .route("/v1/blobs", put(uploads::put_blob))
@@ -48,7 +48,7 @@ pub(crate) fn router(desk: Arc<Desk>, token: Option<&str>) -> Router {
         // Says nothing but that somebody listens, so that it may be asked without a token.
         .route("/v1/health", get(queries::health))
         .fallback(|| async { Failure::new(StatusCode::NOT_FOUND, "not-found", "there is no such address".to_owned()) })
-        .with_state(desk)
+        .with_state(actor_handle)
 }
 
 /// A refused call.

@@ -9,7 +9,7 @@ use registry::{BlobStore, QueryError};
 use tokio::sync::watch;
 use tokio::time::MissedTickBehavior;
 
-use super::actor::{Desk, Refused};
+use super::actor::{ActorHandle, Refused};
 use crate::event::{Candidate, Effect, Event, Known, Observation};
 
 /// How long after a failed read of the store it is tried again.
@@ -18,25 +18,25 @@ const RETRY: Duration = Duration::from_secs(1);
 const COLLECT_EVERY: Duration = Duration::from_secs(15 * 60);
 
 /// Starts doing `effect`.
-pub(crate) fn perform(desk: &Arc<Desk>, effect: &Effect) {
-    let desk = Arc::clone(desk);
+pub(crate) fn perform(actor_handle: &Arc<ActorHandle>, effect: &Effect) {
+    let actor_handle = Arc::clone(actor_handle);
     match effect.clone() {
         // Done already, or an answer to whoever sent the event.
         Effect::Store(_) | Effect::Submitted(_) | Effect::Joined(_) | Effect::Wake => {}
-        Effect::Lookup { key } => drop(tokio::spawn(look_up(desk, key))),
-        Effect::Register { key, candidates } => drop(tokio::spawn(register(desk, key, candidates))),
+        Effect::Lookup { key } => drop(tokio::spawn(look_up(actor_handle, key))),
+        Effect::Register { key, candidates } => drop(tokio::spawn(register(actor_handle, key, candidates))),
         Effect::Prune { task, keep } => drop(tokio::spawn(async move {
             // What is not pruned now is pruned after the next checkpoint.
-            if let Err(error) = desk.store.prune_checkpoints(&task, keep).await {
+            if let Err(error) = actor_handle.store.prune_checkpoints(&task, keep).await {
                 tracing::warn!(%task, %error, "old checkpoints stay");
             }
         })),
     }
 }
 
-async fn tell(desk: &Desk, event: Event) {
+async fn tell(actor_handle: &ActorHandle, event: Event) {
     loop {
-        match desk.decide(event.clone()).await {
+        match actor_handle.decide(event.clone()).await {
             Ok(_) | Err(Refused::Stopped) => return,
             // The state has moved on, or another event has taken this one's place.
             Err(Refused::Rejected(rejected)) => return tracing::debug!(%rejected, "moot"),
@@ -54,21 +54,21 @@ async fn tell(desk: &Desk, event: Event) {
     }
 }
 
-async fn look_up(desk: Arc<Desk>, key: Digest) {
+async fn look_up(actor_handle: Arc<ActorHandle>, key: Digest) {
     let known = loop {
-        match known(&desk, key).await {
+        match known(&actor_handle, key).await {
             Ok(known) => break known,
             Err(error) => tracing::warn!(%key, %error, "cannot look up a stage"),
         }
         tokio::time::sleep(RETRY).await;
     };
-    tell(&desk, Event::LookedUp { key, known }).await;
+    tell(&actor_handle, Event::LookedUp { key, known }).await;
 }
 
 /// A value counts as known only while all of it is there: an artifact that was removed is made again.
-async fn known(desk: &Desk, key: Digest) -> Result<Option<Known>, QueryError> {
-    let Some(row) = desk.store.stage_result(key).await? else { return Ok(None) };
-    let (blobs, outputs) = (desk.store.blobs().clone(), row.outputs.clone());
+async fn known(actor_handle: &ActorHandle, key: Digest) -> Result<Option<Known>, QueryError> {
+    let Some(row) = actor_handle.store.stage_result(key).await? else { return Ok(None) };
+    let (blobs, outputs) = (actor_handle.store.blobs().clone(), row.outputs.clone());
     let whole = blocking(move || outputs.values().all(|output| blobs.complete_manifest(*output).is_ok())).await;
     if !whole {
         tracing::warn!(%key, "a stage's value is known but not all of it is in the store; it is made again");
@@ -76,13 +76,13 @@ async fn known(desk: &Desk, key: Digest) -> Result<Option<Known>, QueryError> {
     Ok(whole.then_some(Known { outputs: row.outputs, metrics: row.metrics }))
 }
 
-async fn register(desk: Arc<Desk>, key: Digest, candidates: Vec<Candidate>) {
-    let blobs = desk.store.blobs().clone();
+async fn register(actor_handle: Arc<ActorHandle>, key: Digest, candidates: Vec<Candidate>) {
+    let blobs = actor_handle.store.blobs().clone();
     let event = match blocking(move || bundles(&blobs, &candidates)).await {
         Ok(bundles) => Event::Bundled { key, bundles },
         Err(message) => Event::RegisterRefused { key, message },
     };
-    tell(&desk, event).await;
+    tell(&actor_handle, event).await;
 }
 
 fn bundles(blobs: &BlobStore, candidates: &[Candidate]) -> Result<Vec<Digest>, String> {
@@ -100,8 +100,8 @@ fn bundles(blobs: &BlobStore, candidates: &[Candidate]) -> Result<Vec<Digest>, S
 }
 
 /// Runs what blocks on a disk outside the threads that serve requests.
-pub(crate) async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
-    match tokio::task::spawn_blocking(work).await {
+pub(crate) async fn blocking<T: Send + 'static>(execution: impl FnOnce() -> T + Send + 'static) -> T {
+    match tokio::task::spawn_blocking(execution).await {
         Ok(value) => value,
         Err(error) => match error.try_into_panic() {
             Ok(panic) => std::panic::resume_unwind(panic),
@@ -112,7 +112,7 @@ pub(crate) async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send 
 }
 
 /// Looks at the clock until the coordinator stops.
-pub(crate) async fn tick(desk: Arc<Desk>, every_ms: u64, mut stopped: watch::Receiver<bool>) {
+pub(crate) async fn tick(actor_handle: Arc<ActorHandle>, every_ms: u64, mut stopped: watch::Receiver<bool>) {
     let mut interval = tokio::time::interval(Duration::from_millis(every_ms.max(1)));
     interval.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut collected = tokio::time::Instant::now();
@@ -122,16 +122,16 @@ pub(crate) async fn tick(desk: Arc<Desk>, every_ms: u64, mut stopped: watch::Rec
             _ = stopped.wait_for(|stop| *stop) => return,
             _ = interval.tick() => {}
         }
-        match desk.observe(Observation::Tick).await {
+        match actor_handle.observe(Observation::Tick).await {
             Ok(()) => {}
             Err(Refused::Stopped) => return,
             Err(error) => tracing::warn!(%error, "a tick was not stored; trying again"),
         }
         if collected.elapsed() > COLLECT_EVERY {
             collected = tokio::time::Instant::now();
-            let desk = Arc::clone(&desk);
+            let actor_handle = Arc::clone(&actor_handle);
             tokio::spawn(async move {
-                if let Err(error) = desk.store.gc(registry::retention::GRACE_MS).await {
+                if let Err(error) = actor_handle.store.gc(registry::retention::GRACE_MS).await {
                     tracing::warn!(%error, "unneeded blobs stay");
                 }
             });

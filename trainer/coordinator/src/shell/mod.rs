@@ -26,7 +26,7 @@ use crate::journal::{self, ReplayError};
 use crate::policy::Policy;
 use crate::view::WorkerView;
 
-use self::actor::Desk;
+use self::actor::ActorHandle;
 pub use self::actor::Refused;
 pub use self::queries::{BlobStored, StageMetrics, Submitted};
 
@@ -67,7 +67,7 @@ impl Config {
 #[derive(Debug, thiserror::Error)]
 pub enum StartError {
     /// It would be open to everybody.
-    #[error("refusing to listen on {0} without a token: anybody who reaches it could run work and move aliases")]
+    #[error("refusing to listen on {0} without a token: anybody who reaches it could run execution and move aliases")]
     NoToken(SocketAddr),
     /// The address is taken, or not ours.
     #[error("cannot listen on {address}: {cause}")]
@@ -116,14 +116,14 @@ impl Coordinator {
         let listener = TcpListener::bind(config.listen).await.map_err(listen)?;
         let address = listener.local_addr().map_err(listen)?;
 
-        let (desk, actor) = actor::start(store, state);
-        desk.decide(Event::Started { alone: config.alone, park: config.park }).await?;
+        let (actor_handle, actor) = actor::start(store, state);
+        actor_handle.decide(Event::Started { alone: config.alone, park: config.park }).await?;
         let (stop, stopped) = watch::channel(false);
-        let clock = tokio::spawn(effects::tick(desk.clone(), config.policy.tick_ms, stopped.clone()));
-        let router = api::router(desk.clone(), config.token.as_deref());
+        let clock = tokio::spawn(effects::tick(actor_handle.clone(), config.policy.tick_ms, stopped.clone()));
+        let router = api::router(actor_handle.clone(), config.token.as_deref());
         let server = tokio::spawn(serve(listener, router, stopped));
         tracing::info!(%address, "coordinator listens");
-        Ok(Handle { address, desk, stop, tasks: vec![clock, server, actor] })
+        Ok(Handle { address, actor_handle, stop, tasks: vec![clock, server, actor] })
     }
 }
 
@@ -146,7 +146,7 @@ async fn serve(listener: TcpListener, router: axum::Router, mut stopped: watch::
 #[derive(Debug)]
 pub struct Handle {
     address: SocketAddr,
-    desk: Arc<Desk>,
+    actor_handle: Arc<ActorHandle>,
     stop: watch::Sender<bool>,
     tasks: Vec<JoinHandle<()>>,
 }
@@ -164,61 +164,61 @@ impl Handle {
 
     /// Submits a pipeline; durable once this returns.
     pub async fn submit(&self, submit: Submit) -> Result<RunId, Refused> {
-        self.desk.submit(submit).await
+        self.actor_handle.submit(submit).await
     }
 
     /// Pauses, resumes or cancels a run.
     pub async fn control(&self, run: &RunId, action: Control) -> Result<(), Refused> {
-        self.desk.decide(Event::Control { run: run.clone(), action }).await.map(drop)
+        self.actor_handle.decide(Event::Control { run: run.clone(), action }).await.map(drop)
     }
 
     /// A run as clients see it.
     pub fn run_view(&self, run: &RunId) -> Option<RunView> {
-        let state = self.desk.state();
-        state.run(run).ok().map(|run| state.view(run, self.desk.now()))
+        let state = self.actor_handle.state();
+        state.run(run).ok().map(|run| state.view(run, self.actor_handle.now()))
     }
 
     /// All runs, oldest first.
     pub fn runs(&self) -> Vec<RunView> {
-        let state = self.desk.state();
-        state.runs.iter().map(|run| state.view(run, self.desk.now())).collect()
+        let state = self.actor_handle.state();
+        state.runs.iter().map(|run| state.view(run, self.actor_handle.now())).collect()
     }
 
     /// All workers.
     pub fn workers(&self) -> Vec<WorkerView> {
-        self.desk.state().worker_views()
+        self.actor_handle.state().worker_views()
     }
 
     /// The launcher saw a worker's process exit.
     pub async fn worker_gone(&self, worker: &WorkerId) -> Result<(), Refused> {
-        self.desk.decide(Event::WorkerGone { worker: worker.clone() }).await.map(drop)
+        self.actor_handle.decide(Event::WorkerGone { worker: worker.clone() }).await.map(drop)
     }
 
     /// Asks all workers to save what they have and leave; no work is given any more.
     pub async fn drain(&self) -> Result<(), Refused> {
-        self.desk.decide(Event::Drain).await.map(drop)
+        self.actor_handle.decide(Event::Drain).await.map(drop)
     }
 
     /// Whether somebody still holds a task.
     pub fn is_busy(&self) -> bool {
-        self.desk.state().works.values().any(|work| work.is_busy())
+        self.actor_handle.state().executions.values().any(|execution| execution.is_busy())
     }
 
     /// Waits until something durable changed since the last call on this receiver.
     pub fn changes(&self) -> watch::Receiver<u64> {
-        self.desk.changes()
+        self.actor_handle.changes()
     }
 
     /// Why the store refused the newest write for want of space or permission; `None` while it takes writes. As long as it
     /// stands, nothing goes on: whoever runs the coordinator should say so and stop.
     pub fn trouble(&self) -> Option<String> {
-        self.desk.trouble()
+        self.actor_handle.trouble()
     }
 
     /// Stops at once. What was acknowledged is in the store; a later start goes on from there.
     pub async fn shutdown(mut self) {
         let _ = self.stop.send(true);
-        self.desk.stop();
+        self.actor_handle.stop();
         for task in std::mem::take(&mut self.tasks) {
             // Ended tasks and cancelled ones alike are what we want here.
             let _ = task.await;
@@ -229,7 +229,7 @@ impl Handle {
 impl Drop for Handle {
     fn drop(&mut self) {
         let _ = self.stop.send(true);
-        self.desk.stop();
+        self.actor_handle.stop();
     }
 }
 

@@ -11,10 +11,10 @@ use registry::Curve;
 use registry::LogRow;
 use serde::{Deserialize, Serialize};
 
-use super::actor::Desk;
+use super::actor::ActorHandle;
 use super::api::Failure;
 use crate::event::{Control, Event, Rejected};
-use crate::state::work::Work;
+use crate::state::execution::StageExecution;
 use crate::view::WorkerView;
 
 /// The answer to `PUT /v1/blobs`.
@@ -60,34 +60,37 @@ fn default_points() -> usize {
     500
 }
 
-pub(crate) async fn health(State(desk): State<Arc<Desk>>) -> Json<serde_json::Value> {
-    let storage = if desk.trouble().is_some() { "trouble" } else { "ok" };
+pub(crate) async fn health(State(actor_handle): State<Arc<ActorHandle>>) -> Json<serde_json::Value> {
+    let storage = if actor_handle.trouble().is_some() { "trouble" } else { "ok" };
     Json(serde_json::json!({"status": "ok", "storage": storage, "version": env!("CARGO_PKG_VERSION")}))
 }
 
-pub(crate) async fn workers(State(desk): State<Arc<Desk>>) -> Json<Vec<WorkerView>> {
-    Json(desk.state().worker_views())
+pub(crate) async fn workers(State(actor_handle): State<Arc<ActorHandle>>) -> Json<Vec<WorkerView>> {
+    Json(actor_handle.state().worker_views())
 }
 
 pub(crate) async fn submit(
-    State(desk): State<Arc<Desk>>,
+    State(actor_handle): State<Arc<ActorHandle>>,
     Json(submit): Json<Submit>,
 ) -> Result<Json<Submitted>, Failure> {
-    Ok(Json(Submitted { run: desk.submit(submit).await? }))
+    Ok(Json(Submitted { run: actor_handle.submit(submit).await? }))
 }
 
-pub(crate) async fn runs(State(desk): State<Arc<Desk>>) -> Json<Vec<RunView>> {
-    let (state, now) = (desk.state(), desk.now());
+pub(crate) async fn runs(State(actor_handle): State<Arc<ActorHandle>>) -> Json<Vec<RunView>> {
+    let (state, now) = (actor_handle.state(), actor_handle.now());
     Json(state.runs.iter().map(|run| state.view(run, now)).collect())
 }
 
-pub(crate) async fn run(State(desk): State<Arc<Desk>>, Path(run): Path<RunId>) -> Result<Json<RunView>, Failure> {
-    let state = desk.state();
-    Ok(Json(state.view(state.run(&run)?, desk.now())))
+pub(crate) async fn run(
+    State(actor_handle): State<Arc<ActorHandle>>,
+    Path(run): Path<RunId>,
+) -> Result<Json<RunView>, Failure> {
+    let state = actor_handle.state();
+    Ok(Json(state.view(state.run(&run)?, actor_handle.now())))
 }
 
 pub(crate) async fn control(
-    State(desk): State<Arc<Desk>>,
+    State(actor_handle): State<Arc<ActorHandle>>,
     Path((run, action)): Path<(RunId, String)>,
 ) -> Result<Json<RunView>, Failure> {
     let action = match action.as_str() {
@@ -99,15 +102,19 @@ pub(crate) async fn control(
             return Err(Rejected::NotFound(message).into());
         }
     };
-    desk.decide(Event::Control { run: run.clone(), action }).await?;
-    let state = desk.state();
-    Ok(Json(state.view(state.run(&run)?, desk.now())))
+    actor_handle.decide(Event::Control { run: run.clone(), action }).await?;
+    let state = actor_handle.state();
+    Ok(Json(state.view(state.run(&run)?, actor_handle.now())))
 }
 
 /// The works behind the stages of a run that have begun, with the stages' names in this run: a stage that another run
 /// computes has its logs and values under that run's name.
-fn works(desk: &Desk, run: &RunId, stage: Option<&StageName>) -> Result<Vec<(StageName, Arc<Work>)>, Failure> {
-    let state = desk.state();
+fn executions(
+    actor_handle: &ActorHandle,
+    run: &RunId,
+    stage: Option<&StageName>,
+) -> Result<Vec<(StageName, Arc<StageExecution>)>, Failure> {
+    let state = actor_handle.state();
     let run = state.run(run)?;
     if let Some(stage) = stage
         && run.position(stage).is_none()
@@ -115,17 +122,17 @@ fn works(desk: &Desk, run: &RunId, stage: Option<&StageName>) -> Result<Vec<(Sta
         return Err(Rejected::NotFound(format!("run `{}` has no stage `{stage}`", run.id)).into());
     }
     let stages = run.pipeline.stages.iter().filter(|s| stage.is_none_or(|stage| s.name == *stage));
-    Ok(stages.filter_map(|s| Some((s.name.clone(), Arc::clone(state.work_of(run, &s.name)?)))).collect())
+    Ok(stages.filter_map(|s| Some((s.name.clone(), Arc::clone(state.execution_of(run, &s.name)?)))).collect())
 }
 
 pub(crate) async fn logs(
-    State(desk): State<Arc<Desk>>,
+    State(actor_handle): State<Arc<ActorHandle>>,
     Path(run): Path<RunId>,
     Query(query): Query<LogQuery>,
 ) -> Result<Json<Vec<LogRow>>, Failure> {
     let mut rows = Vec::new();
-    for (_, work) in works(&desk, &run, query.stage.as_ref())? {
-        rows.extend(desk.store.logs(&work.run, Some(&work.stage), query.after, query.limit).await?);
+    for (_, execution) in executions(&actor_handle, &run, query.stage.as_ref())? {
+        rows.extend(actor_handle.store.logs(&execution.run, Some(&execution.stage), query.after, query.limit).await?);
     }
     rows.sort_by_key(|row| row.id);
     rows.truncate(query.limit as usize);
@@ -133,21 +140,21 @@ pub(crate) async fn logs(
 }
 
 pub(crate) async fn metrics(
-    State(desk): State<Arc<Desk>>,
+    State(actor_handle): State<Arc<ActorHandle>>,
     Path(run): Path<RunId>,
     Query(query): Query<MetricQuery>,
 ) -> Result<Json<StageMetrics>, Failure> {
     let mut stages = StageMetrics::new();
-    for (name, work) in works(&desk, &run, query.stage.as_ref())? {
-        stages.insert(name, desk.store.metrics(&work.run, &work.stage, None, query.points).await?);
+    for (name, execution) in executions(&actor_handle, &run, query.stage.as_ref())? {
+        stages.insert(name, actor_handle.store.metrics(&execution.run, &execution.stage, None, query.points).await?);
     }
     Ok(Json(stages))
 }
 
 /// The registry's commands, on behalf of a client: this process holds the store.
 pub(crate) async fn registry(
-    State(desk): State<Arc<Desk>>,
+    State(actor_handle): State<Arc<ActorHandle>>,
     Json(command): Json<registry::cli::Command>,
 ) -> Json<registry::cli::Answer> {
-    Json(registry::cli::run(command, &desk.store).await)
+    Json(registry::cli::run(command, &actor_handle.store).await)
 }

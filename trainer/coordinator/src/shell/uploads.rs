@@ -12,7 +12,7 @@ use protocol::Digest;
 use protocol::message::{CommitCheckpoint, Grant, LogBatch, MetricBatch, ReportOutcome};
 use registry::{Write, WriteError};
 
-use super::actor::Desk;
+use super::actor::ActorHandle;
 use super::api::Failure;
 use super::effects::blocking;
 use super::queries::BlobStored;
@@ -21,44 +21,47 @@ use crate::event::Event;
 /// The header that carries a blob's grant, as JSON.
 const GRANT_HEADER: &str = "x-stride-grant";
 
-async fn write(desk: &Desk, write: Write) -> Result<Json<()>, Failure> {
-    let written = desk.store.write(vec![write]).await;
-    desk.wrote(&written);
+async fn write(actor_handle: &ActorHandle, write: Write) -> Result<Json<()>, Failure> {
+    let written = actor_handle.store.write(vec![write]).await;
+    actor_handle.wrote(&written);
     written?;
     Ok(Json(()))
 }
 
 pub(crate) async fn metrics(
-    State(desk): State<Arc<Desk>>,
+    State(actor_handle): State<Arc<ActorHandle>>,
     Json(batch): Json<MetricBatch>,
 ) -> Result<Json<()>, Failure> {
-    desk.state().check_write(&batch.grant)?;
-    write(&desk, Write::Metrics { grant: batch.grant, rows: batch.rows }).await
+    actor_handle.state().check_write(&batch.grant)?;
+    write(&actor_handle, Write::Metrics { grant: batch.grant, rows: batch.rows }).await
 }
 
-pub(crate) async fn logs(State(desk): State<Arc<Desk>>, Json(batch): Json<LogBatch>) -> Result<Json<()>, Failure> {
-    desk.state().check_write(&batch.grant)?;
-    write(&desk, Write::Logs { grant: batch.grant, first: batch.first, lines: batch.lines }).await
+pub(crate) async fn logs(
+    State(actor_handle): State<Arc<ActorHandle>>,
+    Json(batch): Json<LogBatch>,
+) -> Result<Json<()>, Failure> {
+    actor_handle.state().check_write(&batch.grant)?;
+    write(&actor_handle, Write::Logs { grant: batch.grant, first: batch.first, lines: batch.lines }).await
 }
 
 pub(crate) async fn checkpoint(
-    State(desk): State<Arc<Desk>>,
+    State(actor_handle): State<Arc<ActorHandle>>,
     Json(commit): Json<CommitCheckpoint>,
 ) -> Result<Json<()>, Failure> {
-    desk.decide(Event::Checkpoint { commit }).await?;
+    actor_handle.decide(Event::Checkpoint { commit }).await?;
     Ok(Json(()))
 }
 
 pub(crate) async fn outcome(
-    State(desk): State<Arc<Desk>>,
+    State(actor_handle): State<Arc<ActorHandle>>,
     Json(report): Json<ReportOutcome>,
 ) -> Result<Json<()>, Failure> {
-    desk.decide(Event::Outcome { report }).await?;
+    actor_handle.decide(Event::Outcome { report }).await?;
     Ok(Json(()))
 }
 
 pub(crate) async fn put_blob(
-    State(desk): State<Arc<Desk>>,
+    State(actor_handle): State<Arc<ActorHandle>>,
     headers: HeaderMap,
     body: Bytes,
 ) -> Result<Json<BlobStored>, Failure> {
@@ -66,21 +69,21 @@ pub(crate) async fn put_blob(
         headers.get(GRANT_HEADER).ok_or_else(|| Failure::invalid(format!("header `{GRANT_HEADER}` is missing")))?;
     let grant: Grant = serde_json::from_slice(grant.as_bytes())
         .map_err(|e| Failure::invalid(format!("header `{GRANT_HEADER}` is no grant: {e}")))?;
-    desk.state().check_write(&grant)?;
-    let blobs = desk.store.blobs().clone();
+    actor_handle.state().check_write(&grant)?;
+    let blobs = actor_handle.store.blobs().clone();
     let put = blocking(move || blobs.put(&body)).await;
     if let Err(checkpoint::BlobError::Storage(message)) = &put {
-        desk.wrote::<()>(&Err(WriteError::Storage(message.clone())));
+        actor_handle.wrote::<()>(&Err(WriteError::Storage(message.clone())));
     }
     Ok(Json(BlobStored { digest: put? }))
 }
 
 pub(crate) async fn get_blob(
-    State(desk): State<Arc<Desk>>,
+    State(actor_handle): State<Arc<ActorHandle>>,
     Path(digest): Path<String>,
 ) -> Result<impl IntoResponse, Failure> {
     let digest: Digest = digest.parse().map_err(|e| Failure::invalid(format!("{e}")))?;
-    let blobs = desk.store.blobs().clone();
+    let blobs = actor_handle.store.blobs().clone();
     let bytes = blocking(move || blobs.get(digest)).await?;
     Ok(([(header::CONTENT_TYPE, "application/octet-stream")], bytes))
 }

@@ -1,11 +1,11 @@
 //! All that the coordinator knows. Changed by `decide` and, for what need not survive a restart, by `observe`; read by
 //! everybody.
 
+pub mod execution;
 pub mod gang;
 pub mod run;
 pub mod task;
 pub mod tasks;
-pub mod work;
 pub mod worker;
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
@@ -14,9 +14,9 @@ use std::sync::Arc;
 use protocol::message::{Grant, Progress};
 use protocol::{Digest, Incarnation, RunId, StageName, TaskId, WorkerId};
 
+use self::execution::StageExecution;
 use self::run::Run;
 use self::task::Task;
-use self::work::Work;
 use self::worker::Worker;
 use crate::event::{Millis, Rejected};
 use crate::policy::Policy;
@@ -49,7 +49,7 @@ pub struct State {
     /// Runs in the order of submission; the first has number 1.
     pub runs: Vec<Arc<Run>>,
     /// Works by the stage's key.
-    pub works: BTreeMap<Digest, Arc<Work>>,
+    pub executions: BTreeMap<Digest, Arc<StageExecution>>,
     /// Which work a task is of, and its place there.
     pub tasks: Arc<BTreeMap<TaskId, (Digest, usize)>>,
     /// About to stop: no grants, workers save and leave.
@@ -73,10 +73,10 @@ impl State {
     }
 
     /// The work and the task that a grant is about.
-    pub fn task(&self, task: &TaskId) -> Result<(&Work, &Task), Rejected> {
+    pub fn task(&self, task: &TaskId) -> Result<(&StageExecution, &Task), Rejected> {
         let (key, i) = self.place(task)?;
-        let work = &self.works[&key];
-        Ok((work, &work.tasks[i]))
+        let execution = &self.executions[&key];
+        Ok((execution, &execution.tasks[i]))
     }
 
     /// The key of the work that a task is of, and its place there.
@@ -91,16 +91,16 @@ impl State {
     }
 
     /// Changes a work; other copies of the state keep theirs.
-    pub(crate) fn work_mut(&mut self, key: Digest) -> &mut Work {
-        Arc::make_mut(self.works.get_mut(&key).expect("works are never forgotten"))
+    pub(crate) fn execution_mut(&mut self, key: Digest) -> &mut StageExecution {
+        Arc::make_mut(self.executions.get_mut(&key).expect("executions are never forgotten"))
     }
 
     /// Changes a task; the only way to.
     pub(crate) fn change<T>(&mut self, key: Digest, i: usize, change: impl FnOnce(&mut Task) -> T) -> T {
-        let work = Arc::make_mut(self.works.get_mut(&key).expect("works are never forgotten"));
-        let before = work.tasks[i].holders().to_vec();
-        let made = work.tasks.change(i, change);
-        let after = work.tasks[i].holders();
+        let execution = Arc::make_mut(self.executions.get_mut(&key).expect("executions are never forgotten"));
+        let before = execution.tasks[i].holders().to_vec();
+        let made = execution.tasks.change(i, change);
+        let after = execution.tasks[i].holders();
         if before != after {
             let (workers, unused) = (Arc::make_mut(&mut self.workers), Arc::make_mut(&mut self.unused));
             let mut set = |name: &WorkerId, holds| {
@@ -134,10 +134,10 @@ impl State {
     }
 
     /// The task that a worker holds.
-    pub fn held_by(&self, worker: &WorkerId) -> Option<(&Work, &Task)> {
+    pub fn held_by(&self, worker: &WorkerId) -> Option<(&StageExecution, &Task)> {
         let (key, i) = self.workers.get(worker)?.holds?;
-        let work = &self.works[&key];
-        Some((work, &work.tasks[i]))
+        let execution = &self.executions[&key];
+        Some((execution, &execution.tasks[i]))
     }
 
     /// The keys of works that a running run waits for, in the order in which they are served: runs as submitted, stages
@@ -149,7 +149,7 @@ impl State {
     }
 
     /// The work behind a stage of a run, if it has begun or was done here before.
-    pub fn work_of(&self, run: &Run, stage: &StageName) -> Option<&Arc<Work>> {
-        self.works.get(&run.status(stage)?.key()?)
+    pub fn execution_of(&self, run: &Run, stage: &StageName) -> Option<&Arc<StageExecution>> {
+        self.executions.get(&run.status(stage)?.key()?)
     }
 }

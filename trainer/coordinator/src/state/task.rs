@@ -39,7 +39,7 @@ pub enum Part {
 
 /// Who has the right to a task.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Hold {
+pub enum Lease {
     /// Nobody.
     Waiting {
         /// Not to be granted before this.
@@ -52,7 +52,7 @@ pub enum Hold {
         /// Proves to a peer that one is of this generation.
         secret: String,
         /// Asked to wind down; released by force at this time.
-        winding: Option<Millis>,
+        drain_by: Option<Millis>,
     },
     /// Done.
     Done {
@@ -80,7 +80,7 @@ pub struct Task {
     /// What part of the stage it is.
     pub part: Part,
     /// Who has it.
-    pub hold: Hold,
+    pub lease: Lease,
     /// The newest try; 0 before the first.
     pub attempt: Attempt,
     /// The newest fence; 0 before the first.
@@ -103,7 +103,7 @@ impl Task {
         Self {
             id,
             part,
-            hold: Hold::Waiting { not_before: None },
+            lease: Lease::Waiting { not_before: None },
             attempt: Attempt(0),
             fence: Fence(0),
             faults: 0,
@@ -116,30 +116,30 @@ impl Task {
 
     /// The members that hold it, by rank; empty unless it is held.
     pub fn holders(&self) -> &[Member] {
-        match &self.hold {
-            Hold::Held { holders, .. } => holders,
-            Hold::Waiting { .. } | Hold::Done { .. } => &[],
+        match &self.lease {
+            Lease::Held { holders, .. } => holders,
+            Lease::Waiting { .. } | Lease::Done { .. } => &[],
         }
     }
 
     /// Whether somebody has it.
     pub fn is_held(&self) -> bool {
-        matches!(self.hold, Hold::Held { .. })
+        matches!(self.lease, Lease::Held { .. })
     }
 
     /// Its artifact, once done.
     pub fn output(&self) -> Option<Digest> {
-        match self.hold {
-            Hold::Done { output } => Some(output),
-            Hold::Waiting { .. } | Hold::Held { .. } => None,
+        match self.lease {
+            Lease::Done { output } => Some(output),
+            Lease::Waiting { .. } | Lease::Held { .. } => None,
         }
     }
 
     /// Whether it may be granted now.
     pub fn is_free(&self, now: Millis) -> bool {
-        match self.hold {
-            Hold::Waiting { not_before } => not_before.is_none_or(|time| time <= now),
-            Hold::Held { .. } | Hold::Done { .. } => false,
+        match self.lease {
+            Lease::Waiting { not_before } => not_before.is_none_or(|time| time <= now),
+            Lease::Held { .. } | Lease::Done { .. } => false,
         }
     }
 
@@ -155,44 +155,44 @@ impl Task {
 
     /// Gives it away: a new try.
     pub fn grant(&mut self, holders: Vec<Member>, secret: impl FnOnce(Fence) -> String) -> Write {
-        assert!(matches!(self.hold, Hold::Waiting { .. }) && !holders.is_empty(), "grant of {self:?}");
+        assert!(matches!(self.lease, Lease::Waiting { .. }) && !holders.is_empty(), "grant of {self:?}");
         self.attempt = self.attempt.next();
-        self.hold(holders, secret)
+        self.lease_to(holders, secret)
     }
 
     /// Changes who has it without a new try.
     pub fn regroup(&mut self, holders: Vec<Member>, secret: impl FnOnce(Fence) -> String) -> Write {
         assert!(self.is_held() && self.part == Part::Gang && !holders.is_empty(), "regroup of {self:?}");
-        self.hold(holders, secret)
+        self.lease_to(holders, secret)
     }
 
-    fn hold(&mut self, holders: Vec<Member>, secret: impl FnOnce(Fence) -> String) -> Write {
-        let winding = match self.hold {
-            Hold::Held { winding, .. } => winding,
-            Hold::Waiting { .. } | Hold::Done { .. } => None,
+    fn lease_to(&mut self, holders: Vec<Member>, secret: impl FnOnce(Fence) -> String) -> Write {
+        let drain_by = match self.lease {
+            Lease::Held { drain_by, .. } => drain_by,
+            Lease::Waiting { .. } | Lease::Done { .. } => None,
         };
         let fence = self.raise();
-        self.hold = Hold::Held { holders, secret: secret(self.fence), winding };
+        self.lease = Lease::Held { holders, secret: secret(self.fence), drain_by };
         fence
     }
 
     /// Takes it away: whoever had it can write no more.
     pub fn release(&mut self, not_before: Option<Millis>) -> Write {
         assert!(self.is_held(), "release of {self:?}");
-        self.hold = Hold::Waiting { not_before };
+        self.lease = Lease::Waiting { not_before };
         self.raise()
     }
 
     /// Takes note that its holders gave it back themselves. What they still have to say about it they may.
     pub fn give_back(&mut self, not_before: Option<Millis>) {
         assert!(self.is_held(), "giving back of {self:?}");
-        self.hold = Hold::Waiting { not_before };
+        self.lease = Lease::Waiting { not_before };
     }
 
     /// Takes note of its artifact.
     pub fn finish(&mut self, output: Digest) {
         assert!(self.is_held(), "finish of {self:?}");
-        self.hold = Hold::Done { output };
+        self.lease = Lease::Done { output };
         self.streak = 0;
     }
 
@@ -200,21 +200,21 @@ impl Task {
     pub fn reopen(&mut self) {
         self.reset_budgets();
         self.checkpoints.clear();
-        self.hold = Hold::Waiting { not_before: None };
+        self.lease = Lease::Waiting { not_before: None };
     }
 
     /// Gives it its restart budgets back.
     pub fn reset_budgets(&mut self) {
         (self.faults, self.losses, self.streak) = (0, 0, 0);
-        if let Hold::Waiting { not_before } = &mut self.hold {
+        if let Lease::Waiting { not_before } = &mut self.lease {
             *not_before = None;
         }
     }
 
     /// Asks its holders to wind down until `deadline`, or (`None`) to carry on.
-    pub fn wind(&mut self, deadline: Option<Millis>) {
-        if let Hold::Held { winding, .. } = &mut self.hold {
-            *winding = match (*winding, deadline) {
+    pub fn drain(&mut self, deadline: Option<Millis>) {
+        if let Lease::Held { drain_by, .. } = &mut self.lease {
+            *drain_by = match (*drain_by, deadline) {
                 (Some(already), Some(_)) => Some(already),
                 (_, deadline) => deadline,
             };
@@ -340,13 +340,13 @@ mod tests {
             }),
             Box::new(|task| {
                 assert!(task.is_held());
-                task.wind(Some(Millis(1)));
+                task.drain(Some(Millis(1)));
             }),
         ];
-        let name = |task: &Task| match task.hold {
-            Hold::Waiting { .. } => "Waiting",
-            Hold::Held { .. } => "Held",
-            Hold::Done { .. } => "Done",
+        let name = |task: &Task| match task.lease {
+            Lease::Waiting { .. } => "Waiting",
+            Lease::Held { .. } => "Held",
+            Lease::Done { .. } => "Done",
         };
         for task in [waiting, held, done] {
             let cells: Vec<&str> = events

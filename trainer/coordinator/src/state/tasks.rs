@@ -5,7 +5,7 @@
 use std::collections::BTreeSet;
 use std::ops::Deref;
 
-use super::task::{Hold, Task};
+use super::task::{Lease, Task};
 
 /// The tasks of a work.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -19,22 +19,22 @@ struct Index {
     held: BTreeSet<usize>,
     waiting: BTreeSet<usize>,
     /// Of the held ones, how many are asked to wind down.
-    winding: usize,
+    drain_by: usize,
 }
 
 impl Index {
     /// Puts the task at `i` in, or takes it out.
-    fn note(&mut self, i: usize, hold: &Hold, there: bool) {
+    fn note(&mut self, i: usize, lease: &Lease, there: bool) {
         let set = match hold {
-            Hold::Held { winding, .. } => {
+            Lease::Held { drain_by, .. } => {
                 match there {
-                    true => self.winding += usize::from(winding.is_some()),
-                    false => self.winding -= usize::from(winding.is_some()),
+                    true => self.drain_by += usize::from(drain_by.is_some()),
+                    false => self.drain_by -= usize::from(drain_by.is_some()),
                 }
                 &mut self.held
             }
-            Hold::Waiting { .. } => &mut self.waiting,
-            Hold::Done { .. } => return,
+            Lease::Waiting { .. } => &mut self.waiting,
+            Lease::Done { .. } => return,
         };
         if there {
             set.insert(i)
@@ -45,7 +45,7 @@ impl Index {
 
     fn of(tasks: &[Task]) -> Self {
         let mut index = Self::default();
-        tasks.iter().enumerate().for_each(|(i, task)| index.note(i, &task.hold, true));
+        tasks.iter().enumerate().for_each(|(i, task)| index.note(i, &task.lease, true));
         index
     }
 }
@@ -78,8 +78,8 @@ impl Tasks {
     }
 
     /// Whether all (`asked`) or none of the held ones are asked to wind down.
-    pub fn all_wind(&self, asked: bool) -> bool {
-        self.index.winding == if asked { self.index.held.len() } else { 0 }
+    pub fn all_draining(&self, asked: bool) -> bool {
+        self.index.drain_by == if asked { self.index.held.len() } else { 0 }
     }
 
     /// Whether the index says what the tasks say.
@@ -88,9 +88,9 @@ impl Tasks {
     }
 
     pub(super) fn change<T>(&mut self, i: usize, change: impl FnOnce(&mut Task) -> T) -> T {
-        self.index.note(i, &self.all[i].hold, false);
+        self.index.note(i, &self.all[i].lease, false);
         let made = change(&mut self.all[i]);
-        self.index.note(i, &self.all[i].hold, true);
+        self.index.note(i, &self.all[i].lease, true);
         made
     }
 }

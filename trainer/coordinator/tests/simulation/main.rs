@@ -67,7 +67,7 @@ fn seeds() -> Vec<u64> {
 fn whatever_happens_every_run_ends_and_every_task_is_done_once() {
     let (seeds, begun) = (seeds(), std::time::Instant::now());
     let next = AtomicUsize::new(0);
-    let work = || {
+    let execution = || {
         let (mut sum, mut failed) = (Tally::default(), Vec::new());
         while let Some(seed) = seeds.get(next.fetch_add(1, Ordering::Relaxed)) {
             match std::panic::catch_unwind(|| simulate(*seed)) {
@@ -84,7 +84,7 @@ fn whatever_happens_every_run_ends_and_every_task_is_done_once() {
     };
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let done: Vec<(Tally, Vec<u64>)> = std::thread::scope(|scope| {
-        let threads: Vec<_> = (0..threads).map(|_| scope.spawn(work)).collect();
+        let threads: Vec<_> = (0..threads).map(|_| scope.spawn(execution)).collect();
         threads.into_iter().map(|thread| thread.join().expect("panics are caught")).collect()
     });
     let sum = |of: fn(&Tally) -> u64| done.iter().map(|(tally, _)| of(tally)).sum::<u64>();

@@ -39,7 +39,7 @@ pub(crate) fn events(state: &State) -> Vec<Event> {
         }
     }
     let known = Known { outputs: BTreeMap::from([("x".into(), Digest::of(b"x"))]), metrics: BTreeMap::new() };
-    for key in state.works.keys().copied().chain([Digest::of(b"no key")]) {
+    for key in state.executions.keys().copied().chain([Digest::of(b"no key")]) {
         events.push(Event::LookedUp { key, known: Some(known.clone()) });
         events.push(Event::LookedUp { key, known: None });
         events.push(Event::Bundled { key, bundles: vec![Digest::of(b"1"), Digest::of(b"2")] });

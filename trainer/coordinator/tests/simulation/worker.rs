@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 
 use coordinator::Millis;
 use protocol::message::{
-    Assignment, CommitCheckpoint, Doing, FailureClass, Grant, Join, Orders, PROTOCOL_VERSION, Poll, Progress,
-    ReportOutcome, Role, TaskOutcome,
+    Assignment, CommitCheckpoint, DesiredAssignments, Doing, FailureClass, Grant, Join, PROTOCOL_VERSION, Poll,
+    Progress, ReportOutcome, Role, TaskOutcome,
 };
 use protocol::stage::Backend;
 use protocol::{Attempt, Digest, Incarnation, TaskId, WorkerId};
@@ -29,7 +29,7 @@ pub(crate) enum Call {
 #[derive(Debug, Clone)]
 pub(crate) enum Answer {
     Joined(Incarnation),
-    Orders(Orders),
+    DesiredAssignments(DesiredAssignments),
     /// To this commit or report: stored.
     Done(Saving),
     /// To this commit or report: never.
@@ -56,7 +56,7 @@ pub(crate) struct FakeWorker {
     pub(crate) hung_until: Millis,
     pub(crate) process: u32,
     incarnation: Option<Incarnation>,
-    orders: Option<Orders>,
+    desired: Option<DesiredAssignments>,
     /// Steps of the state in memory, and of which try.
     live: Option<(TaskId, Attempt, u64)>,
     saved_at: u64,
@@ -73,7 +73,7 @@ impl FakeWorker {
             hung_until: Millis(0),
             process: 0,
             incarnation: None,
-            orders: None,
+            desired: None,
             live: None,
             saved_at: 0,
             saving: Saving::No,
@@ -92,7 +92,7 @@ impl FakeWorker {
     }
 
     fn assignment(&self) -> Option<&Assignment> {
-        self.orders.as_ref()?.assignments.first()
+        self.desired.as_ref()?.assignments.first()
     }
 
     pub(crate) fn grant(&self) -> Option<&Grant> {
@@ -112,9 +112,9 @@ impl FakeWorker {
             Answer::Joined(incarnation) => {
                 self.incarnation.get_or_insert(incarnation);
             }
-            Answer::Orders(orders) => {
+            Answer::DesiredAssignments(desired) => {
                 let held = self.grant().cloned();
-                self.orders = Some(orders);
+                self.desired = Some(desired);
                 if self.grant() != held.as_ref() {
                     self.saving = Saving::No;
                     self.silent_peers_since = None;
@@ -137,7 +137,7 @@ impl FakeWorker {
     /// The process was replaced or is unknown: join again.
     pub(crate) fn forget(&mut self) {
         self.incarnation = None;
-        self.orders = None;
+        self.desired = None;
         self.live = None;
         self.saving = Saving::No;
     }
@@ -167,7 +167,7 @@ impl FakeWorker {
                 _ => Vec::new(),
             },
         });
-        let version = self.orders.as_ref().map_or(0, |orders| orders.version);
+        let version = self.desired.as_ref().map_or(0, |desired| desired.version);
         let mut calls = vec![Call::Poll(Poll { incarnation, doing: doing.into_iter().collect(), version })];
         match &self.saving {
             Saving::Commit(commit) => calls.push(Call::Commit(commit.clone())),
@@ -182,7 +182,7 @@ impl FakeWorker {
     }
 
     /// One unit of work. `peers` says for a gang how far the furthest member is, or `None` if not all are there.
-    pub(crate) fn work(
+    pub(crate) fn execution(
         &mut self,
         now: Millis,
         peers: Option<Option<u64>>,
@@ -222,7 +222,7 @@ impl FakeWorker {
         self.silent_peers_since = None;
         let before = furthest.or(self.live(&grant)).unwrap_or(saved);
         let leads = rank == Some(0);
-        if assignment.wind_down && leads {
+        if assignment.drain && leads {
             if self.saved_at != before {
                 return self.commit(grant, before);
             }

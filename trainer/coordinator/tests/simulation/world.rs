@@ -241,8 +241,13 @@ impl World {
         while self.now.0 < LIMIT_MS && (self.chaos() || !self.is_over()) {
             self.step();
         }
-        let held: Vec<_> =
-            self.state.works.values().flat_map(|work| &work.tasks).filter(|task| task.is_held()).collect();
+        let held: Vec<_> = self
+            .state
+            .executions
+            .values()
+            .flat_map(|execution| &execution.tasks)
+            .filter(|task| task.is_held())
+            .collect();
         assert!(self.is_over(), "not over after {LIMIT_MS} ms: {held:#?} {:#?}", self.workers);
         for run in &self.state.runs {
             let never = format!("{:?}", run.pipeline).contains("never");
@@ -279,5 +284,12 @@ pub(crate) enum Refused {
 
 /// What must survive a restart.
 fn durable(state: &State) -> impl PartialEq + std::fmt::Debug + use<> {
-    (state.workers.clone(), state.runs.clone(), state.works.clone(), state.tasks.clone(), state.draining, state.now)
+    (
+        state.workers.clone(),
+        state.runs.clone(),
+        state.executions.clone(),
+        state.tasks.clone(),
+        state.draining,
+        state.now,
+    )
 }

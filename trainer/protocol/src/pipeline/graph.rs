@@ -35,13 +35,13 @@ pub(super) fn references(settings: &StageSettings) -> Vec<StageInput> {
 
 /// Gives every `register` stage the evaluations of its candidates as inputs.
 pub(super) fn add_evaluations(stages: &mut [PipelineStage]) {
-    let looks_at: Vec<(StageName, StageName)> = stages
+    let evaluated_model: Vec<(StageName, StageName)> = stages
         .iter()
-        .filter_map(|stage| Some((stage.name.clone(), StageName::new(stage.settings.looks_at()?))))
+        .filter_map(|stage| Some((stage.name.clone(), StageName::new(stage.settings.evaluated_model()?))))
         .collect();
     for stage in stages {
         if let StageSettings::Register(settings) = &stage.settings {
-            for (evaluation, model) in &looks_at {
+            for (evaluation, model) in &evaluated_model {
                 if settings.from.iter().any(|from| from == model.as_str()) {
                     stage.inputs.push(StageInput {
                         field: format!("evaluations.{evaluation}"),
@@ -269,7 +269,7 @@ pub(super) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
             }
             StageSettings::Register(s) => {
                 for (i, from) in s.from.iter().enumerate() {
-                    let judged = stages.iter().any(|other| other.settings.looks_at() == Some(from.as_str()));
+                    let judged = stages.iter().any(|other| other.settings.evaluated_model() == Some(from.as_str()));
                     if !judged && (s.from.len() > 1 || !s.promote.to.is_empty()) {
                         let message =
                             format!("no `evaluate.*` stage looks at `{from}`, so `{}` cannot judge it", s.metric);

@@ -28,7 +28,7 @@ use crate::evaluation::frechet::{Gaussian, to_f64};
 use crate::evaluation::interval::Interval;
 use crate::evaluation::retrieval::in_groups;
 use crate::evaluation::{skating, spread};
-use crate::evaluator::Judge;
+use crate::evaluator::TrainedEvaluator;
 use crate::networks::{Autoencoder, Conditions, Denoiser};
 
 /// Motions computed together.
@@ -72,7 +72,7 @@ struct Plan<'a> {
     seed: Seed,
     dataset: Dataset,
     entries: Vec<usize>,
-    judge: Judge,
+    evaluator: TrainedEvaluator,
     evaluator: Digest,
     /// What they are of.
     split: Split,
@@ -85,7 +85,7 @@ impl<'a> Plan<'a> {
         let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
         let dataset = artifacts::dataset(&*blobs, &manifest)?;
         let (evaluator, manifest) = artifacts::input(cx, "evaluator", ArtifactKind::Evaluator)?;
-        let judge = Judge::read(&*blobs, &manifest, &cx.device())?;
+        let evaluator = TrainedEvaluator::read(&*blobs, &manifest, &cx.device())?;
         let (mut entries, mut taken) = (dataset.entries_of(settings.split), settings.split);
         if settings.widen && entries.len() < POOL {
             (entries, taken) = (dataset.entries_of(Split::All), Split::All);
@@ -105,11 +105,11 @@ impl<'a> Plan<'a> {
                 entries.len()
             ));
         }
-        judge.check(&dataset, &entries)?;
+        evaluator.check(&dataset, &entries)?;
         if settings.repeats == 0 {
             return refuse("`repeats` is 0, expected at least 1".into());
         }
-        Ok(Self { settings, seed: cx.task().seed, dataset, entries, split: taken, judge, evaluator })
+        Ok(Self { settings, seed: cx.task().seed, dataset, entries, split: taken, evaluator, evaluator })
     }
 
     fn stream(&self, what: &str, repeat: usize, index: usize) -> Stream {
@@ -252,22 +252,22 @@ pub(super) fn shard(
                 let block = plan.block(unit.block);
                 let draws: Vec<Draw> = block.clone().map(|i| plan.draw(unit.repeat, i, true)).collect();
                 let crops: Vec<Vec<f32>> = draws.iter().map(|d| plan.crop(*d)).collect();
-                text.extend(plan.judge.captions(draws.iter().map(|d| &plan.dataset.captions[d.caption])));
+                text.extend(plan.evaluator.captions(draws.iter().map(|d| &plan.dataset.captions[d.caption])));
                 let motions = match &maker {
                     Some(maker) => {
-                        real.extend(plan.judge.motions(&crops));
+                        real.extend(plan.evaluator.motions(&crops));
                         maker.motions(&plan, &draws, &|k, b, row| {
                             plan.stream(&format!("noise {k}"), unit.repeat, block.start + b).fill_normal(row);
                         })?
                     }
                     None => {
                         let others = block.map(|i| plan.crop(plan.draw(unit.repeat, i, false)));
-                        real.extend(plan.judge.motions(&others.collect::<Vec<_>>()));
+                        real.extend(plan.evaluator.motions(&others.collect::<Vec<_>>()));
                         crops
                     }
                 };
                 skating.extend(motions.iter().map(|motion| skates(motion, plan.dataset.skeleton())));
-                made.extend(plan.judge.motions(&motions));
+                made.extend(plan.evaluator.motions(&motions));
             }
             Part::Many => {
                 let maker = maker.as_ref().ok_or_else(|| StageError::Fault("real motion has no samples".into()))?;
@@ -280,13 +280,13 @@ pub(super) fn shard(
                         let index = entry * samples + first + b;
                         plan.stream(&format!("many {k}"), unit.repeat, index).fill_normal(row);
                     })?;
-                    many.extend(plan.judge.motions(&motions));
+                    many.extend(plan.evaluator.motions(&motions));
                 }
             }
         }
         cx.progress(done as u64 + 1, units.len() as u64, "blocks", &[]);
     }
-    let width = plan.judge.width();
+    let width = plan.evaluator.width();
     let rows = |values: &[f32]| [values.len() / width, width];
     let skated = skating.len();
     let bytes = Tensors::default()
@@ -315,7 +315,7 @@ fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, shards: &[Digest]) -> Result
     struct ShardMeta {
         units: Vec<Unit>,
     }
-    let (blobs, width) = (cx.blobs(), plan.judge.width());
+    let (blobs, width) = (cx.blobs(), plan.evaluator.width());
     let mut all = Gathered::default();
     for digest in shards {
         let manifest = cx.manifest(*digest)?;
@@ -361,7 +361,7 @@ fn reorder(values: &[f64], rows: &[u32], width: usize) -> Vec<f64> {
 
 /// The metrics of one repeat.
 fn measure(plan: &Plan<'_>, all: &Gathered, repeat: usize) -> BTreeMap<&'static str, f64> {
-    let (width, n) = (plan.judge.width(), plan.entries.len());
+    let (width, n) = (plan.evaluator.width(), plan.entries.len());
     let of = |parts: &BTreeMap<Unit, Vec<f64>>| -> Vec<f64> {
         parts.iter().filter(|(unit, _)| unit.repeat == repeat).flat_map(|(_, values)| values.iter().copied()).collect()
     };
@@ -419,7 +419,7 @@ pub(super) fn merge(
             "`{name}` is {value}: embeddings are not finite; train the evaluator anew"
         )));
     }
-    let (samples, width) = (plan.entries.len(), plan.judge.width());
+    let (samples, width) = (plan.entries.len(), plan.evaluator.width());
     let few = (samples < FEW * width).then(|| {
         format!(
             "FID is taken of {samples} motions in {width} dimensions; it is then larger than of many, and compares only with FIDs of as many \
@@ -441,7 +441,7 @@ pub(super) fn merge(
         "metrics": metrics,
         "split": plan.split,
         "evaluator": plan.evaluator,
-        "words": plan.judge.meta().words,
+        "words": plan.evaluator.meta().words,
         "real": settings.real,
         "shuffled": settings.shuffled,
     });

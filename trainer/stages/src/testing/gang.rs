@@ -24,7 +24,7 @@ pub struct Script {
     /// Member and step: it starts once that step is summed. Its number is above those of the first members.
     pub joins: Vec<(usize, u64)>,
     /// All members are told to stop after applying this step.
-    pub wind_down: Option<u64>,
+    pub drain: Option<u64>,
 }
 
 #[derive(Debug, Default)]
@@ -66,7 +66,7 @@ struct Member {
     generation: u64,
     members: Vec<usize>,
     lost_at: Option<u64>,
-    wind_down: Option<u64>,
+    drain: Option<u64>,
 }
 
 impl Member {
@@ -102,7 +102,7 @@ pub(super) fn run(
         generation: 0,
         members: (0..count).collect(),
         lost_at: script.lost.iter().find(|(who, _)| *who == me).map(|(_, step)| *step),
-        wind_down: script.wind_down,
+        drain: script.drain,
     };
     let starters = (0..count).map(|me| (member(me), None));
     let joiners = script.joins.iter().map(|&(me, step)| (member(me), Some(step)));
@@ -267,7 +267,7 @@ impl GangContext for Member {
             Some((at, sum)) if *at == step => Some(Arc::clone(sum)),
             _ => None,
         };
-        let wind_down = self.wind_down.is_some_and(|at| step >= at);
+        let drain = self.drain.is_some_and(|at| step >= at);
         if state.generation != self.generation {
             return Ok(Exchange::Regroup);
         }
@@ -287,7 +287,7 @@ impl GangContext for Member {
         }
         loop {
             if let Some(sum) = found(&state) {
-                return Ok(Exchange::Sum { sum: sum.to_vec(), wind_down });
+                return Ok(Exchange::Sum { sum: sum.to_vec(), drain });
             }
             if state.generation != self.generation {
                 return Ok(Exchange::Regroup);
@@ -355,12 +355,12 @@ mod tests {
                 .collect();
             match cx.exchange(step, SLICES, &parts)? {
                 Exchange::Regroup => (step, value) = meet(cx, applied, (step, value))?,
-                Exchange::Sum { sum, wind_down } => {
+                Exchange::Sum { sum, drain } => {
                     (step, value) = (step + 1, value + sum[0]);
                     if cx.leads() {
                         cx.record(step, &[("value", f64::from(value))]);
                     }
-                    if wind_down {
+                    if drain {
                         if cx.leads() {
                             let meta = serde_json::json!([step, value]);
                             let manifest = Manifest::new(ArtifactKind::Checkpoint, meta);
@@ -398,7 +398,7 @@ mod tests {
             assert_eq!(ran(count, &Script::default(), &mut vec![]).output(), alone.output());
         }
         for _ in 0..20 {
-            let script = Script { lost: vec![(0, 3), (2, 5)], joins: vec![(7, 1), (8, 6)], wind_down: None };
+            let script = Script { lost: vec![(0, 3), (2, 5)], joins: vec![(7, 1), (8, 6)], drain: None };
             assert_eq!(ran(3, &script, &mut vec![]).output(), alone.output());
         }
     }
@@ -407,7 +407,7 @@ mod tests {
     fn a_gang_that_yields_goes_on_from_its_checkpoint() {
         let alone = ran(1, &Script::default(), &mut vec![]);
         let mut saved = vec![];
-        let script = Script { wind_down: Some(4), ..Script::default() };
+        let script = Script { drain: Some(4), ..Script::default() };
         assert_eq!(ran(2, &script, &mut saved).outcome, Outcome::Yielded { at: 5 });
         assert_eq!(saved.len(), 1);
         assert_eq!(ran(3, &Script::default(), &mut saved).output(), alone.output());

@@ -117,8 +117,8 @@ pub fn train(
             }
         }
         let parts: Vec<_> = share.map(|slice| (slice, done.remove(&slice).expect("just computed"))).collect();
-        let (sum, wind_down) = match cx.exchange(state.step, slices, &parts)? {
-            Exchange::Sum { sum, wind_down } => (sum, wind_down),
+        let (sum, drain) = match cx.exchange(state.step, slices, &parts)? {
+            Exchange::Sum { sum, drain } => (sum, drain),
             Exchange::Regroup => {
                 let applied = Some(state.step);
                 if meet(&mut state, applied, cx)? {
@@ -147,11 +147,11 @@ pub fn train(
         cx.progress(state.step, steps, "steps", &values[..1]);
         let every = cx.task().checkpoint.every.0;
         save_is_due |= every > 0 && state.step.is_multiple_of(every);
-        if cx.leads() && state.step < steps && (wind_down || (save_is_due && cx.can_save())) {
+        if cx.leads() && state.step < steps && (drain || (save_is_due && cx.can_save())) {
             save(&state, config, &recent, cx)?;
             (saved_at, save_is_due) = (Some(state.step), false);
         }
-        if wind_down && state.step < steps {
+        if drain && state.step < steps {
             return Ok(Trained::Yielded { at: state.step });
         }
     }

@@ -79,10 +79,10 @@ fn members_at_different_steps_or_with_other_slices_add_nothing_up() {
                 .map(|((step, slices), mesh)| {
                     scope.spawn(move || {
                         let numbers = [1.0f32; 10];
-                        let own = tree::share(slices, mesh.terms.rank, 2);
+                        let own = tree::share(slices, mesh.config.rank, 2);
                         let parts = own.map(|slice| (slice..slice + 1, &numbers[..])).collect();
-                        let bring = exchange::Bring { step, slices, parts, wind_down: false, durable: 0 };
-                        exchange::exchange(mesh, &bring, &|| None)
+                        let contribution = exchange::Contribution { step, slices, parts, drain: false, durable: 0 };
+                        exchange::exchange(mesh, &contribution, &|| None)
                     })
                 })
                 .collect();

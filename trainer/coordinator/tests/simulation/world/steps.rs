@@ -32,8 +32,8 @@ impl World {
             Call::Poll(poll) => {
                 let incarnation = poll.incarnation;
                 let heard = self.hear(Observation::Poll { worker: name.clone(), poll });
-                let orders = self.state.orders(&name, incarnation).map_err(Refused::Rejected);
-                (true, heard.and(orders).map(Answer::Orders))
+                let desired = self.state.desired(&name, incarnation).map_err(Refused::Rejected);
+                (true, heard.and(desired).map(Answer::DesiredAssignments))
             }
             Call::Commit(commit) => {
                 self.checkpoint_steps.insert(commit.manifest, commit.step);
@@ -231,7 +231,7 @@ impl World {
             let furthest = together.then(|| peers.iter().filter_map(|peer| peer.live(&grant)).max());
             let saved = task.and_then(|task| task.newest()).map_or(0, |saved| saved.step);
             let chaos = self.chaos();
-            self.workers[i].work(now, furthest, saved, &mut self.random, chaos);
+            self.workers[i].execution(now, furthest, saved, &mut self.random, chaos);
         }
     }
 }

@@ -14,9 +14,9 @@ use protocol::message::{Assignment, Doing, Grant, Progress, Role};
 use protocol::{Digest, Generation};
 use tokio::sync::Notify;
 
-use crate::bell::{Bell, lock};
+use crate::event_count::{EventCount, lock};
 use crate::gang::endpoint::Endpoint;
-use crate::gang::mesh::{Halt, Mesh, Terms};
+use crate::gang::mesh::{Halt, Mesh, MeshConfig};
 
 /// After a refused write, how long to wait for orders that explain it.
 const STALE_PATIENCE: Duration = Duration::from_secs(30);
@@ -36,9 +36,9 @@ struct State {
 
 /// One assignment.
 #[derive(Debug)]
-pub(crate) struct Held {
+pub(crate) struct ActiveAssignment {
     state: Mutex<State>,
-    bell: Arc<Bell>,
+    event_count: Arc<EventCount>,
     wake: Arc<Notify>,
     endpoint: Arc<Endpoint>,
     flags: Arc<Flags>,
@@ -64,7 +64,7 @@ pub(crate) enum Reading {
     Anew,
 }
 
-impl Held {
+impl ActiveAssignment {
     pub(crate) fn new(
         assignment: Assignment,
         endpoint: Arc<Endpoint>,
@@ -80,7 +80,7 @@ impl Held {
             offered: None,
             newest: None,
         };
-        let held = Self { state: Mutex::new(state), bell: Arc::default(), wake, endpoint, flags };
+        let held = Self { state: Mutex::new(state), event_count: Arc::default(), wake, endpoint, flags };
         held.connect(&mut lock(&held.state));
         Arc::new(held)
     }
@@ -94,8 +94,8 @@ impl Held {
         lock(&self.state).assignment.clone()
     }
 
-    pub(crate) fn bell(&self) -> &Arc<Bell> {
-        &self.bell
+    pub(crate) fn event_count(&self) -> &Arc<EventCount> {
+        &self.event_count
     }
 
     /// What `newer` orders mean for this assignment.
@@ -122,7 +122,7 @@ impl Held {
                 self.connect(&mut state);
             }
         }
-        self.bell.ring();
+        self.event_count.notify();
     }
 
     fn connect(&self, state: &mut State) {
@@ -137,11 +137,11 @@ impl Held {
             return;
         };
         let (task, members, secret) = (grant.task.clone(), members.clone(), secret.clone());
-        let terms = Terms { task, generation: *generation, rank, members, secret };
+        let config = MeshConfig { task, generation: *generation, rank, members, secret };
         if let Some(unused) = state.offered.take() {
             unused.close(Some(*generation));
         }
-        let mesh = Mesh::open(terms, &self.endpoint, self.bell.clone(), self.wake.clone());
+        let mesh = Mesh::open(config, &self.endpoint, self.event_count.clone(), self.wake.clone());
         state.offered = Some(mesh.clone());
         state.newest = Some(mesh);
     }
@@ -168,7 +168,7 @@ impl Held {
                 mesh.close(None);
             }
         }
-        self.bell.ring();
+        self.event_count.notify();
     }
 
     /// Why the grant has ended, if it has.
@@ -184,7 +184,7 @@ impl Held {
             mesh.close(None);
         }
         drop(state);
-        self.bell.ring();
+        self.event_count.notify();
         self.wake.notify_one();
     }
 
@@ -193,8 +193,8 @@ impl Held {
     }
 
     /// Whether to stop between two steps: asked for by the coordinator, or because this process is to go.
-    pub(crate) fn wind_down(&self) -> bool {
-        self.flags.leaving.load(Ordering::SeqCst) || lock(&self.state).assignment.wind_down
+    pub(crate) fn drain(&self) -> bool {
+        self.flags.leaving.load(Ordering::SeqCst) || lock(&self.state).assignment.drain
     }
 
     /// Whether the coordinator did not answer the last poll.
@@ -251,7 +251,7 @@ impl Held {
     pub(crate) fn pause(&self, at_most: Duration) -> Result<(), String> {
         let until = Instant::now() + at_most;
         loop {
-            let ticket = self.bell.ticket();
+            let ticket = self.event_count.ticket();
             if let Some(reason) = self.ended() {
                 return Err(reason);
             }
@@ -259,7 +259,7 @@ impl Held {
             if left.is_zero() {
                 return Ok(());
             }
-            self.bell.wait(ticket, left);
+            self.event_count.wait(ticket, left);
         }
     }
 
@@ -268,7 +268,7 @@ impl Held {
     pub(crate) fn after_stale(&self, refused: &Grant) -> Result<(), String> {
         let until = Instant::now() + STALE_PATIENCE;
         loop {
-            let ticket = self.bell.ticket();
+            let ticket = self.event_count.ticket();
             if let Some(reason) = self.ended() {
                 return Err(reason);
             }
@@ -282,7 +282,7 @@ impl Held {
                 return Err(reason.to_owned());
             }
             self.wake.notify_one();
-            self.bell.wait(ticket, left.min(Duration::from_millis(500)));
+            self.event_count.wait(ticket, left.min(Duration::from_millis(500)));
         }
     }
 }

@@ -23,7 +23,7 @@ use crate::register::Registration;
 
 /// How far the work is.
 #[derive(Debug, Clone, PartialEq)]
-pub enum WorkState {
+pub enum ExecutionState {
     /// The store is asked whether it has the value.
     Looking,
     /// Tasks are to be done.
@@ -48,7 +48,7 @@ pub enum WorkState {
 
 /// The work of one stage.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Work {
+pub struct StageExecution {
     /// The stage's key.
     pub key: Digest,
     /// The run that wanted it first; tasks bear its name.
@@ -70,7 +70,7 @@ pub struct Work {
     /// What a register stage registers.
     pub registration: Option<Registration>,
     /// How far it is.
-    pub state: WorkState,
+    pub state: ExecutionState,
     /// Its tasks: none, one, or the shards and their merge.
     pub tasks: Tasks,
     /// Milliseconds of work, up to `busy_since`.
@@ -81,10 +81,10 @@ pub struct Work {
     pub resumed: bool,
 }
 
-impl Work {
+impl StageExecution {
     /// Makes its tasks, if it has none yet.
     pub fn open(&mut self) {
-        self.state = WorkState::Open;
+        self.state = ExecutionState::Open;
         if !self.tasks.is_empty() {
             return;
         }
@@ -118,14 +118,14 @@ impl Work {
 
     /// Whether somebody works on it.
     pub fn is_busy(&self) -> bool {
-        self.state == WorkState::Bundling || self.tasks.is_any_held()
+        self.state == ExecutionState::Bundling || self.tasks.is_any_held()
     }
 
     /// Whether it is over, one way or the other.
     pub fn is_over(&self) -> bool {
         match self.state {
-            WorkState::Done { .. } | WorkState::Failed { .. } => true,
-            WorkState::Looking | WorkState::Open | WorkState::Bundling => false,
+            ExecutionState::Done { .. } | ExecutionState::Failed { .. } => true,
+            ExecutionState::Looking | ExecutionState::Open | ExecutionState::Bundling => false,
         }
     }
 
@@ -159,7 +159,7 @@ impl Work {
 
     /// Wanted again after it was over: the store is asked first, and budgets are whole again.
     pub fn want_again(&mut self, lost_value: bool) {
-        self.state = WorkState::Looking;
+        self.state = ExecutionState::Looking;
         for i in 0..self.tasks.len() {
             self.tasks.change(i, |task| if lost_value { task.reopen() } else { task.reset_budgets() });
         }

@@ -8,14 +8,14 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use protocol::Incarnation;
-use protocol::message::{Assignment, Join, Joined, Orders, Poll};
+use protocol::message::{Assignment, DesiredAssignments, Join, Joined, Poll};
 use tokio::sync::Notify;
 use tokio::time::sleep;
 
-use crate::bell::{Bell, lock};
+use crate::active_assignment::{ActiveAssignment, Flags, Reading};
 use crate::client::{CallError, Client};
+use crate::event_count::{EventCount, lock};
 use crate::gang::endpoint::Endpoint;
-use crate::held::{Flags, Held, Reading};
 
 /// Longest pause between two polls of a coordinator that is away.
 const LONGEST: Duration = Duration::from_secs(1);
@@ -27,9 +27,9 @@ const REFUSALS: u32 = 5;
 /// What the poll and the stage thread share.
 #[derive(Debug)]
 pub(crate) struct Shared {
-    held: Mutex<Vec<Arc<Held>>>,
+    held: Mutex<Vec<Arc<ActiveAssignment>>>,
     /// Rung when there may be something to start, or nothing more ever.
-    pub(crate) work: Bell,
+    pub(crate) work: EventCount,
     pub(crate) wake: Arc<Notify>,
     flags: Arc<Flags>,
     over: AtomicBool,
@@ -40,7 +40,7 @@ impl Shared {
     pub(crate) fn new(endpoint: Arc<Endpoint>) -> Arc<Self> {
         Arc::new(Self {
             held: Mutex::default(),
-            work: Bell::default(),
+            work: EventCount::default(),
             wake: Arc::default(),
             flags: Arc::default(),
             over: AtomicBool::new(false),
@@ -49,7 +49,7 @@ impl Shared {
     }
 
     /// The next assignment to run. Called by the stage thread between two of them.
-    pub(crate) fn next(&self) -> Option<Arc<Held>> {
+    pub(crate) fn next(&self) -> Option<Arc<ActiveAssignment>> {
         if self.is_leaving() {
             return None;
         }
@@ -60,10 +60,10 @@ impl Shared {
     pub(crate) fn leave(&self) {
         self.flags.leaving.store(true, Ordering::SeqCst);
         for held in lock(&self.held).iter() {
-            held.bell().ring();
+            held.event_count().notify();
         }
         self.wake.notify_one();
-        self.work.ring();
+        self.work.notify();
     }
 
     pub(crate) fn is_leaving(&self) -> bool {
@@ -80,7 +80,7 @@ impl Shared {
         for held in lock(&self.held).drain(..) {
             held.end(reason);
         }
-        self.work.ring();
+        self.work.notify();
     }
 
     fn is_idle(&self, running: bool) -> bool {
@@ -88,19 +88,21 @@ impl Shared {
     }
 
     /// Makes it so.
-    pub(crate) fn apply(&self, orders: &Orders) {
+    pub(crate) fn apply(&self, desired: &DesiredAssignments) {
         let mut held = lock(&self.held);
         held.retain(|old| {
             let grant = old.grant();
-            let listed =
-                orders.assignments.iter().any(|new| new.grant.task == grant.task && new.grant.attempt == grant.attempt);
+            let listed = desired
+                .assignments
+                .iter()
+                .any(|new| new.grant.task == grant.task && new.grant.attempt == grant.attempt);
             if !listed {
                 old.end("the coordinator has taken it back");
             }
             listed
         });
-        for assignment in &orders.assignments {
-            let same = |old: &Arc<Held>| old.grant().task == assignment.grant.task;
+        for assignment in &desired.assignments {
+            let same = |old: &Arc<ActiveAssignment>| old.grant().task == assignment.grant.task;
             let Some(at) = held.iter().position(same) else {
                 held.push(self.hold(assignment));
                 continue;
@@ -114,11 +116,11 @@ impl Shared {
             }
         }
         drop(held);
-        self.work.ring();
+        self.work.notify();
     }
 
-    fn hold(&self, assignment: &Assignment) -> Arc<Held> {
-        Held::new(assignment.clone(), self.endpoint.clone(), self.wake.clone(), self.flags.clone())
+    fn hold(&self, assignment: &Assignment) -> Arc<ActiveAssignment> {
+        ActiveAssignment::new(assignment.clone(), self.endpoint.clone(), self.wake.clone(), self.flags.clone())
     }
 
     fn poll(&self, incarnation: Incarnation, version: u64) -> Poll {
@@ -189,12 +191,12 @@ pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> En
         let answered = !matches!(answer, Err(CallError::Away(_) | CallError::Fault(_)));
         shared.flags.away.store(!answered, Ordering::SeqCst);
         match answer {
-            Ok(orders) => {
+            Ok(desired) => {
                 if std::mem::take(&mut away) {
                     tracing::info!("the coordinator is back");
                 }
-                (version, leave, refusals, pause) = (orders.version, orders.leave, 0, SHORTEST);
-                shared.apply(&orders);
+                (version, leave, refusals, pause) = (desired.version, desired.leave, 0, SHORTEST);
+                shared.apply(&desired);
             }
             Err(CallError::NotFound(message)) => {
                 tracing::warn!("the coordinator does not know this process: {message}; joining again");

@@ -11,13 +11,13 @@ use protocol::stage::{Shape, StageSettings};
 use crate::decide::Deciding;
 use crate::event::{Effect, Millis};
 use crate::register::Registration;
+use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::run::Status;
 use crate::state::tasks::Tasks;
-use crate::state::work::{Work, WorkState};
 
 impl Deciding<'_> {
     /// Brings every run up to date with its works, until nothing moves.
-    pub(crate) fn settle(&mut self) {
+    pub(crate) fn reconcile(&mut self) {
         for i in 0..self.state.runs.len() {
             loop {
                 let mut moved = self.take_over_results(i);
@@ -44,18 +44,18 @@ impl Deciding<'_> {
         for j in 0..self.state.runs[i].stages.len() {
             let Status::Active { key } = self.state.runs[i].stages[j] else { continue };
             self.count_time_of(key, now);
-            let work = &self.state.works[&key];
-            let status = match &work.state {
-                WorkState::Looking | WorkState::Open | WorkState::Bundling => continue,
-                WorkState::Failed { message, .. } => Status::Failed { key, message: message.clone() },
-                WorkState::Done { known, cached } => {
-                    let how = match (cached, work.resumed) {
+            let execution = &self.state.executions[&key];
+            let status = match &execution.state {
+                ExecutionState::Looking | ExecutionState::Open | ExecutionState::Bundling => continue,
+                ExecutionState::Failed { message, .. } => Status::Failed { key, message: message.clone() },
+                ExecutionState::Done { known, cached } => {
+                    let how = match (cached, execution.resumed) {
                         (true, _) => StageState::Cached,
                         (false, true) => StageState::Resumed,
                         (false, false) => StageState::Ran,
                     };
-                    let wall_s = if *cached { 0.0 } else { work.wall_s(now) };
-                    Status::Done { key, how, known: known.clone(), wall_s, attempt: work.attempt() }
+                    let wall_s = if *cached { 0.0 } else { execution.wall_s(now) };
+                    Status::Done { key, how, known: known.clone(), wall_s, attempt: execution.attempt() }
                 }
             };
             Arc::make_mut(&mut self.state.runs[i]).stages[j] = status;
@@ -100,20 +100,22 @@ impl Deciding<'_> {
                 None
             }
         };
-        match self.state.works.contains_key(&key).then(|| self.state.work_mut(key)) {
-            Some(work) => {
-                work.placement = stage.placement.clone();
-                match work.state {
-                    WorkState::Looking | WorkState::Open | WorkState::Bundling => return Status::Active { key },
-                    WorkState::Done { .. } => work.want_again(true),
-                    WorkState::Failed { .. } => {
-                        work.resumed |= work.has_something();
-                        work.want_again(false);
+        match self.state.executions.contains_key(&key).then(|| self.state.execution_mut(key)) {
+            Some(execution) => {
+                execution.placement = stage.placement.clone();
+                match execution.state {
+                    ExecutionState::Looking | ExecutionState::Open | ExecutionState::Bundling => {
+                        return Status::Active { key };
+                    }
+                    ExecutionState::Done { .. } => execution.want_again(true),
+                    ExecutionState::Failed { .. } => {
+                        execution.resumed |= execution.has_something();
+                        execution.want_again(false);
                     }
                 }
             }
             None => {
-                let work = Work {
+                let execution = StageExecution {
                     key,
                     run: run.id.clone(),
                     stage: stage.name.clone(),
@@ -124,29 +126,29 @@ impl Deciding<'_> {
                     backend: run.pipeline.backend,
                     placement: stage.placement.clone(),
                     registration,
-                    state: WorkState::Looking,
+                    state: ExecutionState::Looking,
                     tasks: Tasks::default(),
                     wall_ms: 0,
                     busy_since: None,
                     resumed: false,
                 };
-                self.state.works.insert(key, Arc::new(work));
+                self.state.executions.insert(key, Arc::new(execution));
             }
         }
         self.effects.push(Effect::Lookup { key });
         Status::Active { key }
     }
 
-    /// Work that no running run waits for is asked to wind down; work that one waits for again carries on.
-    pub(crate) fn wind(&mut self) {
+    /// StageExecution that no running run waits for is asked to wind down; work that one waits for again carries on.
+    pub(crate) fn drain(&mut self) {
         let deadline = self.now().after(self.state.policy.grace_ms);
         let wanted: BTreeSet<Digest> = self.state.wanted().into_iter().collect();
         for key in self.keys() {
             let carry_on = wanted.contains(&key) && !self.state.draining;
-            if !self.state.works[&key].tasks.all_wind(!carry_on) {
-                let held: Vec<usize> = self.state.works[&key].tasks.held().collect();
+            if !self.state.executions[&key].tasks.all_draining(!carry_on) {
+                let held: Vec<usize> = self.state.executions[&key].tasks.held().collect();
                 for i in held {
-                    self.state.change(key, i, |task| task.wind((!carry_on).then_some(deadline)));
+                    self.state.change(key, i, |task| task.drain((!carry_on).then_some(deadline)));
                 }
             }
         }
@@ -160,9 +162,9 @@ impl Deciding<'_> {
     }
 
     fn count_time_of(&mut self, key: Digest, now: Millis) {
-        let work = &self.state.works[&key];
-        if work.is_busy() != work.busy_since.is_some() {
-            self.state.work_mut(key).count_time(now);
+        let execution = &self.state.executions[&key];
+        if execution.is_busy() != execution.busy_since.is_some() {
+            self.state.execution_mut(key).count_time(now);
         }
     }
 }

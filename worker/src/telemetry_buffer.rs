@@ -16,9 +16,9 @@ use std::time::Duration;
 
 use protocol::message::{LogBatch, MetricBatch, MetricRow};
 
-use crate::bell::lock;
+use crate::active_assignment::ActiveAssignment;
 use crate::client::{CallError, Client};
-use crate::held::Held;
+use crate::event_count::lock;
 use crate::retry::{self, GaveUp};
 
 /// Rows kept while the coordinator is away. About a day at ten values a second; beyond it the oldest are dropped.
@@ -61,28 +61,28 @@ impl State {
 
 /// What is on its way for one assignment.
 #[derive(Debug)]
-pub(crate) struct Spool {
+pub(crate) struct TelemetryBuffer {
     state: Mutex<State>,
-    held: Arc<Held>,
+    held: Arc<ActiveAssignment>,
     client: Client,
     closing: AtomicBool,
     hurry: AtomicBool,
 }
 
-impl Spool {
+impl TelemetryBuffer {
     /// Starts the thread that sends.
-    pub(crate) fn open(held: Arc<Held>, client: Client) -> (Arc<Self>, Sender) {
-        let spool = Arc::new(Self {
+    pub(crate) fn open(held: Arc<ActiveAssignment>, client: Client) -> (Arc<Self>, Sender) {
+        let telemetry = Arc::new(Self {
             state: Mutex::default(),
             held,
             client,
             closing: AtomicBool::new(false),
             hurry: AtomicBool::new(false),
         });
-        let sender = spool.clone();
-        let thread = thread::Builder::new().name("spool".to_owned()).spawn(move || sender.run());
+        let sender = telemetry.clone();
+        let thread = thread::Builder::new().name("telemetry".to_owned()).spawn(move || sender.run());
         let thread = thread.expect("a thread can be started");
-        (spool.clone(), Sender { spool, thread: Some(thread) })
+        (telemetry.clone(), Sender { telemetry, thread: Some(thread) })
     }
 
     /// Takes values of a step. What is not a number cannot be kept as one and is left out.
@@ -160,7 +160,7 @@ impl Spool {
     /// Waits until all that was put here before is stored.
     pub(crate) fn flush(&self) -> Result<(), GaveUp> {
         loop {
-            let ticket = self.held.bell().ticket();
+            let ticket = self.held.event_count().ticket();
             {
                 let state = lock(&self.state);
                 if let Some(error) = &state.failed {
@@ -175,8 +175,8 @@ impl Spool {
                 return Err(GaveUp::Ended(reason));
             }
             self.hurry.store(true, Ordering::SeqCst);
-            self.held.bell().ring();
-            self.held.bell().wait(ticket + 1, PERIOD);
+            self.held.event_count().notify();
+            self.held.event_count().wait(ticket + 1, PERIOD);
         }
     }
 
@@ -189,7 +189,7 @@ impl Spool {
                 Err(GaveUp::Answer(error)) => {
                     tracing::error!("metrics or logs were refused: {error}");
                     lock(&self.state).failed = Some(error);
-                    self.held.bell().ring();
+                    self.held.event_count().notify();
                     return;
                 }
             }
@@ -201,13 +201,13 @@ impl Spool {
     fn idle(&self) {
         let until = std::time::Instant::now() + PERIOD;
         loop {
-            let ticket = self.held.bell().ticket();
+            let ticket = self.held.event_count().ticket();
             let left = until.saturating_duration_since(std::time::Instant::now());
             let over = self.closing.load(Ordering::SeqCst) || self.held.ended().is_some();
             if left.is_zero() || over || self.hurry.swap(false, Ordering::SeqCst) {
                 return;
             }
-            self.held.bell().wait(ticket, left);
+            self.held.event_count().wait(ticket, left);
         }
     }
 
@@ -260,7 +260,7 @@ impl Spool {
         }
         let more = !rows.is_empty() || !lines.is_empty();
         if more {
-            self.held.bell().ring();
+            self.held.event_count().notify();
         }
         Ok(more)
     }
@@ -269,14 +269,14 @@ impl Spool {
 /// Ends the thread when dropped. What is not sent by then is not sent; flush before.
 #[derive(Debug)]
 pub(crate) struct Sender {
-    spool: Arc<Spool>,
+    telemetry: Arc<TelemetryBuffer>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Drop for Sender {
     fn drop(&mut self) {
-        self.spool.closing.store(true, Ordering::SeqCst);
-        self.spool.held.bell().ring();
+        self.telemetry.closing.store(true, Ordering::SeqCst);
+        self.telemetry.held.event_count().notify();
         if let Some(thread) = self.thread.take()
             && thread.join().is_err()
         {

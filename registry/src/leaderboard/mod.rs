@@ -360,11 +360,13 @@ mod tests {
                 ("aits", 0.03),
             ],
         );
-        let board = leaderboard("m".into(), &[version(1, &[("fid", 0.25)]), two], Some("fid"), Some("kit"));
-        let labels: Vec<_> = board.rows.iter().filter(|r| !r.published).map(|r| r.label.as_str()).collect();
+        let leaderboard = leaderboard("m".into(), &[version(1, &[("fid", 0.25)]), two], Some("fid"), Some("kit"));
+        let labels: Vec<_> = leaderboard.rows.iter().filter(|r| !r.published).map(|r| r.label.as_str()).collect();
         assert_eq!(labels, ["m:2 (four)", "m:1", "m:2 (one)"]);
-        assert!((board.rows[0].measures["fid"].half.unwrap() - 0.1).abs() < 1e-12);
-        assert_eq!(board.rows[0].measures["aits"].value, 0.03);
-        assert!(board.rows.iter().any(|row| row.label == "MotionPCM, 1 step" && row.measures["fid"].value == 0.355));
+        assert!((leaderboard.rows[0].measures["fid"].half.unwrap() - 0.1).abs() < 1e-12);
+        assert_eq!(leaderboard.rows[0].measures["aits"].value, 0.03);
+        assert!(
+            leaderboard.rows.iter().any(|row| row.label == "MotionPCM, 1 step" && row.measures["fid"].value == 0.355)
+        );
     }
 }

@@ -8,17 +8,17 @@ pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// A counter that is waited on. Take a [`ticket`](Bell::ticket), look at what you wait for, then [`wait`](Bell::wait): a
+/// A counter that is waited on. Take a [`ticket`](EventCount::ticket), look at what you wait for, then [`wait`](EventCount::wait): a
 /// ring in between is not missed.
 #[derive(Debug, Default)]
-pub(crate) struct Bell {
+pub(crate) struct EventCount {
     rung: Mutex<u64>,
     changed: Condvar,
 }
 
-impl Bell {
+impl EventCount {
     /// Wakes all who wait.
-    pub(crate) fn ring(&self) {
+    pub(crate) fn notify(&self) {
         *lock(&self.rung) += 1;
         self.changed.notify_all();
     }

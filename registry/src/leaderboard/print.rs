@@ -186,7 +186,7 @@ mod tests {
 
     use super::*;
 
-    fn board() -> Leaderboard {
+    fn leaderboard() -> Leaderboard {
         let row = |label: &str, published, fid: (f64, Option<f64>)| Row {
             label: label.into(),
             source: "MotionPCM".into(),
@@ -204,16 +204,16 @@ mod tests {
     #[test]
     fn rows_can_be_pasted() {
         assert_eq!(
-            board().render(Style::Markdown).lines().nth(2),
+            leaderboard().render(Style::Markdown).lines().nth(2),
             Some("| m_1:1 | - | - | - | - | **0.044±0.003** | - | - | - |")
         );
-        let latex = board().render(Style::Latex);
+        let latex = leaderboard().render(Style::Latex);
         assert_eq!(
             latex.lines().nth(1),
             Some("m\\_1:1 & - & - & - & - & $\\mathbf{0.044^{\\pm0.003}}$ & - & - & - \\\\")
         );
         assert_eq!(latex.lines().nth(3), Some("Paper [MotionPCM] & - & - & - & - & $0.030$ & - & - & - \\\\"));
-        let text = board().render(Style::Text);
+        let text = leaderboard().render(Style::Text);
         assert!(text.contains("0.044 ± 0.003 *") && text.contains("compare only with"), "{text}");
     }
 }
