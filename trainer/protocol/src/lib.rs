@@ -7,6 +7,7 @@ pub mod artifact;
 pub mod canonical;
 pub mod digest;
 pub mod id;
+pub mod limits;
 pub mod message;
 pub mod pipeline;
 pub mod stage;
