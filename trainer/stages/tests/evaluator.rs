@@ -239,12 +239,12 @@ fn a_published_evaluator_is_read_from_its_pickle() {
         }
         assert_eq!(outputs["finest.tar"], outputs["weights.safetensors"], "{fixture}: pickle and safetensors");
         let manifest = bench.manifest(outputs["finest.tar"]).unwrap();
-        let evaluator = TrainedEvaluator::read(&*bench.blobs(), &manifest, &bench.device()).unwrap();
-        assert_eq!((evaluator.meta().origin.as_str(), &evaluator.meta().words), ("imported", &WordsMeta::Hashed));
-        assert_eq!(evaluator.meta().mean, vec![0.25; features]);
+        let trained = TrainedEvaluator::read(&*bench.blobs(), &manifest, &bench.device()).unwrap();
+        assert_eq!((trained.meta().origin.as_str(), &trained.meta().words), ("imported", &WordsMeta::Hashed));
+        assert_eq!(trained.meta().mean, vec![0.25; features]);
         // What is read is what the published file holds.
         let stored = std::fs::read(root.join(fixture).join("weights.safetensors")).unwrap();
-        let (stored, ours) = (safetensors::SafeTensors::deserialize(&stored).unwrap(), evaluator.weights());
+        let (stored, ours) = (safetensors::SafeTensors::deserialize(&stored).unwrap(), trained.weights());
         let ours = safetensors::SafeTensors::deserialize(&ours).unwrap();
         assert_eq!(stored.names().len(), ours.names().len());
         for (name, view) in stored.iter() {
@@ -354,10 +354,10 @@ fn a_vocabulary_is_kept_with_the_evaluator_and_named() {
     let settings = StageSettings::TrainEvaluator(settings);
     let ours = bench.run("evaluator", &settings, &[("dataset", data)]).expect("the stage runs").output();
     let hashed = bench.run("evaluator-2", &small(), &[("dataset", data)]).expect("the stage runs").output();
-    let evaluator =
+    let trained =
         |digest| TrainedEvaluator::read(&*bench.blobs(), &bench.manifest(digest).unwrap(), &bench.device()).unwrap();
-    assert!(matches!(evaluator(ours).meta().words, WordsMeta::Vocabulary { words: 4, .. }));
-    assert_eq!(evaluator(hashed).meta().words, WordsMeta::Hashed);
+    assert!(matches!(trained(ours).meta().words, WordsMeta::Vocabulary { words: 4, .. }));
+    assert_eq!(trained(hashed).meta().words, WordsMeta::Hashed);
 
     std::fs::write(&index, pickled(&rows[..2])).unwrap();
     let refused = bench.run("evaluator-3", &settings, &[("dataset", data)]).unwrap_err().to_string();

@@ -19,17 +19,17 @@ struct Index {
     held: BTreeSet<usize>,
     waiting: BTreeSet<usize>,
     /// Of the held ones, how many are asked to wind down.
-    drain_by: usize,
+    draining: usize,
 }
 
 impl Index {
     /// Puts the task at `i` in, or takes it out.
     fn note(&mut self, i: usize, lease: &Lease, there: bool) {
-        let set = match hold {
+        let set = match lease {
             Lease::Held { drain_by, .. } => {
                 match there {
-                    true => self.drain_by += usize::from(drain_by.is_some()),
-                    false => self.drain_by -= usize::from(drain_by.is_some()),
+                    true => self.draining += usize::from(drain_by.is_some()),
+                    false => self.draining -= usize::from(drain_by.is_some()),
                 }
                 &mut self.held
             }
@@ -79,7 +79,7 @@ impl Tasks {
 
     /// Whether all (`asked`) or none of the held ones are asked to wind down.
     pub fn all_draining(&self, asked: bool) -> bool {
-        self.index.drain_by == if asked { self.index.held.len() } else { 0 }
+        self.index.draining == if asked { self.index.held.len() } else { 0 }
     }
 
     /// Whether the index says what the tasks say.

@@ -72,7 +72,7 @@ struct Plan<'a> {
     seed: Seed,
     dataset: Dataset,
     entries: Vec<usize>,
-    evaluator: TrainedEvaluator,
+    trained: TrainedEvaluator,
     evaluator: Digest,
     /// What they are of.
     split: Split,
@@ -85,7 +85,7 @@ impl<'a> Plan<'a> {
         let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
         let dataset = artifacts::dataset(&*blobs, &manifest)?;
         let (evaluator, manifest) = artifacts::input(cx, "evaluator", ArtifactKind::Evaluator)?;
-        let evaluator = TrainedEvaluator::read(&*blobs, &manifest, &cx.device())?;
+        let trained = TrainedEvaluator::read(&*blobs, &manifest, &cx.device())?;
         let (mut entries, mut taken) = (dataset.entries_of(settings.split), settings.split);
         if settings.widen && entries.len() < POOL {
             (entries, taken) = (dataset.entries_of(Split::All), Split::All);
@@ -105,11 +105,11 @@ impl<'a> Plan<'a> {
                 entries.len()
             ));
         }
-        evaluator.check(&dataset, &entries)?;
+        trained.check(&dataset, &entries)?;
         if settings.repeats == 0 {
             return refuse("`repeats` is 0, expected at least 1".into());
         }
-        Ok(Self { settings, seed: cx.task().seed, dataset, entries, split: taken, evaluator, evaluator })
+        Ok(Self { settings, seed: cx.task().seed, dataset, entries, split: taken, trained, evaluator })
     }
 
     fn stream(&self, what: &str, repeat: usize, index: usize) -> Stream {
@@ -252,22 +252,22 @@ pub(super) fn shard(
                 let block = plan.block(unit.block);
                 let draws: Vec<Draw> = block.clone().map(|i| plan.draw(unit.repeat, i, true)).collect();
                 let crops: Vec<Vec<f32>> = draws.iter().map(|d| plan.crop(*d)).collect();
-                text.extend(plan.evaluator.captions(draws.iter().map(|d| &plan.dataset.captions[d.caption])));
+                text.extend(plan.trained.captions(draws.iter().map(|d| &plan.dataset.captions[d.caption])));
                 let motions = match &maker {
                     Some(maker) => {
-                        real.extend(plan.evaluator.motions(&crops));
+                        real.extend(plan.trained.motions(&crops));
                         maker.motions(&plan, &draws, &|k, b, row| {
                             plan.stream(&format!("noise {k}"), unit.repeat, block.start + b).fill_normal(row);
                         })?
                     }
                     None => {
                         let others = block.map(|i| plan.crop(plan.draw(unit.repeat, i, false)));
-                        real.extend(plan.evaluator.motions(&others.collect::<Vec<_>>()));
+                        real.extend(plan.trained.motions(&others.collect::<Vec<_>>()));
                         crops
                     }
                 };
                 skating.extend(motions.iter().map(|motion| skates(motion, plan.dataset.skeleton())));
-                made.extend(plan.evaluator.motions(&motions));
+                made.extend(plan.trained.motions(&motions));
             }
             Part::Many => {
                 let maker = maker.as_ref().ok_or_else(|| StageError::Fault("real motion has no samples".into()))?;
@@ -280,13 +280,13 @@ pub(super) fn shard(
                         let index = entry * samples + first + b;
                         plan.stream(&format!("many {k}"), unit.repeat, index).fill_normal(row);
                     })?;
-                    many.extend(plan.evaluator.motions(&motions));
+                    many.extend(plan.trained.motions(&motions));
                 }
             }
         }
         cx.progress(done as u64 + 1, units.len() as u64, "blocks", &[]);
     }
-    let width = plan.evaluator.width();
+    let width = plan.trained.width();
     let rows = |values: &[f32]| [values.len() / width, width];
     let skated = skating.len();
     let bytes = Tensors::default()
@@ -315,7 +315,7 @@ fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, shards: &[Digest]) -> Result
     struct ShardMeta {
         units: Vec<Unit>,
     }
-    let (blobs, width) = (cx.blobs(), plan.evaluator.width());
+    let (blobs, width) = (cx.blobs(), plan.trained.width());
     let mut all = Gathered::default();
     for digest in shards {
         let manifest = cx.manifest(*digest)?;
@@ -361,7 +361,7 @@ fn reorder(values: &[f64], rows: &[u32], width: usize) -> Vec<f64> {
 
 /// The metrics of one repeat.
 fn measure(plan: &Plan<'_>, all: &Gathered, repeat: usize) -> BTreeMap<&'static str, f64> {
-    let (width, n) = (plan.evaluator.width(), plan.entries.len());
+    let (width, n) = (plan.trained.width(), plan.entries.len());
     let of = |parts: &BTreeMap<Unit, Vec<f64>>| -> Vec<f64> {
         parts.iter().filter(|(unit, _)| unit.repeat == repeat).flat_map(|(_, values)| values.iter().copied()).collect()
     };
@@ -419,7 +419,7 @@ pub(super) fn merge(
             "`{name}` is {value}: embeddings are not finite; train the evaluator anew"
         )));
     }
-    let (samples, width) = (plan.entries.len(), plan.evaluator.width());
+    let (samples, width) = (plan.entries.len(), plan.trained.width());
     let few = (samples < FEW * width).then(|| {
         format!(
             "FID is taken of {samples} motions in {width} dimensions; it is then larger than of many, and compares only with FIDs of as many \
@@ -441,7 +441,7 @@ pub(super) fn merge(
         "metrics": metrics,
         "split": plan.split,
         "evaluator": plan.evaluator,
-        "words": plan.evaluator.meta().words,
+        "words": plan.trained.meta().words,
         "real": settings.real,
         "shuffled": settings.shuffled,
     });
