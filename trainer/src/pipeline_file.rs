@@ -4,9 +4,9 @@ use std::path::Path;
 
 use motion::Dataset;
 use motion::folder_digest::{files_digest, folder_digest};
-use protocol::StageName;
-use protocol::pipeline::{self, Pipeline};
-use protocol::stage::StageSettings;
+use protocol::pipeline::{self, Pipeline, PipelineStage};
+use protocol::stage::{DataFormat, ExternalFolder};
+use protocol::{Digest, StageName};
 
 use crate::problem::{Problem, Result};
 
@@ -39,10 +39,9 @@ pub(crate) fn read(path: &Path, sets: &[String]) -> Result<PipelineFile> {
 /// Reads the file and digests the dataset folders it names.
 pub(crate) fn read_with_data(path: &Path, sets: &[String]) -> Result<PipelineFile> {
     let mut file = read(path, sets)?;
-    file.pipeline
-        .fill_external(|_, settings| folder_digest(Path::new(&settings.path), settings.format).map_err(bad_folder))?;
-    file.pipeline.fill_files(|stage, path| {
-        files_digest(Path::new(path)).map_err(|e| Problem::usage(format!("stage `{stage}`: {path}: {e}")))
+    file.pipeline.fill_external(|stage, ExternalFolder { path, format, .. }| match format {
+        Some(format) => folder_digest(Path::new(path), *format).map_err(bad_folder),
+        None => files_digest(Path::new(path)).map_err(|e| Problem::usage(format!("stage `{stage}`: {path}: {e}"))),
     })?;
     Ok(file)
 }
@@ -64,11 +63,10 @@ pub(crate) fn check_stage(pipeline: &Pipeline, until: Option<&StageName>) -> Res
 /// Opens the dataset folders whose content this store has not seen yet, so that what is wrong with them is said before
 /// anything is stored.
 pub(crate) fn check_data(pipeline: &Pipeline, store: &Path) -> Result<()> {
-    for stage in &pipeline.stages {
-        if let StageSettings::DataOpen(settings) = &stage.settings
-            && stage.external.get("folder").is_none_or(|digest| !store.join("seen").join(digest.hex()).exists())
-        {
-            Dataset::open(Path::new(&settings.path), settings.format).map_err(bad_folder)?;
+    for (stage, folder, format) in dataset_folders(pipeline) {
+        let seen = |digest: &Digest| store.join("seen").join(digest.hex()).exists();
+        if !stage.external.get(&folder.field).is_some_and(seen) {
+            Dataset::open(Path::new(&folder.path), format).map_err(bad_folder)?;
         }
     }
     Ok(())
@@ -76,11 +74,18 @@ pub(crate) fn check_data(pipeline: &Pipeline, store: &Path) -> Result<()> {
 
 /// Remembers which folders were good, so that they are not opened twice. A hint only: `data.open` checks again.
 pub(crate) fn remember_data(pipeline: &Pipeline, store: &Path) {
-    for digest in pipeline.stages.iter().filter_map(|stage| stage.external.get("folder")) {
+    for digest in dataset_folders(pipeline).filter_map(|(stage, folder, _)| stage.external.get(&folder.field)) {
         let seen = store.join("seen");
         // Losing the note costs one more look at the folder.
         let _ = std::fs::create_dir_all(&seen).and_then(|()| std::fs::write(seen.join(digest.hex()), b""));
     }
+}
+
+fn dataset_folders(pipeline: &Pipeline) -> impl Iterator<Item = (&PipelineStage, ExternalFolder, DataFormat)> {
+    pipeline.stages.iter().flat_map(|stage| {
+        let folders = stage.settings.folders().into_iter();
+        folders.filter_map(move |folder| folder.format.map(|format| (stage, folder, format)))
+    })
 }
 
 fn bad_folder(error: motion::dataset::OpenError) -> Problem {

@@ -57,7 +57,7 @@ async fn known(pipeline: &Pipeline, store: Option<&Store>) -> Result<Known> {
             {
                 known.keys.insert(stage.name.clone(), key);
                 known.made_by.insert(stage.name.clone(), row.run.to_string());
-                let output = row.outputs.get(stage.settings.output().0).copied();
+                let output = row.outputs.get(stage.settings.output().name).copied();
                 known.outputs.extend(output.map(|output| (stage.name.clone(), output)));
             }
             continue;
@@ -204,8 +204,10 @@ fn difference(pipeline: &Pipeline, stage: &PipelineStage, earlier: &[(RunRow, Pi
     if other.backend != pipeline.backend {
         changes.push(format!("backend {} -> {}", other.backend.name(), pipeline.backend.name()));
     }
-    if before.external != stage.external {
-        changes.push("the dataset folder's content".into());
+    for (field, content) in &stage.external {
+        if before.external.get(field) != Some(content) {
+            changes.push(format!("the content of the folder `{field}`"));
+        }
     }
     let json = |stage: &PipelineStage| serde_json::to_value(stage.settings.without_references()).unwrap_or_default();
     compare(&json(before), &json(stage), "", &mut changes);

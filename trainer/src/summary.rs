@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use protocol::message::{RunState, RunView, StageState, StageView, SweepView};
 use protocol::pipeline::Pipeline;
-use protocol::stage::StageSettings;
+use protocol::stage::{EvaluateLatentFid, Register};
 use protocol::{Digest, StageName};
 use serde::Serialize;
 
@@ -165,15 +165,11 @@ pub(crate) fn promoted(pipeline: &Pipeline, run: &RunView) -> Option<(String, us
         matches!(stage.state, StageState::Ran | StageState::Cached | StageState::Resumed).then_some(())
     };
     pipeline.stages.iter().rev().find_map(|stage| {
-        let StageSettings::Register(settings) = &stage.settings else { return None };
+        let settings = stage.settings.get::<Register>()?;
         done(&stage.name)?;
         let pick = if settings.promote.to.is_empty() { "best" } else { &settings.promote.to };
-        let steps = pipeline.stages.iter().find_map(|other| match &other.settings {
-            StageSettings::EvaluateLatentFid(evaluation) if settings.from.contains(&evaluation.model) => {
-                Some(evaluation.sampler.steps)
-            }
-            _ => None,
-        });
+        let evaluations = pipeline.stages.iter().filter_map(|other| other.settings.get::<EvaluateLatentFid>());
+        let steps = evaluations.into_iter().find(|found| settings.from.contains(&found.model)).map(|e| e.sampler.steps);
         Some((format!("{}@{pick}", settings.model), steps.unwrap_or(1)))
     })
 }

@@ -124,7 +124,7 @@ impl Deciding<'_> {
             self.writes.push(Write::Shard { grant, output });
             return Ok(());
         }
-        let (name, _) = execution.settings.output();
+        let name = execution.settings.output().name;
         let mut outputs = BTreeMap::from([(name.to_owned(), output)]);
         outputs.extend(state.map(|state| (STATE_OUTPUT.to_owned(), state)));
         let known = Known { outputs, metrics };

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use protocol::Digest;
 use protocol::message::{RunState, StageState};
-use protocol::stage::{Shape, StageSettings};
+use protocol::stage::{Register, Shape};
 
 use crate::decide::Deciding;
 use crate::event::{Effect, Millis};
@@ -90,13 +90,11 @@ impl Deciding<'_> {
         let run = Arc::clone(&self.state.runs[i]);
         let stage = &run.pipeline.stages[j];
         let key = run.pipeline.identity(stage, &inputs).key();
-        let registration = match &stage.settings {
-            StageSettings::Register(settings) => match Registration::gather(&run, settings) {
-                Ok(registration) => Some(registration),
-                Err(message) => return Status::Failed { key, message },
-            },
-            other => {
-                assert!(other.shape() != Shape::Registry, "only `register` changes the registry");
+        let registration = match stage.settings.get::<Register>().map(|settings| Registration::gather(&run, settings)) {
+            Some(Ok(registration)) => Some(registration),
+            Some(Err(message)) => return Status::Failed { key, message },
+            None => {
+                assert!(stage.settings.shape() != Shape::Registry, "only `register` changes the registry");
                 None
             }
         };

@@ -114,7 +114,7 @@ fn vae_of(pipeline: &Pipeline, stage: &StageName) -> Option<StageName> {
 /// by an evaluator) each keeps its own as `stage.metric`; the plain name, with its interval, is the first one's that gives it.
 fn metrics_of(run: &Run, model: &str) -> BTreeMap<String, f64> {
     let stages = run.pipeline.stages.iter().zip(&run.stages);
-    let looking = stages.filter(|(stage, _)| stage.settings.evaluated_model() == Some(model));
+    let looking = stages.filter(|(stage, _)| stage.settings.evaluated_model().as_deref() == Some(model));
     let known: Vec<_> = looking.filter_map(|(stage, status)| Some((&stage.name, &status.known()?.metrics))).collect();
     together(&known)
 }

@@ -173,7 +173,7 @@ fn concluded(run: &Run, sweep: &Sweeping) -> Status {
     else {
         unreachable!("a trial with a result is done");
     };
-    let name = run.pipeline.stages[place].settings.output().0;
+    let name = run.pipeline.stages[place].settings.output().name;
     let outputs = value(known).map(|output| (name.to_owned(), *output)).into_iter().collect();
     let mut metrics = known.metrics.clone();
     metrics.extend(judged.metrics.clone());

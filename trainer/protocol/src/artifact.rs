@@ -35,6 +35,24 @@ pub enum ArtifactKind {
     Shard,
 }
 
+impl ArtifactKind {
+    /// What it is called in a message.
+    pub fn noun(self) -> &'static str {
+        match self {
+            Self::Dataset => "a dataset",
+            Self::Embeddings => "caption embeddings",
+            Self::Vae => "a VAE",
+            Self::Latents => "latents",
+            Self::Denoiser => "a denoiser",
+            Self::Evaluator => "an evaluator",
+            Self::Report => "a report",
+            Self::Model => "a model",
+            Self::Checkpoint => "a checkpoint",
+            Self::Shard => "a shard",
+        }
+    }
+}
+
 /// One file of an artifact.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FileEntry {

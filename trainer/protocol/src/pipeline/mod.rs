@@ -2,7 +2,7 @@
 //!
 //! [`read`] makes one from YAML and reports every mistake of the file at once; [`Pipeline::check`] repeats the rules that
 //! do not need the text, for pipelines that arrive as JSON. Not its job: touching the file system. The content digests of
-//! dataset folders are put in by the caller ([`Pipeline::fill_external`]).
+//! folders are put in by the caller ([`Pipeline::fill_external`]).
 
 mod diagnostic;
 mod graph;
@@ -18,7 +18,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::stage::{Backend, DataOpen, Placement, StageIdentity, StageSettings};
+use crate::stage::{Backend, ExternalFolder, Placement, StageIdentity, StageSettings, Target};
 use crate::sweep::{Derived, Sweep};
 use crate::{ArtifactKind, Digest, Seed, StageName};
 
@@ -58,7 +58,7 @@ pub struct PipelineStage {
     pub placement: Placement,
     /// The stages it reads.
     pub inputs: Vec<StageInput>,
-    /// Digests of what it reads from outside the pipeline: `folder` is the content of a dataset folder.
+    /// Digests of the folders outside the store that it reads, by the field that names each.
     pub external: BTreeMap<String, Digest>,
     /// A search over its settings.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -86,48 +86,28 @@ impl Pipeline {
         self.stages.iter().find(|stage| &stage.name == name)
     }
 
-    /// The digest that names the pipeline: everything but the paths of dataset folders, whose contents count instead.
+    /// The digest that names the pipeline: everything but the paths of folders outside the store, whose contents count instead.
     pub fn digest(&self) -> Digest {
         let mut pipeline = self.clone();
         for stage in &mut pipeline.stages {
-            match &mut stage.settings {
-                StageSettings::DataOpen(settings) => settings.path.clear(),
-                StageSettings::TrainEvaluator(settings) => settings.words.clear(),
-                StageSettings::ImportEvaluator(settings) => {
-                    settings.path.clear();
-                    settings.words.clear();
-                }
-                _ => {}
-            }
+            let folders = stage.settings.refs().into_iter().filter(|found| !matches!(found.target, Target::Stage(_)));
+            folders.for_each(|folder| folder.name.clear());
         }
         crate::canonical::digest(&crate::stage::later::pipeline(&pipeline))
     }
 
-    /// Asks `folder_digest` for the content of every dataset folder and keeps the answers as `folder`.
-    ///
-    /// # Errors
-    /// The first error of `folder_digest`.
-    pub fn fill_external<E>(
-        &mut self,
-        mut folder_digest: impl FnMut(&StageName, &DataOpen) -> Result<Digest, E>,
-    ) -> Result<(), E> {
-        for stage in &mut self.stages {
-            if let StageSettings::DataOpen(settings) = &stage.settings {
-                let digest = folder_digest(&stage.name, settings)?;
-                stage.external.insert("folder".into(), digest);
-            }
-        }
-        Ok(())
-    }
-
-    /// Asks `digest` for the content of every other folder that a stage reads, and keeps the answers by field.
+    /// Asks `digest` for the content of every folder outside the store that a stage reads, and keeps the answers by field.
     ///
     /// # Errors
     /// The first error of `digest`.
-    pub fn fill_files<E>(&mut self, mut digest: impl FnMut(&StageName, &str) -> Result<Digest, E>) -> Result<(), E> {
+    pub fn fill_external<E>(
+        &mut self,
+        mut digest: impl FnMut(&StageName, &ExternalFolder) -> Result<Digest, E>,
+    ) -> Result<(), E> {
         for stage in &mut self.stages {
-            for (field, path) in stage.settings.files() {
-                stage.external.insert(field.into(), digest(&stage.name, path)?);
+            for folder in stage.settings.folders() {
+                let content = digest(&stage.name, &folder)?;
+                stage.external.insert(folder.field, content);
             }
         }
         Ok(())

@@ -115,14 +115,14 @@ impl Reader {
             return None;
         }
         let judge = self.kind(node, entry.key_at, &owner, path)?;
-        let gives = default.output().1;
-        let field = judged_field(&judge, gives).filter(|_| judge.output().1 == ArtifactKind::Report);
+        let gives = default.output().kind;
+        let field = judged_field(&judge, gives).filter(|_| judge.output().kind == ArtifactKind::Report);
         let Some(field) = field else {
             let judges = StageSettings::all();
             let judges = judges
                 .iter()
-                .filter(|judge| judge.output().1 == ArtifactKind::Report && judged_field(judge, gives).is_some());
-            let message = format!("`{}` does not measure {}, which `{name}` gives", judge.kind(), graph::noun(gives));
+                .filter(|judge| judge.output().kind == ArtifactKind::Report && judged_field(judge, gives).is_some());
+            let message = format!("`{}` does not measure {}, which `{name}` gives", judge.kind(), gives.noun());
             let at = node.entry("kind").map_or(node.at, |kind| kind.value.at);
             let help = format!("kinds that do: {}", list_keys(judges.map(StageSettings::kind)));
             self.mistake(at, &format!("{path}.kind"), message, Some(help));
@@ -170,21 +170,23 @@ impl Reader {
         let example = keys.iter().fold(walk.example, |value, key| &value[key.as_str()]);
         for entry in entries {
             let path = format!("{path}.{}", entry.key);
-            let references = walk.default.inputs();
+            let references: Vec<String> =
+                walk.default.clone().refs().into_iter().map(|reference| reference.field.into_owned()).collect();
             if keys.is_empty() && entry.key == "steps" {
                 let help = "the stage's `steps` are the budget of every trial; search something else";
                 self.mistake(entry.key_at, &path, "`steps` cannot be searched", Some(help.into()));
                 continue;
             }
-            if keys.is_empty() && references.iter().any(|(field, ..)| *field == entry.key) {
-                let message = format!("`{}` names a stage, which cannot be searched", entry.key);
+            if keys.is_empty() && references.contains(&entry.key) {
+                let message = format!("`{}` names a stage or a folder, which cannot be searched", entry.key);
                 self.mistake(entry.key_at, &path, message, Some("write a stage for each of them instead".into()));
                 continue;
             }
             let known = example.as_object().into_iter().flat_map(|known| known.keys().map(String::as_str));
             let known: Vec<&str> = known
                 .filter(|key| {
-                    !keys.is_empty() || !(["kind", "steps"].contains(key) || references.iter().any(|(f, ..)| f == key))
+                    !keys.is_empty()
+                        || !(["kind", "steps"].contains(key) || references.iter().any(|field| field == key))
                 })
                 .collect();
             if !known.contains(&entry.key.as_str()) {

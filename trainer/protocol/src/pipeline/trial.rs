@@ -2,8 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use serde_json::Value;
-
 use super::rules::{Problem, Problems};
 use super::{PipelineStage, StageInput, graph};
 use crate::stage::{Shape, StageSettings};
@@ -16,7 +14,7 @@ const BEST: &str = "@best";
 /// What a swept stage reads because its trials' evaluations do.
 pub(super) fn references(stage: &PipelineStage) -> Vec<StageInput> {
     let Some(sweep) = &stage.sweep else { return Vec::new() };
-    let judged = judged_field(&sweep.evaluate, stage.settings.output().1);
+    let judged = judged_field(&sweep.evaluate, stage.settings.output().kind);
     let inputs = graph::references(&sweep.evaluate).into_iter().filter(|input| Some(&input.field) != judged.as_ref());
     inputs.map(|input| StageInput { field: format!("sweep.evaluate.{}", input.field), ..input }).collect()
 }
@@ -50,14 +48,8 @@ pub(super) fn resolve_best<'a>(
 
 /// Makes the reference `field`, such as `teacher` or `from[0]`, name another stage.
 fn refer(settings: &mut StageSettings, field: &str, stage: &str) {
-    let pointer = format!("/{}", field.replace(['.', '['], "/").replace(']', ""));
-    if let Ok(mut json) = serde_json::to_value(&*settings)
-        && let Some(place) = json.pointer_mut(&pointer)
-    {
-        *place = Value::String(stage.to_owned());
-        if let Ok(changed) = serde_json::from_value(json) {
-            *settings = changed;
-        }
+    if let Some(reference) = settings.refs().into_iter().find(|reference| reference.field == field) {
+        stage.clone_into(reference.name);
     }
 }
 
@@ -78,7 +70,7 @@ impl PipelineStage {
             inputs.push(StageInput { field: STATE_OUTPUT.into(), stage, kind: ArtifactKind::Checkpoint });
         }
         let mut judge = (*sweep.evaluate).clone();
-        if let Some(field) = judged_field(&judge, self.settings.output().1) {
+        if let Some(field) = judged_field(&judge, self.settings.output().kind) {
             refer(&mut judge, &field, name.as_str());
         }
         debug_assert!(settings.shape() == Shape::Gang, "only gangs train");

@@ -1,6 +1,8 @@
-//! Settings of the evaluations that need no evaluator, and what all evaluations share.
+//! What evaluations share: which clips, how motions are drawn, which direction of a metric is better.
 
 use serde::{Deserialize, Serialize};
+
+use super::Problems;
 
 /// Which clips an evaluation looks at.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -16,24 +18,14 @@ pub enum Split {
     All,
 }
 
-/// `evaluate.reconstruction`: MPJPE in mm and feature error of a VAE.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct EvaluateReconstruction {
-    /// Stage that gives the VAE.
-    pub vae: String,
-    /// Stage that gives the clips.
-    pub dataset: String,
-    /// Clips.
-    pub split: Split,
-    /// Shards.
-    pub shards: usize,
-}
-
-impl Default for EvaluateReconstruction {
-    fn default() -> Self {
-        Self { vae: "vae".into(), dataset: "dataset".into(), split: Split::Test, shards: 4 }
-    }
+/// Whether a smaller or a larger value is better.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Mode {
+    /// Smaller is better.
+    Min,
+    /// Larger is better.
+    Max,
 }
 
 /// How motions are drawn from a denoiser.
@@ -54,45 +46,30 @@ impl Default for Sampler {
     }
 }
 
-/// `evaluate.latent_fid`: Frechet distance between sampled and real latents, as a share of the real variance.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct EvaluateLatentFid {
-    /// Stage that gives the denoiser.
-    pub model: String,
-    /// Stage that gives the latents.
-    pub latents: String,
-    /// Stage that gives the caption embeddings.
-    pub text: String,
-    /// Stage that gives the teacher whose 50-step samples `match` compares with; empty leaves `match` out.
-    pub teacher: String,
-    /// Sampler.
-    pub sampler: Sampler,
-    /// Repeats with other noise.
-    pub repeats: usize,
-    /// Samples per entry and repeat.
-    pub samples: usize,
-    /// Principal components of the train latents in which distances are taken.
-    pub components: usize,
-    /// Real clips compared with. `all` on small sets: with few clips the distance of real to real is large.
-    pub split: Split,
-    /// Shards.
-    pub shards: usize,
-}
+impl Sampler {
+    pub(super) fn check(&self, p: &mut Problems) {
+        if !(1..=1000).contains(&self.steps) {
+            p.add("sampler.steps", format!("`sampler.steps` is {}; expected 1 to 1000", self.steps), "");
+        }
+        p.not_negative("sampler.guidance", self.guidance);
+        if let Some(t) = self.timesteps.iter().find(|t| **t > 999) {
+            p.add("sampler.timesteps", format!("timestep {t} is out of range; expected 0 to 999"), "");
+        }
+        if self.timesteps.windows(2).any(|pair| pair[0] < pair[1]) {
+            p.add("sampler.timesteps", "`sampler.timesteps` rise; expected the noisiest first", "");
+        }
+        if !self.timesteps.is_empty() && self.timesteps.len() != self.steps {
+            let entries = self.timesteps.len();
+            let message = format!("`sampler.timesteps` has {entries} entries, but `sampler.steps` is {}", self.steps);
+            p.add("sampler.timesteps", message, "");
+        }
+    }
 
-impl Default for EvaluateLatentFid {
-    fn default() -> Self {
-        Self {
-            model: "mld".into(),
-            latents: "latents".into(),
-            text: "text".into(),
-            teacher: String::new(),
-            sampler: Sampler::default(),
-            repeats: 5,
-            samples: 2,
-            components: 32,
-            split: Split::All,
-            shards: 5,
+    /// For models that choose their timesteps themselves.
+    pub(super) fn refuse_timesteps(&self, model: &str, p: &mut Problems) {
+        if !self.timesteps.is_empty() {
+            let message = format!("`sampler.timesteps` are for LCM students, and `{model}` is none");
+            p.add("sampler.timesteps", message, "leave them out");
         }
     }
 }

@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::Problems;
+
 /// A model's size. The published networks: width 256, 9 layers, 4 heads, feed-forward 1024, dropout 0.1.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
@@ -23,6 +25,32 @@ pub struct Network {
 impl Default for Network {
     fn default() -> Self {
         Self { width: 256, layers: 9, heads: 4, feed_forward: 1024, dropout: 0.1, positions: Positions::Uniform }
+    }
+}
+
+impl Network {
+    pub(super) fn check(&self, p: &mut Problems) {
+        for (field, value) in [
+            ("network.width", self.width),
+            ("network.layers", self.layers),
+            ("network.heads", self.heads),
+            ("network.feed_forward", self.feed_forward),
+        ] {
+            p.positive(field, value);
+            if value > 65_536 {
+                p.add(field, format!("`{field}` is {value}; expected at most 65536"), "");
+            }
+        }
+        if self.layers > 0 && self.layers.is_multiple_of(2) {
+            let message = format!("`network.layers` is {}; expected an odd number", self.layers);
+            p.add("network.layers", message, "the skip stack has as many blocks before its middle block as after it");
+        }
+        if self.heads > 0 && !self.width.is_multiple_of(self.heads) {
+            let (heads, width) = (self.heads, self.width);
+            let message = format!("`network.heads` is {heads}, which does not divide `network.width`, {width}");
+            p.add("network.heads", message, "");
+        }
+        p.fraction("network.dropout", self.dropout, true);
     }
 }
 
@@ -51,5 +79,16 @@ pub struct LatentShape {
 impl Default for LatentShape {
     fn default() -> Self {
         Self { tokens: 16, dim: 32 }
+    }
+}
+
+impl LatentShape {
+    pub(super) fn check(self, p: &mut Problems) {
+        p.positive("latent.tokens", self.tokens);
+        p.positive("latent.dim", self.dim);
+        if self.tokens.saturating_mul(self.dim) > 1 << 20 {
+            let message = format!("a latent of {}x{} is larger than any motion", self.tokens, self.dim);
+            p.add("latent.tokens", message, "published: 1x256 and 16x32");
+        }
     }
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::Mode;
+use super::{Mode, Problems};
 use crate::Steps;
 
 /// What cannot change a stage's value: where it runs and how often it saves.
@@ -15,6 +15,29 @@ pub struct Placement {
     pub workers: WorkerRange,
     /// Checkpoint cadence and retention.
     pub checkpoint: CheckpointPolicy,
+}
+
+impl Placement {
+    pub(crate) fn check(&self, p: &mut Problems) {
+        let w = self.workers;
+        p.positive("workers.min", w.min);
+        if w.max != 0 && w.max < w.min {
+            let message = format!("`workers.max` is {}, below `workers.min`, {}", w.max, w.min);
+            p.add("workers.max", message, "0 sets no upper bound");
+        }
+        let keep = &self.checkpoint.keep;
+        p.positive("checkpoint.keep.latest", keep.latest);
+        if keep.metric.trim().is_empty() {
+            p.add(
+                "checkpoint.keep.metric",
+                "`checkpoint.keep.metric` is empty; expected a value that the stage records",
+                "",
+            );
+        } else if keep.best == 0 && keep.metric != Keep::default().metric {
+            let message = format!("`checkpoint.keep.metric` is `{}`, but no best are kept", keep.metric);
+            p.add("checkpoint.keep.metric", message, "set `checkpoint.keep.best` to how many");
+        }
+    }
 }
 
 /// How many workers a gang takes.

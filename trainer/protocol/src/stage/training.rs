@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::Problems;
 use crate::Steps;
 
 /// The global batch and the fixed slices it is cut into. Part of a stage's identity; the number of workers is not.
@@ -11,6 +12,16 @@ pub struct Batch {
     pub global: usize,
     /// Forward/backward passes that the batch is cut into; divides `global`.
     pub slices: usize,
+}
+
+impl Batch {
+    /// All slices have one size; `field` is where `global` stands.
+    pub(super) fn check_division(self, p: &mut Problems, field: &str) {
+        if self.slices > 0 && !self.global.is_multiple_of(self.slices) {
+            let message = format!("`{field}` is {}, which {} slices do not divide", self.global, self.slices);
+            p.add(field, message, "a slice is one forward and backward pass; all have the same size");
+        }
+    }
 }
 
 /// Learning rate after the warm-up.
@@ -40,6 +51,15 @@ pub struct Optimizer {
 impl Default for Optimizer {
     fn default() -> Self {
         Self { beta1: 0.9, beta2: 0.999, eps: 1e-8, weight_decay: 0.0 }
+    }
+}
+
+impl Optimizer {
+    pub(super) fn check(&self, p: &mut Problems, field: &str) {
+        p.fraction(&format!("{field}.beta1"), self.beta1, true);
+        p.fraction(&format!("{field}.beta2"), self.beta2, true);
+        p.above_zero(&format!("{field}.eps"), self.eps);
+        p.not_negative(&format!("{field}.weight_decay"), self.weight_decay);
     }
 }
 
@@ -84,5 +104,19 @@ impl Training {
     /// The last step of this stage.
     pub fn end(&self) -> Steps {
         self.stop.map_or(self.steps, |stop| stop.min(self.steps))
+    }
+
+    pub(super) fn check(&self, p: &mut Problems) {
+        if self.steps.0 == 0 {
+            p.add("steps", "`steps` is 0; expected at least 1", "");
+        }
+        p.positive("batch.global", self.batch.global);
+        p.positive("batch.slices", self.batch.slices);
+        if self.batch.global > 0 {
+            self.batch.check_division(p, "batch.global");
+        }
+        p.above_zero("lr", self.lr);
+        self.optimizer.check(p, "optimizer");
+        p.not_negative("max_grad_norm", self.max_grad_norm);
     }
 }

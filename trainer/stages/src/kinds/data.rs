@@ -10,18 +10,20 @@ use motion::dataset::{OpenReport, PackError, Split};
 use protocol::ArtifactKind;
 use protocol::stage::{DataFormat, DataOpen, DataSynthetic};
 
+use super::Plain;
 use crate::artifacts::{DatasetMeta, Draft, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
 
 /// The file that says what was left out.
 const REPORT_FILE: &str = "report.txt";
 
-/// Opens a folder in the published layout.
-pub(super) fn open(cx: &mut dyn AttemptContext, settings: &DataOpen) -> Result<Outcome, StageError> {
-    let (dataset, report) =
-        Dataset::open(Path::new(&settings.path), settings.format).map_err(|e| StageError::Input(e.to_string()))?;
-    log_report(cx, &report);
-    pack(cx, &dataset, report.skips.len(), report.to_string())
+impl Plain for DataOpen {
+    fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
+        let (dataset, report) =
+            Dataset::open(Path::new(&self.path), self.format).map_err(|e| StageError::Input(e.to_string()))?;
+        log_report(cx, &report);
+        pack(cx, &dataset, report.skips.len(), report.to_string())
+    }
 }
 
 /// A line for each clip that was left out, and the totals.
@@ -34,14 +36,15 @@ fn log_report(cx: &mut dyn AttemptContext, report: &OpenReport) {
     }
 }
 
-/// Makes clips from nothing but the seed.
-pub(super) fn synthetic(cx: &mut dyn AttemptContext, settings: &DataSynthetic) -> Result<Outcome, StageError> {
-    if settings.clips == 0 {
-        return Err(StageError::Input("`clips` is 0, expected at least 1".into()));
+impl Plain for DataSynthetic {
+    fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
+        if self.clips == 0 {
+            return Err(StageError::Input("`clips` is 0, expected at least 1".into()));
+        }
+        let dataset = motion::synthetic::generate(self, cx.task().seed);
+        let text = format!("made by the program: {} clips, {} captions\n", dataset.clips.len(), dataset.captions.len());
+        pack(cx, &dataset, 0, text)
     }
-    let dataset = motion::synthetic::generate(settings, cx.task().seed);
-    let text = format!("made by the program: {} clips, {} captions\n", dataset.clips.len(), dataset.captions.len());
-    pack(cx, &dataset, 0, text)
 }
 
 fn pack(cx: &mut dyn AttemptContext, dataset: &Dataset, skipped: usize, report: String) -> Result<Outcome, StageError> {

@@ -12,6 +12,7 @@ use protocol::stage::EncodeLatents;
 use protocol::{ArtifactKind, Digest};
 use serde::{Deserialize, Serialize};
 
+use super::Map;
 use crate::artifacts::{self, LATENTS_FILE, LatentsMeta, Tensors, VaeMeta, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::latent_fid::standard_deviation;
@@ -29,124 +30,121 @@ pub(super) fn shard_range(count: usize, index: usize, of: usize) -> Range<usize>
     count * index / of..count * (index + 1) / of
 }
 
-pub(super) fn shard(
-    cx: &mut dyn AttemptContext,
-    settings: &EncodeLatents,
-    index: usize,
-    of: usize,
-) -> Result<Outcome, StageError> {
-    let blobs = cx.blobs();
-    let (vae_digest, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
-    let (_, dataset) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-    if settings.crops == 0 {
-        return Err(StageError::Input("`crops` is 0, expected at least 1".into()));
-    }
-    let dataset = artifacts::dataset(&*blobs, &dataset)?;
-    let vae = Autoencoder::read(&*blobs, &vae, &cx.device())?;
-    let VaeMeta { latent, format, .. } = *vae.meta();
-    vae.check_format(dataset.format)?;
+impl Map for EncodeLatents {
+    fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
+        let blobs = cx.blobs();
+        let (vae_digest, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
+        let (_, dataset) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
+        if self.crops == 0 {
+            return Err(StageError::Input("`crops` is 0, expected at least 1".into()));
+        }
+        let dataset = artifacts::dataset(&*blobs, &dataset)?;
+        let vae = Autoencoder::read(&*blobs, &vae, &cx.device())?;
+        let VaeMeta { latent, format, .. } = *vae.meta();
+        vae.check_format(dataset.format)?;
 
-    let range = shard_range(dataset.entries.len(), index, of);
-    let purpose = format!("{}/crop", cx.task().name);
-    let seed = cx.task().seed;
-    let (size, width) = (latent.tokens * latent.dim, dataset.mean.len());
-    let (mut mu, mut sigma) = (Vec::new(), Vec::new());
-    let mut meta = LatentsMeta {
-        format,
-        vae: vae_digest,
-        latent,
-        crops: settings.crops,
-        splits: Vec::new(),
-        captions: Vec::new(),
-        lengths: Vec::new(),
-    };
-    for (done, e) in range.clone().enumerate() {
-        if cx.interrupted() {
-            return Ok(Outcome::Yielded { at: 0 });
-        }
-        let entry = &dataset.entries[e];
-        let mut rows = dataset.features(entry).to_vec();
-        vae.normalise(&mut rows);
-        let crops: Vec<(usize, usize)> = (0..settings.crops)
-            .map(|c| crop(&mut Stream::new(seed, &purpose, c as u64, e as u64), entry.len, dataset.skeleton()))
-            .collect();
-        let mut by_length: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
-        for (c, (_, frames)) in crops.iter().enumerate() {
-            by_length.entry(*frames).or_default().push(c);
-        }
-        let at = mu.len();
-        mu.resize(at + settings.crops * size, 0.0);
-        sigma.resize(at + settings.crops * size, 0.0);
-        for (frames, members) in by_length {
-            let batch: Vec<f32> = members
-                .iter()
-                .flat_map(|&c| rows[crops[c].0 * width..(crops[c].0 + frames) * width].iter().copied())
+        let range = shard_range(dataset.entries.len(), index, of);
+        let purpose = format!("{}/crop", cx.task().name);
+        let seed = cx.task().seed;
+        let (size, width) = (latent.tokens * latent.dim, dataset.mean.len());
+        let (mut mu, mut sigma) = (Vec::new(), Vec::new());
+        let mut meta = LatentsMeta {
+            format,
+            vae: vae_digest,
+            latent,
+            crops: self.crops,
+            splits: Vec::new(),
+            captions: Vec::new(),
+            lengths: Vec::new(),
+        };
+        for (done, e) in range.clone().enumerate() {
+            if cx.interrupted() {
+                return Ok(Outcome::Yielded { at: 0 });
+            }
+            let entry = &dataset.entries[e];
+            let mut rows = dataset.features(entry).to_vec();
+            vae.normalise(&mut rows);
+            let crops: Vec<(usize, usize)> = (0..self.crops)
+                .map(|c| crop(&mut Stream::new(seed, &purpose, c as u64, e as u64), entry.len, dataset.skeleton()))
                 .collect();
-            let posterior = vae.encode(batch, frames);
-            for (i, c) in members.into_iter().enumerate() {
-                let to = at + c * size..at + (c + 1) * size;
-                mu[to.clone()].copy_from_slice(&posterior.mu[i * size..(i + 1) * size]);
-                sigma[to].copy_from_slice(&posterior.sigma[i * size..(i + 1) * size]);
+            let mut by_length: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+            for (c, (_, frames)) in crops.iter().enumerate() {
+                by_length.entry(*frames).or_default().push(c);
             }
+            let at = mu.len();
+            mu.resize(at + self.crops * size, 0.0);
+            sigma.resize(at + self.crops * size, 0.0);
+            for (frames, members) in by_length {
+                let batch: Vec<f32> = members
+                    .iter()
+                    .flat_map(|&c| rows[crops[c].0 * width..(crops[c].0 + frames) * width].iter().copied())
+                    .collect();
+                let posterior = vae.encode(batch, frames);
+                for (i, c) in members.into_iter().enumerate() {
+                    let to = at + c * size..at + (c + 1) * size;
+                    mu[to.clone()].copy_from_slice(&posterior.mu[i * size..(i + 1) * size]);
+                    sigma[to].copy_from_slice(&posterior.sigma[i * size..(i + 1) * size]);
+                }
+            }
+            meta.splits.push(entry.split);
+            meta.captions.push(entry.captions.clone());
+            meta.lengths.extend(crops.iter().map(|(_, frames)| frames));
+            cx.progress(done as u64 + 1, range.len() as u64, "clips", &[]);
         }
-        meta.splits.push(entry.split);
-        meta.captions.push(entry.captions.clone());
-        meta.lengths.extend(crops.iter().map(|(_, frames)| frames));
-        cx.progress(done as u64 + 1, range.len() as u64, "clips", &[]);
+        let meta = ShardMeta { latents: meta, first: range.start };
+        let bytes = tensors(&meta.latents, meta.first, mu, sigma).to_bytes()?;
+        let output = artifacts::publish(cx, ArtifactKind::Shard, to_meta(&meta), LATENTS_FILE, bytes)?;
+        let metrics = BTreeMap::from([("entries".to_owned(), range.len() as f64)]);
+        Ok(Outcome::Finished { output, metrics })
     }
-    let meta = ShardMeta { latents: meta, first: range.start };
-    let bytes = tensors(&meta.latents, meta.first, mu, sigma).to_bytes()?;
-    let output = artifacts::publish(cx, ArtifactKind::Shard, to_meta(&meta), LATENTS_FILE, bytes)?;
-    let metrics = BTreeMap::from([("entries".to_owned(), range.len() as f64)]);
-    Ok(Outcome::Finished { output, metrics })
-}
 
-pub(super) fn merge(cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError> {
-    let blobs = cx.blobs();
-    let mut whole: Option<LatentsMeta> = None;
-    let (mut mu, mut sigma) = (Vec::new(), Vec::new());
-    for digest in shards {
-        let manifest = cx.manifest(*digest)?;
-        let ShardMeta { latents, first } = artifacts::meta(&manifest, "a shard of the latents")?;
-        let have = whole.as_ref().map_or(0, |w| w.splits.len());
-        if first != have {
-            return Err(StageError::Fault(format!(
-                "a shard begins at entry {first}, the one before it ended at {have}"
-            )));
-        }
-        let mut part = Tensors::from_bytes(&artifacts::file(&*blobs, &manifest, LATENTS_FILE)?, LATENTS_FILE)?;
-        mu.extend(part.take("mu", 3, LATENTS_FILE)?.values);
-        sigma.extend(part.take("sigma", 3, LATENTS_FILE)?.values);
-        match &mut whole {
-            None => whole = Some(latents),
-            Some(whole) => {
-                whole.splits.extend(latents.splits);
-                whole.captions.extend(latents.captions);
-                whole.lengths.extend(latents.lengths);
+    fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError> {
+        let blobs = cx.blobs();
+        let mut whole: Option<LatentsMeta> = None;
+        let (mut mu, mut sigma) = (Vec::new(), Vec::new());
+        for digest in shards {
+            let manifest = cx.manifest(*digest)?;
+            let ShardMeta { latents, first } = artifacts::meta(&manifest, "a shard of the latents")?;
+            let have = whole.as_ref().map_or(0, |w| w.splits.len());
+            if first != have {
+                return Err(StageError::Fault(format!(
+                    "a shard begins at entry {first}, the one before it ended at {have}"
+                )));
+            }
+            let mut part = Tensors::from_bytes(&artifacts::file(&*blobs, &manifest, LATENTS_FILE)?, LATENTS_FILE)?;
+            mu.extend(part.take("mu", 3, LATENTS_FILE)?.values);
+            sigma.extend(part.take("sigma", 3, LATENTS_FILE)?.values);
+            match &mut whole {
+                None => whole = Some(latents),
+                Some(whole) => {
+                    whole.splits.extend(latents.splits);
+                    whole.captions.extend(latents.captions);
+                    whole.lengths.extend(latents.lengths);
+                }
             }
         }
+        let meta = whole.ok_or_else(|| StageError::Fault("latents without shards".into()))?;
+        if !mu.iter().chain(&sigma).all(|v| v.is_finite()) {
+            return Err(StageError::Input(
+                "the VAE gives latents that are not finite; it has not been trained well".into(),
+            ));
+        }
+        let size = meta.latent.tokens * meta.latent.dim;
+        let train: Vec<f32> = mu
+            .chunks_exact(size * meta.crops)
+            .zip(&meta.splits)
+            .filter(|(_, split)| **split == Split::Train)
+            .flat_map(|(rows, _)| rows.iter().copied())
+            .collect();
+        let metrics = BTreeMap::from([
+            ("entries".to_owned(), meta.splits.len() as f64),
+            ("latent_std".to_owned(), standard_deviation(&train)),
+            ("mean_sigma".to_owned(), sigma.iter().map(|s| f64::from(*s)).sum::<f64>() / sigma.len() as f64),
+        ]);
+        let bytes = tensors(&meta, 0, mu, sigma).to_bytes()?;
+        let output = artifacts::publish(cx, ArtifactKind::Latents, to_meta(&meta), LATENTS_FILE, bytes)?;
+        Ok(Outcome::Finished { output, metrics })
     }
-    let meta = whole.ok_or_else(|| StageError::Fault("latents without shards".into()))?;
-    if !mu.iter().chain(&sigma).all(|v| v.is_finite()) {
-        return Err(StageError::Input(
-            "the VAE gives latents that are not finite; it has not been trained well".into(),
-        ));
-    }
-    let size = meta.latent.tokens * meta.latent.dim;
-    let train: Vec<f32> = mu
-        .chunks_exact(size * meta.crops)
-        .zip(&meta.splits)
-        .filter(|(_, split)| **split == Split::Train)
-        .flat_map(|(rows, _)| rows.iter().copied())
-        .collect();
-    let metrics = BTreeMap::from([
-        ("entries".to_owned(), meta.splits.len() as f64),
-        ("latent_std".to_owned(), standard_deviation(&train)),
-        ("mean_sigma".to_owned(), sigma.iter().map(|s| f64::from(*s)).sum::<f64>() / sigma.len() as f64),
-    ]);
-    let bytes = tensors(&meta, 0, mu, sigma).to_bytes()?;
-    let output = artifacts::publish(cx, ArtifactKind::Latents, to_meta(&meta), LATENTS_FILE, bytes)?;
-    Ok(Outcome::Finished { output, metrics })
 }
 
 fn tensors(meta: &LatentsMeta, first: usize, mu: Vec<f32>, sigma: Vec<f32>) -> Tensors {

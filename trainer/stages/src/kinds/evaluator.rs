@@ -21,7 +21,7 @@ use motion::dataset::{Dataset, crop, window};
 use protocol::stage::{Positions, Split, TrainEvaluator};
 use protocol::{ArtifactKind, Seed};
 
-use super::{dropout_seed, group, no_clips};
+use super::{Gang, dropout_seed, group, no_clips};
 use crate::artifacts;
 use crate::context::{GangContext, Outcome, StageError};
 use crate::evaluator::{self, EvaluatorMeta, UNIT, normalise};
@@ -266,72 +266,73 @@ fn emphasised(dataset: &Dataset, emphasis: f64) -> Vec<f32> {
     dataset.std.iter().enumerate().map(scale).collect()
 }
 
-/// Runs one member's attempt.
-pub(super) fn run(cx: &mut dyn GangContext, settings: &TrainEvaluator) -> Result<Outcome, StageError> {
-    let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-    let dataset = artifacts::dataset(&*cx.blobs(), &manifest)?;
-    let train_entries = dataset.entries_of(Split::Train);
-    let stage = cx.task().name.clone();
-    let steps = settings.training.steps.0;
-    let turn = turning_point(settings);
-    if train_entries.is_empty() {
-        return Err(no_clips());
-    }
-    if turn == 0 || turn >= steps {
-        return Err(StageError::Input(format!(
-            "`movement.until` gives {turn} of {steps} steps to the movements; both phases need some"
-        )));
-    }
-    let words = Words::open(&settings.words)?;
-    let meta = EvaluatorMeta {
-        format: dataset.format,
-        config: evaluator::config(&settings.network, dataset.skeleton()),
-        mean: dataset.mean.clone(),
-        std: emphasised(&dataset, settings.emphasis),
-        words: words.meta(),
-        origin: "trained".into(),
-    };
-    let (seed, device, plain) = (cx.task().seed, cx.device().autodiff(), cx.device());
-    let purpose = stage.to_string();
-    let draws = |what: &str| format!("{purpose}/init {what}");
-    let fresh = |purpose: &str| Init::new(seed, purpose, Positions::Uniform, &device);
-    let movements = Movements {
-        encoder: MovementEncoder::new(&meta.config, &mut fresh(&draws("encoder"))),
-        decoder: MovementDecoder::new(&meta.config, meta.mean.len(), &mut fresh(&draws("decoder"))),
-    };
-    let batch = settings.training.batch.global;
-    let window_batch = if settings.movement.batch > 0 { settings.movement.batch } else { batch };
-    let mut objective = EvaluatorObjective {
-        settings: settings.clone(),
-        frozen: MovementEncoder::new(&meta.config, &mut Init::new(seed, "frozen", Positions::Uniform, &plain)),
-        text: TextEncoder::new(&meta.config, &mut fresh(&draws("text"))),
-        motion: MotionEncoder::new(&meta.config, &mut fresh(&draws("motion"))),
-        movements,
-        windows: Order::new(seed, &format!("{purpose}/windows"), train_entries.len(), window_batch, 1),
-        clips: Order::new(seed, &format!("{purpose}/clips"), train_entries.len(), batch, 1),
-        train: train_entries,
-        dataset,
-        words,
-        purpose: purpose.clone(),
-        seed,
-        dropout_seed: dropout_seed(cx),
-        device: plain.clone(),
-        meta,
-    };
-    match train(&mut objective, &settings.training, cx)? {
-        Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-        Trained::Finished { state, metrics } => {
-            let blank = Evaluator::new(
-                &objective.meta.config,
-                &mut Init::new(Seed(0), "blank", Positions::Uniform, &plain.clone().inner()),
-            );
-            let encoder = objective.frozen.num_params();
-            let mut weights = state.result(0).to_vec();
-            weights.extend_from_slice(state.result(1));
-            weights.extend_from_slice(&state.result(2)[..encoder]);
-            let bytes = to_bytes(&flat::layout(&blank), &weights);
-            let output = evaluator::publish(cx, &objective.meta, bytes, &objective.words)?;
-            Ok(Outcome::Finished { output, metrics })
+impl Gang for TrainEvaluator {
+    fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
+        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
+        let dataset = artifacts::dataset(&*cx.blobs(), &manifest)?;
+        let train_entries = dataset.entries_of(Split::Train);
+        let stage = cx.task().name.clone();
+        let steps = self.training.steps.0;
+        let turn = turning_point(self);
+        if train_entries.is_empty() {
+            return Err(no_clips());
+        }
+        if turn == 0 || turn >= steps {
+            return Err(StageError::Input(format!(
+                "`movement.until` gives {turn} of {steps} steps to the movements; both phases need some"
+            )));
+        }
+        let words = Words::open(&self.words)?;
+        let meta = EvaluatorMeta {
+            format: dataset.format,
+            config: evaluator::config(&self.network, dataset.skeleton()),
+            mean: dataset.mean.clone(),
+            std: emphasised(&dataset, self.emphasis),
+            words: words.meta(),
+            origin: "trained".into(),
+        };
+        let (seed, device, plain) = (cx.task().seed, cx.device().autodiff(), cx.device());
+        let purpose = stage.to_string();
+        let draws = |what: &str| format!("{purpose}/init {what}");
+        let fresh = |purpose: &str| Init::new(seed, purpose, Positions::Uniform, &device);
+        let movements = Movements {
+            encoder: MovementEncoder::new(&meta.config, &mut fresh(&draws("encoder"))),
+            decoder: MovementDecoder::new(&meta.config, meta.mean.len(), &mut fresh(&draws("decoder"))),
+        };
+        let batch = self.training.batch.global;
+        let window_batch = if self.movement.batch > 0 { self.movement.batch } else { batch };
+        let mut objective = EvaluatorObjective {
+            settings: self.clone(),
+            frozen: MovementEncoder::new(&meta.config, &mut Init::new(seed, "frozen", Positions::Uniform, &plain)),
+            text: TextEncoder::new(&meta.config, &mut fresh(&draws("text"))),
+            motion: MotionEncoder::new(&meta.config, &mut fresh(&draws("motion"))),
+            movements,
+            windows: Order::new(seed, &format!("{purpose}/windows"), train_entries.len(), window_batch, 1),
+            clips: Order::new(seed, &format!("{purpose}/clips"), train_entries.len(), batch, 1),
+            train: train_entries,
+            dataset,
+            words,
+            purpose: purpose.clone(),
+            seed,
+            dropout_seed: dropout_seed(cx),
+            device: plain.clone(),
+            meta,
+        };
+        match train(&mut objective, &self.training, cx)? {
+            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
+            Trained::Finished { state, metrics } => {
+                let blank = Evaluator::new(
+                    &objective.meta.config,
+                    &mut Init::new(Seed(0), "blank", Positions::Uniform, &plain.clone().inner()),
+                );
+                let encoder = objective.frozen.num_params();
+                let mut weights = state.result(0).to_vec();
+                weights.extend_from_slice(state.result(1));
+                weights.extend_from_slice(&state.result(2)[..encoder]);
+                let bytes = to_bytes(&flat::layout(&blank), &weights);
+                let output = evaluator::publish(cx, &objective.meta, bytes, &objective.words)?;
+                Ok(Outcome::Finished { output, metrics })
+            }
         }
     }
 }

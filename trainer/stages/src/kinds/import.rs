@@ -16,6 +16,7 @@ use protocol::stage::{ImportEvaluator, Positions};
 use pytorch_reader::{DType, PytorchReader};
 use safetensors::SafeTensors;
 
+use super::Plain;
 use crate::artifacts::Tensors;
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluator::{self, EvaluatorMeta};
@@ -24,50 +25,51 @@ use crate::words::{CLASSES, WORD_WIDTH, Words};
 /// The state dicts of the pickle.
 const PARTS: [&str; 3] = ["text_encoder", "motion_encoder", "movement_encoder"];
 
-/// Reads, checks and stores it.
-pub(super) fn run(cx: &mut dyn AttemptContext, settings: &ImportEvaluator) -> Result<Outcome, StageError> {
-    let folder = Path::new(&settings.path);
-    let skeleton = Skeleton::of(settings.format);
-    let (file, bytes) = weights(folder)?;
-    let refuse = |text: String| StageError::Input(format!("{}: {text}", file.display()));
-    let config = sizes(&bytes).map_err(refuse)?;
-    let expected = skeleton.layout().contacts.start;
-    if config.features != expected {
-        return Err(refuse(format!(
-            "its movements are made of {} features, those of {:?} of {expected}; set `format` to what it was trained on",
-            config.features, settings.format
-        )));
+impl Plain for ImportEvaluator {
+    fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
+        let folder = Path::new(&self.path);
+        let skeleton = Skeleton::of(self.format);
+        let (file, bytes) = weights(folder)?;
+        let refuse = |text: String| StageError::Input(format!("{}: {text}", file.display()));
+        let config = sizes(&bytes).map_err(refuse)?;
+        let expected = skeleton.layout().contacts.start;
+        if config.features != expected {
+            return Err(refuse(format!(
+                "its movements are made of {} features, those of {:?} of {expected}; set `format` to what it was trained on",
+                config.features, self.format
+            )));
+        }
+        if (config.word, config.classes) != (WORD_WIDTH, CLASSES) {
+            let (word, classes) = (config.word, config.classes);
+            return Err(refuse(format!(
+                "it reads words of width {word} in {classes} classes, expected {WORD_WIDTH} in {CLASSES}"
+            )));
+        }
+        let (mean, std) = (statistic(folder, "mean.npy", skeleton)?, statistic(folder, "std.npy", skeleton)?);
+        if let Some(i) = std.iter().position(|s| !(*s > 0.0 && s.is_finite())) {
+            return Err(StageError::Input(format!(
+                "{}: std.npy: value {i} is {}, expected above 0",
+                folder.display(),
+                std[i]
+            )));
+        }
+        let device = cx.device().inner();
+        let blank = Evaluator::new(&config, &mut Init::new(Seed(0), "blank", Positions::Uniform, &device));
+        let entries = layout(&blank);
+        let flat = from_bytes(&entries, &bytes, "").map_err(|e| refuse(e.to_string()))?;
+        if let Some(bad) = flat.iter().position(|v| !v.is_finite()) {
+            return Err(refuse(format!("parameter {bad} of {} is not finite", flat.len())));
+        }
+        let words = Words::open(&self.words)?;
+        if words == Words::Hashed {
+            cx.log("no `words` folder: captions are read through the built-in word vectors; the published evaluators need the published ones");
+        }
+        let meta =
+            EvaluatorMeta { format: self.format, config, mean, std, words: words.meta(), origin: "imported".into() };
+        let output = evaluator::publish(cx, &meta, to_bytes(&entries, &flat), &words)?;
+        let metrics = BTreeMap::from([("parameters".to_owned(), flat.len() as f64)]);
+        Ok(Outcome::Finished { output, metrics })
     }
-    if (config.word, config.classes) != (WORD_WIDTH, CLASSES) {
-        let (word, classes) = (config.word, config.classes);
-        return Err(refuse(format!(
-            "it reads words of width {word} in {classes} classes, expected {WORD_WIDTH} in {CLASSES}"
-        )));
-    }
-    let (mean, std) = (statistic(folder, "mean.npy", skeleton)?, statistic(folder, "std.npy", skeleton)?);
-    if let Some(i) = std.iter().position(|s| !(*s > 0.0 && s.is_finite())) {
-        return Err(StageError::Input(format!(
-            "{}: std.npy: value {i} is {}, expected above 0",
-            folder.display(),
-            std[i]
-        )));
-    }
-    let device = cx.device().inner();
-    let blank = Evaluator::new(&config, &mut Init::new(Seed(0), "blank", Positions::Uniform, &device));
-    let entries = layout(&blank);
-    let flat = from_bytes(&entries, &bytes, "").map_err(|e| refuse(e.to_string()))?;
-    if let Some(bad) = flat.iter().position(|v| !v.is_finite()) {
-        return Err(refuse(format!("parameter {bad} of {} is not finite", flat.len())));
-    }
-    let words = Words::open(&settings.words)?;
-    if words == Words::Hashed {
-        cx.log("no `words` folder: captions are read through the built-in word vectors; the published evaluators need the published ones");
-    }
-    let meta =
-        EvaluatorMeta { format: settings.format, config, mean, std, words: words.meta(), origin: "imported".into() };
-    let output = evaluator::publish(cx, &meta, to_bytes(&entries, &flat), &words)?;
-    let metrics = BTreeMap::from([("parameters".to_owned(), flat.len() as f64)]);
-    Ok(Outcome::Finished { output, metrics })
 }
 
 /// The file of the weights, and its tensors as safetensors.

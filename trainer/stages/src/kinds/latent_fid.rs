@@ -17,7 +17,7 @@ use protocol::{ArtifactKind, Digest, Manifest, Seed};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::{no_entries, publish_report};
+use super::{Map, no_entries, publish_report};
 use crate::artifacts::{self, DenoiserMeta, Embeddings, Family, Latents, Tensors, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::latent_fid::{
@@ -191,132 +191,127 @@ fn fits(field: &str, model: &DenoiserMeta, latents: &Latents, embeddings: &Embed
     Ok(())
 }
 
-pub(super) fn shard(
-    cx: &mut dyn AttemptContext,
-    settings: &EvaluateLatentFid,
-    index: usize,
-    of: usize,
-) -> Result<Outcome, StageError> {
-    let blobs = cx.blobs();
-    let (plan, manifest) = Plan::read(cx, settings)?;
-    let mine = |maker: Maker| -> Vec<Unit> {
-        let all = plan.units().into_iter().filter(|u| u.maker == maker);
-        all.enumerate().filter(|(i, _)| i % of == index).map(|(_, unit)| unit).collect()
-    };
-    let units: Vec<Unit> = mine(Maker::Model).into_iter().chain(mine(Maker::Teacher)).collect();
-    let model = Denoiser::read(&*blobs, &manifest, &cx.device())?;
-    let teacher = match plan.teacher {
-        true => {
-            let (_, manifest) = artifacts::input(cx, "teacher", ArtifactKind::Denoiser)?;
-            Some((Denoiser::read(&*blobs, &manifest, &cx.device())?, plan.teacher_sampler()))
-        }
-        false => None,
-    };
-    model.check_sampler(&settings.sampler)?;
-
-    // Network evaluations, so that the progress is even.
-    let cost = |unit: &Unit| match unit.maker {
-        Maker::Model => settings.sampler.steps as u64,
-        Maker::Teacher => TEACHER_STEPS as u64,
-    };
-    let total = units.iter().map(cost).sum();
-    let (mut done, mut values) = (0, Vec::new());
-    for unit in &units {
-        if cx.interrupted() {
-            return Ok(Outcome::Yielded { at: 0 });
-        }
-        let conditions = plan.conditions(*unit);
-        let z = match (&teacher, unit.maker) {
-            (Some((teacher, sampler)), Maker::Teacher) => teacher.sample(&conditions, sampler, &mut |_| Vec::new())?,
-            _ => model.sample(&conditions, &settings.sampler, &mut |step| plan.step_noise(*unit, step))?,
+impl Map for EvaluateLatentFid {
+    fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
+        let blobs = cx.blobs();
+        let (plan, manifest) = Plan::read(cx, self)?;
+        let mine = |maker: Maker| -> Vec<Unit> {
+            let all = plan.units().into_iter().filter(|u| u.maker == maker);
+            all.enumerate().filter(|(i, _)| i % of == index).map(|(_, unit)| unit).collect()
         };
-        values.extend(z);
-        done += cost(unit);
-        cx.progress(done, total, "evaluations", &[]);
-    }
-    let rows = values.len() / plan.width();
-    let bytes = Tensors::default().with("z", [rows, plan.width()], values).to_bytes()?;
-    let output = artifacts::publish(cx, ArtifactKind::Shard, json!({"units": units}), SAMPLES_FILE, bytes)?;
-    Ok(Outcome::Finished { output, metrics: BTreeMap::new() })
-}
+        let units: Vec<Unit> = mine(Maker::Model).into_iter().chain(mine(Maker::Teacher)).collect();
+        let model = Denoiser::read(&*blobs, &manifest, &cx.device())?;
+        let teacher = match plan.teacher {
+            true => {
+                let (_, manifest) = artifacts::input(cx, "teacher", ArtifactKind::Denoiser)?;
+                Some((Denoiser::read(&*blobs, &manifest, &cx.device())?, plan.teacher_sampler()))
+            }
+            false => None,
+        };
+        model.check_sampler(&self.sampler)?;
 
-pub(super) fn merge(
-    cx: &mut dyn AttemptContext,
-    settings: &EvaluateLatentFid,
-    shards: &[Digest],
-) -> Result<Outcome, StageError> {
-    #[derive(Deserialize)]
-    struct ShardMeta {
-        units: Vec<Unit>,
-    }
-    let (plan, _) = Plan::read(cx, settings)?;
-    let blobs = cx.blobs();
-    let mut blocks: BTreeMap<Unit, Vec<f32>> = BTreeMap::new();
-    for digest in shards {
-        let manifest = cx.manifest(*digest)?;
-        let ShardMeta { units } = artifacts::meta(&manifest, "a shard of the samples")?;
-        let bytes = artifacts::file(&*blobs, &manifest, SAMPLES_FILE)?;
-        let rows = Tensors::from_bytes(&bytes, SAMPLES_FILE)?.take("z", 2, SAMPLES_FILE)?;
-        let mut at = 0;
-        for unit in units {
-            let end = at + plan.block(unit.block).len() * plan.width();
-            blocks.insert(unit, rows.values[at..end].to_vec());
-            at = end;
+        // Network evaluations, so that the progress is even.
+        let cost = |unit: &Unit| match unit.maker {
+            Maker::Model => self.sampler.steps as u64,
+            Maker::Teacher => TEACHER_STEPS as u64,
+        };
+        let total = units.iter().map(cost).sum();
+        let (mut done, mut values) = (0, Vec::new());
+        for unit in &units {
+            if cx.interrupted() {
+                return Ok(Outcome::Yielded { at: 0 });
+            }
+            let conditions = plan.conditions(*unit);
+            let z = match (&teacher, unit.maker) {
+                (Some((teacher, sampler)), Maker::Teacher) => {
+                    teacher.sample(&conditions, sampler, &mut |_| Vec::new())?
+                }
+                _ => model.sample(&conditions, &self.sampler, &mut |step| plan.step_noise(*unit, step))?,
+            };
+            values.extend(z);
+            done += cost(unit);
+            cx.progress(done, total, "evaluations", &[]);
         }
+        let rows = values.len() / plan.width();
+        let bytes = Tensors::default().with("z", [rows, plan.width()], values).to_bytes()?;
+        let output = artifacts::publish(cx, ArtifactKind::Shard, json!({"units": units}), SAMPLES_FILE, bytes)?;
+        Ok(Outcome::Finished { output, metrics: BTreeMap::new() })
     }
-    let expected: BTreeSet<Unit> = plan.units().into_iter().collect();
-    if !blocks.keys().eq(&expected) {
-        return Err(StageError::Fault(format!("{} blocks of samples, expected {}", blocks.len(), expected.len())));
-    }
-    if !blocks.values().flatten().all(|v| v.is_finite()) {
-        return Err(StageError::Input("samples are not finite; the denoiser has not been trained well".into()));
-    }
-    let of = |maker: Maker, repeat: usize| -> Vec<f32> {
-        let mine = blocks.iter().filter(|(u, _)| u.maker == maker && u.repeat == repeat);
-        mine.flat_map(|(_, values)| values.iter().copied()).collect()
-    };
 
-    let z = draw(&plan, 0);
-    let reference = reference(&plan, &z);
-    let sampled: Vec<usize> = (0..plan.samples()).map(|i| plan.entry(i)).collect();
-    let tested = |i: &usize| plan.latents.meta.splits[sampled[*i]] == Split::Test;
-    let mut values: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
-    for repeat in 0..settings.repeats {
-        let samples = of(Maker::Model, repeat);
-        let found = reference.measure(&samples, &sampled, plan.seed, repeat as u64);
-        let test: Vec<usize> = (0..plan.samples()).filter(tested).map(|i| found.ranks[i]).collect();
-        let mut put = |name, value| values.entry(name).or_default().push(value);
-        put("latent_fid", found.latent_fid);
-        put("latent_std", found.latent_std);
-        put("latent_r_precision_top1", top(found.ranks.iter().copied(), 1));
-        put("latent_r_precision_top3", top(found.ranks.iter().copied(), 3));
-        if !test.is_empty() {
-            put("latent_r_precision_top3_test", top(test.iter().copied(), 3));
+    fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError> {
+        #[derive(Deserialize)]
+        struct ShardMeta {
+            units: Vec<Unit>,
         }
-        if repeat == 0 && plan.matched {
-            let teacher = if plan.teacher { of(Maker::Teacher, 0) } else { samples.clone() };
-            put("match", relative_distance(&samples, &teacher, plan.width()));
-            if settings.samples > 1 {
-                // One entry's samples are a whole number of entries apart.
-                let mut others = teacher.clone();
-                others.rotate_left(plan.entries.len() * plan.width());
-                put("match_other_noise", relative_distance(&others, &teacher, plan.width()));
+        let (plan, _) = Plan::read(cx, self)?;
+        let blobs = cx.blobs();
+        let mut blocks: BTreeMap<Unit, Vec<f32>> = BTreeMap::new();
+        for digest in shards {
+            let manifest = cx.manifest(*digest)?;
+            let ShardMeta { units } = artifacts::meta(&manifest, "a shard of the samples")?;
+            let bytes = artifacts::file(&*blobs, &manifest, SAMPLES_FILE)?;
+            let rows = Tensors::from_bytes(&bytes, SAMPLES_FILE)?.take("z", 2, SAMPLES_FILE)?;
+            let mut at = 0;
+            for unit in units {
+                let end = at + plan.block(unit.block).len() * plan.width();
+                blocks.insert(unit, rows.values[at..end].to_vec());
+                at = end;
             }
         }
+        let expected: BTreeSet<Unit> = plan.units().into_iter().collect();
+        if !blocks.keys().eq(&expected) {
+            return Err(StageError::Fault(format!("{} blocks of samples, expected {}", blocks.len(), expected.len())));
+        }
+        if !blocks.values().flatten().all(|v| v.is_finite()) {
+            return Err(StageError::Input("samples are not finite; the denoiser has not been trained well".into()));
+        }
+        let of = |maker: Maker, repeat: usize| -> Vec<f32> {
+            let mine = blocks.iter().filter(|(u, _)| u.maker == maker && u.repeat == repeat);
+            mine.flat_map(|(_, values)| values.iter().copied()).collect()
+        };
+
+        let z = draw(&plan, 0);
+        let reference = reference(&plan, &z);
+        let sampled: Vec<usize> = (0..plan.samples()).map(|i| plan.entry(i)).collect();
+        let tested = |i: &usize| plan.latents.meta.splits[sampled[*i]] == Split::Test;
+        let mut values: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
+        for repeat in 0..self.repeats {
+            let samples = of(Maker::Model, repeat);
+            let found = reference.measure(&samples, &sampled, plan.seed, repeat as u64);
+            let test: Vec<usize> = (0..plan.samples()).filter(tested).map(|i| found.ranks[i]).collect();
+            let mut put = |name, value| values.entry(name).or_default().push(value);
+            put("latent_fid", found.latent_fid);
+            put("latent_std", found.latent_std);
+            put("latent_r_precision_top1", top(found.ranks.iter().copied(), 1));
+            put("latent_r_precision_top3", top(found.ranks.iter().copied(), 3));
+            if !test.is_empty() {
+                put("latent_r_precision_top3_test", top(test.iter().copied(), 3));
+            }
+            if repeat == 0 && plan.matched {
+                let teacher = if plan.teacher { of(Maker::Teacher, 0) } else { samples.clone() };
+                put("match", relative_distance(&samples, &teacher, plan.width()));
+                if self.samples > 1 {
+                    // One entry's samples are a whole number of entries apart.
+                    let mut others = teacher.clone();
+                    others.rotate_left(plan.entries.len() * plan.width());
+                    put("match_other_noise", relative_distance(&others, &teacher, plan.width()));
+                }
+            }
+        }
+        let mut metrics = BTreeMap::new();
+        let mut spread = BTreeMap::new();
+        for (name, values) in &values {
+            let (mean, sd) = mean_and_spread(values);
+            metrics.insert((*name).to_owned(), mean);
+            spread.extend(sd.map(|sd| (*name, sd)));
+        }
+        if let Some(sd) = spread.get("latent_fid") {
+            metrics.insert("latent_fid_sd".into(), *sd);
+        }
+        metrics.insert("latent_fid_floor".into(), reference.distance(&fresh(&plan)));
+        metrics.insert("latent_std_real".into(), standard_deviation(&compared(&plan, &z)));
+        publish_report(cx, metrics, details(&plan, &reference, &values, &spread))
     }
-    let mut metrics = BTreeMap::new();
-    let mut spread = BTreeMap::new();
-    for (name, values) in &values {
-        let (mean, sd) = mean_and_spread(values);
-        metrics.insert((*name).to_owned(), mean);
-        spread.extend(sd.map(|sd| (*name, sd)));
-    }
-    if let Some(sd) = spread.get("latent_fid") {
-        metrics.insert("latent_fid_sd".into(), *sd);
-    }
-    metrics.insert("latent_fid_floor".into(), reference.distance(&fresh(&plan)));
-    metrics.insert("latent_std_real".into(), standard_deviation(&compared(&plan, &z)));
-    publish_report(cx, metrics, details(&plan, &reference, &values, &spread))
 }
 
 /// What a reader of the report may want besides the metrics.

@@ -8,7 +8,7 @@ use protocol::ArtifactKind;
 use protocol::stage::DistillLcm;
 
 use super::consistency::Distiller;
-use super::slice_gradient;
+use super::{Gang, slice_gradient};
 use crate::artifacts::{self, Family, MODEL_FILE, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, train};
@@ -41,18 +41,19 @@ impl Objective for Lcm {
     }
 }
 
-/// Runs one member's attempt.
-pub(super) fn run(cx: &mut dyn GangContext, settings: &DistillLcm) -> Result<Outcome, StageError> {
-    let mut objective = Lcm(Distiller::read(cx, &settings.distillation)?);
-    match train(&mut objective, &settings.distillation.training, cx)? {
-        Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-        Trained::Finished { state, metrics } => {
-            let family = Family::Lcm { skip: settings.distillation.skip, guidance: settings.distillation.guidance };
-            // The online network is what is kept, as upstream; its average only was the target.
-            let bytes = to_bytes(&state.groups[0].entries, &state.groups[0].params);
-            let meta = to_meta(&objective.0.meta(family));
-            let output = artifacts::publish(cx, ArtifactKind::Denoiser, meta, MODEL_FILE, bytes)?;
-            Ok(Outcome::Finished { output, metrics })
+impl Gang for DistillLcm {
+    fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
+        let mut objective = Lcm(Distiller::read(cx, &self.distillation)?);
+        match train(&mut objective, &self.distillation.training, cx)? {
+            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
+            Trained::Finished { state, metrics } => {
+                let family = Family::Lcm { skip: self.distillation.skip, guidance: self.distillation.guidance };
+                // The online network is what is kept, as upstream; its average only was the target.
+                let bytes = to_bytes(&state.groups[0].entries, &state.groups[0].params);
+                let meta = to_meta(&objective.0.meta(family));
+                let output = artifacts::publish(cx, ArtifactKind::Denoiser, meta, MODEL_FILE, bytes)?;
+                Ok(Outcome::Finished { output, metrics })
+            }
         }
     }
 }

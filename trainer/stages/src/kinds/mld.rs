@@ -13,7 +13,7 @@ use protocol::ArtifactKind;
 use protocol::stage::TrainMld;
 
 use super::latent_data::LatentData;
-use super::{group, slice_gradient};
+use super::{Gang, group, slice_gradient};
 use crate::artifacts::{self, DenoiserMeta, Family, MODEL_FILE, VaeMeta, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, train};
@@ -54,42 +54,43 @@ impl Objective for Mld {
     }
 }
 
-/// Runs one member's attempt.
-pub(super) fn run(cx: &mut dyn GangContext, settings: &TrainMld) -> Result<Outcome, StageError> {
-    let data = LatentData::read(cx, &settings.training)?;
-    let (vae_digest, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
-    let vae: VaeMeta = artifacts::meta(&vae, "the VAE")?;
-    if data.vae() != vae_digest || data.meta().latent != vae.latent {
-        return Err(StageError::Input(format!(
-            "`latents` were made by another VAE ({} x {} latents) than `vae` ({} x {}); name the VAE that encoded them",
-            data.meta().latent.tokens,
-            data.meta().latent.dim,
-            vae.latent.tokens,
-            vae.latent.dim
-        )));
-    }
-    let meta = DenoiserMeta {
-        family: Family::Mld,
-        latent: vae.latent,
-        network: settings.network.clone(),
-        text_relu: settings.text_relu,
-        guidance_dim: 0,
-        encoder: data.text_meta().encoder.clone(),
-        text_dim: data.text_meta().dim,
-        vae: vae_digest,
-    };
-    let device = cx.device().autodiff();
-    let purpose = format!("{}/init", cx.task().name);
-    let mut init = Init::new(cx.task().seed, &purpose, settings.network.positions, &device);
-    let network = Denoiser::new(&meta.config(), &mut init);
-    let seed = super::dropout_seed(cx);
-    let mut objective = Mld { settings: settings.clone(), data, network, noise: Schedule::published(), seed };
-    match train(&mut objective, &settings.training, cx)? {
-        Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-        Trained::Finished { state, metrics } => {
-            let bytes = to_bytes(&state.groups[0].entries, state.result(0));
-            let output = artifacts::publish(cx, ArtifactKind::Denoiser, to_meta(&meta), MODEL_FILE, bytes)?;
-            Ok(Outcome::Finished { output, metrics })
+impl Gang for TrainMld {
+    fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
+        let data = LatentData::read(cx, &self.training)?;
+        let (vae_digest, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
+        let vae: VaeMeta = artifacts::meta(&vae, "the VAE")?;
+        if data.vae() != vae_digest || data.meta().latent != vae.latent {
+            return Err(StageError::Input(format!(
+                "`latents` were made by another VAE ({} x {} latents) than `vae` ({} x {}); name the VAE that encoded them",
+                data.meta().latent.tokens,
+                data.meta().latent.dim,
+                vae.latent.tokens,
+                vae.latent.dim
+            )));
+        }
+        let meta = DenoiserMeta {
+            family: Family::Mld,
+            latent: vae.latent,
+            network: self.network.clone(),
+            text_relu: self.text_relu,
+            guidance_dim: 0,
+            encoder: data.text_meta().encoder.clone(),
+            text_dim: data.text_meta().dim,
+            vae: vae_digest,
+        };
+        let device = cx.device().autodiff();
+        let purpose = format!("{}/init", cx.task().name);
+        let mut init = Init::new(cx.task().seed, &purpose, self.network.positions, &device);
+        let network = Denoiser::new(&meta.config(), &mut init);
+        let seed = super::dropout_seed(cx);
+        let mut objective = Mld { settings: self.clone(), data, network, noise: Schedule::published(), seed };
+        match train(&mut objective, &self.training, cx)? {
+            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
+            Trained::Finished { state, metrics } => {
+                let bytes = to_bytes(&state.groups[0].entries, state.result(0));
+                let output = artifacts::publish(cx, ArtifactKind::Denoiser, to_meta(&meta), MODEL_FILE, bytes)?;
+                Ok(Outcome::Finished { output, metrics })
+            }
         }
     }
 }

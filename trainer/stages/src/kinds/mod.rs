@@ -1,4 +1,5 @@
-//! One file per stage kind, and the table that finds it.
+//! How each stage kind runs: one file a kind, and the list that finds it. What a kind is called, takes and gives is in its file in
+//! `protocol::stage`.
 
 mod consistency;
 mod data;
@@ -21,8 +22,8 @@ use burn::module::Module;
 use burn::tensor::Tensor;
 use models::flat::{self, add_gradients};
 use motion::Stream;
-use protocol::ArtifactKind;
 use protocol::stage::{Split, StageSettings, Training};
+use protocol::{ArtifactKind, Digest};
 use serde_json::{Value, json};
 
 use crate::artifacts;
@@ -32,47 +33,78 @@ use crate::train::GroupPlan;
 /// Where a report's details are.
 pub const REPORT_FILE: &str = "report.json";
 
+/// A kind that one worker does alone.
+trait Plain {
+    /// Does it.
+    fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError>;
+}
+
+/// A kind that is cut into shards.
+trait Map {
+    /// Does shard `index` of `of`.
+    fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError>;
+    /// Makes the stage's artifact of those of all shards, in order.
+    fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError>;
+}
+
+/// A kind that trains.
+trait Gang {
+    /// Runs one member's attempt.
+    fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError>;
+}
+
+/// What runs a stage.
+enum Stage<'a> {
+    Plain(&'a dyn Plain),
+    Map(&'a dyn Map),
+    Gang(&'a dyn Gang),
+}
+
+/// Makes [`runner`] of the list of kinds.
+macro_rules! runners {
+    ($($shape:ident: $($name:ident),+;)*) => {
+        /// What runs stages with these settings; nothing runs those that the coordinator does itself.
+        fn runner(settings: &StageSettings) -> Option<Stage<'_>> {
+            match settings {
+                $($(StageSettings::$name(settings) => Some(Stage::$shape(settings)),)+)*
+                _ => None,
+            }
+        }
+    };
+}
+
+// The list of what runs. It is held against `protocol`'s list of kinds by a test below.
+runners! {
+    Plain: DataOpen, DataSynthetic, TextEmbed, ImportEvaluator;
+    Map: EncodeLatents, EvaluateReconstruction, EvaluateLatentFid, EvaluateT2m;
+    Gang: TrainVae, TrainMld, DistillLcm, DistillPcm, TrainEvaluator;
+}
+
 /// Runs a plain stage.
 pub fn run_alone(cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
-    match cx.task().settings.clone() {
-        StageSettings::DataOpen(settings) => data::open(cx, &settings),
-        StageSettings::DataSynthetic(settings) => data::synthetic(cx, &settings),
-        StageSettings::TextEmbed(settings) => text::run(cx, &settings),
-        StageSettings::ImportEvaluator(settings) => import::run(cx, &settings),
-        other => Err(misplaced(&other, "by one worker alone")),
+    let settings = cx.task().settings.clone();
+    match runner(&settings) {
+        Some(Stage::Plain(stage)) => stage.run(cx),
+        _ => Err(misplaced(&settings, "by one worker alone")),
     }
 }
 
 /// Runs one shard of a map stage, or merges them.
 pub fn run_part(cx: &mut dyn AttemptContext, part: Part) -> Result<Outcome, StageError> {
-    match (cx.task().settings.clone(), part) {
-        (StageSettings::EncodeLatents(settings), Part::Shard { index, of }) => encode::shard(cx, &settings, index, of),
-        (StageSettings::EncodeLatents(_), Part::Merge { shards }) => encode::merge(cx, &shards),
-        (StageSettings::EvaluateReconstruction(settings), Part::Shard { index, of }) => {
-            reconstruction::shard(cx, &settings, index, of)
-        }
-        (StageSettings::EvaluateReconstruction(_), Part::Merge { shards }) => reconstruction::merge(cx, &shards),
-        (StageSettings::EvaluateLatentFid(settings), Part::Shard { index, of }) => {
-            latent_fid::shard(cx, &settings, index, of)
-        }
-        (StageSettings::EvaluateLatentFid(settings), Part::Merge { shards }) => {
-            latent_fid::merge(cx, &settings, &shards)
-        }
-        (StageSettings::EvaluateT2m(settings), Part::Shard { index, of }) => t2m::shard(cx, &settings, index, of),
-        (StageSettings::EvaluateT2m(settings), Part::Merge { shards }) => t2m::merge(cx, &settings, &shards),
-        (other, _) => Err(misplaced(&other, "in shards")),
+    let settings = cx.task().settings.clone();
+    match (runner(&settings), part) {
+        (Some(Stage::Map(stage)), Part::Shard { index, of }) => stage.shard(cx, index, of),
+        (Some(Stage::Map(stage)), Part::Merge { shards }) => stage.merge(cx, &shards),
+        _ => Err(misplaced(&settings, "in shards")),
     }
 }
 
 /// Runs a training stage as a member of its gang.
 pub fn run_gang(cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
-    match cx.task().settings.clone() {
-        StageSettings::TrainVae(settings) => vae::run(cx, &settings),
-        StageSettings::TrainMld(settings) => mld::run(cx, &settings),
-        StageSettings::DistillLcm(settings) => lcm::run(cx, &settings),
-        StageSettings::DistillPcm(settings) => pcm::run(cx, &settings),
-        StageSettings::TrainEvaluator(settings) => evaluator::run(cx, &settings),
-        other => Err(misplaced(&other, "by a gang")),
+    let settings = cx.task().settings.clone();
+    match runner(&settings) {
+        Some(Stage::Gang(stage)) => stage.run(cx),
+        _ => Err(misplaced(&settings, "by a gang")),
     }
 }
 
@@ -134,4 +166,24 @@ fn publish_report(
     let bytes = protocol::canonical::to_bytes(&report);
     let output = artifacts::publish(cx, ArtifactKind::Report, meta, REPORT_FILE, bytes)?;
     Ok(Outcome::Finished { output, metrics })
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::stage::Shape;
+
+    use super::*;
+
+    #[test]
+    fn every_kind_has_a_runner_of_its_shape() {
+        for settings in StageSettings::all() {
+            let shape = match runner(&settings) {
+                Some(Stage::Plain(_)) => Shape::Plain,
+                Some(Stage::Map(_)) => Shape::Map,
+                Some(Stage::Gang(_)) => Shape::Gang,
+                None => Shape::Registry,
+            };
+            assert_eq!(shape, settings.shape(), "{}", settings.kind());
+        }
+    }
 }

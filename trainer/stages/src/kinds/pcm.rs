@@ -20,7 +20,7 @@ use protocol::ArtifactKind;
 use protocol::stage::{DistillPcm, Training};
 
 use super::consistency::{Distiller, SolverStep};
-use super::{group, slice_gradient};
+use super::{Gang, group, slice_gradient};
 use crate::artifacts::{self, Family, MODEL_FILE, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, train};
@@ -124,28 +124,29 @@ impl Pcm {
     }
 }
 
-/// Runs one member's attempt.
-pub(super) fn run(cx: &mut dyn GangContext, settings: &DistillPcm) -> Result<Outcome, StageError> {
-    let it = Distiller::read(cx, &settings.distillation)?;
-    let phases = Phases::new(&it.grid, settings.phases);
-    let heads = (settings.adversarial > 0.0).then(|| {
-        let device = cx.device().autodiff();
-        let purpose = format!("{}/heads", cx.task().name);
-        let network = &it.teacher_meta.network;
-        let mut init = Init::new(cx.task().seed, &purpose, network.positions, &device);
-        Discriminator::new(network.layers, network.width, &mut init)
-    });
-    let mut objective = Pcm { it, settings: settings.clone(), phases, heads };
-    match train(&mut objective, &settings.distillation.training, cx)? {
-        Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-        Trained::Finished { state, metrics } => {
-            let distillation = &settings.distillation;
-            let family =
-                Family::Pcm { skip: distillation.skip, guidance: distillation.guidance, phases: settings.phases };
-            let bytes = to_bytes(&state.groups[0].entries, &state.groups[0].params);
-            let meta = to_meta(&objective.it.meta(family));
-            let output = artifacts::publish(cx, ArtifactKind::Denoiser, meta, MODEL_FILE, bytes)?;
-            Ok(Outcome::Finished { output, metrics })
+impl Gang for DistillPcm {
+    fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
+        let it = Distiller::read(cx, &self.distillation)?;
+        let phases = Phases::new(&it.grid, self.phases);
+        let heads = (self.adversarial > 0.0).then(|| {
+            let device = cx.device().autodiff();
+            let purpose = format!("{}/heads", cx.task().name);
+            let network = &it.teacher_meta.network;
+            let mut init = Init::new(cx.task().seed, &purpose, network.positions, &device);
+            Discriminator::new(network.layers, network.width, &mut init)
+        });
+        let mut objective = Pcm { it, settings: self.clone(), phases, heads };
+        match train(&mut objective, &self.distillation.training, cx)? {
+            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
+            Trained::Finished { state, metrics } => {
+                let distillation = &self.distillation;
+                let family =
+                    Family::Pcm { skip: distillation.skip, guidance: distillation.guidance, phases: self.phases };
+                let bytes = to_bytes(&state.groups[0].entries, &state.groups[0].params);
+                let meta = to_meta(&objective.it.meta(family));
+                let output = artifacts::publish(cx, ArtifactKind::Denoiser, meta, MODEL_FILE, bytes)?;
+                Ok(Outcome::Finished { output, metrics })
+            }
         }
     }
 }

@@ -21,7 +21,7 @@ use protocol::{ArtifactKind, Digest, Seed};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
-use super::{REPORT_FILE, no_entries, word};
+use super::{Map, REPORT_FILE, no_entries, word};
 use crate::artifacts::{self, DenoiserMeta, Embeddings, Tensors};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::frechet::{Gaussian, to_f64};
@@ -227,77 +227,139 @@ fn skates(features: &[f32], skeleton: &Skeleton) -> f32 {
     skating::ratio(&metres, skeleton.joints, skating::feet(skeleton.format), skeleton.fps) as f32
 }
 
-pub(super) fn shard(
-    cx: &mut dyn AttemptContext,
-    settings: &EvaluateT2m,
-    index: usize,
-    of: usize,
-) -> Result<Outcome, StageError> {
-    let plan = Plan::read(cx, settings)?;
-    let maker = if settings.real { None } else { Some(Maker::read(cx, &plan)?) };
-    // Of either part every `of`-th, since they cost differently.
-    let mine = |part: Part| -> Vec<Unit> {
-        let all = plan.units().into_iter().filter(|u| u.part == part).enumerate();
-        all.filter(|(i, _)| i % of == index).map(|(_, unit)| unit).collect()
-    };
-    let units: Vec<Unit> = mine(Part::Entries).into_iter().chain(mine(Part::Many)).collect();
-    let (mut text, mut made, mut real, mut skating) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-    let mut many = Vec::new();
-    for (done, unit) in units.iter().enumerate() {
-        if cx.interrupted() {
-            return Ok(Outcome::Yielded { at: 0 });
-        }
-        match unit.part {
-            Part::Entries => {
-                let block = plan.block(unit.block);
-                let draws: Vec<Draw> = block.clone().map(|i| plan.draw(unit.repeat, i, true)).collect();
-                let crops: Vec<Vec<f32>> = draws.iter().map(|d| plan.crop(*d)).collect();
-                text.extend(plan.trained.captions(draws.iter().map(|d| &plan.dataset.captions[d.caption])));
-                let motions = match &maker {
-                    Some(maker) => {
-                        real.extend(plan.trained.motions(&crops));
-                        maker.motions(&plan, &draws, &|k, b, row| {
-                            plan.stream(&format!("noise {k}"), unit.repeat, block.start + b).fill_normal(row);
-                        })?
-                    }
-                    None => {
-                        let others = block.map(|i| plan.crop(plan.draw(unit.repeat, i, false)));
-                        real.extend(plan.trained.motions(&others.collect::<Vec<_>>()));
-                        crops
-                    }
-                };
-                skating.extend(motions.iter().map(|motion| skates(motion, plan.dataset.skeleton())));
-                made.extend(plan.trained.motions(&motions));
+impl Map for EvaluateT2m {
+    fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
+        let plan = Plan::read(cx, self)?;
+        let maker = if self.real { None } else { Some(Maker::read(cx, &plan)?) };
+        // Of either part every `of`-th, since they cost differently.
+        let mine = |part: Part| -> Vec<Unit> {
+            let all = plan.units().into_iter().filter(|u| u.part == part).enumerate();
+            all.filter(|(i, _)| i % of == index).map(|(_, unit)| unit).collect()
+        };
+        let units: Vec<Unit> = mine(Part::Entries).into_iter().chain(mine(Part::Many)).collect();
+        let (mut text, mut made, mut real, mut skating) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        let mut many = Vec::new();
+        for (done, unit) in units.iter().enumerate() {
+            if cx.interrupted() {
+                return Ok(Outcome::Yielded { at: 0 });
             }
-            Part::Many => {
-                let maker = maker.as_ref().ok_or_else(|| StageError::Fault("real motion has no samples".into()))?;
-                let entry = plan.many(unit.repeat)[unit.block];
-                let draw = plan.draw(unit.repeat, entry, true);
-                let samples = settings.multimodality.samples;
-                for first in (0..samples).step_by(BLOCK) {
-                    let count = BLOCK.min(samples - first);
-                    let motions = maker.motions(&plan, &vec![draw; count], &|k, b, row| {
-                        let index = entry * samples + first + b;
-                        plan.stream(&format!("many {k}"), unit.repeat, index).fill_normal(row);
-                    })?;
-                    many.extend(plan.trained.motions(&motions));
+            match unit.part {
+                Part::Entries => {
+                    let block = plan.block(unit.block);
+                    let draws: Vec<Draw> = block.clone().map(|i| plan.draw(unit.repeat, i, true)).collect();
+                    let crops: Vec<Vec<f32>> = draws.iter().map(|d| plan.crop(*d)).collect();
+                    text.extend(plan.trained.captions(draws.iter().map(|d| &plan.dataset.captions[d.caption])));
+                    let motions = match &maker {
+                        Some(maker) => {
+                            real.extend(plan.trained.motions(&crops));
+                            maker.motions(&plan, &draws, &|k, b, row| {
+                                plan.stream(&format!("noise {k}"), unit.repeat, block.start + b).fill_normal(row);
+                            })?
+                        }
+                        None => {
+                            let others = block.map(|i| plan.crop(plan.draw(unit.repeat, i, false)));
+                            real.extend(plan.trained.motions(&others.collect::<Vec<_>>()));
+                            crops
+                        }
+                    };
+                    skating.extend(motions.iter().map(|motion| skates(motion, plan.dataset.skeleton())));
+                    made.extend(plan.trained.motions(&motions));
+                }
+                Part::Many => {
+                    let maker = maker.as_ref().ok_or_else(|| StageError::Fault("real motion has no samples".into()))?;
+                    let entry = plan.many(unit.repeat)[unit.block];
+                    let draw = plan.draw(unit.repeat, entry, true);
+                    let samples = self.multimodality.samples;
+                    for first in (0..samples).step_by(BLOCK) {
+                        let count = BLOCK.min(samples - first);
+                        let motions = maker.motions(&plan, &vec![draw; count], &|k, b, row| {
+                            let index = entry * samples + first + b;
+                            plan.stream(&format!("many {k}"), unit.repeat, index).fill_normal(row);
+                        })?;
+                        many.extend(plan.trained.motions(&motions));
+                    }
                 }
             }
+            cx.progress(done as u64 + 1, units.len() as u64, "blocks", &[]);
         }
-        cx.progress(done as u64 + 1, units.len() as u64, "blocks", &[]);
+        let width = plan.trained.width();
+        let rows = |values: &[f32]| [values.len() / width, width];
+        let skated = skating.len();
+        let bytes = Tensors::default()
+            .with("text", rows(&text), text)
+            .with("made", rows(&made), made)
+            .with("real", rows(&real), real)
+            .with("many", rows(&many), many)
+            .with("skating", [skated], skating)
+            .to_bytes()?;
+        let output = artifacts::publish(cx, ArtifactKind::Shard, json!({"units": units}), EMBEDDINGS_FILE, bytes)?;
+        Ok(Outcome::Finished { output, metrics: BTreeMap::new() })
     }
-    let width = plan.trained.width();
-    let rows = |values: &[f32]| [values.len() / width, width];
-    let skated = skating.len();
-    let bytes = Tensors::default()
-        .with("text", rows(&text), text)
-        .with("made", rows(&made), made)
-        .with("real", rows(&real), real)
-        .with("many", rows(&many), many)
-        .with("skating", [skated], skating)
-        .to_bytes()?;
-    let output = artifacts::publish(cx, ArtifactKind::Shard, json!({"units": units}), EMBEDDINGS_FILE, bytes)?;
-    Ok(Outcome::Finished { output, metrics: BTreeMap::new() })
+
+    fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError> {
+        let plan = Plan::read(cx, self)?;
+        let all = gather(cx, &plan, shards)?;
+        let mut values: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
+        for repeat in 0..self.repeats {
+            for (name, value) in measure(&plan, &all, repeat) {
+                values.entry(name).or_default().push(value);
+            }
+        }
+        let mut metrics = BTreeMap::new();
+        for (name, values) in &values {
+            let interval = Interval::of(values);
+            metrics.insert((*name).to_owned(), interval.mean);
+            metrics.insert(format!("{name}.lower"), interval.lower());
+            metrics.insert(format!("{name}.upper"), interval.upper());
+        }
+        if let Some((name, value)) = metrics.iter().find(|(_, value)| !value.is_finite()) {
+            return Err(StageError::Input(format!(
+                "`{name}` is {value}: embeddings are not finite; train the evaluator anew"
+            )));
+        }
+        let (samples, width) = (plan.entries.len(), plan.trained.width());
+        let few = (samples < FEW * width).then(|| {
+        format!(
+            "FID is taken of {samples} motions in {width} dimensions; it is then larger than of many, and compares only with FIDs of as many \
+             motions in the same evaluator"
+        )
+    });
+        if let Some(few) = &few {
+            cx.log(few);
+        }
+        if plan.split != self.split {
+            cx.log(&format!(
+                "the split `{}` is too small for pools of {POOL}: measured on all {samples} entries",
+                word(&self.split)
+            ));
+        }
+        metrics.insert("samples".to_owned(), samples as f64);
+        let meta = json!({
+            "kind": cx.task().settings.kind(),
+            "metrics": metrics,
+            "split": plan.split,
+            "evaluator": plan.evaluator,
+            "words": plan.trained.meta().words,
+            "real": self.real,
+            "shuffled": self.shuffled,
+        });
+        let report = json!({
+            "metrics": metrics,
+            "details": {
+                "split": plan.split,
+                "seed": plan.seed,
+                "sampler": self.sampler,
+                "samples_per_repeat": samples,
+                "pools_per_repeat": samples / POOL,
+                "diversity_pairs": spread::DIVERSITY_PAIRS.min(samples),
+                "note": few,
+                "repeats": values,
+            },
+        });
+        let bytes = protocol::canonical::to_bytes(&report);
+        let output = artifacts::publish(cx, ArtifactKind::Report, meta, REPORT_FILE, bytes)?;
+        Ok(Outcome::Finished { output, metrics })
+    }
 }
 
 /// Everything that the shards made, by unit.
@@ -392,73 +454,4 @@ fn measure(plan: &Plan<'_>, all: &Gathered, repeat: usize) -> BTreeMap<&'static 
         metrics.insert("multimodality", spread::multimodality(&many, of.samples, width, &first, &second));
     }
     metrics
-}
-
-pub(super) fn merge(
-    cx: &mut dyn AttemptContext,
-    settings: &EvaluateT2m,
-    shards: &[Digest],
-) -> Result<Outcome, StageError> {
-    let plan = Plan::read(cx, settings)?;
-    let all = gather(cx, &plan, shards)?;
-    let mut values: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
-    for repeat in 0..settings.repeats {
-        for (name, value) in measure(&plan, &all, repeat) {
-            values.entry(name).or_default().push(value);
-        }
-    }
-    let mut metrics = BTreeMap::new();
-    for (name, values) in &values {
-        let interval = Interval::of(values);
-        metrics.insert((*name).to_owned(), interval.mean);
-        metrics.insert(format!("{name}.lower"), interval.lower());
-        metrics.insert(format!("{name}.upper"), interval.upper());
-    }
-    if let Some((name, value)) = metrics.iter().find(|(_, value)| !value.is_finite()) {
-        return Err(StageError::Input(format!(
-            "`{name}` is {value}: embeddings are not finite; train the evaluator anew"
-        )));
-    }
-    let (samples, width) = (plan.entries.len(), plan.trained.width());
-    let few = (samples < FEW * width).then(|| {
-        format!(
-            "FID is taken of {samples} motions in {width} dimensions; it is then larger than of many, and compares only with FIDs of as many \
-             motions in the same evaluator"
-        )
-    });
-    if let Some(few) = &few {
-        cx.log(few);
-    }
-    if plan.split != settings.split {
-        cx.log(&format!(
-            "the split `{}` is too small for pools of {POOL}: measured on all {samples} entries",
-            word(&settings.split)
-        ));
-    }
-    metrics.insert("samples".to_owned(), samples as f64);
-    let meta = json!({
-        "kind": cx.task().settings.kind(),
-        "metrics": metrics,
-        "split": plan.split,
-        "evaluator": plan.evaluator,
-        "words": plan.trained.meta().words,
-        "real": settings.real,
-        "shuffled": settings.shuffled,
-    });
-    let report = json!({
-        "metrics": metrics,
-        "details": {
-            "split": plan.split,
-            "seed": plan.seed,
-            "sampler": settings.sampler,
-            "samples_per_repeat": samples,
-            "pools_per_repeat": samples / POOL,
-            "diversity_pairs": spread::DIVERSITY_PAIRS.min(samples),
-            "note": few,
-            "repeats": values,
-        },
-    });
-    let bytes = protocol::canonical::to_bytes(&report);
-    let output = artifacts::publish(cx, ArtifactKind::Report, meta, REPORT_FILE, bytes)?;
-    Ok(Outcome::Finished { output, metrics })
 }

@@ -15,7 +15,7 @@ use motion::dataset::{Dataset, crop, window};
 use protocol::stage::{Split, TrainVae};
 use protocol::{ArtifactKind, Seed};
 
-use super::{group, no_clips, slice_gradient};
+use super::{Gang, group, no_clips, slice_gradient};
 use crate::artifacts::{self, MODEL_FILE, VaeMeta, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::train::{GroupPlan, Objective, Order, Pick, SliceResult, TrainState, Trained, train};
@@ -130,47 +130,48 @@ impl Objective for VaeObjective {
     }
 }
 
-/// Runs one member's attempt.
-pub(super) fn run(cx: &mut dyn GangContext, settings: &TrainVae) -> Result<Outcome, StageError> {
-    let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-    let dataset = artifacts::dataset(&*cx.blobs(), &manifest)?;
-    let train_entries = dataset.entries_of(Split::Train);
-    let stage = cx.task().name.clone();
-    if train_entries.is_empty() {
-        return Err(no_clips());
-    }
-    let meta = VaeMeta {
-        format: dataset.format,
-        features: dataset.mean.len(),
-        latent: settings.latent,
-        network: settings.network.clone(),
-        mean: dataset.mean.clone(),
-        std: dataset.std.clone(),
-    };
-    let (seed, device) = (cx.task().seed, cx.device().autodiff());
-    let purpose = stage.to_string();
-    let mut init = Init::new(seed, &format!("{purpose}/init"), settings.network.positions, &device);
-    let batch = settings.training.batch.global;
-    let window_batch = if settings.windows.batch > 0 { settings.windows.batch } else { batch };
-    let mut objective = VaeObjective {
-        settings: settings.clone(),
-        windows: Order::new(seed, &format!("{purpose}/windows"), train_entries.len(), window_batch, POOL),
-        clips: Order::new(seed, &format!("{purpose}/clips"), train_entries.len(), batch, POOL),
-        body: Body::new(dataset.skeleton(), &dataset.mean, &dataset.std, &cx.device()),
-        train: train_entries,
-        dataset,
-        network: Vae::new(&meta.config(), &mut init),
-        purpose,
-        seed,
-        dropout_seed: super::dropout_seed(cx),
-        device: cx.device(),
-    };
-    match train(&mut objective, &settings.training, cx)? {
-        Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-        Trained::Finished { state, metrics } => {
-            let bytes = to_bytes(&state.groups[0].entries, state.result(0));
-            let output = artifacts::publish(cx, ArtifactKind::Vae, to_meta(&meta), MODEL_FILE, bytes)?;
-            Ok(Outcome::Finished { output, metrics })
+impl Gang for TrainVae {
+    fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
+        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
+        let dataset = artifacts::dataset(&*cx.blobs(), &manifest)?;
+        let train_entries = dataset.entries_of(Split::Train);
+        let stage = cx.task().name.clone();
+        if train_entries.is_empty() {
+            return Err(no_clips());
+        }
+        let meta = VaeMeta {
+            format: dataset.format,
+            features: dataset.mean.len(),
+            latent: self.latent,
+            network: self.network.clone(),
+            mean: dataset.mean.clone(),
+            std: dataset.std.clone(),
+        };
+        let (seed, device) = (cx.task().seed, cx.device().autodiff());
+        let purpose = stage.to_string();
+        let mut init = Init::new(seed, &format!("{purpose}/init"), self.network.positions, &device);
+        let batch = self.training.batch.global;
+        let window_batch = if self.windows.batch > 0 { self.windows.batch } else { batch };
+        let mut objective = VaeObjective {
+            settings: self.clone(),
+            windows: Order::new(seed, &format!("{purpose}/windows"), train_entries.len(), window_batch, POOL),
+            clips: Order::new(seed, &format!("{purpose}/clips"), train_entries.len(), batch, POOL),
+            body: Body::new(dataset.skeleton(), &dataset.mean, &dataset.std, &cx.device()),
+            train: train_entries,
+            dataset,
+            network: Vae::new(&meta.config(), &mut init),
+            purpose,
+            seed,
+            dropout_seed: super::dropout_seed(cx),
+            device: cx.device(),
+        };
+        match train(&mut objective, &self.training, cx)? {
+            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
+            Trained::Finished { state, metrics } => {
+                let bytes = to_bytes(&state.groups[0].entries, state.result(0));
+                let output = artifacts::publish(cx, ArtifactKind::Vae, to_meta(&meta), MODEL_FILE, bytes)?;
+                Ok(Outcome::Finished { output, metrics })
+            }
         }
     }
 }

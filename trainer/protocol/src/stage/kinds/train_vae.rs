@@ -1,8 +1,9 @@
-//! Settings of the stages around the VAE.
+//! `train.vae`: the motion VAE. Source: MLD (v1, 1x256), MotionLCM v2 (16x32).
 
 use serde::{Deserialize, Serialize};
 
-use super::{LatentShape, Network, Training};
+use crate::ArtifactKind;
+use crate::stage::{Batch, LatentShape, Network, Output, Problems, Ref, Shape, StageSpec, Training};
 
 /// Weights of the VAE loss. Source: MotionLCM v2 (feature 1, joint 1, velocity 0, KL 1e-4).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -83,22 +84,64 @@ impl Default for TrainVae {
     }
 }
 
-/// `encode.latents`: posteriors of random crops, computed once.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct EncodeLatents {
-    /// Stage that gives the clips.
-    pub dataset: String,
-    /// Stage that gives the VAE.
-    pub vae: String,
-    /// Random crops per entry.
-    pub crops: usize,
-    /// Shards.
-    pub shards: usize,
+impl StageSpec for TrainVae {
+    const KIND: &'static str = "train.vae";
+    const SHAPE: Shape = Shape::Gang;
+    const OUTPUT: Output = Output { name: "vae", kind: ArtifactKind::Vae };
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset)]
+    }
+
+    fn check(&self, p: &mut Problems) {
+        self.latent.check(p);
+        self.network.check(p);
+        self.loss.check(p);
+        self.windows.check(p, self.training.batch.slices);
+        p.fraction("ema", self.ema, true);
+        self.training.check(p);
+    }
+
+    fn training(&mut self) -> Option<&mut Training> {
+        Some(&mut self.training)
+    }
+
+    fn latent(&self) -> Option<LatentShape> {
+        Some(self.latent)
+    }
 }
 
-impl Default for EncodeLatents {
-    fn default() -> Self {
-        Self { dataset: "dataset".into(), vae: "vae".into(), crops: 8, shards: 8 }
+impl VaeLoss {
+    fn check(&self, p: &mut Problems) {
+        for (field, weight) in [
+            ("loss.feature", self.feature),
+            ("loss.joint", self.joint),
+            ("loss.velocity", self.velocity),
+            ("loss.kl", self.kl),
+        ] {
+            p.not_negative(field, weight);
+        }
+        if self.feature == 0.0 && self.joint == 0.0 {
+            p.add("loss.feature", "`loss.feature` and `loss.joint` are both 0, so nothing is reconstructed", "");
+        }
+        p.fraction("loss.joint_from", self.joint_from, false);
+    }
+}
+
+impl Windows {
+    fn check(&self, p: &mut Problems, slices: usize) {
+        p.fraction("windows.until", self.until, false);
+        if self.until > 0.0 {
+            if self.min < 4 {
+                p.add("windows.min", format!("`windows.min` is {}; expected at least 4 frames", self.min), "");
+            }
+            if self.min > self.max {
+                let (min, max) = (self.min, self.max);
+                p.add("windows.max", format!("`windows.max` is {max}, below `windows.min`, {min}"), "");
+            }
+            if self.batch != 0 {
+                Batch { global: self.batch, slices }.check_division(p, "windows.batch");
+            }
+        }
     }
 }

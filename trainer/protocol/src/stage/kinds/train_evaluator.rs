@@ -1,9 +1,9 @@
-//! Settings of the stages around the text-motion evaluator.
+//! `train.evaluator`: embeds captions and motions in one space, in which the papers measure. Source: text-to-motion (Guo et al., CVPR 2022).
 
 use serde::{Deserialize, Serialize};
 
-use super::{Batch, DataFormat, Decay, Optimizer, Sampler, Split, Training};
-use crate::Steps;
+use crate::stage::{Batch, Decay, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training};
+use crate::{ArtifactKind, Steps};
 
 /// An evaluator's size. The published one: 512, 1024, 512, 512, dropout 0.2.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -98,91 +98,56 @@ impl Default for TrainEvaluator {
     }
 }
 
-/// `import.evaluator`: the published files.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct ImportEvaluator {
-    /// Folder in the published layout: `text_mot_match/model/finest.tar` (or `finest.safetensors`) and, where there are several, the one
-    /// folder `Comp_*/meta` with `mean.npy` and `std.npy`. Not part of the key: the content's digest is.
-    pub path: String,
-    /// What it was trained on.
-    pub format: DataFormat,
-    /// Folder with the word vectors that it was trained with; empty takes the built-in ones, for an evaluator of our own.
-    pub words: String,
-}
+impl StageSpec for TrainEvaluator {
+    const KIND: &'static str = "train.evaluator";
+    const SHAPE: Shape = Shape::Gang;
+    const OUTPUT: Output = Output { name: "evaluator", kind: ArtifactKind::Evaluator };
 
-impl Default for ImportEvaluator {
-    fn default() -> Self {
-        Self { path: String::new(), format: DataFormat::Humanml3d, words: String::new() }
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset), Ref::folder("words", &mut self.words)]
     }
-}
 
-/// How different the motions of one caption are.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct MultiModality {
-    /// Captions per repeat; 0 leaves the metric out.
-    pub captions: usize,
-    /// Motions per caption.
-    pub samples: usize,
-    /// Pairs compared per caption.
-    pub pairs: usize,
-}
-
-impl Default for MultiModality {
-    fn default() -> Self {
-        Self { captions: 100, samples: 30, pairs: 10 }
-    }
-}
-
-/// `evaluate.t2m`: the papers' metrics, in an evaluator's space.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct EvaluateT2m {
-    /// Stage that gives the denoiser.
-    pub model: String,
-    /// Stage that gives its VAE.
-    pub vae: String,
-    /// Stage that gives the clips.
-    pub dataset: String,
-    /// Stage that gives the caption embeddings.
-    pub text: String,
-    /// Stage that gives the evaluator.
-    pub evaluator: String,
-    /// Measures real motion, against itself with other crops; no model is read.
-    pub real: bool,
-    /// The control: captions are dealt to motions at random, so that retrieval is left to chance.
-    pub shuffled: bool,
-    /// Sampler.
-    pub sampler: Sampler,
-    /// Repeats with other noise, captions, crops and pools.
-    pub repeats: usize,
-    /// MultiModality.
-    pub multimodality: MultiModality,
-    /// Clips. Choose on `val`; `test` is for the last look.
-    pub split: Split,
-    /// Takes all clips where the split has fewer than a pool of 32, and says so in the report; otherwise that is refused.
-    pub widen: bool,
-    /// Shards.
-    pub shards: usize,
-}
-
-impl Default for EvaluateT2m {
-    fn default() -> Self {
-        Self {
-            model: "mld".into(),
-            vae: "vae".into(),
-            dataset: "dataset".into(),
-            text: "text".into(),
-            evaluator: "evaluator".into(),
-            real: false,
-            shuffled: false,
-            sampler: Sampler::default(),
-            repeats: 20,
-            multimodality: MultiModality::default(),
-            split: Split::Val,
-            widen: false,
-            shards: 8,
+    fn check(&self, p: &mut Problems) {
+        for (field, value) in [
+            ("network.movement", self.network.movement),
+            ("network.motion", self.network.motion),
+            ("network.text", self.network.text),
+            ("network.embedding", self.network.embedding),
+        ] {
+            p.positive(field, value);
         }
+        p.fraction("network.dropout", self.network.dropout, true);
+        self.movement.check(p, self.training.batch.slices);
+        p.above_zero("emphasis", self.emphasis);
+        p.above_zero("margin", self.margin);
+        p.fraction("ema", self.ema, true);
+        self.training.check(p);
+        let batch = self.training.batch;
+        if batch.slices > 0 && batch.global / batch.slices < 2 {
+            let message = format!("a slice of {} and {} slices has no two captions", batch.global, batch.slices);
+            p.add("batch.slices", message, "captions are told apart within a slice; take fewer slices");
+        }
+    }
+
+    fn training(&mut self) -> Option<&mut Training> {
+        Some(&mut self.training)
+    }
+}
+
+impl MovementPhase {
+    fn check(&self, p: &mut Problems, slices: usize) {
+        p.fraction("movement.until", self.until, true);
+        if self.until == 0.0 {
+            p.add("movement.until", "`movement.until` is 0; movements must be trained before they are matched", "");
+        }
+        if self.window < 8 {
+            let message = format!("`movement.window` is {}; expected at least 8 frames", self.window);
+            p.add("movement.window", message, "two movements of four frames, so that they have a difference");
+        }
+        if self.batch != 0 {
+            Batch { global: self.batch, slices }.check_division(p, "movement.batch");
+        }
+        p.not_negative("movement.sparsity", self.sparsity);
+        p.not_negative("movement.smoothness", self.smoothness);
     }
 }

@@ -1,0 +1,109 @@
+//! What both distillations share. Source: MotionLCM, MotionPCM.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Neighbours, Problems, Ref, Training};
+use crate::ArtifactKind;
+
+/// Which distance consistency losses use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Distance {
+    /// `sqrt(d^2 + c^2) - c`.
+    Huber,
+    /// Mean squared error.
+    L2,
+}
+
+/// What both distillations share.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default = "Distillation::motion_lcm")]
+pub struct Distillation {
+    /// Stage that gives the teacher.
+    pub teacher: String,
+    /// Stage that gives the latents.
+    pub latents: String,
+    /// Stage that gives the caption embeddings.
+    pub text: String,
+    /// Guidance scale w is drawn from this range, in the form `cond + w (cond - uncond)`.
+    pub guidance: (f64, f64),
+    /// Width of the guidance embedding.
+    pub guidance_dim: usize,
+    /// Solver step k; the grid has 1000/k points.
+    pub skip: usize,
+    /// Distance.
+    pub distance: Distance,
+    /// Pseudo-Huber constant c.
+    pub huber_c: f64,
+    /// Decay of the target network.
+    pub ema: f64,
+    /// Dropout in the frozen networks, as the original script has it by accident.
+    pub upstream_dropout: bool,
+    /// The rest.
+    #[serde(flatten)]
+    pub training: Training,
+}
+
+impl Distillation {
+    pub(super) fn motion_lcm() -> Self {
+        Self::published(192_000, 128)
+    }
+
+    pub(super) fn published(steps: u64, global: usize) -> Self {
+        Self {
+            teacher: "mld".into(),
+            latents: "latents".into(),
+            text: "text".into(),
+            guidance: (5.0, 15.0),
+            guidance_dim: 256,
+            skip: 100,
+            distance: Distance::Huber,
+            huber_c: 0.5,
+            ema: 0.95,
+            upstream_dropout: false,
+            training: Training::published(steps, global, 2e-4),
+        }
+    }
+
+    pub(super) fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![
+            Ref::stage("teacher", &mut self.teacher, ArtifactKind::Denoiser),
+            Ref::stage("latents", &mut self.latents, ArtifactKind::Latents),
+            Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
+        ]
+    }
+
+    /// Points of the solver grid; `None` if `skip` is wrong.
+    pub(super) fn grid(&self) -> Option<usize> {
+        (self.skip > 0 && 1000usize.is_multiple_of(self.skip)).then(|| 1000 / self.skip)
+    }
+
+    pub(super) fn check(&self, p: &mut Problems) {
+        let (low, high) = self.guidance;
+        if low > high {
+            p.add("guidance", format!("`guidance` is [{low}, {high}]; expected the smaller number first"), "");
+        }
+        if !(low >= 0.0 && high.is_finite()) {
+            p.add("guidance", format!("`guidance` is [{low}, {high}]; expected numbers of 0 or more"), "");
+        }
+        if self.guidance_dim < 4 || !self.guidance_dim.is_multiple_of(2) {
+            let message = format!("`guidance_dim` is {}; expected an even number of at least 4", self.guidance_dim);
+            p.add("guidance_dim", message, "half of it are sines, half cosines");
+        }
+        if self.grid().is_none() {
+            let message = format!("`skip` is {}; expected a divisor of the 1000 timesteps", self.skip);
+            p.add("skip", message, "published: 100 (MotionLCM v2, MotionPCM) and 20 (MotionLCM v1)");
+        }
+        if self.distance == Distance::Huber {
+            p.above_zero("huber_c", self.huber_c);
+        }
+        p.fraction("ema", self.ema, true);
+        self.training.check(p);
+    }
+
+    pub(super) fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
+        stages.is_teacher(p, &self.teacher);
+        stages.same_vae(p, ("teacher", stages.vae_of_denoiser(&self.teacher)), &self.latents);
+        stages.same_data(p, &self.latents, &self.text);
+    }
+}

@@ -1,0 +1,52 @@
+//! `data.synthetic`: procedural clips, the dataset that needs no download. Source: ours.
+
+use serde::{Deserialize, Serialize};
+
+use crate::ArtifactKind;
+use crate::stage::{DataFormat, Output, Problems, Ref, Shape, StageSpec};
+
+/// `dataset: {format: synthetic, clips: 400}`: procedural motion with captions, in the HumanML3D layout.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct DataSynthetic {
+    /// Clips to make, before mirroring.
+    pub clips: usize,
+    /// Share of the clips for validation.
+    pub val: f64,
+    /// Share of the clips for the test split.
+    pub test: f64,
+    /// Adds the left/right mirrored twin of every clip.
+    pub mirror: bool,
+}
+
+impl Default for DataSynthetic {
+    fn default() -> Self {
+        Self { clips: 400, val: 0.05, test: 0.15, mirror: false }
+    }
+}
+
+impl StageSpec for DataSynthetic {
+    const KIND: &'static str = "data.synthetic";
+    const SHAPE: Shape = Shape::Plain;
+    const OUTPUT: Output = Output { name: "dataset", kind: ArtifactKind::Dataset };
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![]
+    }
+
+    fn check(&self, p: &mut Problems) {
+        p.positive("clips", self.clips);
+        if self.clips > 1_000_000 {
+            p.add("clips", format!("`clips` is {}; expected at most 1000000", self.clips), "");
+        }
+        p.fraction("val", self.val, true);
+        p.fraction("test", self.test, true);
+        if (0.0..1.0).contains(&self.val) && (0.0..1.0).contains(&self.test) && self.val + self.test >= 1.0 {
+            p.add("test", "`val` and `test` leave no clips to train on; expected a sum below 1", "");
+        }
+    }
+
+    fn format(&self) -> Option<DataFormat> {
+        Some(DataFormat::Humanml3d)
+    }
+}

@@ -1,0 +1,84 @@
+//! `distill.pcm`: phased consistency distillation with a discriminator. Source: MotionPCM, Algorithm 1.
+
+use serde::{Deserialize, Serialize};
+
+use crate::ArtifactKind;
+use crate::stage::{Distillation, Neighbours, Optimizer, Output, Problems, Ref, Sampler, Shape, StageSpec, Training};
+
+/// `distill.pcm`. Source: MotionPCM, Algorithm 1.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct DistillPcm {
+    /// M: phases, and sampling steps.
+    pub phases: usize,
+    /// Weight of the adversarial term; 0 trains without a discriminator.
+    pub adversarial: f64,
+    /// The discriminator's learning rate; 0 takes `lr`.
+    pub discriminator_lr: f64,
+    /// The discriminator's AdamW.
+    pub discriminator_optimizer: Optimizer,
+    /// Everything else.
+    #[serde(flatten)]
+    pub distillation: Distillation,
+}
+
+impl Default for DistillPcm {
+    fn default() -> Self {
+        Self {
+            phases: 1,
+            adversarial: 0.1,
+            discriminator_lr: 0.0,
+            discriminator_optimizer: Optimizer::default(),
+            distillation: Distillation::published(384_000, 128),
+        }
+    }
+}
+
+impl StageSpec for DistillPcm {
+    const KIND: &'static str = "distill.pcm";
+    const SHAPE: Shape = Shape::Gang;
+    const OUTPUT: Output = Output { name: "denoiser", kind: ArtifactKind::Denoiser };
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        self.distillation.refs()
+    }
+
+    fn check(&self, p: &mut Problems) {
+        self.distillation.check(p);
+        p.positive("phases", self.phases);
+        if let Some(grid) = self.distillation.grid()
+            && self.phases > grid
+        {
+            let (phases, skip) = (self.phases, self.distillation.skip);
+            let message = format!("`phases` is {phases}, but the grid of `skip` {skip} has only {grid} points");
+            p.add("phases", message, "take fewer phases or a smaller `skip`");
+        }
+        p.not_negative("adversarial", self.adversarial);
+        p.not_negative("discriminator_lr", self.discriminator_lr);
+        self.discriminator_optimizer.check(p, "discriminator_optimizer");
+    }
+
+    fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
+        self.distillation.check_neighbours(stages, p);
+    }
+
+    fn training(&mut self) -> Option<&mut Training> {
+        Some(&mut self.distillation.training)
+    }
+
+    fn is_student(&self) -> bool {
+        true
+    }
+
+    fn check_sampler(&self, model: &str, sampler: &Sampler, p: &mut Problems) {
+        if self.phases == sampler.steps {
+            sampler.refuse_timesteps(model, p);
+        } else {
+            let message = format!(
+                "`sampler.steps` is {}, but `{model}` has {} phase(s); a PCM student makes one step a phase",
+                sampler.steps, self.phases
+            );
+            p.add("sampler.steps", message, &format!("write `steps: {}`", self.phases));
+        }
+    }
+}

@@ -1,0 +1,48 @@
+//! `encode.latents`: VAE posteriors, computed once for all who train in the latent space. Source: ours.
+
+use serde::{Deserialize, Serialize};
+
+use crate::ArtifactKind;
+use crate::stage::{Output, Problems, Ref, Shape, StageSpec};
+
+/// `encode.latents`: posteriors of random crops, computed once.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct EncodeLatents {
+    /// Stage that gives the clips.
+    pub dataset: String,
+    /// Stage that gives the VAE.
+    pub vae: String,
+    /// Random crops per entry.
+    pub crops: usize,
+    /// Shards.
+    pub shards: usize,
+}
+
+impl Default for EncodeLatents {
+    fn default() -> Self {
+        Self { dataset: "dataset".into(), vae: "vae".into(), crops: 8, shards: 8 }
+    }
+}
+
+impl StageSpec for EncodeLatents {
+    const KIND: &'static str = "encode.latents";
+    const SHAPE: Shape = Shape::Map;
+    const OUTPUT: Output = Output { name: "latents", kind: ArtifactKind::Latents };
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![
+            Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
+            Ref::stage("vae", &mut self.vae, ArtifactKind::Vae),
+        ]
+    }
+
+    fn check(&self, p: &mut Problems) {
+        p.positive("crops", self.crops);
+        p.shards(self.shards);
+    }
+
+    fn shards(&self) -> usize {
+        self.shards
+    }
+}

@@ -1,0 +1,95 @@
+//! `evaluate.latent_fid`: a denoiser measured in its own latent space, without an evaluator. Source: ours.
+
+use serde::{Deserialize, Serialize};
+
+use crate::ArtifactKind;
+use crate::stage::{Neighbours, Output, Problems, Ref, Sampler, Shape, Split, StageSpec};
+
+/// `evaluate.latent_fid`: Frechet distance between sampled and real latents, as a share of the real variance.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct EvaluateLatentFid {
+    /// Stage that gives the denoiser.
+    pub model: String,
+    /// Stage that gives the latents.
+    pub latents: String,
+    /// Stage that gives the caption embeddings.
+    pub text: String,
+    /// Stage that gives the teacher whose 50-step samples `match` compares with; empty leaves `match` out.
+    pub teacher: String,
+    /// Sampler.
+    pub sampler: Sampler,
+    /// Repeats with other noise.
+    pub repeats: usize,
+    /// Samples per entry and repeat.
+    pub samples: usize,
+    /// Principal components of the train latents in which distances are taken.
+    pub components: usize,
+    /// Real clips compared with. `all` on small sets: with few clips the distance of real to real is large.
+    pub split: Split,
+    /// Shards.
+    pub shards: usize,
+}
+
+impl Default for EvaluateLatentFid {
+    fn default() -> Self {
+        Self {
+            model: "mld".into(),
+            latents: "latents".into(),
+            text: "text".into(),
+            teacher: String::new(),
+            sampler: Sampler::default(),
+            repeats: 5,
+            samples: 2,
+            components: 32,
+            split: Split::All,
+            shards: 5,
+        }
+    }
+}
+
+impl StageSpec for EvaluateLatentFid {
+    const KIND: &'static str = "evaluate.latent_fid";
+    // 2: retrieval among latents has names of its own.
+    const VERSION: u32 = 2;
+    const SHAPE: Shape = Shape::Map;
+    const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![
+            Ref::stage("model", &mut self.model, ArtifactKind::Denoiser).measured_if(true),
+            Ref::stage("latents", &mut self.latents, ArtifactKind::Latents),
+            Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
+            Ref::stage("teacher", &mut self.teacher, ArtifactKind::Denoiser).optional(),
+        ]
+    }
+
+    fn check(&self, p: &mut Problems) {
+        self.sampler.check(p);
+        p.positive("repeats", self.repeats);
+        p.positive("samples", self.samples);
+        p.positive("components", self.components);
+        p.shards(self.shards);
+    }
+
+    fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
+        stages.same_vae(p, ("model", stages.vae_of_denoiser(&self.model)), &self.latents);
+        stages.same_data(p, &self.latents, &self.text);
+        if !self.teacher.is_empty() {
+            stages.same_vae(p, ("teacher", stages.vae_of_denoiser(&self.teacher)), &self.latents);
+            stages.is_teacher(p, &self.teacher);
+        }
+        if let Some(latent) = stages.vae_of_latents(&self.latents).and_then(|vae| stages.latent(vae)) {
+            let size = latent.tokens * latent.dim;
+            if self.components > size {
+                let message = format!("`components` is {}, but a latent has only {size} numbers", self.components);
+                p.add("components", message, "");
+            }
+        }
+        stages.check_sampler(p, &self.model, &self.sampler);
+    }
+
+    fn shards(&self) -> usize {
+        self.shards
+    }
+}

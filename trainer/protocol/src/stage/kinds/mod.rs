@@ -1,0 +1,50 @@
+//! The list of stage kinds. A kind is its file here, its file in `stages::kinds` that runs it, and a line in each of the two lists.
+
+mod data_open;
+mod data_synthetic;
+mod distill_lcm;
+mod distill_pcm;
+mod encode_latents;
+mod evaluate_latent_fid;
+mod evaluate_reconstruction;
+mod evaluate_t2m;
+mod import_evaluator;
+mod register;
+mod text_embed;
+mod train_evaluator;
+mod train_mld;
+mod train_vae;
+
+pub use data_open::DataOpen;
+pub use data_synthetic::DataSynthetic;
+pub use distill_lcm::DistillLcm;
+pub use distill_pcm::DistillPcm;
+pub use encode_latents::EncodeLatents;
+pub use evaluate_latent_fid::EvaluateLatentFid;
+pub use evaluate_reconstruction::EvaluateReconstruction;
+pub use evaluate_t2m::{EvaluateT2m, MultiModality};
+pub use import_evaluator::ImportEvaluator;
+pub use register::{Promote, Register};
+pub use text_embed::{TextEmbed, TextEncoder};
+pub use train_evaluator::{EvaluatorNetwork, MovementPhase, TrainEvaluator};
+pub use train_mld::TrainMld;
+pub use train_vae::{TrainVae, VaeLoss, Windows};
+
+use super::StageSpec;
+
+super::spec::stage_kinds! {
+    DataOpen,
+    DataSynthetic,
+    TextEmbed,
+    TrainVae,
+    EncodeLatents,
+    TrainMld,
+    DistillLcm,
+    DistillPcm,
+    EvaluateReconstruction,
+    EvaluateLatentFid,
+    TrainEvaluator,
+    ImportEvaluator,
+    EvaluateT2m,
+    Register,
+}

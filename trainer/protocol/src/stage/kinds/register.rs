@@ -1,0 +1,155 @@
+//! `register`: model versions, and the best of them promoted. Done by the coordinator, because it changes the registry. Source: ours.
+
+use serde::{Deserialize, Serialize};
+
+use crate::ArtifactKind;
+use crate::id::is_name;
+use crate::stage::{Mode, Neighbours, Output, Problems, Ref, Shape, StageSpec};
+
+/// `register`: model versions, and the best of them promoted.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Register {
+    /// Model name.
+    pub model: String,
+    /// Training stages whose denoisers become versions. The metrics of every `evaluate.*` stage of the pipeline that
+    /// looks at one of them go with it.
+    pub from: Vec<String>,
+    /// Metric that decides which is best.
+    pub metric: String,
+    /// Its direction.
+    pub mode: Mode,
+    /// What is promoted; without it nothing is.
+    pub promote: Promote,
+}
+
+impl Default for Register {
+    fn default() -> Self {
+        Self {
+            model: String::new(),
+            from: Vec::new(),
+            metric: "latent_fid".into(),
+            mode: Mode::Min,
+            promote: Promote::default(),
+        }
+    }
+}
+
+/// The promotion at the end of a `register` stage.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Promote {
+    /// Alias; empty promotes nothing.
+    pub to: String,
+    /// Gates, such as `latent_fid <= 0.3`.
+    pub require: Vec<String>,
+}
+
+impl StageSpec for Register {
+    const KIND: &'static str = "register";
+    const SHAPE: Shape = Shape::Registry;
+    const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
+
+    /// The pipeline adds the evaluations of the candidates.
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        let field = |i| format!("from[{i}]");
+        let stages = self.from.iter_mut().enumerate();
+        stages.map(|(i, stage)| Ref::stage(field(i), stage, ArtifactKind::Denoiser)).collect()
+    }
+
+    fn check(&self, p: &mut Problems) {
+        if self.model.is_empty() {
+            p.add("model", "`model` is missing: the name under which versions are registered", "");
+        } else if !is_name(&self.model) {
+            let message =
+                format!("`{}` is not a model name; expected letters, digits, `.`, `_`, `-`, at most 64", self.model);
+            p.add("model", message, "");
+        }
+        if self.from.is_empty() {
+            p.add(
+                "from",
+                "`from` is missing: the training stages whose denoisers become versions",
+                "such as `from: [lcm, pcm]`",
+            );
+        }
+        for (i, stage) in self.from.iter().enumerate() {
+            if self.from[..i].contains(stage) {
+                p.add("from", format!("`from` lists `{stage}` twice"), "");
+            }
+        }
+        if self.metric.trim().is_empty() {
+            p.add("metric", "`metric` is empty; expected the metric that decides which version is best", "");
+        }
+        self.promote.check(p);
+    }
+
+    fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
+        for (i, from) in self.from.iter().enumerate() {
+            if !stages.measures(from) && (self.from.len() > 1 || !self.promote.to.is_empty()) {
+                let message = format!("no `evaluate.*` stage looks at `{from}`, so `{}` cannot judge it", self.metric);
+                let help = format!("add a stage such as `{{kind: evaluate.latent_fid, model: {from}}}`");
+                p.add(&format!("from[{i}]"), message, &help);
+            }
+        }
+    }
+}
+
+impl Promote {
+    fn check(&self, p: &mut Problems) {
+        if !self.to.is_empty() && !is_name(&self.to) {
+            let message = format!("`{}` is not an alias; expected letters, digits, `.`, `_`, `-`, at most 64", self.to);
+            p.add("promote.to", message, "");
+        }
+        if self.to.is_empty() && !self.require.is_empty() {
+            p.add("promote.require", "`promote.require` has gates, but `promote.to` names no alias", "");
+        }
+        for gate in self.require.iter().filter(|gate| !is_gate(gate)) {
+            let message =
+                format!("`{gate}` is not a gate; expected a metric, one of <= >= < >, and a number or an alias");
+            p.add("promote.require", message, "such as \"latent_fid <= 0.3\"");
+        }
+    }
+}
+
+/// `metric <= number`, or with `alias`, `alias + number`, `alias - number` on the right.
+fn is_gate(gate: &str) -> bool {
+    let Some(at) = gate.find(['<', '>']) else { return false };
+    let (metric, rest) = gate.split_at(at);
+    let metric = metric.trim();
+    let Some(right) = ["<=", ">=", "<", ">"].iter().find_map(|operator| rest.strip_prefix(operator)) else {
+        return false;
+    };
+    let metric_fits = !metric.is_empty()
+        && metric.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-' | b'@' | b'/'));
+    let number = |text: &str| text.parse::<f64>().is_ok_and(f64::is_finite);
+    let words: Vec<&str> = right.split_whitespace().collect();
+    let right_fits = match words[..] {
+        [bound] => number(bound) || (is_name(bound) && bound.parse::<f64>().is_err()),
+        [alias, "+" | "-", offset] => is_name(alias) && number(offset),
+        _ => false,
+    };
+    metric_fits && right_fits
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gates_are_comparisons() {
+        for good in [
+            "latent_fid <= 0.3",
+            "fid<=0.05",
+            "fid.upper <= 0.05",
+            "eval.r_precision_top1 >= staging - 0.005",
+            "a > 1",
+            "a < prod",
+            "fid.upper <= 0.05",
+        ] {
+            assert!(is_gate(good), "{good}");
+        }
+        for bad in ["", "latent_fid", "<= 1", "a <= ", "a => 1", "a == 1", "a <= b c", "a b <= 1", "a <= nan"] {
+            assert!(!is_gate(bad), "{bad}");
+        }
+    }
+}

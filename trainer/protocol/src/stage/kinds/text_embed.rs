@@ -1,0 +1,40 @@
+//! `text.embed`: every caption of a dataset as a vector, computed once. `hashed` is ours.
+
+use serde::{Deserialize, Serialize};
+
+use crate::ArtifactKind;
+use crate::stage::{Output, Ref, Shape, StageSpec};
+
+/// `text: {encoder: hashed}`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct TextEmbed {
+    /// `hashed`: n-grams hashed to signed coordinates, unit norm; needs no weights.
+    pub encoder: TextEncoder,
+    /// Stage whose captions are embedded.
+    pub dataset: String,
+}
+
+impl Default for TextEmbed {
+    fn default() -> Self {
+        Self { encoder: TextEncoder::Hashed, dataset: "dataset".into() }
+    }
+}
+
+/// How a caption becomes a vector.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum TextEncoder {
+    /// Words and word pairs hashed into 768 signed coordinates, L2-normalised.
+    Hashed,
+}
+
+impl StageSpec for TextEmbed {
+    const KIND: &'static str = "text.embed";
+    const SHAPE: Shape = Shape::Plain;
+    const OUTPUT: Output = Output { name: "embeddings", kind: ArtifactKind::Embeddings };
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset)]
+    }
+}

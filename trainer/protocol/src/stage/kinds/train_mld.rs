@@ -1,0 +1,78 @@
+//! `train.mld`: the latent-diffusion teacher. Source: MLD, MotionLCM v1/v2.
+
+use serde::{Deserialize, Serialize};
+
+use crate::ArtifactKind;
+use crate::stage::{Neighbours, Network, Output, Problems, Ref, Sampler, Shape, StageSpec, Training};
+
+/// `train.mld`: the latent-diffusion teacher. Source: MLD, MotionLCM v1/v2.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct TrainMld {
+    /// Stage that gives the VAE; its latent shape must be that of `latents`.
+    pub vae: String,
+    /// Stage that gives the latents.
+    pub latents: String,
+    /// Stage that gives the caption embeddings.
+    pub text: String,
+    /// Size.
+    pub network: Network,
+    /// A ReLU on the text embedding (v1); v2 removed it.
+    pub text_relu: bool,
+    /// Probability that a caption is replaced by the empty one.
+    pub guidance_dropout: f64,
+    /// EMA of the weights that is kept as the result; 0 keeps the weights themselves.
+    pub ema: f64,
+    /// The rest.
+    #[serde(flatten)]
+    pub training: Training,
+}
+
+impl Default for TrainMld {
+    fn default() -> Self {
+        Self {
+            vae: "vae".into(),
+            latents: "latents".into(),
+            text: "text".into(),
+            network: Network::default(),
+            text_relu: false,
+            guidance_dropout: 0.1,
+            ema: 0.0,
+            training: Training::published(1_150_000, 64, 1e-4),
+        }
+    }
+}
+
+impl StageSpec for TrainMld {
+    const KIND: &'static str = "train.mld";
+    const SHAPE: Shape = Shape::Gang;
+    const OUTPUT: Output = Output { name: "denoiser", kind: ArtifactKind::Denoiser };
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![
+            Ref::stage("vae", &mut self.vae, ArtifactKind::Vae),
+            Ref::stage("latents", &mut self.latents, ArtifactKind::Latents),
+            Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
+        ]
+    }
+
+    fn check(&self, p: &mut Problems) {
+        self.network.check(p);
+        p.fraction("guidance_dropout", self.guidance_dropout, false);
+        p.fraction("ema", self.ema, true);
+        self.training.check(p);
+    }
+
+    fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
+        stages.same_vae(p, ("vae", Some(&self.vae)), &self.latents);
+        stages.same_data(p, &self.latents, &self.text);
+    }
+
+    fn training(&mut self) -> Option<&mut Training> {
+        Some(&mut self.training)
+    }
+
+    fn check_sampler(&self, model: &str, sampler: &Sampler, p: &mut Problems) {
+        sampler.refuse_timesteps(model, p);
+    }
+}

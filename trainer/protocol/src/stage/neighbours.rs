@@ -1,0 +1,124 @@
+//! The other stages of a pipeline, as a kind's checks see them: found by following references, not by kind.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::{DataFormat, LatentShape, Problems, Sampler, StageSettings};
+use crate::{ArtifactKind, StageName};
+
+/// The stages of a pipeline by name. References are sound: they lead to stages that give the right kind, and nowhere in a circle.
+#[derive(Debug)]
+pub struct Neighbours<'a> {
+    stages: BTreeMap<&'a str, &'a StageSettings>,
+    /// For each stage, the stages that it reads by what they give.
+    reads: BTreeMap<&'a str, Vec<(ArtifactKind, String)>>,
+    measured: BTreeSet<String>,
+}
+
+impl<'a> Neighbours<'a> {
+    pub(crate) fn new(stages: impl Iterator<Item = (&'a StageName, &'a StageSettings)>) -> Self {
+        let stages: BTreeMap<&str, &StageSettings> = stages.map(|(name, settings)| (name.as_str(), settings)).collect();
+        let read = |settings: &StageSettings| -> Vec<(ArtifactKind, String)> {
+            settings.inputs().into_iter().map(|(_, stage, kind)| (kind, stage)).collect()
+        };
+        let reads = stages.iter().map(|(name, settings)| (*name, read(settings))).collect();
+        let measured = stages.values().filter_map(|settings| settings.evaluated_model()).collect();
+        Self { stages, reads, measured }
+    }
+
+    /// The stage of that name.
+    pub fn stage(&self, name: &str) -> Option<&'a StageSettings> {
+        self.stages.get(name).copied()
+    }
+
+    /// The first stage giving `kind` that stage `name` reads.
+    pub fn read_by(&self, name: &str, kind: ArtifactKind) -> Option<&str> {
+        self.reads.get(name)?.iter().find(|(found, _)| *found == kind).map(|(_, stage)| stage.as_str())
+    }
+
+    /// Which VAE the latents were encoded with.
+    pub fn vae_of_latents(&self, latents: &str) -> Option<&str> {
+        self.read_by(latents, ArtifactKind::Vae)
+    }
+
+    /// Which VAE made the latents that a denoiser was trained on.
+    pub fn vae_of_denoiser(&self, denoiser: &str) -> Option<&str> {
+        self.vae_of_latents(self.read_by(denoiser, ArtifactKind::Latents)?)
+    }
+
+    /// The clips behind latents or caption embeddings.
+    pub fn dataset_of(&self, name: &str) -> Option<&str> {
+        self.read_by(name, ArtifactKind::Dataset)
+    }
+
+    /// The skeleton of a dataset, or the one that an evaluator is for.
+    pub fn format(&self, name: &str) -> Option<DataFormat> {
+        self.stage(name)?.spec().format().or_else(|| {
+            let dataset = self.dataset_of(name)?;
+            if dataset == name { None } else { self.format(dataset) }
+        })
+    }
+
+    /// The shape of a VAE's latents.
+    pub fn latent(&self, vae: &str) -> Option<LatentShape> {
+        self.stage(vae)?.spec().latent()
+    }
+
+    /// Whether an evaluation measures stage `name`.
+    pub fn measures(&self, name: &str) -> bool {
+        self.measured.contains(name)
+    }
+
+    /// Refuses latents of another VAE than `vae`, which `field` stands for.
+    pub(crate) fn same_vae(&self, p: &mut Problems, (field, vae): (&str, Option<&str>), latents: &str) {
+        if let (Some(vae), Some(other)) = (vae, self.vae_of_latents(latents))
+            && vae != other
+        {
+            let shape = |vae| self.latent(vae).map_or_else(String::new, |l| format!(" ({}x{})", l.tokens, l.dim));
+            let (shape, other_shape) = (shape(vae), shape(other));
+            let message = if field == "vae" {
+                format!("`vae` is `{vae}`{shape}, but `{latents}` was encoded with `{other}`{other_shape}")
+            } else {
+                format!(
+                    "`{field}` works on latents of `{vae}`{shape}, but `{latents}` was encoded with `{other}`{other_shape}"
+                )
+            };
+            p.add(field, message, "latents of another VAE mean other motions; name the same VAE in both places");
+        }
+    }
+
+    /// Refuses captions of other clips than those of `latents`.
+    pub(crate) fn same_data(&self, p: &mut Problems, latents: &str, text: &str) {
+        if let (Some(data), Some(other)) = (self.dataset_of(latents), self.dataset_of(text))
+            && data != other
+        {
+            let message = format!("`{text}` embeds the captions of `{other}`, but `{latents}` are of `{data}`");
+            p.add("text", message, &format!("add a `text.embed` stage with `dataset: {data}`"));
+        }
+    }
+
+    /// Refuses captions of other clips than those of `dataset`.
+    pub(crate) fn same_captions(&self, p: &mut Problems, text: &str, dataset: &str) {
+        if let Some(data) = self.dataset_of(text)
+            && data != dataset
+        {
+            let message = format!("`{text}` embeds the captions of `{data}`, but the clips are of `{dataset}`");
+            p.add("text", message, &format!("add a `text.embed` stage with `dataset: {dataset}`"));
+        }
+    }
+
+    /// Refuses a student where a teacher is needed.
+    pub(crate) fn is_teacher(&self, p: &mut Problems, teacher: &str) {
+        if let Some(settings) = self.stage(teacher).filter(|settings| settings.spec().is_student()) {
+            let kind = settings.kind();
+            let message = format!("`{teacher}` is a student ({kind}), but `teacher` needs a `train.mld` stage");
+            p.add("teacher", message, "a student has guidance built in, and cannot be asked without it");
+        }
+    }
+
+    /// Refuses steps and timesteps that the model does not have.
+    pub(crate) fn check_sampler(&self, p: &mut Problems, model: &str, sampler: &Sampler) {
+        if let Some(settings) = self.stage(model) {
+            settings.spec().check_sampler(model, sampler, p);
+        }
+    }
+}

@@ -1,0 +1,58 @@
+//! What does not hold of a stage, collected by its checks.
+
+/// A rule that does not hold.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Problem {
+    /// The field, as a path inside the stage; empty for the stage itself.
+    pub field: String,
+    /// What is wrong and what was expected.
+    pub message: String,
+    /// What to do.
+    pub help: Option<String>,
+}
+
+/// Problems of one stage, in the order in which they were found.
+#[derive(Debug, Default)]
+pub struct Problems(pub Vec<Problem>);
+
+impl Problems {
+    /// Adds one; an empty `help` is none.
+    pub fn add(&mut self, field: &str, message: impl Into<String>, help: &str) {
+        let help = (!help.is_empty()).then(|| help.to_owned());
+        self.0.push(Problem { field: field.to_owned(), message: message.into(), help });
+    }
+
+    pub(crate) fn positive(&mut self, field: &str, value: usize) {
+        if value == 0 {
+            self.add(field, format!("`{field}` is 0; expected at least 1"), "");
+        }
+    }
+
+    pub(crate) fn above_zero(&mut self, field: &str, value: f64) {
+        if !(value > 0.0 && value.is_finite()) {
+            self.add(field, format!("`{field}` is {value}; expected a number above 0"), "");
+        }
+    }
+
+    pub(crate) fn not_negative(&mut self, field: &str, value: f64) {
+        if !(value >= 0.0 && value.is_finite()) {
+            self.add(field, format!("`{field}` is {value}; expected 0 or more"), "");
+        }
+    }
+
+    /// 0 <= value <= 1, or < 1 when `open`.
+    pub(crate) fn fraction(&mut self, field: &str, value: f64, open: bool) {
+        let fits = value >= 0.0 && if open { value < 1.0 } else { value <= 1.0 };
+        if !fits {
+            let range = if open { "at least 0 and below 1" } else { "between 0 and 1" };
+            self.add(field, format!("`{field}` is {value}; expected {range}"), "");
+        }
+    }
+
+    /// Shards of a map stage.
+    pub(crate) fn shards(&mut self, shards: usize) {
+        if !(1..=100_000).contains(&shards) {
+            self.add("shards", format!("`shards` is {shards}; expected 1 to 100000"), "");
+        }
+    }
+}
