@@ -150,6 +150,11 @@ impl StageSettings {
         settings.refs().into_iter().find(|reference| reference.measured).map(|reference| reference.name.clone())
     }
 
+    /// The schema of the kind's keys.
+    pub(crate) fn schema(&self, generator: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        self.spec().schema(generator)
+    }
+
     pub(crate) fn check(&self, problems: &mut Problems) {
         self.spec().check(problems);
     }

@@ -6,6 +6,7 @@
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -13,7 +14,7 @@ use crate::stage::{Mode, Placement, StageSettings, WorkerRange};
 use crate::{ArtifactKind, StageName, Steps, pipeline};
 
 /// How the space is searched.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum SearchKind {
     /// Every point of the grid, each for the whole budget.
@@ -36,7 +37,7 @@ impl SearchKind {
 }
 
 /// Budgets at which ASHA compares trials: `first`, `first * factor`, ... below the stage's `steps`, and these.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Rungs {
     /// Steps of the first rung.

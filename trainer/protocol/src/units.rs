@@ -1,7 +1,9 @@
 //! Quantities that users write with a unit or a suffix.
 
+use std::borrow::Cow;
 use std::fmt;
 
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::{self, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -54,6 +56,21 @@ impl<'de> Deserialize<'de> for Steps {
             }
         }
         deserializer.deserialize_any(StepsVisitor)
+    }
+}
+
+impl JsonSchema for Steps {
+    fn schema_name() -> Cow<'static, str> {
+        "Steps".into()
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        json_schema!({
+            "type": ["integer", "string"],
+            "minimum": 0,
+            "pattern": r"^ *[0-9_.]+ *[kM]? *(steps?)? *$",
+            "x-unit": "steps",
+        })
     }
 }
 

@@ -28,6 +28,22 @@ pub(crate) struct DevicesArgs {
     pub(super) output: Output,
 }
 
+#[derive(Debug, Args)]
+pub(crate) struct SchemaArgs {
+    /// Prints the reference of all stage kinds and their keys, `docs/pipeline.md`, instead
+    #[arg(long)]
+    markdown: bool,
+}
+
+pub(crate) fn schema(args: &SchemaArgs) -> u8 {
+    if args.markdown {
+        print::out(protocol::pipeline::markdown().trim_end());
+    } else {
+        print::json(&protocol::pipeline::json_schema());
+    }
+    0
+}
+
 pub(crate) fn config(verb: &ConfigVerb) -> Result<u8> {
     let ConfigVerb::Show { pipeline: args, output } = verb;
     let pipeline = pipeline_file::read(&args.pipeline, &args.set)?.pipeline;

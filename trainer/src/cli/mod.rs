@@ -60,6 +60,8 @@ enum Verb {
     /// Pipeline files
     #[command(subcommand)]
     Config(config::ConfigVerb),
+    /// Prints the JSON Schema of pipelines, for editors
+    Schema(config::SchemaArgs),
     /// Workers
     #[command(subcommand)]
     Worker(WorkerVerb),
@@ -201,7 +203,11 @@ impl Verb {
             Self::Time(args) => args.output,
             Self::Devices(args) => args.output,
             Self::Worker(WorkerVerb::List(args)) => args.output,
-            Self::Serve(_) | Self::Config(_) | Self::Worker(WorkerVerb::Join(_)) | Self::Registry(_) => Output::Table,
+            Self::Serve(_)
+            | Self::Config(_)
+            | Self::Schema(_)
+            | Self::Worker(WorkerVerb::Join(_))
+            | Self::Registry(_) => Output::Table,
         }
     }
 }
@@ -222,6 +228,7 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Time(args) => time::time(args).await,
         Verb::Devices(args) => Ok(config::devices(&args)),
         Verb::Config(verb) => config::config(&verb),
+        Verb::Schema(args) => Ok(config::schema(&args)),
         Verb::Worker(WorkerVerb::List(args)) => remote::workers(args).await,
         Verb::Worker(WorkerVerb::Join(_)) => Ok(0),
         Verb::Registry(args) => Ok(registry::cli::execute(args.verb, &args.store, args.output).await),

@@ -8,6 +8,7 @@ mod diagnostic;
 mod graph;
 mod overrides;
 mod read;
+mod reference;
 mod rules;
 mod schema;
 mod sweep;
@@ -24,6 +25,7 @@ use crate::{ArtifactKind, Digest, Seed, StageName};
 
 pub use diagnostic::{Diagnostic, Diagnostics};
 pub use read::read;
+pub use reference::{json_schema, markdown};
 
 #[cfg(test)]
 mod sweep_tests;

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -42,11 +43,25 @@ pub fn read(file: &str, text: &str, sets: &[String]) -> Result<Pipeline, Diagnos
 }
 
 /// What a pipeline says of itself.
-#[derive(Debug, Serialize, Deserialize)]
+#[derive(Debug, Serialize, Deserialize, JsonSchema)]
 struct Head {
+    /// Names its runs: a letter or digit, then letters, digits, `.`, `_`, `-`.
     name: String,
+    /// What all randomness is keyed by.
     seed: Seed,
+    /// Where tensors live.
     backend: Backend,
+}
+
+impl Default for Head {
+    fn default() -> Self {
+        Self { name: String::new(), seed: Seed(0), backend: Backend::default() }
+    }
+}
+
+/// The keys of a pipeline that have a type of their own.
+pub(super) fn described_head() -> Value {
+    super::reference::described(&Head::default())
 }
 
 /// A stage as it stands in the file.
@@ -100,8 +115,7 @@ impl Reader {
     }
 
     fn head(&mut self, root: &Node) -> Option<Head> {
-        let head = Head { name: String::new(), seed: Seed(0), backend: Backend::default() };
-        let mut base = serde_json::to_value(head).ok()?;
+        let mut base = serde_json::to_value(Head::default()).ok()?;
         overlay::<Head>(&mut base, root, "the pipeline", "", &["dataset", "text", "stages"], &mut self.mistakes);
         match root.entry("name") {
             None => {

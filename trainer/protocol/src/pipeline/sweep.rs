@@ -5,8 +5,9 @@
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use super::PipelineStage;
 use super::diagnostic::Position;
@@ -21,14 +22,20 @@ use crate::{ArtifactKind, StageName};
 
 /// What a domain may be.
 const DOMAINS: [&str; 3] = ["choice", "uniform", "log_uniform"];
-/// The keys of a sweep that have a type of their own.
-#[derive(Debug, Serialize, Deserialize)]
+/// Searches some of the stage's settings for the values with which `evaluate` measures best.
+#[derive(Debug, Serialize, Deserialize, JsonSchema)]
 struct Head {
+    /// How.
     search: SearchKind,
+    /// The value of `evaluate` that decides which trial is best.
     metric: String,
+    /// Its direction.
     mode: Mode,
+    /// How many points of the space are tried; a grid may leave it out.
     trials: usize,
+    /// Trials that may be under way at a time.
     parallel: usize,
+    /// ASHA's budgets.
     rungs: Rungs,
 }
 
@@ -43,6 +50,23 @@ impl Default for Head {
             rungs: Rungs::default(),
         }
     }
+}
+
+/// The keys of a sweep.
+pub(super) fn described() -> Value {
+    let mut schema = super::reference::described(&Head::default());
+    let properties = &mut schema["properties"];
+    properties["space"] = json!({
+        "description": "Settings of the stage, each with `choice: [a, b]`, `uniform: [from, to]` or `log_uniform: [from, to]`.",
+        "type": "object",
+    });
+    properties["evaluate"] = json!({
+        "description": "The stage that judges a trial, without what it judges: an `evaluate.*` kind and its keys.",
+        "type": "object",
+        "required": ["kind"],
+    });
+    schema["required"] = json!(["metric", "space", "evaluate"]);
+    schema
 }
 
 impl Reader {

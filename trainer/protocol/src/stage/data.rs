@@ -1,9 +1,10 @@
 //! The formats of datasets.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Length-dependent rules of the two data formats.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum DataFormat {
     /// 263 features, 22 joints, 20 fps, metres.

@@ -1,12 +1,13 @@
 //! What both distillations share. Source: MotionLCM, MotionPCM.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{Neighbours, Problems, Ref, Training};
 use crate::ArtifactKind;
 
 /// Which distance consistency losses use.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Distance {
     /// `sqrt(d^2 + c^2) - c`.
@@ -16,7 +17,7 @@ pub enum Distance {
 }
 
 /// What both distillations share.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default = "Distillation::motion_lcm")]
 pub struct Distillation {
     /// Stage that gives the teacher.

@@ -1,11 +1,12 @@
 //! What evaluations share: which clips, how motions are drawn, which direction of a metric is better.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::Problems;
 
 /// Which clips an evaluation looks at.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Split {
     /// `train.txt`.
@@ -19,7 +20,7 @@ pub enum Split {
 }
 
 /// Whether a smaller or a larger value is better.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Mode {
     /// Smaller is better.
@@ -29,7 +30,7 @@ pub enum Mode {
 }
 
 /// How motions are drawn from a denoiser.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Sampler {
     /// Network evaluations. A PCM student has as many as phases.

@@ -1,11 +1,12 @@
 //! The size of networks and of latents.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::Problems;
 
 /// A model's size. The published networks: width 256, 9 layers, 4 heads, feed-forward 1024, dropout 0.1.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Network {
     /// Width H of the tokens.
@@ -55,7 +56,7 @@ impl Network {
 }
 
 /// What learned position tables start from. The tables are trained either way and import and export alike.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Positions {
     /// Uniform on [0, 1), as published: frames start out almost alike.
@@ -67,7 +68,7 @@ pub enum Positions {
 }
 
 /// Shape of a latent: `tokens` x `dim`. 1x256 is v1, 16x32 is v2.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct LatentShape {
     /// N latent tokens.

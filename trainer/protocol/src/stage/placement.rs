@@ -2,13 +2,14 @@
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{Mode, Problems};
 use crate::Steps;
 
 /// What cannot change a stage's value: where it runs and how often it saves.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, Default)]
 #[serde(default)]
 pub struct Placement {
     /// How many workers a gang takes.
@@ -41,7 +42,7 @@ impl Placement {
 }
 
 /// How many workers a gang takes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct WorkerRange {
     /// Below this many it yields and waits.
@@ -57,7 +58,7 @@ impl Default for WorkerRange {
 }
 
 /// When checkpoints are saved and which are kept.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct CheckpointPolicy {
     /// Saved after every so many steps; 0 saves only when the stage yields.
@@ -73,7 +74,7 @@ impl Default for CheckpointPolicy {
 }
 
 /// Which checkpoints of a task are kept; the union.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Keep {
     /// Newest.

@@ -6,6 +6,7 @@
 use std::any::Any;
 use std::borrow::Cow;
 
+use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
@@ -35,7 +36,9 @@ pub struct Output {
 }
 
 /// A stage kind. Its `Default` is the published recipe where there is one, and the schema of its keys.
-pub trait StageSpec: Default + Clone + PartialEq + std::fmt::Debug + Serialize + DeserializeOwned + 'static {
+pub trait StageSpec:
+    Default + Clone + PartialEq + std::fmt::Debug + Serialize + DeserializeOwned + JsonSchema + 'static
+{
     /// Its name in YAML, such as `train.vae`.
     const KIND: &'static str;
     /// Grows when a change of ours changes what the kind computes, so that an old result is not mistaken for a new one.
@@ -153,6 +156,7 @@ pub(super) trait AnySpec: Any {
     fn version(&self) -> u32;
     fn shape(&self) -> Shape;
     fn output(&self) -> Output;
+    fn schema(&self, generator: &mut SchemaGenerator) -> Schema;
     fn refs(&mut self) -> Vec<Ref<'_>>;
     fn check(&self, problems: &mut Problems);
     fn check_neighbours(&self, stages: &Neighbours<'_>, problems: &mut Problems);
@@ -179,6 +183,10 @@ impl<S: StageSpec> AnySpec for S {
 
     fn output(&self) -> Output {
         S::OUTPUT
+    }
+
+    fn schema(&self, generator: &mut SchemaGenerator) -> Schema {
+        S::json_schema(generator)
     }
 
     fn refs(&mut self) -> Vec<Ref<'_>> {

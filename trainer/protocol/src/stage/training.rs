@@ -1,12 +1,13 @@
 //! What training stages share: batch, schedule, optimizer.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::Problems;
 use crate::Steps;
 
 /// The global batch and the fixed slices it is cut into. Part of a stage's identity; the number of workers is not.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct Batch {
     /// Examples per optimizer update, over all workers.
     pub global: usize,
@@ -25,7 +26,7 @@ impl Batch {
 }
 
 /// Learning rate after the warm-up.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Decay {
     /// Half a cosine down to zero at the last step.
@@ -35,7 +36,7 @@ pub enum Decay {
 }
 
 /// AdamW. Defaults are the papers' (betas 0.9/0.999, eps 1e-8, weight decay 0), not a library's.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Optimizer {
     /// First moment's decay.
@@ -64,7 +65,7 @@ impl Optimizer {
 }
 
 /// What every training stage shares.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Training {
     /// Optimizer updates.
     pub steps: Steps,

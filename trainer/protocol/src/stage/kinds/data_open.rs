@@ -1,12 +1,13 @@
 //! `data.open`: a folder in the published layout. Source: HumanML3D, KIT-ML.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
 use crate::stage::{DataFormat, Output, Problems, Ref, Shape, StageSpec};
 
 /// `dataset: {format: humanml3d, path: ...}`: a folder in the published layout.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct DataOpen {
     /// Which of the two formats.

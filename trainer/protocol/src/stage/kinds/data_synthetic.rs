@@ -1,12 +1,13 @@
 //! `data.synthetic`: procedural clips, the dataset that needs no download. Source: ours.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
 use crate::stage::{DataFormat, Output, Problems, Ref, Shape, StageSpec};
 
 /// `dataset: {format: synthetic, clips: 400}`: procedural motion with captions, in the HumanML3D layout.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct DataSynthetic {
     /// Clips to make, before mirroring.

@@ -1,12 +1,13 @@
 //! `distill.lcm`: latent consistency distillation. Source: MotionLCM.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
 use crate::stage::{Distillation, Neighbours, Output, Problems, Ref, Sampler, Shape, StageSpec, Training};
 
 /// `distill.lcm`. Source: MotionLCM.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct DistillLcm {
     /// Everything.

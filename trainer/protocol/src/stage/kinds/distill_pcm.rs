@@ -1,12 +1,13 @@
 //! `distill.pcm`: phased consistency distillation with a discriminator. Source: MotionPCM, Algorithm 1.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
 use crate::stage::{Distillation, Neighbours, Optimizer, Output, Problems, Ref, Sampler, Shape, StageSpec, Training};
 
 /// `distill.pcm`. Source: MotionPCM, Algorithm 1.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct DistillPcm {
     /// M: phases, and sampling steps.

@@ -1,12 +1,13 @@
 //! `encode.latents`: VAE posteriors, computed once for all who train in the latent space. Source: ours.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
 use crate::stage::{Output, Problems, Ref, Shape, StageSpec};
 
 /// `encode.latents`: posteriors of random crops, computed once.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EncodeLatents {
     /// Stage that gives the clips.

@@ -1,12 +1,13 @@
 //! `evaluate.latent_fid`: a denoiser measured in its own latent space, without an evaluator. Source: ours.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
 use crate::stage::{Neighbours, Output, Problems, Ref, Sampler, Shape, Split, StageSpec};
 
 /// `evaluate.latent_fid`: Frechet distance between sampled and real latents, as a share of the real variance.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluateLatentFid {
     /// Stage that gives the denoiser.

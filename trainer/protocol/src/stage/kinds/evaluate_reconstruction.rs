@@ -1,12 +1,13 @@
 //! `evaluate.reconstruction`: what a VAE loses. Source: MLD's MPJPE, DisCoRD's sJPE, and our feature error.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
 use crate::stage::{Output, Problems, Ref, Shape, Split, StageSpec};
 
 /// `evaluate.reconstruction`: MPJPE in mm and feature error of a VAE.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluateReconstruction {
     /// Stage that gives the VAE.

@@ -1,12 +1,13 @@
 //! `evaluate.t2m`: the papers' metrics, in an evaluator's space. Source: text-to-motion (Guo et al., CVPR 2022) and all after it.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
 use crate::stage::{Neighbours, Output, Problems, Ref, Sampler, Shape, Split, StageSpec};
 
 /// How different the motions of one caption are.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct MultiModality {
     /// Captions per repeat; 0 leaves the metric out.
@@ -24,7 +25,7 @@ impl Default for MultiModality {
 }
 
 /// `evaluate.t2m`: the papers' metrics, in an evaluator's space.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluateT2m {
     /// Stage that gives the denoiser.

@@ -1,12 +1,13 @@
 //! `import.evaluator`: a published evaluator, read from its files. Source: text-to-motion (Guo et al., CVPR 2022).
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
 use crate::stage::{DataFormat, Output, Problems, Ref, Shape, StageSpec};
 
 /// `import.evaluator`: the published files.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct ImportEvaluator {
     /// Folder in the published layout: `text_mot_match/model/finest.tar` (or `finest.safetensors`) and, where there are several, the one

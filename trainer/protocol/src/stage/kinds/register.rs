@@ -1,5 +1,6 @@
 //! `register`: model versions, and the best of them promoted. Done by the coordinator, because it changes the registry. Source: ours.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
@@ -7,7 +8,7 @@ use crate::id::is_name;
 use crate::stage::{Mode, Neighbours, Output, Problems, Ref, Shape, StageSpec};
 
 /// `register`: model versions, and the best of them promoted.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Register {
     /// Model name.
@@ -36,7 +37,7 @@ impl Default for Register {
 }
 
 /// The promotion at the end of a `register` stage.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Promote {
     /// Alias; empty promotes nothing.

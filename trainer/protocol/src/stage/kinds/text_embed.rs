@@ -1,12 +1,13 @@
 //! `text.embed`: every caption of a dataset as a vector, computed once. `hashed` is ours.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
 use crate::stage::{Output, Ref, Shape, StageSpec};
 
 /// `text: {encoder: hashed}`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct TextEmbed {
     /// `hashed`: n-grams hashed to signed coordinates, unit norm; needs no weights.
@@ -22,7 +23,7 @@ impl Default for TextEmbed {
 }
 
 /// How a caption becomes a vector.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum TextEncoder {
     /// Words and word pairs hashed into 768 signed coordinates, L2-normalised.

@@ -1,12 +1,13 @@
 //! `train.evaluator`: embeds captions and motions in one space, in which the papers measure. Source: text-to-motion (Guo et al., CVPR 2022).
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::stage::{Batch, Decay, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training};
 use crate::{ArtifactKind, Steps};
 
 /// An evaluator's size. The published one: 512, 1024, 512, 512, dropout 0.2.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluatorNetwork {
     /// Width of a movement, and between the two convolutions that make it.
@@ -28,7 +29,7 @@ impl Default for EvaluatorNetwork {
 }
 
 /// The first phase: movements learn to hold their frames.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct MovementPhase {
     /// Share of the steps that it takes.
@@ -50,7 +51,7 @@ impl Default for MovementPhase {
 }
 
 /// `train.evaluator`. Source: text-to-motion (Guo et al., CVPR 2022).
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct TrainEvaluator {
     /// Stage that gives the clips.

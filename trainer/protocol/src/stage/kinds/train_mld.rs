@@ -1,12 +1,13 @@
 //! `train.mld`: the latent-diffusion teacher. Source: MLD, MotionLCM v1/v2.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
 use crate::stage::{Neighbours, Network, Output, Problems, Ref, Sampler, Shape, StageSpec, Training};
 
 /// `train.mld`: the latent-diffusion teacher. Source: MLD, MotionLCM v1/v2.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct TrainMld {
     /// Stage that gives the VAE; its latent shape must be that of `latents`.

@@ -1,12 +1,13 @@
 //! `train.vae`: the motion VAE. Source: MLD (v1, 1x256), MotionLCM v2 (16x32).
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
 use crate::stage::{Batch, LatentShape, Network, Output, Problems, Ref, Shape, StageSpec, Training};
 
 /// Weights of the VAE loss. Source: MotionLCM v2 (feature 1, joint 1, velocity 0, KL 1e-4).
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct VaeLoss {
     /// Smooth-L1 on normalised features.
@@ -30,7 +31,7 @@ impl Default for VaeLoss {
 }
 
 /// Short crops for the first part of the training: most steps per second, best result per hour on small budgets.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Windows {
     /// Shortest crop in frames.
@@ -50,7 +51,7 @@ impl Default for Windows {
 }
 
 /// `train.vae`. Source: MLD (v1, 1x256), MotionLCM v2 (16x32).
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct TrainVae {
     /// Stage that gives the clips.
