@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
+use access::ServerOptions;
 use clap::Parser;
 use registry::cli::{Output, Verb, execute};
 
@@ -13,6 +14,8 @@ struct Cli {
     /// The store's folder
     #[arg(long, env = "STRIDE_STORE", default_value = ".stride", global = true)]
     store: PathBuf,
+    #[command(flatten)]
+    server: ServerOptions,
     /// How the answer is printed
     #[arg(short, long, value_enum, default_value_t, global = true)]
     output: Output,
@@ -23,6 +26,10 @@ struct Cli {
 fn main() -> ExitCode {
     registry::failpoints::arm_from_env();
     let cli = Cli::parse();
+    if !matches!(cli.verb, Verb::Export { .. }) {
+        // What is made in a store is its user's alone.
+        nix::sys::stat::umask(nix::sys::stat::Mode::from_bits_truncate(0o077));
+    }
     let runtime = match tokio::runtime::Runtime::new() {
         Ok(runtime) => runtime,
         Err(e) => {
@@ -30,5 +37,21 @@ fn main() -> ExitCode {
             return ExitCode::FAILURE;
         }
     };
-    ExitCode::from(runtime.block_on(execute(cli.verb, &cli.store, cli.output)))
+    ExitCode::from(runtime.block_on(execute(cli.verb, &cli.store, &cli.server, cli.output)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_commands_of_the_documents_parse() {
+        let commands = cluster_tests::documented::commands(&cluster_tests::Bench::repository(), "registry");
+        assert!(commands.len() >= 8, "{commands:#?}");
+        for words in commands {
+            if let Err(error) = Cli::try_parse_from(&words) {
+                panic!("{}: {error}", words.join(" "));
+            }
+        }
+    }
 }

@@ -10,8 +10,9 @@
 //!
 //! One process holds a store. A second one is told who, and asks that one over HTTP.
 
-use std::fs;
+use std::fs::{self, DirBuilder};
 use std::io;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -149,8 +150,9 @@ impl Store {
     /// Opens the store in `dir`, making it if there is none. `holder` says to others what this process is.
     pub async fn open(dir: &Path, holder: Holder) -> Result<Self, OpenError> {
         let io = |path: &Path, e: io::Error| OpenError::io(path, &e);
-        fs::create_dir_all(dir).map_err(|e| io(dir, e))?;
+        DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(|e| io(dir, e))?;
         let dir = dir.canonicalize().map_err(|e| io(dir, e))?;
+        close_to_others(&dir).map_err(|e| io(&dir, e))?;
         if let Some(kind) = network_filesystem(&dir).map_err(|e| io(&dir, e))? {
             return Err(OpenError::NetworkFilesystem { dir, kind });
         }
@@ -275,6 +277,17 @@ impl Store {
     async fn order(&self, order: Order) -> Result<Done, WriteError> {
         self.0.writer.order(order).await
     }
+}
+
+/// Takes the folder from everybody but its user; whoever cannot reach it reaches nothing in it. A folder of somebody else, or
+/// of a group that was let in by hand, stays as it is.
+fn close_to_others(dir: &Path) -> io::Result<()> {
+    let metadata = fs::metadata(dir)?;
+    let mode = metadata.permissions().mode();
+    if mode & 0o007 != 0 && metadata.uid() == nix::unistd::geteuid().as_raw() {
+        fs::set_permissions(dir, fs::Permissions::from_mode(mode & !0o077))?;
+    }
+    Ok(())
 }
 
 fn promoted(done: Done) -> Result<Promotion, WriteError> {

@@ -196,7 +196,7 @@ async fn a_store_that_is_held_is_asked_through_its_holder() {
     let hosted = store.clone();
     tokio::task::spawn_blocking(move || {
         for _ in 0..2 {
-            serve_once(&listener, |command| runtime.block_on(registry::cli::run(command, &hosted)));
+            serve_once(&listener, |command| runtime.block_on(registry::cli::run(command, &hosted, "bob")));
         }
     })
     .await

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use cluster_tests::cluster::{Cluster, TOKEN, stage_of};
+use cluster_tests::cluster::{Cluster, stage_of};
 use cluster_tests::network::Network;
 use cluster_tests::{Bench, Running, digests, wait_for};
 use nix::sys::signal::Signal;
@@ -125,7 +125,7 @@ fn network_cut(how_long: Duration, sets: &[&str], expected: &(Value, Curves), ou
     let mut cluster = Cluster::listen(TRAINER, network.coordinator());
     let names = ["w1", "w2", "w3"];
     for (i, name) in names.into_iter().enumerate() {
-        cluster.join_by(name, &network.inside(i), &["--token", TOKEN]);
+        cluster.join_by(name, &network.inside(i), &[]);
     }
     let run = cluster.submit(&config(), sets);
     let is_in =

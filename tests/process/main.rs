@@ -2,9 +2,11 @@
 //!
 //! The pipeline is `configs/smoke.yaml`: every stage kind of the quickstart at toy sizes.
 
+mod access;
 mod bad_input;
 mod cluster;
 mod determinism;
+mod documented;
 mod failpoints;
 mod memory;
 mod registry;

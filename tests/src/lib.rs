@@ -4,6 +4,7 @@
 //! with a bound after which the test fails and prints what the trainer said.
 
 pub mod cluster;
+pub mod documented;
 pub mod network;
 
 use std::collections::BTreeMap;
@@ -24,6 +25,7 @@ pub const PATIENCE: Duration = Duration::from_secs(300);
 pub struct Bench {
     trainer: PathBuf,
     dir: tempfile::TempDir,
+    token: Option<&'static str>,
 }
 
 /// What a finished command said.
@@ -59,7 +61,13 @@ impl Bench {
     /// A fresh folder. `trainer` is `env!("CARGO_BIN_EXE_trainer")`.
     pub fn new(trainer: &str) -> Self {
         let dir = tempfile::tempdir().expect("a temporary folder");
-        Self { trainer: trainer.into(), dir }
+        Self { trainer: trainer.into(), dir, token: None }
+    }
+
+    /// Every command shows this token, and a server wants it.
+    #[must_use]
+    pub fn with_token(self, token: &'static str) -> Self {
+        Self { token: Some(token), ..self }
     }
 
     /// The folder.
@@ -87,6 +95,9 @@ impl Bench {
         let mut command = Command::new(&self.trainer);
         command.args(arguments).current_dir(self.path()).stdin(Stdio::null());
         command.env_remove("RUST_LOG").env("NO_COLOR", "1");
+        if let Some(token) = self.token {
+            command.env("STRIDE_TOKEN", token);
+        }
         command
     }
 

@@ -2,8 +2,8 @@
 //! length of a command.
 
 use std::path::Path;
-use std::time::Duration;
 
+use access::{Server, ServerOptions, explain, local};
 use coordinator::{Config, Coordinator, Handle, WorkerView};
 use protocol::message::{
     ApiError, DesiredAssignments, FailureClass, Poll, ReportOutcome, RunView, Submit, TaskOutcome,
@@ -11,6 +11,7 @@ use protocol::message::{
 use protocol::{Digest, Incarnation, RunId, WorkerId};
 use registry::cli::{Answer, Command};
 use registry::{Holder, LogRow, OpenError, Store};
+use reqwest::Method;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
@@ -22,20 +23,14 @@ pub(crate) struct Target {
     /// The store's folder
     #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR")]
     pub(crate) store: std::path::PathBuf,
-    /// A server to ask instead of the store's folder
-    #[arg(long, env = "STRIDE_SERVER", value_name = "URL")]
-    pub(crate) server: Option<String>,
-    /// Bearer token of the server
-    #[arg(long, env = "STRIDE_TOKEN", hide_env_values = true)]
-    pub(crate) token: Option<String>,
+    #[command(flatten)]
+    pub(crate) server: ServerOptions,
 }
 
 /// A coordinator that can be asked.
 #[derive(Debug)]
 pub(crate) struct Client {
-    http: reqwest::Client,
-    url: String,
-    token: Option<String>,
+    server: Server,
     /// Kept alive: a coordinator of our own, if nobody else's was running.
     own: Option<Handle>,
 }
@@ -43,29 +38,26 @@ pub(crate) struct Client {
 impl Client {
     /// Finds the coordinator of `target`.
     pub(crate) async fn connect(target: &Target) -> Result<Self> {
-        if let Some(url) = &target.server {
-            return Self::new(url, target.token.clone());
+        if let Some(server) = target.server.connect()? {
+            return Ok(Self { server, own: None });
         }
         match Store::open_existing(&target.store, Holder::this_process("trainer")).await {
             Ok(store) => {
                 let handle = Coordinator::start(store, Config::embedded()).await?;
-                let client = Self::new(&handle.url(), None)?;
+                let client = Self::of(&handle)?;
                 Ok(Self { own: Some(handle), ..client })
             }
             Err(OpenError::Busy { holder: Holder { address: Some(address), .. }, .. }) => {
-                Self::new(&address, target.token.clone())
+                Ok(Self { server: target.server.holder(&target.store, &address)?, own: None })
             }
             Err(error) => Err(error.into()),
         }
     }
 
-    /// A client of the server at `url`.
-    pub(crate) fn new(url: &str, token: Option<String>) -> Result<Self> {
-        let http = reqwest::Client::builder().connect_timeout(Duration::from_secs(5)).build();
-        let http = http.map_err(|error| Problem::failed(format!("no HTTP client: {error}")))?;
-        let url = url.trim_end_matches('/').to_owned();
-        let url = if url.contains("://") { url } else { format!("http://{url}") };
-        Ok(Self { http, url, token, own: None })
+    /// A client of a coordinator in this process.
+    pub(crate) fn of(handle: &Handle) -> Result<Self> {
+        let server = Server::new(&handle.local_url(), Some(handle.token().clone()), None)?;
+        Ok(Self { server, own: None })
     }
 
     /// Whether the coordinator lives only as long as this command.
@@ -81,13 +73,9 @@ impl Client {
     }
 
     async fn send(&self, request: reqwest::RequestBuilder) -> Result<reqwest::Response> {
-        let request = match &self.token {
-            Some(token) => request.bearer_auth(token),
-            None => request,
-        };
+        let url = self.server.url();
         let answer = request.send().await.map_err(|error| {
-            let problem =
-                Problem::new(exit::UNREACHABLE, anyhow::anyhow!("cannot reach `{}`: {}", self.url, innermost(&error)));
+            let problem = Problem::new(exit::UNREACHABLE, anyhow::anyhow!("cannot reach `{url}`: {}", explain(&error)));
             problem.hint("start it with `trainer serve`, or give its address with --server")
         })?;
         if answer.status().is_success() {
@@ -97,7 +85,7 @@ impl Client {
         let body = answer.bytes().await.unwrap_or_default();
         let error = serde_json::from_slice::<ApiError>(&body).unwrap_or_else(|_| ApiError {
             code: "internal".into(),
-            message: format!("`{}` answered {status}: {}", self.url, String::from_utf8_lossy(&body)),
+            message: format!("`{url}` answered {status}: {}", String::from_utf8_lossy(&body)),
             hint: None,
         });
         let code = match (status.as_u16(), error.code.as_str()) {
@@ -108,26 +96,25 @@ impl Client {
             _ => exit::FAILED,
         };
         let mut problem = Problem::new(code, anyhow::anyhow!("{}", error.message));
-        problem.hint = error.hint.or_else(|| {
-            (code == exit::UNAUTHORISED).then(|| "give the server's token with --token or STRIDE_TOKEN".to_owned())
-        });
+        problem.hint = error.hint;
         Err(problem)
     }
 
     async fn read<T: DeserializeOwned>(&self, request: reqwest::RequestBuilder) -> Result<T> {
         let answer = self.send(request).await?;
         answer.json().await.map_err(|error| {
-            let problem = Problem::failed(format!("the answer of `{}` does not read: {}", self.url, innermost(&error)));
+            let problem =
+                Problem::failed(format!("the answer of `{}` does not read: {}", self.server.url(), explain(&error)));
             problem.hint("use one build for client and server")
         })
     }
 
     async fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T> {
-        self.read(self.http.get(format!("{}{path}", self.url))).await
+        self.read(self.server.request(Method::GET, path)).await
     }
 
     async fn post<T: DeserializeOwned>(&self, path: &str, body: &impl Serialize) -> Result<T> {
-        self.read(self.http.post(format!("{}{path}", self.url)).json(body)).await
+        self.read(self.server.request(Method::POST, path).json(body)).await
     }
 
     pub(crate) async fn submit(&self, submit: &Submit) -> Result<RunId> {
@@ -178,8 +165,8 @@ impl Client {
     }
 
     pub(crate) async fn blob(&self, digest: Digest) -> Result<Vec<u8>> {
-        let answer = self.send(self.http.get(format!("{}/v1/blobs/{digest}", self.url))).await?;
-        let bytes = answer.bytes().await.map_err(|error| Problem::failed(innermost(&error)))?;
+        let answer = self.send(self.server.request(Method::GET, &format!("/v1/blobs/{digest}"))).await?;
+        let bytes = answer.bytes().await.map_err(|error| Problem::failed(explain(&error)))?;
         Ok(bytes.into())
     }
 
@@ -207,15 +194,15 @@ impl Client {
     }
 }
 
+/// Tells the commands of this user where `handle` answers and how to be let in. What is given back takes that away again, and
+/// is to be dropped before the store is.
+pub(crate) fn announce(store: &Store, handle: &Handle) -> Result<local::Published> {
+    let announced = local::publish(store.dir(), handle.token())
+        .and_then(|published| store.set_address(handle.local_url()).map(|()| published));
+    announced.map_err(|error| Problem::usage(format!("cannot write to the store `{}`: {error}", store.dir().display())))
+}
+
 /// A store's folder as messages show it.
 pub(crate) fn shown(store: &Path) -> String {
     store.display().to_string()
-}
-
-fn innermost(error: &dyn std::error::Error) -> String {
-    let mut inner = error;
-    while let Some(source) = inner.source() {
-        inner = source;
-    }
-    inner.to_string()
 }

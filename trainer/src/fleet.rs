@@ -4,6 +4,8 @@ use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
+use access::Token;
+use coordinator::Handle;
 use protocol::WorkerId;
 use protocol::stage::Backend;
 use tokio::process::{Child, Command};
@@ -36,6 +38,7 @@ struct Member {
 pub(crate) struct Fleet {
     members: Vec<Member>,
     url: String,
+    token: Token,
     backend: Backend,
     logs: PathBuf,
     memory: Watch,
@@ -50,8 +53,8 @@ pub(crate) struct Death {
 }
 
 impl Fleet {
-    /// Starts `count` workers for the coordinator at `url`. What they say goes to files in `logs`.
-    pub(crate) fn start(count: usize, url: String, backend: Backend, logs: &Path) -> Result<Self> {
+    /// Starts `count` workers for `coordinator`. What they say goes to files in `logs`.
+    pub(crate) fn start(count: usize, coordinator: &Handle, backend: Backend, logs: &Path) -> Result<Self> {
         // Their place is a comfort: without the folder they are silent.
         let _ = std::fs::create_dir_all(logs);
         let devices = device_count(backend);
@@ -66,7 +69,8 @@ impl Fleet {
             next_start: now,
         };
         let members = (0..count).map(member).collect();
-        let mut fleet = Self { members, url, backend, logs: logs.to_owned(), memory: Watch::new() };
+        let (url, token) = (coordinator.local_url(), coordinator.token().clone());
+        let mut fleet = Self { members, url, token, backend, logs: logs.to_owned(), memory: Watch::new() };
         for i in 0..count {
             fleet.spawn(i)?;
         }
@@ -84,6 +88,11 @@ impl Fleet {
         let child = Command::new(program)
             .args(["worker", "join", &self.url, "--name", member.name.as_str(), "--die-with-parent"])
             .args(["--backend", self.backend.name(), "--device", &member.device.to_string()])
+            // Not an argument, which every user of the machine can read.
+            .env("STRIDE_TOKEN", self.token.secret())
+            // Ours are of another server.
+            .env_remove("STRIDE_TOKEN_FILE")
+            .env_remove("STRIDE_CA")
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .stderr(stderr)

@@ -53,6 +53,23 @@ impl From<anyhow::Error> for Problem {
     }
 }
 
+impl From<access::FileError> for Problem {
+    fn from(error: access::FileError) -> Self {
+        let hint = error.advice().map(str::to_owned);
+        Self { hint, ..Self::new(exit::USAGE, error) }
+    }
+}
+
+impl From<access::ConnectError> for Problem {
+    fn from(error: access::ConnectError) -> Self {
+        match error {
+            access::ConnectError::File(error) => error.into(),
+            access::ConnectError::Holder { .. } => Self::new(exit::UNAUTHORISED, error),
+            _ => Self::new(exit::USAGE, error),
+        }
+    }
+}
+
 impl From<registry::OpenError> for Problem {
     fn from(error: registry::OpenError) -> Self {
         let hint = error.hint();
@@ -75,8 +92,11 @@ impl From<coordinator::StartError> for Problem {
     fn from(error: coordinator::StartError) -> Self {
         match &error {
             coordinator::StartError::NoToken(_) => {
-                Self::new(exit::USAGE, error).hint("set a token with --token or STRIDE_TOKEN, or listen on 127.0.0.1")
+                Self::new(exit::USAGE, error).hint("give a file of tokens with --token-file, or listen on 127.0.0.1")
             }
+            coordinator::StartError::NoTls(_) => Self::new(exit::USAGE, error).hint(
+                "give --tls-cert and --tls-key; on a network that only you see, or one that encrypts by itself, say --insecure",
+            ),
             coordinator::StartError::Listen { .. } => {
                 Self::new(exit::USAGE, error).hint("choose another address with --bind; port 0 takes a free one")
             }

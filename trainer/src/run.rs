@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
+use coordinator::shell::raise_descriptor_limit;
 use coordinator::{Config, Control, Coordinator, Handle, WorkerView};
 use protocol::message::{FailureClass, RunState, RunView, StageState, Submit};
 use protocol::pipeline::Pipeline;
@@ -84,10 +85,9 @@ pub(crate) async fn run(work: Work, options: Options) -> Result<u8> {
         Work::Run(_) => Store::open_existing(&options.store, holder).await?,
     };
     let dir = store.dir().to_owned();
+    raise_descriptor_limit();
     let handle = Coordinator::start(store.clone(), Config::embedded()).await?;
-    store
-        .set_address(handle.url())
-        .map_err(|error| Problem::usage(format!("cannot write to the store `{}`: {error}", dir.display())))?;
+    let _announced = client::announce(&store, &handle)?;
 
     let (run, pipeline) = begin(&handle, &store, work).await?;
     pipeline_file::remember_data(&pipeline, &dir);
@@ -161,7 +161,7 @@ async fn watch(
         if fleet.is_none() && wants_workers(&view) {
             let count = options.workers.unwrap_or_else(|| fleet::default_size(pipeline.backend));
             let logs = options.store.join("workers");
-            *fleet = Some(Fleet::start(count, handle.url(), pipeline.backend, &logs)?);
+            *fleet = Some(Fleet::start(count, handle, pipeline.backend, &logs)?);
         }
         if let Some(fleet) = fleet {
             for death in fleet.reap(true)? {
@@ -198,7 +198,7 @@ async fn report_death(handle: &Handle, death: &Death) {
 }
 
 async fn fail_for(handle: &Handle, dead: &WorkerView, why: &str) -> Result<()> {
-    let client = client::Client::new(&handle.url(), None)?;
+    let client = client::Client::of(handle)?;
     let message = format!("worker `{}` {why}", dead.worker);
     client.fail_for(&dead.worker, dead.incarnation, FailureClass::OutOfMemory, &message).await
 }

@@ -2,19 +2,20 @@
 
 use std::path::PathBuf;
 
+use access::ConnectionOptions;
 use protocol::WorkerId;
 use protocol::stage::Backend;
 
-use crate::Options;
+use crate::{JoinError, Options};
 
 /// Offer this machine to a coordinator.
 #[derive(Debug, Clone, clap::Args)]
 pub struct JoinArgs {
     /// The coordinator, such as `http://127.0.0.1:7700`
+    #[arg(env = "STRIDE_SERVER")]
     pub url: String,
-    /// Bearer token of the coordinator
-    #[arg(long, env = "STRIDE_TOKEN", hide_env_values = true)]
-    pub token: Option<String>,
+    #[command(flatten)]
+    pub connection: ConnectionOptions,
     /// The worker's name, unique among live workers [default: host and process id]
     #[arg(long)]
     pub name: Option<String>,
@@ -35,18 +36,21 @@ pub struct JoinArgs {
     pub die_with_parent: bool,
 }
 
-impl From<JoinArgs> for Options {
-    fn from(args: JoinArgs) -> Self {
-        Self {
-            url: args.url,
-            token: args.token,
+impl TryFrom<JoinArgs> for Options {
+    type Error = JoinError;
+
+    fn try_from(args: JoinArgs) -> Result<Self, JoinError> {
+        let unusable = |error: &dyn std::fmt::Display| JoinError::Usage(error.to_string());
+        let server = args.connection.connect(&args.url).map_err(|error| unusable(&error))?;
+        Ok(Self {
+            server,
             name: args.name.map(WorkerId::new),
             backend: args.backend,
             device: args.device,
             cache: args.cache,
             peer_address: args.peer_address,
             die_with_parent: args.die_with_parent,
-        }
+        })
     }
 }
 

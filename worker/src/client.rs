@@ -4,6 +4,7 @@
 
 use std::time::Duration;
 
+use access::{Server, explain};
 use bytes::Bytes;
 use protocol::Digest;
 use protocol::message::{ApiError, DesiredAssignments, Grant, Join, Joined, Poll};
@@ -35,12 +36,10 @@ pub(crate) enum CallError {
     Refused(String),
 }
 
-/// A coordinator's address.
+/// A coordinator, and the thread that talks to it.
 #[derive(Debug, Clone)]
 pub(crate) struct Client {
-    http: reqwest::Client,
-    base: String,
-    token: Option<String>,
+    server: Server,
     runtime: Handle,
 }
 
@@ -50,24 +49,13 @@ const SHORT: Duration = Duration::from_secs(30);
 const LONG: Duration = Duration::from_secs(600);
 
 impl Client {
-    /// A client of the coordinator at `url`.
-    pub(crate) fn new(url: &str, token: Option<String>, runtime: Handle) -> Result<Self, String> {
-        let parsed =
-            reqwest::Url::parse(url).map_err(|e| format!("`{url}` is not a URL: {e}; expected `http://HOST:PORT`"))?;
-        if parsed.scheme() != "http" || parsed.host().is_none() {
-            return Err(format!("`{url}`: expected `http://HOST:PORT`; for TLS put a proxy in front"));
-        }
-        let http = reqwest::Client::builder().connect_timeout(Duration::from_secs(5)).tcp_nodelay(true).build();
-        let http = http.map_err(|e| format!("no HTTP client: {e}"))?;
-        Ok(Self { http, base: url.trim_end_matches('/').to_owned(), token, runtime })
+    /// A client of `server`.
+    pub(crate) fn new(server: Server, runtime: Handle) -> Self {
+        Self { server, runtime }
     }
 
     fn request(&self, method: reqwest::Method, path: &str, timeout: Duration) -> RequestBuilder {
-        let request = self.http.request(method, format!("{}{path}", self.base)).timeout(timeout);
-        match &self.token {
-            Some(token) => request.bearer_auth(token),
-            None => request,
-        }
+        self.server.request(method, path).timeout(timeout)
     }
 
     /// Runs one call from a thread that is not the runtime's.
@@ -103,7 +91,7 @@ impl Client {
 
     pub(crate) async fn get_blob(&self, digest: Digest) -> Result<Bytes, CallError> {
         let request = self.request(reqwest::Method::GET, &format!("/v1/blobs/{digest}"), LONG);
-        check(request.send().await).await?.bytes().await.map_err(|e| CallError::Away(chain(&e)))
+        check(request.send().await).await?.bytes().await.map_err(|e| CallError::Away(explain(&e)))
     }
 
     async fn post<T: Serialize + Sync>(&self, path: &str, what: &T, timeout: Duration) -> Result<Response, CallError> {
@@ -112,14 +100,14 @@ impl Client {
 }
 
 async fn answer<T: DeserializeOwned>(response: Response) -> Result<T, CallError> {
-    let bytes = response.bytes().await.map_err(|e| CallError::Away(chain(&e)))?;
+    let bytes = response.bytes().await.map_err(|e| CallError::Away(explain(&e)))?;
     serde_json::from_slice(&bytes)
         .map_err(|e| CallError::Refused(format!("the coordinator's answer does not parse: {e}; is it the same build?")))
 }
 
 async fn check(sent: Result<Response, reqwest::Error>) -> Result<Response, CallError> {
     let response =
-        sent.map_err(|e| if e.is_builder() { CallError::Refused(chain(&e)) } else { CallError::Away(chain(&e)) })?;
+        sent.map_err(|e| if e.is_builder() { CallError::Refused(explain(&e)) } else { CallError::Away(explain(&e)) })?;
     let status = response.status();
     if status.is_success() {
         return Ok(response);
@@ -143,16 +131,4 @@ async fn check(sent: Result<Response, reqwest::Error>) -> Result<Response, CallE
         (status, _) if status.is_server_error() => CallError::Away(message),
         _ => CallError::Refused(message),
     })
-}
-
-/// The error and what caused it; `reqwest` alone says only "error sending request".
-fn chain(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(error) = cause {
-        text.push_str(": ");
-        text.push_str(&error.to_string());
-        cause = error.source();
-    }
-    text
 }

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::thread;
 use std::time::Duration;
 
+use access::Server;
 use burn::tensor::Device;
 use protocol::WorkerId;
 use protocol::message::{Join, PROTOCOL_VERSION};
@@ -27,10 +28,8 @@ const FAREWELL: Duration = Duration::from_secs(2);
 /// How a worker takes part.
 #[derive(Debug, Clone)]
 pub struct Options {
-    /// The coordinator: `http://HOST:PORT`.
-    pub url: String,
-    /// Its bearer token, if it asks for one.
-    pub token: Option<String>,
+    /// The coordinator.
+    pub server: Server,
     /// The worker's name, unique among live workers; host and process id if there is none.
     pub name: Option<WorkerId>,
     /// Where to compute.
@@ -110,8 +109,7 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
     }
     let runtime = runtime::Builder::new_multi_thread().worker_threads(1).thread_name("http").enable_all().build();
     let runtime = runtime.map_err(system("the HTTP thread"))?;
-    let client =
-        Client::new(&options.url, options.token.clone(), runtime.handle().clone()).map_err(JoinError::Usage)?;
+    let client = Client::new(options.server.clone(), runtime.handle().clone());
     let (bind, advertised) = peer_address(&options)?;
     let endpoint = Endpoint::open(bind, timing).map_err(system("the listener for peers"))?;
     let cache = Cache::new(options.cache.clone(), Bounds::default()).map_err(system("the blob cache"))?;
@@ -164,7 +162,8 @@ fn peer_address(options: &Options) -> Result<(SocketAddr, Option<String>), JoinE
             .ok_or_else(|| JoinError::Usage(format!("`{address}` is not an address for peers: expected HOST:PORT")))?;
         return Ok((SocketAddr::from(([0, 0, 0, 0], port)), Some(address.clone())));
     }
-    let url = reqwest::Url::parse(&options.url).map_err(|e| JoinError::Usage(format!("`{}`: {e}", options.url)))?;
+    let url = options.server.url();
+    let url = reqwest::Url::parse(url).map_err(|e| JoinError::Usage(format!("`{url}`: {e}")))?;
     let host = url.host_str().unwrap_or_default().trim_matches(['[', ']']).to_owned();
     let port = url.port_or_known_default().unwrap_or(80);
     let local = (host.as_str(), port).to_socket_addrs().ok().into_iter().flatten().find_map(|coordinator| {

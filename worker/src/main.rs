@@ -17,7 +17,7 @@ fn main() -> ExitCode {
     worker::process::tune_allocator();
     let Command::Join(args) = Command::parse();
     worker::init_logging();
-    match worker::join(args.into()) {
+    match worker::Options::try_from(args).and_then(worker::join) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             tracing::error!("{error}");

@@ -35,6 +35,14 @@ use crate::stage_thread::{self, Bench, Kinds};
 
 type Metrics = BTreeMap<(u64, String), f64>;
 
+const TOKEN: &str = "a-token-of-tests-only";
+
+/// A coordinator at `url`, who wants [`TOKEN`].
+pub(crate) fn server_at(url: &str) -> access::Server {
+    let token = TOKEN.parse().expect("a token");
+    access::Server::new(url, Some(token), None).expect("a server")
+}
+
 #[derive(Debug, Default)]
 struct ActorHandle {
     assignments: Vec<Assignment>,
@@ -173,7 +181,7 @@ async fn outcome(State(fake): State<Arc<Fake>>, Json(report): Json<ReportOutcome
 
 async fn put_blob(State(fake): State<Arc<Fake>>, headers: axum::http::HeaderMap, body: Bytes) -> Response {
     let grant: Grant = serde_json::from_slice(headers["x-stride-grant"].as_bytes()).expect("a grant");
-    assert_eq!(headers["authorization"], "Bearer token");
+    assert_eq!(headers["authorization"], format!("Bearer {TOKEN}"));
     let digest = Digest::of(&body);
     let response = fake.write(&grant, |coordinator| drop(coordinator.blobs.insert(digest, body.to_vec())));
     if response.status().is_success() {
@@ -245,7 +253,7 @@ impl Worker {
         let url = format!("http://{}", listener.local_addr().expect("bound"));
         server.spawn(async move { axum::serve(listener, router).await });
 
-        let client = Client::new(&url, Some("token".to_owned()), server.handle().clone()).expect("a client");
+        let client = Client::new(server_at(&url), server.handle().clone());
         let endpoint = Endpoint::open(([127, 0, 0, 1], 0).into(), Timing::default()).expect("loopback");
         let peer_address = endpoint.address().to_string();
         let member = Member { worker: "w0".into(), incarnation: Incarnation(1), peer_address: peer_address.clone() };

@@ -52,9 +52,6 @@ pub enum Verb {
         /// Why, for the log
         #[arg(long)]
         reason: String,
-        /// Who, for the log; otherwise the user's name
-        #[arg(long, env = "STRIDE_ACTOR")]
-        actor: Option<String>,
     },
     /// Points an alias back at the version before its last promotion
     Rollback {
@@ -72,9 +69,6 @@ pub enum Verb {
         /// Why, for the log
         #[arg(long, default_value = "rollback")]
         reason: String,
-        /// Who, for the log; otherwise the user's name
-        #[arg(long, env = "STRIDE_ACTOR")]
-        actor: Option<String>,
     },
     /// Compares two versions metric by metric, and says which differences are beyond noise
     Compare {
@@ -122,18 +116,27 @@ pub enum Verb {
     },
 }
 
+/// What a verb comes to.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Asked {
+    /// A command for whoever holds the store.
+    Command(Command),
+    /// Something that ends in this machine's files.
+    Export { model: String, dir: PathBuf },
+}
+
 impl Verb {
-    /// What is asked. Relative paths are resolved here, for the store's holder may run elsewhere.
-    pub fn into_command(self) -> std::io::Result<Command> {
-        Ok(match self {
+    /// What is asked, and whether it is of the store's holder alone.
+    pub(super) fn asks(self) -> Asked {
+        Asked::Command(match self {
             Self::List => Command::List,
             Self::Show { model } => Command::Show { reference: model },
             Self::History { model, alias } => Command::History { model, alias },
-            Self::Promote { model, to, expect, require, reason, actor } => {
-                Command::Promote { reference: model, to, expect, require, reason, actor: actor.unwrap_or_else(user) }
+            Self::Promote { model, to, expect, require, reason } => {
+                Command::Promote { reference: model, to, expect, require, reason }
             }
-            Self::Rollback { model, alias, to, expect, reason, actor } => {
-                Command::Rollback { model, alias, to, expect, reason, actor: actor.unwrap_or_else(user) }
+            Self::Rollback { model, alias, to, expect, reason } => {
+                Command::Rollback { model, alias, to, expect, reason }
             }
             Self::Compare { left, right, style } => Command::Compare { left, right, style },
             Self::Leaderboard { of, no_published, style } => {
@@ -142,13 +145,7 @@ impl Verb {
             Self::Lineage { artifact } => Command::Lineage { reference: artifact },
             Self::Fsck => Command::Fsck,
             Self::Gc { dry_run, grace } => Command::Gc { dry_run, grace_minutes: Some(grace) },
-            Self::Export { model, dir } => Command::Export { reference: model, dir: std::path::absolute(dir)? },
+            Self::Export { model, dir } => return Asked::Export { model, dir },
         })
     }
-}
-
-fn user() -> String {
-    let named =
-        ["USER", "LOGNAME"].into_iter().find_map(|name| std::env::var(name).ok().filter(|user| !user.is_empty()));
-    named.unwrap_or_else(|| "unknown".into())
 }

@@ -1,8 +1,15 @@
-//! Runs a command where it can be run: here if nobody holds the store, else at its holder.
+//! Runs a command where it can be run: at the server that is named, here if nobody holds the store, else at its holder.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use access::{ConnectError, Server, ServerOptions, explain};
+use protocol::Digest;
+use protocol::message::ApiError;
+use reqwest::{Method, Response};
+
+use super::args::Asked;
+use super::export::{self, Source};
 use super::{Answer, Command, Output, Verb, error, print, run};
 use crate::{Holder, OpenError, Store};
 
@@ -10,39 +17,119 @@ use crate::{Holder, OpenError, Store};
 const PATIENCE: Duration = Duration::from_secs(5);
 const BETWEEN: Duration = Duration::from_millis(50);
 
-/// Runs a verb on the store in `dir` and prints the answer; returns the exit code.
-pub async fn execute(verb: Verb, dir: &Path, output: Output) -> u8 {
-    let answer = match verb.into_command() {
-        Ok(command) => ask(command, dir).await,
-        Err(e) => Answer::refused(error("invalid", format!("the folder does not resolve: {e}"), None)),
+/// Runs a verb on the store in `dir`, or at the server of `options`, and prints the answer; returns the exit code.
+pub async fn execute(verb: Verb, dir: &Path, options: &ServerOptions, output: Output) -> u8 {
+    let answer = match verb.asks() {
+        Asked::Command(command) => ask(command, dir, options).await,
+        Asked::Export { model, dir: into } => {
+            with(dir, options, async |place| export(place, &model, &into).await).await
+        }
     };
     // A closed pipe (`| head`) is no failure of the command.
     let _ = print::show(&answer, output);
     answer.exit
 }
 
-/// Runs a command on the store in `dir`: here if nobody holds it, else at its holder.
-pub async fn ask(command: Command, dir: &Path) -> Answer {
+/// Runs a command on the store in `dir`, or at the server of `options`.
+pub async fn ask(command: Command, dir: &Path, options: &ServerOptions) -> Answer {
+    with(dir, options, async |place| place.ask(&command).await).await
+}
+
+/// Where commands are run.
+enum Place {
+    Here(Box<Store>),
+    At(Server),
+}
+
+/// Why a holder did not do what it was asked.
+enum Missed {
+    /// It was not reached at all, so nothing was done.
+    NotThere(String),
+    /// It may or may not have been done.
+    Broken(String),
+}
+
+impl Place {
+    async fn ask(&self, command: &Command) -> Result<Answer, Missed> {
+        match self {
+            Self::Here(store) => Ok(run(command.clone(), store, &user()).await),
+            Self::At(server) => {
+                let sent = server.request(Method::POST, "/v1/registry").json(command).send().await;
+                match check(sent).await? {
+                    Ok(response) => response.json().await.map_err(|e| Missed::Broken(explain(&e))),
+                    Err(refused) => Ok(Answer::refused(refused)),
+                }
+            }
+        }
+    }
+}
+
+/// The answer, or what was refused.
+async fn check(sent: Result<Response, reqwest::Error>) -> Result<Result<Response, ApiError>, Missed> {
+    let response =
+        sent.map_err(|e| if e.is_connect() { Missed::NotThere(explain(&e)) } else { Missed::Broken(explain(&e)) })?;
+    let status = response.status();
+    if status.is_success() {
+        return Ok(Ok(response));
+    }
+    let body = response.bytes().await.unwrap_or_default();
+    Ok(Err(serde_json::from_slice(&body).unwrap_or_else(|_| {
+        error("internal", format!("it answered {status}: {}", String::from_utf8_lossy(&body)), None)
+    })))
+}
+
+/// Finds the place for `work`, and waits where it is about to be free.
+async fn with(dir: &Path, options: &ServerOptions, work: impl AsyncFn(&Place) -> Result<Answer, Missed>) -> Answer {
+    match options.connect() {
+        Ok(None) => {}
+        Ok(Some(server)) => {
+            let url = server.url().to_owned();
+            return work(&Place::At(server)).await.unwrap_or_else(|missed| {
+                let (Missed::NotThere(why) | Missed::Broken(why)) = missed;
+                unreachable_(&format!("cannot reach `{url}`: {why}"))
+            });
+        }
+        Err(e) => return refused(&e),
+    }
     let until = Instant::now() + PATIENCE;
     loop {
         let busy = match Store::open_existing(dir, Holder::this_process("registry")).await {
-            Ok(store) => return run(command, &store).await,
+            Ok(store) => {
+                let done = work(&Place::Here(Box::new(store))).await;
+                return done.unwrap_or_else(|_| Answer::refused(error("internal", "the store did not answer", None)));
+            }
             Err(e) => e,
         };
         let OpenError::Busy { holder, .. } = &busy else { return Answer::from(&busy) };
         let problem = match &holder.address {
-            Some(address) => match post(address, &command).await {
-                Ok(answer) => return answer,
-                // Not reached at all, so nothing was done: it may be ending, and the store be free in a moment.
-                Err(e) if e.is_connect() => format!("{busy}, which does not answer: {}", innermost(&e)),
-                Err(e) => return unreachable_(&format!("{busy}, whose answer could not be read: {}", innermost(&e))),
-            },
+            Some(address) => {
+                let server = match options.holder(dir, address) {
+                    Ok(server) => server,
+                    Err(e) => return refused(&e),
+                };
+                match work(&Place::At(server)).await {
+                    Ok(answer) => return answer,
+                    // It may be ending, and the store be free in a moment.
+                    Err(Missed::NotThere(why)) => format!("{busy}, which does not answer: {why}"),
+                    Err(Missed::Broken(why)) => {
+                        return unreachable_(&format!("{busy}, whose answer could not be read: {why}"));
+                    }
+                }
+            }
             None => format!("{busy}, which takes no requests"),
         };
         if Instant::now() >= until {
             return unreachable_(&problem);
         }
         tokio::time::sleep(BETWEEN).await;
+    }
+}
+
+fn refused(e: &ConnectError) -> Answer {
+    match e {
+        ConnectError::File(file) => Answer::refused(error("invalid", e, file.advice())),
+        ConnectError::Holder { .. } => Answer::refused(error("unauthorized", e, None)),
+        _ => Answer::refused(error("invalid", e, None)),
     }
 }
 
@@ -54,15 +141,54 @@ fn unreachable_(message: &str) -> Answer {
     ))
 }
 
-async fn post(address: &str, command: &Command) -> Result<Answer, reqwest::Error> {
-    let client = reqwest::Client::builder().connect_timeout(Duration::from_secs(5)).build()?;
-    client.post(format!("{address}/v1/registry")).json(command).send().await?.error_for_status()?.json().await
+async fn export(place: &Place, model: &str, dir: &Path) -> Result<Answer, Missed> {
+    let shown = place.ask(&Command::Show { reference: model.to_owned() }).await?;
+    Ok(match shown.data {
+        Some(super::Data::Version { version, .. }) => match export::export(place, &version, dir).await {
+            Ok(files) => Answer::done(super::Data::Exported { version, dir: dir.to_owned(), files }),
+            Err(error) => Answer::refused(error),
+        },
+        Some(_) => Answer::refused(error(
+            "invalid",
+            format!("`{model}` is no one version"),
+            Some("say MODEL@best or MODEL:VERSION"),
+        )),
+        None => shown,
+    })
 }
 
-fn innermost(e: &dyn std::error::Error) -> String {
-    let mut inner = e;
-    while let Some(source) = inner.source() {
-        inner = source;
+impl Source for Place {
+    async fn fetch(&self, digest: Digest, into: &mut impl FnMut(&[u8]) -> std::io::Result<()>) -> Result<(), ApiError> {
+        let damaged = |e: &dyn std::fmt::Display| error("damaged", e, Some("`registry fsck` checks the store"));
+        let unwritten = |e: std::io::Error| error("storage", e, None);
+        match self {
+            Self::Here(store) => {
+                let bytes = store.blobs().get(digest).map_err(|e| damaged(&e))?;
+                into(&bytes).map_err(unwritten)
+            }
+            Self::At(server) => {
+                let lost = |missed| {
+                    let (Missed::NotThere(why) | Missed::Broken(why)) = missed;
+                    error(
+                        "unreachable",
+                        format!("blob {digest} did not come whole from `{}`: {why}", server.url()),
+                        None,
+                    )
+                };
+                let sent = server.request(Method::GET, &format!("/v1/blobs/{digest}")).send().await;
+                let mut response = check(sent).await.map_err(lost)??;
+                while let Some(part) = response.chunk().await.map_err(|e| lost(Missed::Broken(explain(&e))))? {
+                    into(&part).map_err(unwritten)?;
+                }
+                Ok(())
+            }
+        }
     }
-    inner.to_string()
+}
+
+/// Who moves an alias of a store that nobody serves; a server writes down whose token it was.
+fn user() -> String {
+    let named =
+        ["USER", "LOGNAME"].into_iter().find_map(|name| std::env::var(name).ok().filter(|user| !user.is_empty()));
+    named.unwrap_or_else(|| "unknown".into())
 }

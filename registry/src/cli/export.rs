@@ -1,17 +1,25 @@
-//! A model's files in a folder, under the names that its manifest gives them.
+//! A model's files in a folder of this machine, under the names that its manifest gives them, from wherever the blobs are.
 
-use std::fs;
-use std::io;
+use std::fs::{self, File};
+use std::io::{self, Write};
 use std::path::{Component, Path};
 
-use protocol::Digest;
 use protocol::message::ApiError;
+use protocol::{Digest, Manifest};
+use sha2::{Digest as _, Sha256};
 
 use super::error;
-use crate::BlobStore;
+use crate::Version;
 
-/// Writes `manifest.json` and every file; returns their names. The folder must be empty or missing.
-pub(super) fn export(blobs: &BlobStore, artifact: Digest, dir: &Path) -> Result<Vec<String>, ApiError> {
+/// Where blobs come from.
+pub(super) trait Source {
+    /// Gives the bytes of a blob to `into`, part by part.
+    async fn fetch(&self, digest: Digest, into: &mut impl FnMut(&[u8]) -> io::Result<()>) -> Result<(), ApiError>;
+}
+
+/// Writes `manifest.json` and every file; returns their names. The folder must be empty or missing. What is there afterwards
+/// has the digests that the manifest says, wherever it came from.
+pub(super) async fn export(source: &impl Source, version: &Version, dir: &Path) -> Result<Vec<String>, ApiError> {
     let failed =
         |path: &Path, e: &io::Error| error("storage", format!("failed to write `{}`: {e}", path.display()), None);
     match fs::read_dir(dir) {
@@ -25,21 +33,47 @@ pub(super) fn export(blobs: &BlobStore, artifact: Digest, dir: &Path) -> Result<
         Err(e) => return Err(failed(dir, &e)),
     }
     let damaged = |e: &dyn std::fmt::Display| error("damaged", e, Some("`registry fsck` checks the store"));
-    let manifest = blobs.complete_manifest(artifact).map_err(|e| damaged(&e))?;
+    let mut bytes = Vec::new();
+    whole(source, version.artifact, &mut |part| bytes.write_all(part)).await?;
+    let manifest = serde_json::from_slice::<Manifest>(&bytes).map_err(|e| damaged(&e))?;
     let mut names = Vec::new();
-    for (name, file) in &manifest.files {
+    for (name, entry) in &manifest.files {
         let relative = Path::new(name);
         if !relative.components().all(|part| matches!(part, Component::Normal(_))) {
-            return Err(damaged(&format!("manifest {artifact} names a file `{name}` outside of its folder")));
+            return Err(damaged(&format!("manifest {} names a file `{name}` outside of its folder", version.artifact)));
         }
         let path = dir.join(relative);
-        let bytes = blobs.get(file.digest).map_err(|e| damaged(&e))?;
         let parent = path.parent().unwrap_or(dir);
-        fs::create_dir_all(parent).and_then(|()| fs::write(&path, bytes)).map_err(|e| failed(&path, &e))?;
+        let file = fs::create_dir_all(parent).and_then(|()| File::create_new(&path));
+        let mut file = file.map_err(|e| failed(&path, &e))?;
+        whole(source, entry.digest, &mut |part| file.write_all(part)).await?;
         names.push(name.clone());
     }
     let path = dir.join("manifest.json");
-    fs::write(&path, manifest.to_bytes()).map_err(|e| failed(&path, &e))?;
+    fs::write(&path, bytes).map_err(|e| failed(&path, &e))?;
     names.push("manifest.json".into());
     Ok(names)
+}
+
+/// A blob's bytes, and that they are those.
+async fn whole(
+    source: &impl Source,
+    digest: Digest,
+    write: &mut impl FnMut(&[u8]) -> io::Result<()>,
+) -> Result<(), ApiError> {
+    let mut hash = Sha256::new();
+    let mut into = |part: &[u8]| {
+        hash.update(part);
+        write(part)
+    };
+    source.fetch(digest, &mut into).await?;
+    let found = Digest::from_bytes(hash.finalize().into());
+    if found == digest {
+        return Ok(());
+    }
+    Err(error(
+        "damaged",
+        format!("blob {digest} is corrupt: its bytes hash to {found}"),
+        Some("`registry fsck` checks the store"),
+    ))
 }

@@ -2,14 +2,16 @@
 //! [`run`].
 //!
 //! [`Command`] is what may be asked and [`Answer`] what comes back, both plain data, so that a client can send the one and
-//! show the other. Exit codes: 0 done, 1 other errors, 2 wrong usage or an unusable store, 3 not found, 4 conflict, 6 the
-//! holder of the store does not answer, 9 damage found, 10 a gate does not hold.
+//! show the other. A command never names a place on the machine that runs it: what `export` writes, the client fetches and
+//! writes itself. Exit codes: 0 done, 1 other errors, 2 wrong usage or an unusable store, 3 not found, 4 conflict, 5 the token
+//! is refused, 6 the holder of the store does not answer, 9 damage found, 10 a gate does not hold.
 
 mod args;
 mod client;
 mod export;
 mod print;
 
+use access::Scope;
 use checkpoint::bundle;
 use protocol::message::ApiError;
 use protocol::{Alias, Digest, Manifest, ModelName};
@@ -54,8 +56,6 @@ pub enum Command {
         require: Vec<String>,
         /// Why.
         reason: String,
-        /// Who.
-        actor: String,
     },
     /// Moves an alias back.
     Rollback {
@@ -69,8 +69,6 @@ pub enum Command {
         expect: Option<Expect>,
         /// Why.
         reason: String,
-        /// Who.
-        actor: String,
     },
     /// Two versions, metric by metric.
     Compare {
@@ -104,13 +102,23 @@ pub enum Command {
         /// Minutes for which a fresh blob is safe.
         grace_minutes: Option<u32>,
     },
-    /// Copies a model's files to a folder of the machine that holds the store.
-    Export {
-        /// A model version.
-        reference: String,
-        /// An absolute path; the folder must be empty or missing.
-        dir: std::path::PathBuf,
-    },
+}
+
+impl Command {
+    /// What a token must allow for it.
+    pub fn scope(&self) -> Scope {
+        match self {
+            Self::List
+            | Self::Show { .. }
+            | Self::History { .. }
+            | Self::Compare { .. }
+            | Self::Leaderboard { .. }
+            | Self::Lineage { .. } => Scope::Read,
+            Self::Promote { .. } | Self::Rollback { .. } => Scope::Promote,
+            // Reads every byte of the store.
+            Self::Fsck | Self::Gc { .. } => Scope::Admin,
+        }
+    }
 }
 
 /// What a command gives.
@@ -164,6 +172,7 @@ impl Answer {
             "invalid" | "store" => 2,
             "not-found" => 3,
             "conflict" | "stale-fence" => 4,
+            "unauthorized" | "forbidden" => 5,
             "unreachable" => 6,
             "damaged" => 9,
             "gate" => 10,
@@ -237,12 +246,12 @@ impl From<ApiError> for Answer {
     }
 }
 
-/// Runs a command on a store that this process holds.
-pub async fn run(command: Command, store: &Store) -> Answer {
-    answer(command, store).await.unwrap_or_else(|refused| *refused.0)
+/// Runs a command on a store that this process holds, in the name of `actor`.
+pub async fn run(command: Command, store: &Store, actor: &str) -> Answer {
+    answer(command, store, actor).await.unwrap_or_else(|refused| *refused.0)
 }
 
-async fn answer(command: Command, store: &Store) -> Result<Answer, Refused> {
+async fn answer(command: Command, store: &Store, actor: &str) -> Result<Answer, Refused> {
     let data = match command {
         Command::List => Data::Models { models: store.models().await? },
         Command::Show { reference } => show(store, &reference).await?,
@@ -252,7 +261,7 @@ async fn answer(command: Command, store: &Store) -> Result<Answer, Refused> {
             let history = store.history(&model, alias.as_ref()).await?;
             Data::History { model, history }
         }
-        Command::Promote { reference, to, expect, require, reason, actor } => {
+        Command::Promote { reference, to, expect, require, reason } => {
             let reference: ModelRef = reference.parse().map_err(invalid)?;
             let alias: Alias = to.parse().map_err(invalid)?;
             for gate in &require {
@@ -264,12 +273,12 @@ async fn answer(command: Command, store: &Store) -> Result<Answer, Refused> {
                     "`{model}` has several versions: say `{model}@best` or `{model}:VERSION`"
                 )));
             };
-            let promotion = store.promote(&reference.model, pick, &alias, expect, require, &reason, &actor).await?;
+            let promotion = store.promote(&reference.model, pick, &alias, expect, require, &reason, actor).await?;
             Data::Promotion { promotion }
         }
-        Command::Rollback { model, alias, to, expect, reason, actor } => {
+        Command::Rollback { model, alias, to, expect, reason } => {
             let (model, alias): (ModelName, Alias) = (model.parse().map_err(invalid)?, alias.parse().map_err(invalid)?);
-            let promotion = store.rollback(&model, &alias, to, expect, &reason, &actor).await?;
+            let promotion = store.rollback(&model, &alias, to, expect, &reason, actor).await?;
             Data::Promotion { promotion }
         }
         Command::Compare { left, right, style } => {
@@ -306,11 +315,6 @@ async fn answer(command: Command, store: &Store) -> Result<Answer, Refused> {
             let grace_ms = grace_minutes.map_or(GRACE_MS, |minutes| i64::from(minutes) * 60_000);
             let plan = if dry_run { store.gc_plan(grace_ms).await? } else { store.gc(grace_ms).await? };
             Data::Gc { dry_run, plan }
-        }
-        Command::Export { reference, dir } => {
-            let version = store.resolve(&reference).await?;
-            let files = export::export(store.blobs(), version.artifact, &dir)?;
-            Data::Exported { version, dir, files }
         }
     };
     Ok(Answer::done(data))

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use coordinator::{Config, Coordinator};
+use coordinator::{Config, Connections, Coordinator};
 use protocol::message::{
     Assignment, DesiredAssignments, Grant, Join, Joined, MetricBatch, MetricRow, PROTOCOL_VERSION, Poll, ReportOutcome,
     Submit, TaskOutcome,
@@ -34,18 +34,21 @@ const SHARDS: usize = 100;
 struct Connection {
     stream: TcpStream,
     buffer: Vec<u8>,
+    token: String,
 }
 
 impl Connection {
-    async fn open(address: SocketAddr) -> Result<Self> {
+    async fn open(address: SocketAddr, token: &str) -> Result<Self> {
         let stream = TcpStream::connect(address).await?;
         stream.set_nodelay(true)?;
-        Ok(Self { stream, buffer: Vec::new() })
+        Ok(Self { stream, buffer: Vec::new(), token: token.to_owned() })
     }
 
     async fn send(&mut self, what: &str, headers: &str, body: &[u8]) -> Result<Vec<u8>> {
         let length = body.len();
-        let head = format!("{what} HTTP/1.1\r\nhost: x\r\n{headers}content-length: {length}\r\n\r\n");
+        let token = &self.token;
+        let headers = format!("authorization: Bearer {token}\r\n{headers}content-length: {length}");
+        let head = format!("{what} HTTP/1.1\r\nhost: localhost\r\n{headers}\r\n\r\n");
         let mut request = head.into_bytes();
         request.extend_from_slice(body);
         self.stream.write_all(&request).await?;
@@ -97,8 +100,8 @@ struct Worker {
 }
 
 impl Worker {
-    async fn join(address: SocketAddr, i: usize) -> Result<Self> {
-        let mut connection = Connection::open(address).await?;
+    async fn join(address: SocketAddr, token: &str, i: usize) -> Result<Self> {
+        let mut connection = Connection::open(address, token).await?;
         let name = format!("w{i}");
         let join = Join {
             protocol: PROTOCOL_VERSION,
@@ -206,8 +209,12 @@ async fn heartbeats(workers: Vec<Worker>, seconds: u64) -> Result<(Vec<Worker>, 
 async fn main() -> Result {
     let dir = tempfile::tempdir()?;
     let store = Store::open(dir.path(), Holder::this_process("a bench")).await?;
-    let handle = Coordinator::start(store, Config { alone: false, park: false, ..Config::embedded() }).await?;
-    let address = handle.address();
+    coordinator::shell::raise_descriptor_limit();
+    // Workers that wait for their turn in this bench are silent for longer than any real one.
+    let connections = Connections { idle: Duration::from_secs(600), ..Connections::default() };
+    let config = Config { alone: false, park: false, connections, ..Config::embedded() };
+    let handle = Coordinator::start(store, config).await?;
+    let (address, token) = (handle.address(), handle.token().secret().to_owned());
     let mut out = std::io::stdout();
 
     for seed in 0..RUNS {
@@ -217,7 +224,7 @@ async fn main() -> Result {
     let begun = Instant::now();
     let mut workers = Vec::new();
     for i in 0..WORKERS {
-        workers.push(Worker::join(address, i).await?);
+        workers.push(Worker::join(address, &token, i).await?);
     }
     writeln!(
         out,

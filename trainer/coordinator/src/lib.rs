@@ -27,6 +27,6 @@ pub use decide::decide;
 pub use event::{Control, Effect, Event, Millis, Moment, Observation, Rejected};
 pub use observe::observe;
 pub use policy::Policy;
-pub use shell::{Config, Coordinator, Handle, Refused, StartError};
+pub use shell::{Config, Connections, Coordinator, Handle, Refused, StartError};
 pub use state::State;
 pub use view::WorkerView;

@@ -11,6 +11,7 @@ mod time;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
+use access::ServerOptions;
 use clap::{Args, Parser, Subcommand};
 use protocol::StageName;
 use registry::{Holder, OpenError, Store};
@@ -140,6 +141,8 @@ struct RegistryArgs {
     /// The store's folder
     #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR", global = true)]
     store: PathBuf,
+    #[command(flatten)]
+    server: ServerOptions,
     /// How the answer is printed
     #[arg(short, long, value_enum, default_value_t, global = true)]
     output: registry::cli::Output,
@@ -152,7 +155,7 @@ pub(crate) fn main(cli: Cli) -> ExitCode {
     if let Verb::Worker(WorkerVerb::Join(args)) = cli.verb {
         // Its own threads, its own logging: a worker is synchronous at heart.
         worker::init_logging();
-        return match worker::join(args.into()) {
+        return match worker::Options::try_from(args).and_then(worker::join) {
             Ok(()) => ExitCode::SUCCESS,
             Err(error) => {
                 tracing::error!("{error}");
@@ -161,6 +164,7 @@ pub(crate) fn main(cli: Cli) -> ExitCode {
         };
     }
     init_logging();
+    cli.verb.keep_to_oneself();
     let output = cli.verb.output();
     let runtime = match tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build() {
         Ok(runtime) => runtime,
@@ -189,6 +193,18 @@ fn init_logging() {
 }
 
 impl Verb {
+    /// What a store gets is its user's alone; what else a command writes, the user's umask decides.
+    fn keep_to_oneself(&self) {
+        let store_only = match self {
+            Self::Run(_) | Self::Serve(_) | Self::Resume(_) => true,
+            Self::Registry(args) => !matches!(args.verb, registry::cli::Verb::Export { .. }),
+            _ => false,
+        };
+        if store_only {
+            nix::sys::stat::umask(nix::sys::stat::Mode::from_bits_truncate(0o077));
+        }
+    }
+
     fn output(&self) -> Output {
         match self {
             Self::Run(args) => args.output,
@@ -231,7 +247,7 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Schema(args) => Ok(config::schema(&args)),
         Verb::Worker(WorkerVerb::List(args)) => remote::workers(args).await,
         Verb::Worker(WorkerVerb::Join(_)) => Ok(0),
-        Verb::Registry(args) => Ok(registry::cli::execute(args.verb, &args.store, args.output).await),
+        Verb::Registry(args) => Ok(registry::cli::execute(args.verb, &args.store, &args.server, args.output).await),
     }
 }
 
@@ -271,7 +287,7 @@ async fn show_plan(args: PlanArgs) -> Result<u8> {
 }
 
 async fn resume(args: ResumeArgs) -> Result<u8> {
-    if args.target.server.is_none() {
+    if args.target.server.server.is_none() {
         match Store::open_existing(&args.target.store, Holder::this_process("trainer resume")).await {
             Ok(store) => {
                 // Nobody holds it, so nobody would do the work: this process does.
@@ -293,4 +309,36 @@ async fn resume(args: ResumeArgs) -> Result<u8> {
     let view = client.control(&found.run, "resume").await?;
     remote::show(&view, args.output);
     Ok(0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_commands_of_the_documents_parse() {
+        let commands = cluster_tests::documented::commands(&cluster_tests::Bench::repository(), "trainer");
+        assert!(commands.len() >= 10, "{commands:#?}");
+        for words in commands {
+            if let Err(error) = Cli::try_parse_from(&words) {
+                panic!("{}: {error}", words.join(" "));
+            }
+        }
+    }
+
+    #[test]
+    fn options_are_consistent() {
+        <Cli as clap::CommandFactory>::command().debug_assert();
+    }
+
+    #[test]
+    fn a_blank_token_is_refused_by_every_command() {
+        for line in ["serve --token", "status --token", "worker join http://h:1 --token", "registry list --token"] {
+            for token in ["", " ", "short"] {
+                let words = ["trainer"].into_iter().chain(line.split(' ')).chain([token]);
+                let error = Cli::try_parse_from(words).expect_err("no token").to_string();
+                assert!(error.contains("the token"), "{line} {token:?}: {error}");
+            }
+        }
+    }
 }

@@ -1,51 +1,86 @@
 //! `trainer serve`: the coordinator as a server.
 
-use std::net::SocketAddr;
+use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 
+use access::{Scopes, TokenOptions, Tokens};
 use clap::Args;
 use coordinator::{Config, Coordinator};
 use registry::{Holder, Store};
 use tokio::signal::unix::{SignalKind, signal};
 
-use crate::print;
 use crate::problem::{Problem, Result};
+use crate::{client, print};
+
+const TOKENS: &str = "\
+A token file has a line `NAME SCOPES TOKEN` for each caller, such as `alice submit,promote` and what `openssl rand -hex 32`
+prints. Scopes: read, submit, worker, promote, admin. A token alone, in a file or as --token, may do everything. Without
+any, one is made for this user at every start and lies in the store's folder; beyond this machine a token is required.";
 
 #[derive(Debug, Args)]
+#[command(after_help = TOKENS)]
 pub(crate) struct ServeArgs {
     /// Where to listen
-    #[arg(long, env = "STRIDE_BIND", default_value = "127.0.0.1:7700", value_name = "HOST:PORT")]
+    #[arg(long, env = "STRIDE_BIND", default_value_t = SocketAddr::from((Ipv4Addr::LOCALHOST, access::PORT)), value_name = "HOST:PORT")]
     bind: SocketAddr,
-    /// What callers must bear; required beyond this machine
-    #[arg(long, env = "STRIDE_TOKEN", hide_env_values = true)]
-    token: Option<String>,
+    #[command(flatten)]
+    token: TokenOptions,
+    /// Certificate (PEM) for TLS, with those that sign it
+    #[arg(long, env = "STRIDE_TLS_CERT", value_name = "FILE", requires = "tls_key")]
+    tls_cert: Option<PathBuf>,
+    /// Its private key (PEM), closed to other users
+    #[arg(long, env = "STRIDE_TLS_KEY", value_name = "FILE", requires = "tls_cert")]
+    tls_key: Option<PathBuf>,
+    /// Listen beyond this machine without TLS: whoever sees the traffic has the tokens
+    #[arg(long)]
+    insecure: bool,
+    /// A name by which callers know this server, besides the machine's own; may be repeated
+    #[arg(long, env = "STRIDE_HOST", value_name = "NAME", value_delimiter = ',')]
+    host: Vec<String>,
     /// The store's folder
     #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR")]
     store: PathBuf,
+}
+
+impl ServeArgs {
+    fn config(&self) -> Result<Config> {
+        let mut tokens = match &self.token.token_file {
+            Some(path) => Tokens::read(path)?,
+            None => Tokens::default(),
+        };
+        if let Some(token) = &self.token.token {
+            tokens.add("admin", Scopes::all(), token);
+        }
+        let tls = self.tls_cert.as_deref().zip(self.tls_key.as_deref());
+        let tls = tls.map(|(certificate, key)| access::tls::server(certificate, key)).transpose()?;
+        let (hosts, insecure) = (self.host.clone(), self.insecure);
+        Ok(Config { hosts, tls, insecure, ..Config::server(self.bind, tokens) })
+    }
 }
 
 pub(crate) async fn serve(args: ServeArgs) -> Result<u8> {
     let failed = |error| Problem::failed(format!("cannot listen for signals: {error}"));
     let mut interrupt = signal(SignalKind::interrupt()).map_err(failed)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(failed)?;
-    if !args.bind.ip().is_loopback() && args.token.as_deref().is_none_or(str::is_empty) {
-        // Said before the store is made.
-        return Err(coordinator::StartError::NoToken(args.bind).into());
-    }
+    coordinator::shell::raise_descriptor_limit();
+    let config = args.config()?;
+    // Said before the store is made.
+    config.check()?;
+    let open = config.tokens.is_empty();
     let store = Store::open(&args.store, Holder::this_process("trainer serve")).await?;
-    let handle = Coordinator::start(store.clone(), Config::server(args.bind, args.token)).await?;
-    store.set_address(handle.url()).map_err(|error| Problem::usage(format!("cannot write to the store: {error}")))?;
+    let handle = Coordinator::start(store.clone(), config).await?;
+    let announced = client::announce(&store, &handle)?;
+    let token = if open { format!(" --token-file {}", args.store.join("token").display()) } else { String::new() };
+    let url = handle.url();
     print::note(&format!(
-        "listening on {} with the store {}\n  trainer worker join {}\n  trainer submit PIPELINE --server {}",
-        handle.url(),
+        "listening on {url} with the store {}\n  trainer worker join {url}{token}\n  trainer submit PIPELINE --server {url}{token}",
         args.store.display(),
-        handle.url(),
-        handle.url()
     ));
     tokio::select! {
         _ = interrupt.recv() => {}
         _ = terminate.recv() => {}
     }
+    drop(announced);
     // Workers keep training without us and re-attach to the next server.
     handle.shutdown().await;
     Ok(0)

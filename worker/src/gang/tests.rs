@@ -122,7 +122,7 @@ impl Gang {
     fn context(&self, seat: usize) -> HttpContext {
         let held = self.held(seat).expect("a member");
         // Nobody is there; nothing in these tests is recorded or uploaded.
-        let client = Client::new("http://127.0.0.1:9", None, self.runtime.handle().clone()).expect("a client");
+        let client = Client::new(crate::tests::server_at("http://127.0.0.1:9"), self.runtime.handle().clone());
         let cache = Arc::new(Cache::new(None, Bounds::default()).expect("memory"));
         HttpContext::new(held, client, cache, Device::default())
     }

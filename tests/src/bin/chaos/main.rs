@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime};
 
-use cluster_tests::cluster::{Cluster, TOKEN};
+use cluster_tests::cluster::Cluster;
 use cluster_tests::network::Network;
 use cluster_tests::{Bench, digests, signal, wait_for};
 use nix::sys::signal::Signal;
@@ -130,7 +130,7 @@ impl Chaos {
 
     fn join(&mut self, i: usize) {
         match &self.network {
-            Some(network) => self.cluster.join_by(WORKERS[i], &network.inside(i), &["--token", TOKEN]),
+            Some(network) => self.cluster.join_by(WORKERS[i], &network.inside(i), &[]),
             None => self.cluster.join(WORKERS[i]),
         }
     }

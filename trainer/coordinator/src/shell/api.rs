@@ -1,53 +1,100 @@
 //! Routes, and how refusals look on the wire.
 
 use std::sync::Arc;
+use std::time::Duration;
 
+use access::Scope::{self, Admin, Promote, Read, Submit, Worker};
 use axum::extract::DefaultBodyLimit;
-use axum::http::StatusCode;
+use axum::handler::Handler;
+use axum::http::{Method, StatusCode};
 use axum::response::{IntoResponse, Response};
-use axum::routing::{get, post, put};
+use axum::routing::{MethodFilter, MethodRouter, get, on};
 use axum::{Json, Router, middleware};
 use checkpoint::BlobError;
-use protocol::Digest;
+use protocol::limits;
 use protocol::message::ApiError;
 use registry::{QueryError, WriteError};
 
 use super::actor::{ActorHandle, Refused};
-use super::{auth, polls, queries, uploads};
+use super::auth::{self, Gate};
+use super::{polls, queries, uploads};
 use crate::event::Rejected;
 
-/// The largest message that is no blob.
-const MESSAGE_BYTES: usize = 64 << 20;
-/// The largest blob.
-const BLOB_BYTES: usize = 8 << 30;
+/// How long a call may take that waits for nothing but the disk.
+const SHORT: Duration = Duration::from_secs(60);
+/// How long a call may take that moves or reads much.
+const LONG: Duration = Duration::from_secs(3600);
 
-/// All routes.
-pub(crate) fn router(actor_handle: Arc<ActorHandle>, token: Option<&str>) -> Router {
-    let token = token.filter(|token| !token.is_empty()).map(|token| Digest::of(token.trim().as_bytes()));
-    let blobs = Router::new()
-        .route("/v1/blobs", put(uploads::put_blob))
-        .route("/v1/blobs/{digest}", get(uploads::get_blob))
-        .layer(DefaultBodyLimit::max(BLOB_BYTES));
-    Router::new()
-        .route("/v1/workers", post(polls::join).get(queries::workers))
-        .route("/v1/workers/{worker}/poll", post(polls::poll))
-        .route("/v1/workers/{worker}/gone", post(polls::gone))
-        .route("/v1/metrics", post(uploads::metrics))
-        .route("/v1/logs", post(uploads::logs))
-        .route("/v1/checkpoints", post(uploads::checkpoint))
-        .route("/v1/outcomes", post(uploads::outcome))
-        .route("/v1/runs", post(queries::submit).get(queries::runs))
-        .route("/v1/runs/{run}", get(queries::run))
-        .route("/v1/runs/{run}/logs", get(queries::logs))
-        .route("/v1/runs/{run}/metrics", get(queries::metrics))
-        .route("/v1/runs/{run}/{action}", post(queries::control))
-        .route("/v1/registry", post(queries::registry))
-        .layer(DefaultBodyLimit::max(MESSAGE_BYTES))
-        .merge(blobs)
-        .layer(middleware::from_fn_with_state(token, auth::require_token))
+/// A call that can be made, and by whom.
+#[derive(Debug, Clone, Copy)]
+pub struct Route {
+    /// `GET`, `POST` or `PUT`.
+    pub method: &'static str,
+    /// With `{names}` for what varies.
+    pub path: &'static str,
+    /// A token needs one of these. For commands of the registry, each command then asks for its own.
+    pub scopes: &'static [Scope],
+    pub(crate) body: usize,
+    pub(crate) time: Duration,
+}
+
+type Entry = (Route, MethodRouter<Arc<ActorHandle>>);
+
+fn entry<H: Handler<T, Arc<ActorHandle>>, T: 'static>(
+    method: &'static str,
+    path: &'static str,
+    scopes: &'static [Scope],
+    body: usize,
+    time: Duration,
+    handler: H,
+) -> Entry {
+    let filter = Method::from_bytes(method.as_bytes()).ok().and_then(|method| MethodFilter::try_from(method).ok());
+    let filter = filter.expect("the table has methods of HTTP");
+    (Route { method, path, scopes, body, time }, on(filter, handler))
+}
+
+/// Every call but `GET /v1/health`, with the scopes of which its token needs one, its largest body and its time.
+#[rustfmt::skip]
+fn table() -> Vec<Entry> {
+    const CALL: usize = limits::CALL_BYTES;
+    vec![
+        entry("POST", "/v1/workers",               &[Worker],       CALL,                     SHORT, polls::join),
+        entry("GET",  "/v1/workers",               &[Read],         CALL,                     SHORT, queries::workers),
+        entry("POST", "/v1/workers/{worker}/poll", &[Worker],       CALL,                     SHORT, polls::poll),
+        entry("POST", "/v1/workers/{worker}/gone", &[Worker],       CALL,                     SHORT, polls::gone),
+        entry("POST", "/v1/metrics",               &[Worker],       limits::BATCH_BYTES,      SHORT, uploads::metrics),
+        entry("POST", "/v1/logs",                  &[Worker],       limits::BATCH_BYTES,      SHORT, uploads::logs),
+        entry("POST", "/v1/checkpoints",           &[Worker],       CALL,                     SHORT, uploads::checkpoint),
+        entry("POST", "/v1/outcomes",              &[Worker],       CALL,                     SHORT, uploads::outcome),
+        entry("PUT",  "/v1/blobs",                 &[Worker],       limits::BLOB_BYTES,       LONG,  uploads::put_blob),
+        entry("GET",  "/v1/blobs/{digest}",        &[Read, Worker], CALL,                     LONG,  uploads::get_blob),
+        entry("POST", "/v1/runs",                  &[Submit],       limits::SUBMISSION_BYTES, SHORT, queries::submit),
+        entry("GET",  "/v1/runs",                  &[Read],         CALL,                     SHORT, queries::runs),
+        entry("GET",  "/v1/runs/{run}",            &[Read],         CALL,                     SHORT, queries::run),
+        entry("GET",  "/v1/runs/{run}/logs",       &[Read],         CALL,                     SHORT, queries::logs),
+        entry("GET",  "/v1/runs/{run}/metrics",    &[Read],         CALL,                     SHORT, queries::metrics),
+        entry("POST", "/v1/runs/{run}/{action}",   &[Submit],       CALL,                     SHORT, queries::control),
+        entry("POST", "/v1/registry", &[Read, Promote, Admin],      CALL,                     LONG,  queries::registry),
+    ]
+}
+
+/// Every call that needs a token.
+pub fn routes() -> Vec<Route> {
+    table().into_iter().map(|(route, _)| route).collect()
+}
+
+/// All routes behind `gate`.
+pub(crate) fn router(actor_handle: Arc<ActorHandle>, gate: &Arc<Gate>) -> Router {
+    let mut router = Router::new();
+    for (route, handler) in table() {
+        let admit = middleware::from_fn_with_state((Arc::clone(gate), route), auth::admit);
+        router = router.route(route.path, handler.route_layer(DefaultBodyLimit::max(route.body)).route_layer(admit));
+    }
+    router
         // Says nothing but that somebody listens, so that it may be asked without a token.
         .route("/v1/health", get(queries::health))
         .fallback(|| async { Failure::new(StatusCode::NOT_FOUND, "not-found", "there is no such address".to_owned()) })
+        .layer(middleware::from_fn_with_state(Arc::clone(gate), auth::check_host))
         .with_state(actor_handle)
 }
 
@@ -70,6 +117,16 @@ impl Failure {
 
     pub(crate) fn invalid(message: String) -> Self {
         Self::new(StatusCode::BAD_REQUEST, "invalid", message)
+    }
+
+    /// As the whole answer to a request that is not read.
+    pub(crate) fn to_http(&self) -> Vec<u8> {
+        let body = serde_json::json!(self.error).to_string();
+        let (status, length) = (self.status, body.len());
+        let head = format!(
+            "HTTP/1.1 {status}\r\ncontent-type: application/json\r\nconnection: close\r\ncontent-length: {length}"
+        );
+        format!("{head}\r\n\r\n{body}").into_bytes()
     }
 }
 

@@ -6,18 +6,21 @@
 mod actor;
 mod api;
 mod auth;
+mod body;
 mod effects;
+mod listener;
 mod polls;
 mod queries;
 mod uploads;
 
-use std::net::SocketAddr;
+use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 
+use access::{Scopes, Token, Tokens};
 use protocol::message::{RunView, Submit};
 use protocol::{RunId, WorkerId};
 use registry::{QueryError, Store, WriteError};
-use tokio::net::TcpListener;
+use rustls::ServerConfig;
 use tokio::sync::{oneshot, watch};
 use tokio::task::JoinHandle;
 
@@ -28,6 +31,10 @@ use crate::view::WorkerView;
 
 use self::actor::ActorHandle;
 pub use self::actor::Refused;
+pub use self::api::{Route, routes};
+use self::auth::Gate;
+use self::listener::Listener;
+pub use self::listener::{Connections, raise_descriptor_limit};
 pub use self::queries::{BlobStored, StageMetrics, Submitted};
 
 /// How a coordinator is run.
@@ -35,8 +42,16 @@ pub use self::queries::{BlobStored, StageMetrics, Submitted};
 pub struct Config {
     /// Where to listen; port 0 takes a free one.
     pub listen: SocketAddr,
-    /// What callers must bear. Required to listen beyond this machine.
-    pub token: Option<String>,
+    /// Who may ask. One token more, for this machine's command line, is made at every start: [`Handle::token`].
+    pub tokens: Tokens,
+    /// Names by which callers know this server, besides the machine's own and its addresses.
+    pub hosts: Vec<String>,
+    /// Encrypts all but what stays on this machine.
+    pub tls: Option<Arc<ServerConfig>>,
+    /// Whether tokens may cross a network as they are.
+    pub insecure: bool,
+    /// How many connections there may be.
+    pub connections: Connections,
     /// Times and budgets.
     pub policy: Policy,
     /// No worker of an earlier coordinator can reach this one (`trainer run` starts its own): theirs are gone for certain.
@@ -48,27 +63,48 @@ pub struct Config {
 impl Config {
     /// For `trainer run`: this machine only, any port, own workers.
     pub fn embedded() -> Self {
-        Self {
-            listen: SocketAddr::from(([127, 0, 0, 1], 0)),
-            token: None,
-            policy: Policy::default(),
-            alone: true,
-            park: true,
-        }
+        Self { alone: true, park: true, ..Self::server(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)), Tokens::default()) }
     }
 
     /// For `trainer serve`: workers of before may still be at work and re-attach.
-    pub fn server(listen: SocketAddr, token: Option<String>) -> Self {
-        Self { listen, token, policy: Policy::default(), alone: false, park: false }
+    pub fn server(listen: SocketAddr, tokens: Tokens) -> Self {
+        Self {
+            listen,
+            tokens,
+            hosts: Vec::new(),
+            tls: None,
+            insecure: false,
+            connections: Connections::default(),
+            policy: Policy::default(),
+            alone: false,
+            park: false,
+        }
+    }
+
+    /// Whether it may listen where it is to, as far as its callers are concerned.
+    pub fn check(&self) -> Result<(), StartError> {
+        if self.listen.ip().is_loopback() {
+            return Ok(());
+        }
+        if self.tokens.is_empty() {
+            return Err(StartError::NoToken(self.listen));
+        }
+        if self.tls.is_none() && !self.insecure {
+            return Err(StartError::NoTls(self.listen));
+        }
+        Ok(())
     }
 }
 
 /// Why a coordinator did not start.
 #[derive(Debug, thiserror::Error)]
 pub enum StartError {
-    /// It would be open to everybody.
-    #[error("refusing to listen on {0} without a token: anybody who reaches it could run execution and move aliases")]
+    /// Nobody could call it.
+    #[error("refusing to listen on {0} without a token: nobody beyond this machine could be let in")]
     NoToken(SocketAddr),
+    /// Whoever listens on the network would have the tokens.
+    #[error("refusing to listen on {0} without TLS: whoever sees the traffic has the tokens")]
+    NoTls(SocketAddr),
     /// The address is taken, or not ours.
     #[error("cannot listen on {address}: {cause}")]
     Listen {
@@ -108,44 +144,48 @@ pub struct Coordinator;
 impl Coordinator {
     /// Recovers from the journal of `store`, then listens.
     pub async fn start(store: Store, config: Config) -> Result<Handle, StartError> {
-        if !config.listen.ip().is_loopback() && config.token.as_deref().is_none_or(str::is_empty) {
-            return Err(StartError::NoToken(config.listen));
-        }
+        config.check()?;
         let state = journal::replay(config.policy.clone(), store.journal_read().await?)?;
-        let listen = |cause| StartError::Listen { address: config.listen, cause };
-        let listener = TcpListener::bind(config.listen).await.map_err(listen)?;
-        let address = listener.local_addr().map_err(listen)?;
+        let listen = |address| move |cause| StartError::Listen { address, cause };
+        let main = Listener::bind(config.listen, config.tls.clone()).await.map_err(listen(config.listen))?;
+        let address = main.address().map_err(listen(config.listen))?;
+        let (mut listeners, mut local) = (vec![main], address);
+        if config.tls.is_some() || !config.listen.ip().is_loopback() {
+            // For the commands of this machine, which know neither our names nor our certificate.
+            let here = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
+            let here = Listener::bind(here, None).await.map_err(listen(here))?;
+            local = here.address().map_err(listen(config.listen))?;
+            listeners.push(here);
+        }
+        let (token, mut tokens) = (Token::random(), config.tokens.clone());
+        tokens.add(user(), Scopes::all(), &token);
 
         let (actor_handle, actor) = actor::start(store, state);
         actor_handle.decide(Event::Started { alone: config.alone, park: config.park }).await?;
         let (stop, stopped) = watch::channel(false);
         let clock = tokio::spawn(effects::tick(actor_handle.clone(), config.policy.tick_ms, stopped.clone()));
-        let router = api::router(actor_handle.clone(), config.token.as_deref());
-        let server = tokio::spawn(serve(listener, router, stopped));
+        let gate = Arc::new(Gate::new(tokens, &config.hosts));
+        let router = api::router(actor_handle.clone(), &gate);
+        let server = tokio::spawn(listener::serve(listeners, router, config.connections.clone(), stopped));
         tracing::info!(%address, "coordinator listens");
-        Ok(Handle { address, actor_handle, stop, tasks: vec![clock, server, actor] })
+        let tls = config.tls.is_some();
+        Ok(Handle { address, local, tls, token, actor_handle, stop, tasks: vec![clock, server, actor] })
     }
 }
 
-async fn serve(listener: TcpListener, router: axum::Router, mut stopped: watch::Receiver<bool>) {
-    let stop = async move {
-        // An error means that the handle is gone, which is a stop too.
-        let _ = stopped.wait_for(|stop| *stop).await;
-    };
-    tokio::select! {
-        served = axum::serve(listener, router).into_future() => {
-            if let Err(error) = served {
-                tracing::error!(%error, "the server ended");
-            }
-        }
-        () = stop => {}
-    }
+/// The name of the user whom this process belongs to.
+fn user() -> String {
+    let uid = nix::unistd::geteuid();
+    nix::unistd::User::from_uid(uid).ok().flatten().map_or_else(|| format!("uid-{uid}"), |user| user.name)
 }
 
 /// A running coordinator. Dropping it stops it as `kill -9` would: nothing acknowledged is lost.
 #[derive(Debug)]
 pub struct Handle {
     address: SocketAddr,
+    local: SocketAddr,
+    tls: bool,
+    token: Token,
     actor_handle: Arc<ActorHandle>,
     stop: watch::Sender<bool>,
     tasks: Vec<JoinHandle<()>>,
@@ -159,7 +199,17 @@ impl Handle {
 
     /// Its URL.
     pub fn url(&self) -> String {
-        format!("http://{}", self.address)
+        format!("{}://{}", if self.tls { "https" } else { "http" }, self.address)
+    }
+
+    /// Its URL for processes of this machine, never encrypted.
+    pub fn local_url(&self) -> String {
+        format!("http://{}", self.local)
+    }
+
+    /// A token that allows everything and lasts as long as this coordinator. Its name is that of the user.
+    pub fn token(&self) -> &Token {
+        &self.token
     }
 
     /// Submits a pipeline; durable once this returns.

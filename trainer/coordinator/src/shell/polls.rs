@@ -10,11 +10,12 @@ use protocol::message::{DesiredAssignments, Join, Joined, PROTOCOL_VERSION, Poll
 
 use super::actor::{ActorHandle, Refused};
 use super::api::Failure;
+use super::body::Message;
 use crate::event::{Effect, Event, Rejected};
 
 pub(crate) async fn join(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Json(join): Json<Join>,
+    Message(join): Message<Join>,
 ) -> Result<Json<Joined>, Failure> {
     // Here and not in `decide`: the journal keeps the joins of earlier versions, and must replay.
     if join.protocol != PROTOCOL_VERSION {
@@ -38,7 +39,7 @@ pub(crate) async fn join(
 pub(crate) async fn poll(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(worker): Path<WorkerId>,
-    Json(poll): Json<Poll>,
+    Message(poll): Message<Poll>,
 ) -> Result<Json<DesiredAssignments>, Failure> {
     let (incarnation, version) = (poll.incarnation, poll.version);
     let mut changes = actor_handle.changes();

@@ -3,8 +3,9 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use axum::Json;
+use access::Caller;
 use axum::extract::{Path, Query, State};
+use axum::{Extension, Json};
 use protocol::message::{RunView, Submit};
 use protocol::{Digest, RunId, StageName};
 use registry::Curve;
@@ -13,6 +14,8 @@ use serde::{Deserialize, Serialize};
 
 use super::actor::ActorHandle;
 use super::api::Failure;
+use super::auth;
+use super::body::Message;
 use crate::event::{Control, Event, Rejected};
 use crate::state::execution::StageExecution;
 use crate::view::WorkerView;
@@ -71,7 +74,7 @@ pub(crate) async fn workers(State(actor_handle): State<Arc<ActorHandle>>) -> Jso
 
 pub(crate) async fn submit(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Json(submit): Json<Submit>,
+    Message(submit): Message<Submit>,
 ) -> Result<Json<Submitted>, Failure> {
     Ok(Json(Submitted { run: actor_handle.submit(submit).await? }))
 }
@@ -154,7 +157,12 @@ pub(crate) async fn metrics(
 /// The registry's commands, on behalf of a client: this process holds the store.
 pub(crate) async fn registry(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Json(command): Json<registry::cli::Command>,
-) -> Json<registry::cli::Answer> {
-    Json(registry::cli::run(command, &actor_handle.store).await)
+    Extension(caller): Extension<Arc<Caller>>,
+    Message(command): Message<registry::cli::Command>,
+) -> Result<Json<registry::cli::Answer>, Failure> {
+    let scope = command.scope();
+    if !caller.scopes.allow(scope) {
+        return Err(auth::forbidden(&caller, &[scope]));
+    }
+    Ok(Json(registry::cli::run(command, &actor_handle.store, &caller.name).await))
 }

@@ -14,6 +14,7 @@ use registry::{Write, WriteError};
 
 use super::actor::ActorHandle;
 use super::api::Failure;
+use super::body::Message;
 use super::effects::blocking;
 use super::queries::BlobStored;
 use crate::event::Event;
@@ -30,7 +31,7 @@ async fn write(actor_handle: &ActorHandle, write: Write) -> Result<Json<()>, Fai
 
 pub(crate) async fn metrics(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Json(batch): Json<MetricBatch>,
+    Message(batch): Message<MetricBatch>,
 ) -> Result<Json<()>, Failure> {
     actor_handle.state().check_write(&batch.grant)?;
     write(&actor_handle, Write::Metrics { grant: batch.grant, rows: batch.rows }).await
@@ -38,7 +39,7 @@ pub(crate) async fn metrics(
 
 pub(crate) async fn logs(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Json(batch): Json<LogBatch>,
+    Message(batch): Message<LogBatch>,
 ) -> Result<Json<()>, Failure> {
     actor_handle.state().check_write(&batch.grant)?;
     write(&actor_handle, Write::Logs { grant: batch.grant, first: batch.first, lines: batch.lines }).await
@@ -46,7 +47,7 @@ pub(crate) async fn logs(
 
 pub(crate) async fn checkpoint(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Json(commit): Json<CommitCheckpoint>,
+    Message(commit): Message<CommitCheckpoint>,
 ) -> Result<Json<()>, Failure> {
     actor_handle.decide(Event::Checkpoint { commit }).await?;
     Ok(Json(()))
@@ -54,7 +55,7 @@ pub(crate) async fn checkpoint(
 
 pub(crate) async fn outcome(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Json(report): Json<ReportOutcome>,
+    Message(report): Message<ReportOutcome>,
 ) -> Result<Json<()>, Failure> {
     actor_handle.decide(Event::Outcome { report }).await?;
     Ok(Json(()))

@@ -1,0 +1,241 @@
+//! README's cluster and the units of `ops/`, run as they stand: with a folder of ours in place of the machine's root, this
+//! machine in place of `coordinator`, a free port, and a smaller pipeline.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use cluster_tests::documented::{shell_lines, words};
+use cluster_tests::{Bench, PATIENCE, Running, wait_for};
+
+const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
+
+/// `registry`, which is built beside the trainer; `trainer registry`, which is the same, where it is not.
+fn programs(dir: &Path) -> PathBuf {
+    let bin = dir.join("bin");
+    fs::create_dir_all(&bin).expect("a folder");
+    let registry = Path::new(TRAINER).with_file_name("registry");
+    std::os::unix::fs::symlink(TRAINER, bin.join("trainer")).expect("a link");
+    if registry.exists() {
+        std::os::unix::fs::symlink(registry, bin.join("registry")).expect("a link");
+    } else {
+        let script = format!("#!/bin/sh\nexec '{TRAINER}' registry \"$@\"\n");
+        fs::write(bin.join("registry"), script).expect("a script");
+        fs::set_permissions(bin.join("registry"), std::os::unix::fs::PermissionsExt::from_mode(0o755)).expect("ours");
+    }
+    bin
+}
+
+fn free_port() -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
+    listener.local_addr().expect("bound").port().to_string()
+}
+
+/// The commands of README's "More machines", with what differs here replaced.
+fn readme(port: &str) -> Vec<String> {
+    let lines =
+        shell_lines(&Bench::repository().join("README.md"), Some("<!-- run by tests/process/documented.rs -->"));
+    let smoke = Bench::config("smoke.yaml");
+    let here = |line: String| {
+        let line = line.replace("coordinator", "localhost").replace("7700", port);
+        line.replace("configs/quickstart.yaml", &smoke).replace("quickstart@", "smoke@")
+    };
+    lines.into_iter().map(here).collect()
+}
+
+fn bash(dir: &Path, preamble: &str, line: &str) -> Command {
+    let mut command = Command::new("bash");
+    let path = format!("{}:{}", dir.join("bin").display(), std::env::var("PATH").unwrap_or_default());
+    command.args(["-euc", &format!("{preamble}\n{line}")]).current_dir(dir).env("PATH", path).stdin(Stdio::null());
+    for (name, _) in std::env::vars() {
+        if name.starts_with("STRIDE_") {
+            command.env_remove(name);
+        }
+    }
+    command
+}
+
+fn has_openssl() -> bool {
+    let found = Command::new("openssl").arg("version").output().is_ok_and(|output| output.status.success());
+    if !found {
+        eprintln!("SKIPPED: the documented commands make a certificate with openssl, which is not here");
+    }
+    found
+}
+
+#[test]
+fn the_cluster_of_the_readme() {
+    if !has_openssl() {
+        return;
+    }
+    let bench = Bench::new(TRAINER);
+    let dir = bench.path();
+    programs(dir);
+    let port = free_port();
+    let (mut preamble, mut running, mut ran) = (String::new(), Vec::new(), 0);
+    for line in readme(&port) {
+        ran += 1;
+        println!("$ {line}");
+        if line.starts_with("umask") || line.starts_with("export") {
+            preamble += &format!("{line}\n");
+        } else if line.starts_with("trainer serve") || line.starts_with("trainer worker join") {
+            let log = dir.join(format!("{ran}.log"));
+            let mut process = Running::logged(&mut bash(dir, &preamble, &format!("exec {line}")), &log);
+            wait_for("the server to listen, or the worker to be sent off", || {
+                assert!(process.alive(), "{line} ended:\n{}", fs::read_to_string(&log).unwrap_or_default());
+                (line.contains("worker") || dir.join(".stride/token").exists()).then_some(())
+            });
+            running.push(process);
+        } else {
+            let said = Running::start(bash(dir, &preamble, &line)).wait();
+            assert_eq!(said.code, Some(0), "{line}\n{}\n{}", said.stdout, said.stderr);
+            if line.starts_with("trainer status") {
+                assert!(said.stdout.contains("finished"), "{}", said.stdout);
+            }
+            if line.starts_with("registry list") {
+                assert!(said.stdout.contains("smoke"), "{}", said.stdout);
+            }
+        }
+    }
+    assert!(running.len() == 2 && ran >= 12, "{} of {ran} commands keep running", running.len());
+    assert!(dir.join("model/manifest.json").exists(), "the client has the files");
+}
+
+/// A unit's keys, each with its last value.
+fn unit(name: &str) -> (String, BTreeMap<String, String>) {
+    let text = fs::read_to_string(Bench::repository().join("ops").join(name)).expect("a unit");
+    let pairs = text.lines().filter(|line| !line.starts_with('#')).filter_map(|line| line.split_once('='));
+    let keys = pairs.map(|(key, value)| (key.to_owned(), value.to_owned())).collect();
+    (text, keys)
+}
+
+#[test]
+fn the_units_of_systemd() {
+    if !has_openssl() {
+        return;
+    }
+    let bench = Bench::new(TRAINER);
+    let dir = bench.path();
+    let root = dir.join("root");
+    for folder in ["etc/stride", "var/lib/stride", "usr/local"] {
+        fs::create_dir_all(root.join(folder)).expect("a folder");
+    }
+    let bin = programs(dir);
+    std::os::unix::fs::symlink(bin, root.join("usr/local/bin")).expect("a link");
+    let port = free_port();
+    // Tokens and certificate as README makes them, at the places where the units look.
+    for line in readme(&port).iter().take_while(|line| !line.starts_with("trainer")) {
+        let etc = root.join("etc/stride");
+        let mut command = bash(dir, "umask 077", line);
+        let said = Running::start({
+            command.current_dir(&etc);
+            command
+        });
+        assert_eq!(said.wait().code, Some(0), "{line}");
+    }
+    let here = |text: &str| {
+        let mut text = text.replace("coordinator", "localhost").replace("7700", &port);
+        for folder in ["/usr/local/bin/", "/var/lib/stride", "/etc/stride"] {
+            text = text.replace(folder, &format!("{}{folder}", root.display()));
+        }
+        text.replace("%H-%i", "here-1")
+    };
+    let start = |line: &str, environment: &BTreeMap<String, String>, log: &str| {
+        let words = words(&here(line));
+        let mut command = Command::new(&words[0]);
+        command.args(&words[1..]).current_dir(&root).env_clear().envs(environment).stdin(Stdio::null());
+        Running::logged(&mut command, &dir.join(log))
+    };
+
+    let (_, server) = unit("stride.service");
+    let mut serve = start(&server["ExecStart"], &BTreeMap::new(), "serve.log");
+    let token = root.join("var/lib/stride/store/token");
+    wait_for("the server to start", || {
+        assert!(serve.alive(), "{}", fs::read_to_string(dir.join("serve.log")).unwrap_or_default());
+        token.exists().then_some(())
+    });
+
+    let (text, worker) = unit("stride-worker@.service");
+    assert_eq!(worker["EnvironmentFile"], "/etc/stride/worker.env");
+    // The file that the unit's own comment shows.
+    let shown = text.lines().filter_map(|line| line.strip_prefix("#   ")).filter_map(|line| line.split_once('='));
+    let environment: BTreeMap<String, String> = shown
+        .map(|(name, value)| (name.to_owned(), here(value)))
+        .filter(|(name, _)| name.starts_with("STRIDE_"))
+        .collect();
+    assert_eq!(environment.len(), 3, "{environment:?}");
+    let mut join = start(&worker["ExecStart"], &environment, "worker.log");
+
+    let url = format!("https://localhost:{port}");
+    let etc = |name: &str| root.join("etc/stride").join(name).display().to_string();
+    let (me, ca) = (etc("me.token"), etc("tls.crt"));
+    let options = ["--server", &url, "--token-file", &me, "--ca", &ca];
+    let ask = |arguments: &[&str]| bench.run(&[arguments, &options].concat());
+    wait_for("the worker to join", || {
+        assert!(join.alive(), "{}", fs::read_to_string(dir.join("worker.log")).unwrap_or_default());
+        ask(&["worker", "list"]).expect_code(0).stdout.contains("here-1").then_some(())
+    });
+    ask(&["submit", &Bench::config("smoke.yaml"), "--until", "vae", "--follow"]).expect_code(0);
+    assert!(ask(&["status"]).expect_code(0).stdout.contains("vae"));
+    ask(&["registry", "list"]).expect_code(0);
+
+    // What the wrong caller hears.
+    let nodes = etc("nodes.token");
+    let said = bench.run(&["registry", "list", "--server", &url, "--token-file", &nodes, "--ca", &ca]).expect_code(5);
+    assert!(said.stderr.contains("`nodes` may worker"), "{}", said.stderr);
+    let said = bench.run(&["status", "--server", &url, "--ca", &ca]).expect_code(5);
+    assert!(said.stderr.contains("--token-file"), "{}", said.stderr);
+    let said = bench.run(&["status", "--server", &url, "--token-file", &me]).expect_code(6);
+    assert!(said.stderr.contains("certificate"), "{}", said.stderr);
+    let plain = format!("http://localhost:{port}");
+    let said = bench.run(&["status", "--server", &plain, "--token-file", &me]).expect_code(1);
+    assert!(said.stderr.contains("speaks TLS") && said.stderr.contains("https://"), "{}", said.stderr);
+
+    // SIGTERM, as systemd sends it.
+    join.signal(nix::sys::signal::Signal::SIGTERM);
+    assert_eq!(join.wait().code, Some(0));
+    serve.signal(nix::sys::signal::Signal::SIGTERM);
+    assert_eq!(serve.wait().code, Some(0));
+    assert!(!token.exists() && PATIENCE.as_secs() > 0);
+}
+
+#[test]
+fn the_container_file_builds_what_there_is() {
+    let root = Bench::repository();
+    let text = fs::read_to_string(root.join("ops/Containerfile")).expect("a container file");
+    let line =
+        |start: &str| text.lines().find(|line| line.starts_with(start)).unwrap_or_else(|| panic!("no `{start}`"));
+    let manifest = fs::read_to_string(root.join("Cargo.toml")).expect("a manifest");
+    let version = manifest.lines().find_map(|line| line.strip_prefix("rust-version = ")).expect("a version");
+    assert!(
+        line("FROM docker.io/library/rust:").contains(version.trim_matches('"')),
+        "the toolchain is that of Cargo.toml"
+    );
+
+    let build = words(line("RUN cargo build"));
+    for (_, program) in build.iter().zip(&build[1..]).filter(|(option, _)| *option == "--bin") {
+        assert!(root.join(program).join("src/main.rs").exists(), "`{program}` is built");
+        assert!(line("COPY --from=build").contains(&format!("/src/target/release/{program}")), "`{program}` is copied");
+    }
+    let entry: Vec<String> = serde_json::from_str(line("ENTRYPOINT").trim_start_matches("ENTRYPOINT ")).expect("JSON");
+    let arguments: Vec<String> = serde_json::from_str(line("CMD").trim_start_matches("CMD ")).expect("JSON");
+    assert_eq!(entry, ["trainer"]);
+    let bench = Bench::new(TRAINER);
+    bench.run(&arguments.iter().map(String::as_str).collect::<Vec<_>>()).expect_code(0);
+
+    // What the comments say to run in the image parses: `plan` in place of `run`, and nothing is bound for `serve`.
+    let inside = |comment: &str| {
+        let line = text.lines().find(|line| line.contains(comment)).expect("a comment with a command");
+        words(line.split_once(" stride ").expect("the image's name").1)
+    };
+    let run = inside("Runs the quickstart:");
+    let pipeline = run[1].replace("/usr/share/stride", &root.display().to_string());
+    assert!(run[0] == "run" && Path::new(&pipeline).exists(), "{run:?}");
+    bench.run(&["plan", &pipeline]).expect_code(0);
+    let serve = inside("Serves:");
+    let serve: Vec<&str> = serve.iter().map(String::as_str).collect();
+    let said = bench.run(&serve).expect_code(2);
+    assert!(said.stderr.contains("/etc/stride/tokens"), "it wants the file that the comment mounts: {}", said.stderr);
+}

@@ -1,0 +1,144 @@
+//! A server as a client sees it.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use reqwest::{Method, RequestBuilder, Url};
+
+use crate::secret::{FileError, Token};
+use crate::tls;
+
+/// Shorter than a server keeps an idle connection, so that none is closed under a request.
+const IDLE: Duration = Duration::from_secs(10);
+
+/// Why a server cannot even be asked.
+#[derive(Debug, thiserror::Error)]
+pub enum ConnectError {
+    /// Not an address of ours.
+    #[error("`{url}` is no server: {why}; expected `http://HOST:PORT` or `https://HOST:PORT`")]
+    Url {
+        /// What was given.
+        url: String,
+        /// What is wrong with it.
+        why: String,
+    },
+    /// A certificate was pinned and nothing would be checked against it.
+    #[error("`{0}` is not encrypted, so there is nothing to check with --ca; expected `https://`")]
+    Plain(String),
+    /// A file with a secret or a certificate is not used.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// A store is held by somebody else's process.
+    #[error("the token of the process that holds `{}` cannot be read: {error}; run this as the user who started it", dir.display())]
+    Holder {
+        /// The store.
+        dir: PathBuf,
+        /// Why not.
+        error: std::io::Error,
+    },
+    /// The system gives no client.
+    #[error("no HTTP client: {0}")]
+    Client(String),
+}
+
+/// A server's address, with the token that is shown to it and whom to believe that it is the one.
+#[derive(Debug, Clone)]
+pub struct Server {
+    http: reqwest::Client,
+    base: String,
+    token: Option<Token>,
+}
+
+impl Server {
+    /// A server at `url`; a host and a port alone are taken for `http://`. With `ca`, only what that certificate signs is believed.
+    pub fn new(url: &str, token: Option<Token>, ca: Option<&Path>) -> Result<Self, ConnectError> {
+        let base = url.trim().trim_end_matches('/');
+        let base = if base.contains("://") { base.to_owned() } else { format!("http://{base}") };
+        let wrong = |why: String| ConnectError::Url { url: url.to_owned(), why };
+        let parsed = Url::parse(&base).map_err(|error| wrong(error.to_string()))?;
+        if !matches!(parsed.scheme(), "http" | "https") || parsed.host().is_none() {
+            return Err(wrong("not an address".to_owned()));
+        }
+        if !matches!(parsed.path(), "" | "/") || parsed.query().is_some() || !parsed.username().is_empty() {
+            return Err(wrong("more than an address".to_owned()));
+        }
+        let http = reqwest::Client::builder()
+            .connect_timeout(Duration::from_secs(5))
+            .pool_idle_timeout(IDLE)
+            .tcp_nodelay(true)
+            // An answer that sends us elsewhere is none of ours, and must not get the token.
+            .redirect(reqwest::redirect::Policy::none());
+        let http = match (parsed.scheme(), ca) {
+            ("https", Some(ca)) => http.tls_backend_preconfigured(tls::pinned(ca)?),
+            ("https", None) => {
+                tls::install_provider();
+                http
+            }
+            (_, Some(_)) => return Err(ConnectError::Plain(base)),
+            (_, None) => http.tls_backend_preconfigured(tls::nobody()),
+        };
+        let http = http.build().map_err(|error| ConnectError::Client(explain(&error)))?;
+        Ok(Self { http, base, token })
+    }
+
+    /// Its address, without a slash at the end.
+    pub fn url(&self) -> &str {
+        &self.base
+    }
+
+    /// A call of `path`, which begins with a slash.
+    pub fn request(&self, method: Method, path: &str) -> RequestBuilder {
+        let request = self.http.request(method, format!("{}{path}", self.base));
+        match &self.token {
+            Some(token) => request.bearer_auth(token.secret()),
+            None => request,
+        }
+    }
+}
+
+/// What went wrong with a call, down to its cause, in words that say what to do where TLS is at fault; `reqwest` alone says
+/// only "error sending request".
+pub fn explain(error: &reqwest::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause: Option<&dyn std::error::Error> = std::error::Error::source(error);
+    while let Some(error) = cause {
+        let more = error.to_string();
+        if !text.contains(&more) {
+            text.push_str(": ");
+            text.push_str(&more);
+        }
+        cause = error.source();
+    }
+    let advice = [
+        ("InvalidContentType", "it does not speak TLS there: is it `http://`?"),
+        ("UnknownIssuer", "its certificate is signed by nobody who is trusted: is --ca the right file?"),
+        ("NotValidForName", "its certificate is for another name: ask it by a name that stands in the certificate"),
+        ("Expired", "its certificate has expired"),
+    ];
+    match advice.iter().find(|(sign, _)| text.contains(sign)) {
+        Some((_, advice)) => format!("{text}; {advice}"),
+        None => text,
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a test may panic")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn addresses_are_whole_and_nothing_more() {
+        let url = |text: &str| Server::new(text, None, None).map(|server| server.url().to_owned());
+        assert_eq!(url("127.0.0.1:7700/").unwrap(), "http://127.0.0.1:7700");
+        assert_eq!(url("http://[::1]:7700").unwrap(), "http://[::1]:7700");
+        for wrong in ["", "ftp://host", "http://host/path", "http://user@host:1", "http://host?x", "unix:///run"] {
+            assert!(matches!(url(wrong), Err(ConnectError::Url { .. })), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_pinned_certificate_is_never_ignored() {
+        let error = Server::new("http://host:1", None, Some(Path::new("ca.pem"))).unwrap_err();
+        assert!(error.to_string().contains("not encrypted"), "{error}");
+    }
+}

@@ -1,0 +1,68 @@
+//! How the commands of the user who holds a store are let in: by a token in a file of the store's folder that only this user
+//! can read. It is another one at every start of the holder.
+
+use std::fs::{self, OpenOptions};
+use std::io::{self, Write};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+
+use crate::secret::Token;
+
+fn path(dir: &Path) -> PathBuf {
+    dir.join("token")
+}
+
+/// The file, while its token is good for something. Removed with this; to be dropped before the store's lock is.
+#[derive(Debug)]
+pub struct Published {
+    path: PathBuf,
+}
+
+/// Puts `token` into the folder of the store that this process holds.
+pub fn publish(dir: &Path, token: &Token) -> io::Result<Published> {
+    let (path, fresh) = (path(dir), dir.join(format!("token.{}", std::process::id())));
+    let _ = fs::remove_file(&fresh);
+    // New, so that it is ours with this mode, whatever lay under the name before.
+    let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&fresh)?;
+    file.write_all(token.secret().as_bytes())?;
+    fs::rename(&fresh, &path)?;
+    Ok(Published { path })
+}
+
+impl Drop for Published {
+    fn drop(&mut self) {
+        // What stays is of no use to anybody: the next holder makes another.
+        let _ = fs::remove_file(&self.path);
+    }
+}
+
+/// The token of the process that holds the store in `dir`; `None` if there is none.
+pub fn read(dir: &Path) -> io::Result<Option<Token>> {
+    match fs::read_to_string(path(dir)) {
+        Ok(text) => text.parse().map(Some).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error)),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a test may panic")]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    #[test]
+    fn the_file_is_its_users_alone_and_goes_with_its_holder() {
+        let dir = tempfile::tempdir().unwrap();
+        assert_eq!(read(dir.path()).unwrap(), None);
+        fs::write(path(dir.path()), "left by one that was killed").unwrap();
+        fs::set_permissions(path(dir.path()), fs::Permissions::from_mode(0o644)).unwrap();
+        let token = Token::random();
+        let published = publish(dir.path(), &token).unwrap();
+        assert_eq!(read(dir.path()).unwrap(), Some(token));
+        assert_eq!(fs::metadata(path(dir.path())).unwrap().permissions().mode() & 0o777, 0o600);
+        drop(published);
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 0);
+    }
+}

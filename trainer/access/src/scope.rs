@@ -1,0 +1,111 @@
+//! What a token may do.
+
+use std::fmt;
+use std::str::FromStr;
+
+/// A kind of call. Which call is of which kind stands in the coordinator's table of routes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Scope {
+    /// Looking: runs, logs, metrics, models and their files.
+    Read,
+    /// Submitting, pausing, resuming and cancelling runs.
+    Submit,
+    /// Computing: joining, polling, uploading.
+    Worker,
+    /// Moving aliases.
+    Promote,
+    /// What touches everybody's data: collecting, checking, and all of the above.
+    Admin,
+}
+
+impl Scope {
+    /// All scopes.
+    pub const ALL: [Self; 5] = [Self::Read, Self::Submit, Self::Worker, Self::Promote, Self::Admin];
+
+    /// Its word in a token file.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Read => "read",
+            Self::Submit => "submit",
+            Self::Worker => "worker",
+            Self::Promote => "promote",
+            Self::Admin => "admin",
+        }
+    }
+
+    fn bit(self) -> u8 {
+        1 << self as u8
+    }
+}
+
+impl fmt::Display for Scope {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// The scopes of one token. `admin` holds all others; whoever submits or promotes may also read what came of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Scopes(u8);
+
+impl Scopes {
+    /// These, and what they imply.
+    pub fn of(scopes: &[Scope]) -> Self {
+        let one = |scope: Scope| match scope {
+            Scope::Read | Scope::Worker => scope.bit(),
+            Scope::Submit | Scope::Promote => scope.bit() | Scope::Read.bit(),
+            Scope::Admin => Scope::ALL.iter().fold(0, |all, scope| all | scope.bit()),
+        };
+        Self(scopes.iter().fold(0, |all, scope| all | one(*scope)))
+    }
+
+    /// Everything.
+    pub fn all() -> Self {
+        Self::of(&[Scope::Admin])
+    }
+
+    /// Whether a call of this kind is allowed.
+    pub fn allow(self, scope: Scope) -> bool {
+        self.0 & scope.bit() != 0
+    }
+}
+
+impl fmt::Display for Scopes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let names: Vec<&str> = Scope::ALL.into_iter().filter(|scope| self.allow(*scope)).map(Scope::name).collect();
+        f.write_str(&names.join(","))
+    }
+}
+
+impl FromStr for Scopes {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let one = |word: &str| {
+            Scope::ALL.into_iter().find(|scope| scope.name() == word).ok_or_else(|| {
+                let known = Scope::ALL.map(Scope::name).join(", ");
+                format!("`{word}` is no scope; expected some of {known}, separated by commas")
+            })
+        };
+        Ok(Self::of(&text.split(',').map(one).collect::<Result<Vec<_>, _>>()?))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_scope_implies_no_more_than_it_needs() {
+        let allowed = |text: &str| text.parse::<Scopes>().map(|scopes| scopes.to_string());
+        assert_eq!(allowed("read").as_deref(), Ok("read"));
+        assert_eq!(allowed("worker").as_deref(), Ok("worker"));
+        assert_eq!(allowed("submit").as_deref(), Ok("read,submit"));
+        assert_eq!(allowed("promote").as_deref(), Ok("read,promote"));
+        assert_eq!(allowed("worker,submit").as_deref(), Ok("read,submit,worker"));
+        assert_eq!(allowed("admin").as_deref(), Ok("read,submit,worker,promote,admin"));
+        for wrong in ["", "root", "read,", "Read"] {
+            assert!(allowed(wrong).is_err_and(|error| error.contains("read, submit, worker")), "{wrong}");
+        }
+    }
+}

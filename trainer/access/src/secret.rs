@@ -1,0 +1,209 @@
+//! Tokens as texts, and the files they stand in.
+
+use std::fmt;
+use std::fs::File;
+use std::io::Read;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use protocol::Digest;
+
+/// Shorter tokens could be guessed.
+const SHORTEST: usize = 16;
+const LONGEST: usize = 512;
+/// A token file has a line a person or machine.
+const FILE_BYTES: u64 = 1 << 20;
+
+/// What a caller shows to be let in. Does not appear in debug output.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Token(String);
+
+impl Token {
+    /// 256 bits from the system's generator.
+    pub fn random() -> Self {
+        let mut bytes = [0; 32];
+        getrandom::fill(&mut bytes).expect("the system has random bytes");
+        Self(bytes.iter().map(|byte| format!("{byte:02x}")).collect())
+    }
+
+    /// The text, for the header that carries it.
+    pub fn secret(&self) -> &str {
+        &self.0
+    }
+
+    /// What a server keeps of it: comparing digests says nothing about the token by the time it takes.
+    pub(crate) fn digest(&self) -> Digest {
+        Digest::of(self.0.as_bytes())
+    }
+
+    /// The one token of a client's file: alone, or as the line `NAME SCOPES TOKEN` of a server's file.
+    pub fn from_file(path: &Path) -> Result<Self, FileError> {
+        let text = read_secret(path)?;
+        let mut lines = entries(&text);
+        let (Some((line, words)), None) = (lines.next(), lines.next()) else {
+            return Err(FileError::new(path, "expected one token, found none or several")
+                .hint("a client's file has a line with its own token and nothing else"));
+        };
+        let word = match words.as_slice() {
+            [token] | [_, _, token] => token,
+            _ => return Err(FileError::line(path, line, "expected a token, or `NAME SCOPES TOKEN`")),
+        };
+        word.parse().map_err(|error: TokenError| FileError::line(path, line, error))
+    }
+}
+
+impl fmt::Debug for Token {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Token(..)")
+    }
+}
+
+/// A text that is no token. Says nothing of what it was.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum TokenError {
+    /// Nothing but white space.
+    #[error("the token is empty; `openssl rand -hex 32` makes one")]
+    Empty,
+    /// It could be guessed.
+    #[error("the token has {0} characters, expected at least {SHORTEST}; `openssl rand -hex 32` makes one")]
+    Short(usize),
+    /// It does not fit a header.
+    #[error("the token has more than {LONGEST} characters")]
+    Long,
+    /// It does not fit a header.
+    #[error("the token has a blank or a character that is not plain ASCII")]
+    Characters,
+}
+
+impl FromStr for Token {
+    type Err = TokenError;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let text = text.trim();
+        if text.is_empty() {
+            return Err(TokenError::Empty);
+        }
+        if !text.bytes().all(|byte| byte.is_ascii_graphic()) {
+            return Err(TokenError::Characters);
+        }
+        match text.len() {
+            n if n < SHORTEST => Err(TokenError::Short(n)),
+            n if n > LONGEST => Err(TokenError::Long),
+            _ => Ok(Self(text.to_owned())),
+        }
+    }
+}
+
+/// Why a file with a secret is not used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("`{}`{}: {message}", path.display(), line.map_or_else(String::new, |line| format!(", line {line}")))]
+pub struct FileError {
+    path: PathBuf,
+    line: Option<usize>,
+    message: String,
+    hint: Option<String>,
+}
+
+impl FileError {
+    pub(crate) fn new(path: &Path, message: impl fmt::Display) -> Self {
+        Self { path: path.to_owned(), line: None, message: message.to_string(), hint: None }
+    }
+
+    pub(crate) fn line(path: &Path, line: usize, message: impl fmt::Display) -> Self {
+        Self { line: Some(line), ..Self::new(path, message) }
+    }
+
+    pub(crate) fn hint(mut self, hint: &str) -> Self {
+        self.hint = Some(hint.to_owned());
+        self
+    }
+
+    /// What to do about it.
+    pub fn advice(&self) -> Option<&str> {
+        self.hint.as_deref()
+    }
+}
+
+/// The text of a file that must not be readable by everybody.
+pub(crate) fn read_secret(path: &Path) -> Result<String, FileError> {
+    let failed = |error: std::io::Error| FileError::new(path, error);
+    let file = File::open(path).map_err(failed)?;
+    let metadata = file.metadata().map_err(failed)?;
+    if metadata.is_dir() {
+        return Err(FileError::new(path, "is a folder, expected a file"));
+    }
+    let mode = metadata.permissions().mode() & 0o777;
+    if mode & 0o007 != 0 {
+        return Err(FileError::new(path, format!("is open to every user of this machine (mode {mode:03o})"))
+            .hint(&format!("`chmod 600 {}`; if others could read it, make a new one", path.display())));
+    }
+    let mut text = String::new();
+    file.take(FILE_BYTES + 1).read_to_string(&mut text).map_err(failed)?;
+    if text.len() as u64 > FILE_BYTES {
+        return Err(FileError::new(path, "has more than a mebibyte; is it another file?"));
+    }
+    Ok(text)
+}
+
+/// The lines that say something, with their numbers and words.
+pub(crate) fn entries(text: &str) -> impl Iterator<Item = (usize, Vec<&str>)> {
+    let lines = text.lines().enumerate().map(|(i, line)| (i + 1, line.split_whitespace().collect::<Vec<_>>()));
+    lines.filter(|(_, words)| words.first().is_some_and(|word| !word.starts_with('#')))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a test may panic")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn blanks_and_short_texts_are_no_tokens() {
+        for (text, expected) in [
+            ("", TokenError::Empty),
+            (" \t\n", TokenError::Empty),
+            ("secret", TokenError::Short(6)),
+            ("a token with blanks in it", TokenError::Characters),
+            ("ein-längerer-Schlüssel", TokenError::Characters),
+            (&"x".repeat(513), TokenError::Long),
+        ] {
+            assert_eq!(text.parse::<Token>(), Err(expected), "{text:?}");
+        }
+        let token: Token = " 0123456789abcdef\n".parse().unwrap();
+        assert_eq!(token.secret(), "0123456789abcdef");
+        assert!(!format!("{token:?}").contains("0123"));
+        assert_ne!(Token::random(), Token::random());
+        assert!(Token::random().secret().parse::<Token>().is_ok());
+    }
+
+    #[test]
+    fn a_file_open_to_everybody_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("token");
+        std::fs::write(&path, "0123456789abcdef\n").unwrap();
+        for (mode, fine) in [(0o644, false), (0o604, false), (0o602, false), (0o640, true), (0o600, true)] {
+            std::fs::set_permissions(&path, std::fs::Permissions::from_mode(mode)).unwrap();
+            let read = Token::from_file(&path);
+            assert_eq!(read.is_ok(), fine, "{mode:o}: {read:?}");
+            assert!(read.err().is_none_or(|error| error.advice().unwrap().contains("chmod 600")));
+        }
+    }
+
+    #[test]
+    fn a_clients_file_has_one_token() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("token");
+        let read = |text: &str| {
+            std::fs::write(&path, text).unwrap();
+            std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o600)).unwrap();
+            Token::from_file(&path).map(|token| token.secret().to_owned()).map_err(|error| error.to_string())
+        };
+        assert_eq!(read("# mine\nw worker 0123456789abcdef\n").unwrap(), "0123456789abcdef");
+        assert!(read("").is_err() && read("a read 0123456789abcdef\nb read 0123456789abcdeg\n").is_err());
+        assert!(
+            read("\n secret\n").unwrap_err().ends_with(
+                "line 2: the token has 6 characters, expected at least 16; `openssl rand -hex 32` makes one"
+            )
+        );
+    }
+}

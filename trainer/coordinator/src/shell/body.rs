@@ -1,0 +1,117 @@
+//! Bodies: read within limits of size, time and memory, and parsed where a large one holds nobody up.
+
+use std::future::Future;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use axum::body::{Body, Bytes, HttpBody};
+use axum::extract::{FromRequest, Request};
+use axum::http::{StatusCode, header};
+use http_body::{Frame, SizeHint};
+use serde::de::DeserializeOwned;
+use tokio::time::{Instant, Sleep};
+
+use super::api::{Failure, Route};
+use super::auth::{Gate, too_large};
+use super::effects::blocking;
+
+/// How long a body may say nothing.
+const SILENCE: Duration = Duration::from_secs(30);
+/// Larger bodies are parsed beside the threads that answer heartbeats.
+const LARGE: usize = 64 << 10;
+
+/// A body that ends with an error when its sender pauses for too long.
+#[derive(Debug)]
+pub(crate) struct Paced {
+    body: Body,
+    silence: Pin<Box<Sleep>>,
+}
+
+impl Paced {
+    pub(crate) fn new(body: Body) -> Self {
+        Self { body, silence: Box::pin(tokio::time::sleep(SILENCE)) }
+    }
+}
+
+impl HttpBody for Paced {
+    type Data = Bytes;
+    type Error = axum::Error;
+
+    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
+        match Pin::new(&mut self.body).poll_frame(cx) {
+            Poll::Ready(frame) => {
+                self.silence.as_mut().reset(Instant::now() + SILENCE);
+                Poll::Ready(frame)
+            }
+            Poll::Pending => match self.silence.as_mut().poll(cx) {
+                Poll::Ready(()) => {
+                    let message = format!("nothing of the body came for {} s", SILENCE.as_secs());
+                    Poll::Ready(Some(Err(axum::Error::new(std::io::Error::new(std::io::ErrorKind::TimedOut, message)))))
+                }
+                Poll::Pending => Poll::Pending,
+            },
+        }
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
+
+/// A message as JSON, like `axum::Json`, but bounded by its route and by what all bodies together may take.
+#[derive(Debug)]
+pub(crate) struct Message<T>(pub(crate) T);
+
+impl<S: Sync, T: DeserializeOwned + Send + 'static> FromRequest<S> for Message<T> {
+    type Rejection = Failure;
+
+    async fn from_request(request: Request, _: &S) -> Result<Self, Failure> {
+        let extensions = request.extensions();
+        let (Some(gate), Some(route)) = (extensions.get::<Arc<Gate>>().cloned(), extensions.get::<Route>().copied())
+        else {
+            return Err(Failure::new(
+                StatusCode::INTERNAL_SERVER_ERROR,
+                "internal",
+                "a route without a gate".to_owned(),
+            ));
+        };
+        let is_json = |text: &str| text.split(';').next().is_some_and(|kind| kind.trim() == "application/json");
+        let kind = request.headers().get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok());
+        if !kind.is_some_and(is_json) {
+            let message = "expected `content-type: application/json`".to_owned();
+            return Err(Failure::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "invalid", message));
+        }
+        // As much as it may become if it does not say how long it is.
+        let most = HttpBody::size_hint(request.body()).upper().and_then(|most| usize::try_from(most).ok());
+        let kibibytes = most.unwrap_or(route.body).min(route.body).div_ceil(1 << 10);
+        let permit = gate.bodies.clone().acquire_many_owned(u32::try_from(kibibytes).unwrap_or(u32::MAX)).await;
+        let bytes = axum::body::to_bytes(request.into_body(), route.body).await.map_err(|e| unread(&e, route.body))?;
+        let parsed = if bytes.len() > LARGE {
+            blocking(move || serde_json::from_slice(&bytes)).await
+        } else {
+            serde_json::from_slice(&bytes)
+        };
+        drop(permit);
+        parsed.map(Self).map_err(|error| Failure::invalid(format!("the body does not parse: {error}")))
+    }
+}
+
+fn unread(error: &axum::Error, limit: usize) -> Failure {
+    let mut cause: Option<&dyn std::error::Error> = Some(error);
+    while let Some(inner) = cause {
+        if inner.downcast_ref::<std::io::Error>().is_some_and(|e| e.kind() == std::io::ErrorKind::TimedOut) {
+            return Failure::new(StatusCode::REQUEST_TIMEOUT, "slow", inner.to_string());
+        }
+        if inner.to_string().contains("length limit exceeded") {
+            return too_large(limit);
+        }
+        cause = inner.source();
+    }
+    Failure::invalid(format!("the body was cut off: {error}"))
+}
