@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use sqlx::Row;
 
 use crate::blob::BlobStore;
-use crate::{QueryError, Store, retention};
+use crate::{QueryError, ReadStore, retention};
 
 /// What a check found.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -20,11 +20,14 @@ pub struct Report {
     pub problems: Vec<String>,
 }
 
-impl Store {
+impl ReadStore {
     /// Checks everything. Reads every byte, so it takes as long as that takes.
     pub async fn fsck(&self) -> Result<Report, QueryError> {
-        let mut conn = self.readers().acquire().await?;
         let mut problems = Vec::new();
+        if let Err(problem) = self.check_identity().await {
+            problems.push(problem);
+        }
+        let mut conn = self.readers().acquire().await?;
         for row in sqlx::query("PRAGMA integrity_check").fetch_all(&mut *conn).await? {
             let line: String = row.try_get(0)?;
             if line != "ok" {

@@ -13,6 +13,7 @@ mod clock;
 mod db;
 pub mod failpoints;
 pub mod fsck;
+mod identity;
 pub mod leaderboard;
 mod lock;
 mod metrics;
@@ -23,8 +24,9 @@ mod write;
 
 pub use blob::BlobStore;
 pub use catalog::{Expect, Gate, Model, ModelRef, Pick, Promotion, Version};
+pub use identity::{Mismatch, StoreId};
 pub use lock::Holder;
 pub use metrics::{Curve, Point};
 pub use query::{CheckpointRow, LineageNode, LogRow, QueryError, RunRow, StageResultRow};
-pub use store::{OpenError, Store};
+pub use store::{OpenError, ReadStore, Store};
 pub use write::{Write, WriteError};

@@ -7,6 +7,7 @@ use std::io::{self, Read};
 use std::os::unix::fs::FileExt;
 use std::path::Path;
 use std::sync::Mutex;
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
@@ -54,17 +55,55 @@ pub(crate) enum Taken {
     Busy(Holder),
 }
 
-impl StoreLock {
-    pub(crate) fn take(path: &Path, holder: Holder) -> io::Result<Taken> {
-        let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)?;
-        match file.try_lock() {
-            Ok(()) => {
-                let lock = Self { file, holder: Mutex::new(holder.clone()) };
-                lock.write(&holder)?;
-                Ok(Taken::Ours(lock))
-            }
-            Err(TryLockError::WouldBlock) => Ok(Taken::Busy(read(file)?)),
+/// How long an opening waits for commands that read the store, each of which is short.
+const READERS_END: Duration = Duration::from_secs(10);
+const BETWEEN: Duration = Duration::from_millis(20);
+
+/// Kept by processes that read a store which nobody holds.
+#[derive(Debug)]
+pub(crate) struct SharedLock(#[expect(dead_code, reason = "the lock lasts as long as the file is open")] File);
+
+impl SharedLock {
+    /// `None` if somebody holds the store. A store without the file is held by nobody, and not locked: it is being made, or was
+    /// put there without it.
+    pub(crate) fn try_take(path: &Path) -> io::Result<Option<Self>> {
+        let file = match File::open(path) {
+            Ok(file) => file,
+            Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
+            Err(e) => return Err(e),
+        };
+        match file.try_lock_shared() {
+            Ok(()) => Ok(Some(Self(file))),
+            Err(TryLockError::WouldBlock) => Ok(None),
             Err(TryLockError::Error(e)) => Err(e),
+        }
+    }
+}
+
+impl StoreLock {
+    /// Takes the lock, once commands that only read have ended.
+    pub(crate) async fn take(path: &Path, holder: Holder) -> io::Result<Taken> {
+        let until = Instant::now() + READERS_END;
+        loop {
+            let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)?;
+            match file.try_lock() {
+                Ok(()) => {
+                    let lock = Self { file, holder: Mutex::new(holder.clone()) };
+                    lock.write(&holder)?;
+                    return Ok(Taken::Ours(lock));
+                }
+                Err(TryLockError::Error(e)) => return Err(e),
+                Err(TryLockError::WouldBlock) => {}
+            }
+            // A lock that can be shared is one that readers share.
+            if SharedLock::try_take(path)?.is_none() {
+                return Ok(Taken::Busy(read(file)?));
+            }
+            if Instant::now() >= until {
+                let what = "commands that read it".to_owned();
+                return Ok(Taken::Busy(Holder { pid: 0, what, address: None }));
+            }
+            tokio::time::sleep(BETWEEN).await;
         }
     }
 
@@ -137,21 +176,40 @@ mod tests {
         assert_eq!(network_kind(0x0102_1994), None, "tmpfs");
     }
 
-    #[test]
-    fn the_second_learns_who_was_first_and_the_lock_ends_with_its_holder() {
+    #[tokio::test]
+    async fn the_second_learns_who_was_first_and_the_lock_ends_with_its_holder() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("lock");
-        let Taken::Ours(first) = StoreLock::take(&path, Holder::this_process("first, with a long name")).unwrap()
+        let Taken::Ours(first) = StoreLock::take(&path, Holder::this_process("first, with a long name")).await.unwrap()
         else {
             panic!("the first takes it")
         };
         first.set_address("http://127.0.0.1:1".into()).unwrap();
-        let Taken::Busy(holder) = StoreLock::take(&path, Holder::this_process("second")).unwrap() else {
+        let Taken::Busy(holder) = StoreLock::take(&path, Holder::this_process("second")).await.unwrap() else {
             panic!("the second does not")
         };
         assert_eq!(holder, first.holder());
         assert!(holder.to_string().ends_with("at http://127.0.0.1:1"), "{holder}");
         drop(first);
-        assert!(matches!(StoreLock::take(&path, Holder::this_process("third")).unwrap(), Taken::Ours(_)));
+        assert!(matches!(StoreLock::take(&path, Holder::this_process("third")).await.unwrap(), Taken::Ours(_)));
+    }
+    #[tokio::test]
+    async fn readers_share_what_nobody_holds_and_are_waited_for() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("lock");
+        assert!(SharedLock::try_take(&path).unwrap().is_none(), "there is no store yet");
+        let Taken::Ours(held) = StoreLock::take(&path, Holder::this_process("writer")).await.unwrap() else {
+            panic!("nobody holds it")
+        };
+        assert!(SharedLock::try_take(&path).unwrap().is_none(), "it is held");
+        drop(held);
+        let readers = (SharedLock::try_take(&path).unwrap().unwrap(), SharedLock::try_take(&path).unwrap().unwrap());
+        let opening = tokio::spawn(async move {
+            matches!(StoreLock::take(&path, Holder::this_process("writer")).await.unwrap(), Taken::Ours(_))
+        });
+        tokio::task::yield_now().await;
+        assert!(!opening.is_finished());
+        drop(readers);
+        assert!(opening.await.unwrap());
     }
 }

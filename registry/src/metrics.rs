@@ -10,7 +10,7 @@ use protocol::{RunId, StageName};
 use serde::{Deserialize, Serialize};
 use sqlx::Row;
 
-use crate::{QueryError, Store};
+use crate::{QueryError, ReadStore};
 
 /// A value after a step. What was no number is NaN, and `null` in JSON.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -35,7 +35,7 @@ pub struct Curve {
     pub points: Vec<Point>,
 }
 
-impl Store {
+impl ReadStore {
     /// The current values of a stage by key; of all keys, or of `keys`; at most about `points` of each, 0 for all.
     pub async fn metrics(
         &self,

@@ -9,7 +9,7 @@ use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
 use crate::catalog::{self, Model, Promotion, Version, numbers};
-use crate::{Store, WriteError};
+use crate::{ReadStore, WriteError};
 
 /// Why a question has no answer.
 #[derive(Debug, thiserror::Error)]
@@ -26,6 +26,9 @@ pub enum QueryError {
     /// The blobs.
     #[error("{0}")]
     Blob(String),
+    /// The disk did not take a change.
+    #[error("{0}")]
+    Storage(String),
 }
 
 impl From<QueryError> for WriteError {
@@ -35,6 +38,7 @@ impl From<QueryError> for WriteError {
             QueryError::Invalid(message) => Self::Conflict(message),
             QueryError::Database(e) => crate::db::write_error(e),
             QueryError::Blob(message) => Self::Internal(message),
+            QueryError::Storage(message) => Self::Storage(message),
         }
     }
 }
@@ -140,7 +144,7 @@ pub struct LineageNode {
     pub depth: u32,
 }
 
-impl Store {
+impl ReadStore {
     async fn connection(&self) -> Result<sqlx::pool::PoolConnection<sqlx::Sqlite>> {
         Ok(self.readers().acquire().await?)
     }

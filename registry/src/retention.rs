@@ -1,27 +1,32 @@
 //! What may go. Marks from roots, then sweeps what was not marked and is old enough; forgets checkpoints by policy.
 //!
 //! Roots: every version (so whatever an alias points at), every stage result, every checkpoint that was not pruned, every
-//! shard of a run that may still need it, every pin. From a root the mark follows the manifest's files, digests in the
-//! manifest's own words (`meta`), and the lineage. A blob that was put within the grace period is never collected: the row
-//! that will name it may be on its way.
+//! shard of a run that may still need it, every pin, and what held tasks have uploaded. From a root the mark follows the
+//! manifest's files, digests in the manifest's own words (`meta`), and the lineage. A blob that was put within the grace
+//! period is never collected: the row that will name it may be on its way. After a restart nobody knows any more what a
+//! held task had uploaded before; so while a run is under way, blobs from before the restart have the usual grace however
+//! short a one was asked for.
 //!
-//! Collection runs in the writer's thread, between two transactions: no row can come to name a blob while it goes, and
-//! what rows no longer name is committed before a blob goes. A root whose manifest does not read stops the collection, for
-//! nobody can say what it needs.
+//! The writer goes on meanwhile. Marking reads one moment of the database; from just before that moment on the writer notes
+//! what new rows name ([`Named`]), and a blob is removed only while nobody can be noting it. A root whose manifest does not
+//! read stops the collection, for nobody can say what it needs; so does a database or a folder of blobs that is not the
+//! store's own any more ([`crate::identity`]).
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::ops::Deref;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use checkpoint::BlobError;
 use protocol::stage::Keep;
 use protocol::{Digest, TaskId};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
-use sqlx::{Row, SqliteConnection};
+use sqlx::{Connection, Row, SqliteConnection};
 
 use crate::blob::{BlobStore, ManifestError};
 use crate::db::apply::{int, run};
 use crate::query::{self, QueryError};
-use crate::{Store, WriteError, clock};
+use crate::{ReadStore, Store, WriteError, clock};
 
 /// How long a fresh blob is safe from collection: longer than any upload waits for its row.
 pub const GRACE_MS: i64 = 60 * 60 * 1000;
@@ -41,11 +46,100 @@ pub struct Plan {
     pub forget_shards: Vec<TaskId>,
 }
 
-impl Store {
-    /// What [`Self::gc`] would remove.
+impl ReadStore {
+    /// What [`Store::gc`] would remove.
     pub async fn gc_plan(&self, grace_ms: i64) -> Result<Plan, QueryError> {
-        let mut conn = self.readers().acquire().await?;
-        plan(&mut conn, self.blobs(), grace_ms).await
+        let (rows, blobs) = (Rows::read(self).await?, self.blobs().clone());
+        let ages = Ages { now_ms: clock::now_ms(), grace_ms, opened_ms: self.opened_ms(), live: rows.live };
+        blocking(move || plan(&blobs, &rows, &ages)).await
+    }
+}
+
+impl Store {
+    /// Removes blobs that nothing needs and that were last put more than `grace_ms` ago; returns what went. Writes go on
+    /// meanwhile. Killed in between it has removed only what nothing needs; the next one goes on.
+    pub async fn gc(&self, grace_ms: i64) -> Result<Plan, WriteError> {
+        let _alone = self.collecting().await;
+        self.check_identity().await.map_err(|why| WriteError::Storage(format!("nothing was collected: {why}")))?;
+        let _noting = Noting(Arc::clone(self.named()));
+        let forgotten = self.begin_collection().await?;
+        let (rows, blobs, named) = (Rows::read(self).await?, self.blobs().clone(), Arc::clone(self.named()));
+        let ages = Ages { now_ms: clock::now_ms(), grace_ms, opened_ms: self.opened_ms(), live: rows.live };
+        let plan = blocking(move || {
+            let plan = plan(&blobs, &rows, &ages)?;
+            sweep(&blobs, &rows, &ages, &named, plan)
+        });
+        Ok(Plan { forget_shards: forgotten, ..plan.await? })
+    }
+}
+
+async fn blocking<T: Send + 'static>(
+    work: impl FnOnce() -> Result<T, QueryError> + Send + 'static,
+) -> Result<T, QueryError> {
+    let ended = |e: tokio::task::JoinError| QueryError::Blob(format!("the collection ended early: {e}"));
+    tokio::task::spawn_blocking(work).await.map_err(ended)?
+}
+
+/// Blobs, for the writer: what rows come to name while a collection is under way is noted.
+#[derive(Debug, Clone)]
+pub(crate) struct Vouched {
+    pub(crate) blobs: BlobStore,
+    pub(crate) named: Arc<Named>,
+}
+
+impl Deref for Vouched {
+    type Target = BlobStore;
+
+    fn deref(&self) -> &BlobStore {
+        &self.blobs
+    }
+}
+
+/// What rows have come to name since a collection began; `None` while there is none.
+#[derive(Debug, Default)]
+pub(crate) struct Named(Mutex<Option<BTreeSet<Digest>>>);
+
+impl Named {
+    fn lock(&self) -> MutexGuard<'_, Option<BTreeSet<Digest>>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// From here on names are noted.
+    pub(crate) fn begin(&self) {
+        *self.lock() = Some(BTreeSet::new());
+    }
+
+    /// Notes what a row is about to name. To be called before it is checked that the blob is there: whoever finds it there
+    /// keeps it.
+    pub(crate) fn note(&self, digests: impl IntoIterator<Item = Digest>) {
+        if let Some(named) = &mut *self.lock() {
+            named.extend(digests);
+        }
+    }
+
+    /// Whether a collection is under way, which is when notes are taken.
+    pub(crate) fn is_noting(&self) -> bool {
+        self.lock().is_some()
+    }
+
+    fn noted(&self) -> BTreeSet<Digest> {
+        self.lock().clone().unwrap_or_default()
+    }
+
+    /// Does `remove` unless the blob has been named; nobody can name it meanwhile.
+    fn unless_named<T>(&self, digest: Digest, remove: impl FnOnce() -> T) -> Option<T> {
+        let named = self.lock();
+        let is_named = named.as_ref().is_some_and(|named| named.contains(&digest));
+        (!is_named).then(remove)
+    }
+}
+
+/// Ends the noting, however the collection ends.
+struct Noting(Arc<Named>);
+
+impl Drop for Noting {
+    fn drop(&mut self) {
+        *self.0.lock() = None;
     }
 }
 
@@ -71,7 +165,7 @@ pub(crate) async fn prune(conn: &mut SqliteConnection, task: &TaskId, keep: &Kee
 /// Sets a pin, or ends it.
 pub(crate) async fn pin(
     conn: &mut SqliteConnection,
-    blobs: &BlobStore,
+    blobs: &Vouched,
     digest: Digest,
     reason: Option<&str>,
 ) -> Result<(), WriteError> {
@@ -85,27 +179,14 @@ pub(crate) async fn pin(
     run(conn, sqlx::query(set).bind(name).bind(reason).bind(clock::now_ms())).await.map(|_| ())
 }
 
-/// Removes what nothing needs. Killed in between it has removed only what nothing needs; the next one goes on.
-pub(crate) async fn collect(conn: &mut SqliteConnection, blobs: &BlobStore, grace_ms: i64) -> Result<Plan, WriteError> {
-    let before_ms = clock::now_ms().saturating_sub(grace_ms);
-    let mut plan = plan(conn, blobs, grace_ms).await?;
-    // Outside of a transaction: on disk when it returns.
-    run(conn, sqlx::query(FORGET_SHARDS)).await?;
-    let mut removed = Vec::with_capacity(plan.remove.len());
-    for digest in std::mem::take(&mut plan.remove) {
-        match blobs.remove_older(digest, before_ms) {
-            Ok(true) => removed.push(digest),
-            // Put again in the meantime.
-            Ok(false) => {}
-            Err(e) => return Err(WriteError::Storage(e.to_string())),
-        }
-    }
-    plan.remove = removed;
-    Ok(plan)
+/// Forgets the shards of finished runs, for which the stage's artifact stands; returns their tasks.
+pub(crate) async fn forget_shards(conn: &mut SqliteConnection) -> Result<Vec<TaskId>, WriteError> {
+    let forget = "DELETE FROM shards WHERE run IN (SELECT run FROM runs WHERE state = 'finished') RETURNING task";
+    let rows = sqlx::query(forget).fetch_all(conn).await.map_err(crate::db::write_error)?;
+    let mut tasks: Vec<_> = rows.iter().map(|row| TaskId::new(row.get::<String, _>(0))).collect();
+    tasks.sort();
+    Ok(tasks)
 }
-
-/// The stage's artifact stands for the shards of a run that is finished.
-const FORGET_SHARDS: &str = "DELETE FROM shards WHERE run IN (SELECT run FROM runs WHERE state = 'finished')";
 
 /// Every digest that a row names and that must therefore be whole, with the row in words.
 pub(crate) async fn roots(conn: &mut SqliteConnection) -> Result<Vec<(Digest, String)>, QueryError> {
@@ -135,27 +216,78 @@ pub(crate) async fn roots(conn: &mut SqliteConnection) -> Result<Vec<(Digest, St
     Ok(roots)
 }
 
-async fn plan(conn: &mut SqliteConnection, blobs: &BlobStore, grace_ms: i64) -> Result<Plan, QueryError> {
-    let done = "SELECT task FROM shards WHERE run IN (SELECT run FROM runs WHERE state = 'finished') ORDER BY task";
-    let rows = sqlx::query(done).fetch_all(&mut *conn).await?;
-    let forget_shards: Vec<_> =
-        rows.iter().map(|row| row.try_get::<String, _>(0).map(TaskId::new)).collect::<Result<_, _>>()?;
-    let forgotten: BTreeSet<_> = forget_shards.iter().map(|task| format!("shard `{task}`")).collect();
+/// What a collection has to know of the rows, as of one moment.
+struct Rows {
+    roots: BTreeMap<Digest, String>,
+    /// What each artifact was made of.
+    parents: HashMap<Digest, Vec<Digest>>,
+    /// Shards that go, by task.
+    forget_shards: Vec<TaskId>,
+    /// Whether a run is under way.
+    live: bool,
+}
 
-    let roots: BTreeMap<Digest, String> =
-        roots(conn).await?.into_iter().filter(|(_, why)| !forgotten.contains(why)).collect();
-    let all = blobs.list().map_err(|e| QueryError::Blob(e.to_string()))?;
-    let mut queue: Vec<Digest> = roots.keys().copied().collect();
-    let mut marked = BTreeSet::new();
+impl Rows {
+    async fn read(store: &ReadStore) -> Result<Self, QueryError> {
+        let mut conn = store.readers().acquire().await?;
+        // A transaction that reads sees one moment of the database.
+        let mut moment = conn.begin().await?;
+        let rows = Self::of(&mut moment).await?;
+        moment.rollback().await?;
+        Ok(rows)
+    }
+
+    async fn of(conn: &mut SqliteConnection) -> Result<Self, QueryError> {
+        let done = "SELECT task FROM shards WHERE run IN (SELECT run FROM runs WHERE state = 'finished') ORDER BY task";
+        let done = sqlx::query(done).fetch_all(&mut *conn).await?;
+        let forget_shards: Vec<_> =
+            done.iter().map(|row| row.try_get::<String, _>(0).map(TaskId::new)).collect::<Result<_, _>>()?;
+        let forgotten: BTreeSet<_> = forget_shards.iter().map(|task| format!("shard `{task}`")).collect();
+        let roots = roots(conn).await?.into_iter().filter(|(_, why)| !forgotten.contains(why)).collect();
+        let mut parents: HashMap<Digest, Vec<Digest>> = HashMap::new();
+        for row in sqlx::query("SELECT parent, child FROM edges").fetch_all(&mut *conn).await? {
+            parents.entry(query::digest(&row, "child")?).or_default().push(query::digest(&row, "parent")?);
+        }
+        let live = "SELECT EXISTS (SELECT 1 FROM runs WHERE state IN ('running', 'paused'))";
+        let live = sqlx::query(live).fetch_one(&mut *conn).await?.try_get(0)?;
+        Ok(Self { roots, parents, forget_shards, live })
+    }
+}
+
+/// How old a blob must be to go.
+struct Ages {
+    now_ms: i64,
+    grace_ms: i64,
+    /// When this process opened the store.
+    opened_ms: i64,
+    /// Whether a run is under way.
+    live: bool,
+}
+
+impl Ages {
+    /// A blob that was last put at `put_ms` goes if that is before this time.
+    fn before_ms(&self, put_ms: i64) -> i64 {
+        let unknown = self.live && put_ms < self.opened_ms;
+        let grace_ms = if unknown { self.grace_ms.max(GRACE_MS) } else { self.grace_ms };
+        self.now_ms.saturating_sub(grace_ms)
+    }
+}
+
+/// Adds all that `queue` needs to `marked`. `is_there` says which digests are blobs.
+fn mark(
+    blobs: &BlobStore,
+    rows: &Rows,
+    is_there: impl Fn(Digest) -> bool,
+    mut queue: Vec<Digest>,
+    marked: &mut BTreeSet<Digest>,
+) -> Result<(), QueryError> {
     while let Some(digest) = queue.pop() {
-        if !marked.insert(digest) || !(all.contains_key(&digest) || roots.contains_key(&digest)) {
+        let root = rows.roots.get(&digest);
+        if !marked.insert(digest) || !(root.is_some() || is_there(digest)) {
             continue;
         }
-        let parents = sqlx::query("SELECT parent FROM edges WHERE child = ?").bind(digest.to_string());
-        for row in parents.fetch_all(&mut *conn).await? {
-            queue.push(query::digest(&row, "parent")?);
-        }
-        match (blobs.manifest(digest), roots.get(&digest)) {
+        queue.extend(rows.parents.get(&digest).into_iter().flatten());
+        match (blobs.manifest(digest), root) {
             (Ok(manifest), _) => {
                 marked.extend(manifest.files.values().map(|file| file.digest));
                 named(&manifest.meta, &mut queue);
@@ -170,13 +302,18 @@ async fn plan(conn: &mut SqliteConnection, blobs: &BlobStore, grace_ms: i64) -> 
             }
         }
     }
+    Ok(())
+}
 
-    let before_ms = clock::now_ms().saturating_sub(grace_ms);
-    let mut plan = Plan { forget_shards, ..Plan::default() };
+fn plan(blobs: &BlobStore, rows: &Rows, ages: &Ages) -> Result<Plan, QueryError> {
+    let all = blobs.list().map_err(|e| QueryError::Blob(e.to_string()))?;
+    let mut marked = BTreeSet::new();
+    mark(blobs, rows, |digest| all.contains_key(&digest), rows.roots.keys().copied().collect(), &mut marked)?;
+    let mut plan = Plan { forget_shards: rows.forget_shards.clone(), ..Plan::default() };
     for (digest, entry) in all {
         if marked.contains(&digest) {
             plan.kept += 1;
-        } else if entry.put_ms >= before_ms {
+        } else if entry.put_ms >= ages.before_ms(entry.put_ms) {
             plan.fresh += 1;
         } else {
             plan.remove.push(digest);
@@ -186,8 +323,32 @@ async fn plan(conn: &mut SqliteConnection, blobs: &BlobStore, grace_ms: i64) -> 
     Ok(plan)
 }
 
+/// Blobs that are removed before new rows are looked at again.
+const BATCH: usize = 64;
+
+/// Removes what was planned, but what was put again or named since.
+fn sweep(blobs: &BlobStore, rows: &Rows, ages: &Ages, named: &Named, plan: Plan) -> Result<Plan, QueryError> {
+    let storage = |e: BlobError| QueryError::Storage(e.to_string());
+    let mut plan = Plan { bytes: 0, ..plan };
+    let mut kept = BTreeSet::new();
+    let candidates = std::mem::take(&mut plan.remove);
+    for batch in candidates.chunks(BATCH) {
+        // What new rows name has needs of its own.
+        mark(blobs, rows, |_| true, named.noted().into_iter().collect(), &mut kept)?;
+        for digest in batch.iter().filter(|digest| !kept.contains(digest)) {
+            let Some(entry) = blobs.entry(*digest).map_err(storage)? else { continue };
+            let remove = || blobs.remove_older(*digest, ages.before_ms(entry.put_ms));
+            if named.unless_named(*digest, remove).transpose().map_err(storage)? == Some(true) {
+                plan.remove.push(*digest);
+                plan.bytes += entry.bytes;
+            }
+        }
+    }
+    Ok(plan)
+}
+
 /// Digests in a manifest's own words, such as the teacher's in a student's.
-fn named(meta: &Value, found: &mut Vec<Digest>) {
+pub(crate) fn named(meta: &Value, found: &mut Vec<Digest>) {
     match meta {
         Value::String(text) => found.extend(text.parse::<Digest>()),
         Value::Array(items) => items.iter().for_each(|item| named(item, found)),

@@ -3,6 +3,8 @@
 //! ```text
 //! .stride/
 //!   stride.db        SQLite, WAL
+//!   witness          how many transactions the database has had, at least
+//!   blobs/IDENTITY   which store the blobs belong to
 //!   blobs/sha256/    bytes by digest
 //!   staging/         blobs on their way; emptied when the store is opened
 //!   lock             the operating system's lock, and who holds it
@@ -23,11 +25,12 @@ use sqlx::SqlitePool;
 use crate::blob::BlobStore;
 use crate::blob::fs::{Folder, free_bytes, is_full, is_read_only};
 use crate::catalog::{Expect, Pick, PromoteOrder, Promotion, Which};
-use crate::db;
-use crate::db::writer::{Done, Order, Writer};
-use crate::lock::{Holder, StoreLock, Taken, network_filesystem};
-use crate::retention::Plan;
-use crate::{Write, WriteError};
+use crate::db::writer::{Done, Order, Session, Writer};
+use crate::db::{self, Opened};
+use crate::identity::{self, Found, Mismatch, StoreId, Verdict, Witness};
+use crate::lock::{Holder, SharedLock, StoreLock, Taken, network_filesystem};
+use crate::retention::{Named, Vouched};
+use crate::{Write, WriteError, clock};
 
 /// Below this much free space nothing is opened for writing: the database's log would not fit.
 const OPEN_NEEDS_BYTES: u64 = 16 << 20;
@@ -42,6 +45,22 @@ pub enum OpenError {
         dir: PathBuf,
         /// Who.
         holder: Holder,
+    },
+    /// Its database, its blobs and its folder do not belong together, or one of them is missing or has gone back.
+    #[error("store `{}` is not whole: {mismatch}", dir.display())]
+    Mismatch {
+        /// The store.
+        dir: PathBuf,
+        /// What does not fit.
+        mismatch: Mismatch,
+    },
+    /// No store, and the folder is somebody else's.
+    #[error("there is no store in `{}`, and none is made among other files: it holds {found}", dir.display())]
+    NotEmpty {
+        /// The folder.
+        dir: PathBuf,
+        /// Some of what lies in it.
+        found: String,
     },
     /// There is none, and none was to be made.
     #[error("there is no store in `{}`", .0.display())]
@@ -80,6 +99,16 @@ pub enum OpenError {
         /// The newest that this build knows.
         known: i64,
     },
+    /// An older build made it, and whoever only reads does not change it.
+    #[error("database `{}` has schema {found}, this build reads {known}", path.display())]
+    OlderSchema {
+        /// The database.
+        path: PathBuf,
+        /// Its schema.
+        found: i64,
+        /// The one that this build reads.
+        known: i64,
+    },
     /// It is not a database, or not one of ours.
     #[error("database `{}` is damaged: {message}", path.display())]
     Damaged {
@@ -108,6 +137,8 @@ impl OpenError {
             Self::Busy { holder, .. } => {
                 format!("wait for process {} to end, or choose another folder with `--store`", holder.pid)
             }
+            Self::Mismatch { mismatch, .. } => mismatch.hint().into(),
+            Self::NotEmpty { .. } => "choose a folder that is empty or does not exist with `--store`".into(),
             Self::NotAStore(_) => "`trainer run PIPELINE` makes one; name its folder with `--store`".into(),
             Self::ReadOnly { .. } => "make the folder writable for this user, or choose another with `--store`".into(),
             Self::Full { .. } => "free some space, or choose a folder on another disk with `--store`".into(),
@@ -115,6 +146,7 @@ impl OpenError {
                 "choose a folder on a local disk with `--store`; workers on other machines need none, they talk to the server".into()
             }
             Self::NewerSchema { .. } => "use the newer build that wrote it, or choose another folder with `--store`".into(),
+            Self::OlderSchema { .. } => "a command that writes, such as `registry gc`, brings it up to date".into(),
             Self::Damaged { .. } => "restore it from a backup, or choose another folder with `--store`".into(),
             Self::Other { .. } => "look at the folder's permissions and disk, or choose another with `--store`".into(),
         }
@@ -132,62 +164,71 @@ impl OpenError {
     }
 }
 
+/// What a store can be asked, from what is committed. A [`Store`] is one; a process that only reads opens one by itself, whether
+/// or not somebody holds the store. It starts nothing and writes nothing. Clones share it.
+#[derive(Debug, Clone)]
+pub struct ReadStore(Arc<Reading>);
+
+#[derive(Debug)]
+struct Reading {
+    dir: PathBuf,
+    id: StoreId,
+    opened_ms: i64,
+    blobs: BlobStore,
+    readers: SqlitePool,
+    /// Keeps writers out of a database that is read without its log.
+    _closed: Option<SharedLock>,
+}
+
 /// A store, held by this process. Clones share it; the last one to go lets it go.
 #[derive(Debug, Clone)]
 pub struct Store(Arc<Inner>);
 
 #[derive(Debug)]
 struct Inner {
-    dir: PathBuf,
-    blobs: BlobStore,
-    readers: SqlitePool,
+    read: ReadStore,
     /// Before `lock`: the writer ends first.
     writer: Writer,
     lock: Arc<StoreLock>,
+    named: Arc<Named>,
+    collecting: tokio::sync::Mutex<()>,
 }
 
-impl Store {
-    /// Opens the store in `dir`, making it if there is none. `holder` says to others what this process is.
-    pub async fn open(dir: &Path, holder: Holder) -> Result<Self, OpenError> {
+impl std::ops::Deref for Store {
+    type Target = ReadStore;
+
+    fn deref(&self) -> &ReadStore {
+        &self.0.read
+    }
+}
+
+impl ReadStore {
+    /// Opens the store in `dir` for reading only.
+    pub async fn open(dir: &Path) -> Result<Self, OpenError> {
+        if !db::is_there(dir) && found(dir)?.evidence().is_none() {
+            return Err(OpenError::NotAStore(dir.to_owned()));
+        }
         let io = |path: &Path, e: io::Error| OpenError::io(path, &e);
-        DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(|e| io(dir, e))?;
         let dir = dir.canonicalize().map_err(|e| io(dir, e))?;
-        close_to_others(&dir).map_err(|e| io(&dir, e))?;
         if let Some(kind) = network_filesystem(&dir).map_err(|e| io(&dir, e))? {
             return Err(OpenError::NetworkFilesystem { dir, kind });
         }
-        let path = dir.join("lock");
-        let lock = match StoreLock::take(&path, holder).map_err(|e| io(&path, e))? {
-            Taken::Ours(lock) => Arc::new(lock),
-            Taken::Busy(holder) => return Err(OpenError::Busy { dir, holder }),
-        };
-        let free = free_bytes(&dir).map_err(|e| io(&dir, e))?;
-        if free < OPEN_NEEDS_BYTES {
-            let message = format!("{free} bytes are free, {OPEN_NEEDS_BYTES} are needed");
-            return Err(OpenError::Full { path: dir, message });
-        }
-        let blobs = BlobStore::new(Folder::open(&dir).map_err(|e| io(&dir, e))?);
-        let writer = Writer::start(dir.clone(), blobs.clone(), Arc::clone(&lock)).await?;
-        let readers = db::open_readers(&dir);
-        Ok(Self(Arc::new(Inner { dir, blobs, readers, writer, lock })))
+        // Without a log the database file is all there is. As long as writers are kept out it does not change, and is read
+        // as a file: reading through a log would have to make one. With a log, SQLite keeps readers and the writer apart.
+        let shared = SharedLock::try_take(&dir.join("lock")).map_err(|e| io(&dir.join("lock"), e))?;
+        let closed = shared.filter(|_| db::log_bytes(&dir) == 0);
+        // Before the database: the witness never knows of more than what is committed.
+        let found = found(&dir)?;
+        let id = db::check_to_read(&dir, &found, closed.is_some()).await?;
+        let blobs = BlobStore::new(Folder::to_read(&dir));
+        let readers = db::open_readers(&dir, closed.is_some());
+        let opened_ms = clock::now_ms();
+        Ok(Self(Arc::new(Reading { dir, id, opened_ms, blobs, readers, _closed: closed })))
     }
 
-    /// Opens a store that is there.
-    pub async fn open_existing(dir: &Path, holder: Holder) -> Result<Self, OpenError> {
-        if !db::is_there(dir) {
-            return Err(OpenError::NotAStore(dir.to_owned()));
-        }
-        Self::open(dir, holder).await
-    }
-
-    /// Tells other processes where this one answers requests.
-    pub fn set_address(&self, address: impl Into<String>) -> io::Result<()> {
-        self.0.lock.set_address(address.into())
-    }
-
-    /// What others are told about this process.
-    pub fn holder(&self) -> Holder {
-        self.0.lock.holder()
+    /// The store's name, which no other store has.
+    pub fn id(&self) -> &StoreId {
+        &self.0.id
     }
 
     /// The folder.
@@ -200,8 +241,93 @@ impl Store {
         &self.0.blobs
     }
 
+    /// When this process opened it, in milliseconds since 1970.
+    pub(crate) fn opened_ms(&self) -> i64 {
+        self.0.opened_ms
+    }
+
     pub(crate) fn readers(&self) -> &SqlitePool {
         &self.0.readers
+    }
+
+    /// Says what is wrong if the database or the blobs are not those that were opened: somebody has removed, emptied or replaced
+    /// them since.
+    pub(crate) async fn check_identity(&self) -> Result<(), String> {
+        identity::check(self.id(), self.dir(), self.readers()).await
+    }
+}
+
+impl Store {
+    /// Opens the store in `dir`, making it if there is none. `holder` says to others what this process is.
+    pub async fn open(dir: &Path, holder: Holder) -> Result<Self, OpenError> {
+        let io = |path: &Path, e: io::Error| OpenError::io(path, &e);
+        if !db::is_there(dir) && found(dir)?.evidence().is_none() {
+            refuse_other_files(dir)?;
+        }
+        DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(|e| io(dir, e))?;
+        Self::take(dir, holder, false).await
+    }
+
+    /// Opens a store that is there.
+    pub async fn open_existing(dir: &Path, holder: Holder) -> Result<Self, OpenError> {
+        if !db::is_there(dir) && found(dir)?.evidence().is_none() {
+            return Err(OpenError::NotAStore(dir.to_owned()));
+        }
+        Self::take(dir, holder, false).await
+    }
+
+    /// Opens a store whose blobs are missing or whose database has gone back, and makes what is left one store again. What was lost
+    /// stays lost: blobs that only lost rows named go with the next collection.
+    pub async fn adopt(dir: &Path, holder: Holder) -> Result<Self, OpenError> {
+        if !db::is_there(dir) && found(dir)?.evidence().is_none() {
+            return Err(OpenError::NotAStore(dir.to_owned()));
+        }
+        Self::take(dir, holder, true).await
+    }
+
+    async fn take(dir: &Path, holder: Holder, adopt: bool) -> Result<Self, OpenError> {
+        let io = |path: &Path, e: io::Error| OpenError::io(path, &e);
+        let dir = dir.canonicalize().map_err(|e| io(dir, e))?;
+        close_to_others(&dir).map_err(|e| io(&dir, e))?;
+        if let Some(kind) = network_filesystem(&dir).map_err(|e| io(&dir, e))? {
+            return Err(OpenError::NetworkFilesystem { dir, kind });
+        }
+        let path = dir.join("lock");
+        let lock = match StoreLock::take(&path, holder).await.map_err(|e| io(&path, e))? {
+            Taken::Ours(lock) => Arc::new(lock),
+            Taken::Busy(holder) => return Err(OpenError::Busy { dir, holder }),
+        };
+        let free = free_bytes(&dir).map_err(|e| io(&dir, e))?;
+        if free < OPEN_NEEDS_BYTES {
+            let message = format!("{free} bytes are free, {OPEN_NEEDS_BYTES} are needed");
+            return Err(OpenError::Full { path: dir, message });
+        }
+        // Under the lock: nobody is making the store at the same time.
+        let Opened { mut conn, store: id, verdict } = db::open_writer(&dir, &found(&dir)?, adopt).await?;
+        let blobs = BlobStore::new(Folder::open(&dir).map_err(|e| io(&dir, e))?);
+        if let Verdict::New | Verdict::Unfinished(_) = verdict {
+            identity::mark_blobs(&dir, &id).map_err(|e| io(&dir, e))?;
+        }
+        let stored = db::raise_epoch(&dir, &mut conn).await?;
+        let witness = Witness::begin(&dir, &stored).map_err(|e| io(&dir, e))?;
+        let session = Session { conn, epoch: stored.epoch, witness };
+        let named = Arc::new(Named::default());
+        let vouched = Vouched { blobs: blobs.clone(), named: Arc::clone(&named) };
+        let writer = Writer::start(session, vouched, Arc::clone(&lock)).map_err(|e| io(&dir, e))?;
+        let readers = db::open_readers(&dir, false);
+        let opened_ms = clock::now_ms();
+        let read = ReadStore(Arc::new(Reading { dir, id, opened_ms, blobs, readers, _closed: None }));
+        Ok(Self(Arc::new(Inner { read, writer, lock, named, collecting: tokio::sync::Mutex::default() })))
+    }
+
+    /// Tells other processes where this one answers requests.
+    pub fn set_address(&self, address: impl Into<String>) -> io::Result<()> {
+        self.0.lock.set_address(address.into())
+    }
+
+    /// What others are told about this process.
+    pub fn holder(&self) -> Holder {
+        self.0.lock.holder()
     }
 
     /// One transaction: returns once all of `writes` would survive a loss of power, or none is stored.
@@ -266,10 +392,20 @@ impl Store {
         self.order(Order::Pin { digest, reason: None }).await.map(|_| ())
     }
 
-    /// Removes blobs that nothing needs and that were last put more than `grace_ms` ago; returns what went.
-    pub async fn gc(&self, grace_ms: i64) -> Result<Plan, WriteError> {
-        match self.order(Order::Collect { grace_ms }).await? {
-            Done::Collected(plan) => Ok(plan),
+    /// Waits until no collection is under way, and keeps others from beginning.
+    pub(crate) async fn collecting(&self) -> tokio::sync::MutexGuard<'_, ()> {
+        self.0.collecting.lock().await
+    }
+
+    /// What rows come to name while a collection is under way.
+    pub(crate) fn named(&self) -> &Arc<Named> {
+        &self.0.named
+    }
+
+    /// Forgets the rows that a collection takes with it; returns the tasks whose shards went.
+    pub(crate) async fn begin_collection(&self) -> Result<Vec<TaskId>, WriteError> {
+        match self.order(Order::BeginCollection).await? {
+            Done::Begun(forgotten) => Ok(forgotten),
             done => Err(unexpected(&done)),
         }
     }
@@ -288,6 +424,40 @@ fn close_to_others(dir: &Path) -> io::Result<()> {
         fs::set_permissions(dir, fs::Permissions::from_mode(mode & !0o077))?;
     }
     Ok(())
+}
+
+fn found(dir: &Path) -> Result<Found, OpenError> {
+    Found::look(dir).map_err(|mismatch| OpenError::Mismatch { dir: dir.to_owned(), mismatch })
+}
+
+/// Names that a store's folder may have before its database is there.
+const OF_A_STORE: [&str; 5] = ["lock", "blobs", "staging", "witness", "witness.new"];
+
+/// A store is not made in a folder that holds something else.
+fn refuse_other_files(dir: &Path) -> Result<(), OpenError> {
+    let entries = match fs::read_dir(dir) {
+        Ok(entries) => entries,
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
+        Err(e) => return Err(OpenError::io(dir, &e)),
+    };
+    let mut other = Vec::new();
+    for entry in entries {
+        let name = entry.map_err(|e| OpenError::io(dir, &e))?.file_name();
+        let name = name.to_string_lossy();
+        // Beside the database lie its log and, while it is made, a journal.
+        if !OF_A_STORE.contains(&&*name) && !name.starts_with(db::FILE) {
+            other.push(format!("`{name}`"));
+        }
+    }
+    other.sort();
+    match other.len() {
+        0 => Ok(()),
+        1..=3 => Err(OpenError::NotEmpty { dir: dir.to_owned(), found: other.join(", ") }),
+        more => {
+            let found = format!("{} and {} more", other[..3].join(", "), more - 3);
+            Err(OpenError::NotEmpty { dir: dir.to_owned(), found })
+        }
+    }
 }
 
 fn promoted(done: Done) -> Result<Promotion, WriteError> {

@@ -147,6 +147,14 @@ pub enum WriteError {
         /// The fence of the write.
         carried: Fence,
     },
+    /// Another process has opened the store since this one did, so this one may not write to it any more.
+    #[error(
+        "the store was opened by another process: this one held it under epoch {epoch}, which is over; nothing was written"
+    )]
+    Superseded {
+        /// This process's epoch.
+        epoch: u64,
+    },
     /// What is stored contradicts it.
     #[error("{0}")]
     Conflict(String),

@@ -42,6 +42,11 @@ impl Folder {
         Ok(folder)
     }
 
+    /// For reading only: makes and clears nothing.
+    pub fn to_read(dir: &Path) -> Self {
+        Self { blobs: dir.join("blobs/sha256"), staging: dir.join("staging"), next: AtomicU64::new(0) }
+    }
+
     fn path(&self, digest: Digest) -> PathBuf {
         let hex = digest.hex();
         self.blobs.join(&hex[..2]).join(&hex[2..])

@@ -109,6 +109,12 @@ impl BlobStore {
         Ok(self.size(digest)?.is_some())
     }
 
+    /// A blob as a listing shows it, if it is there.
+    pub(crate) fn entry(&self, digest: Digest) -> Result<Option<Entry>, BlobError> {
+        let (bytes, put_ms) = (self.backend.size(digest)?, self.backend.put_ms(digest)?);
+        Ok(bytes.zip(put_ms).map(|(bytes, put_ms)| Entry { digest, bytes, put_ms }))
+    }
+
     /// All blobs by name.
     pub fn list(&self) -> Result<BTreeMap<Digest, Entry>, BlobError> {
         Ok(self.backend.list()?.into_iter().map(|entry| (entry.digest, entry)).collect())

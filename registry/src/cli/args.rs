@@ -107,6 +107,8 @@ pub enum Verb {
         #[arg(long, value_name = "MINUTES", default_value_t = 60)]
         grace: u32,
     },
+    /// Goes on with what is left of a store whose blobs are missing or whose database has gone back
+    Adopt,
     /// Copies a version's files to a folder
     Export {
         /// MODEL@ALIAS, MODEL@best or MODEL:VERSION
@@ -145,6 +147,7 @@ impl Verb {
             Self::Lineage { artifact } => Command::Lineage { reference: artifact },
             Self::Fsck => Command::Fsck,
             Self::Gc { dry_run, grace } => Command::Gc { dry_run, grace_minutes: Some(grace) },
+            Self::Adopt => Command::Adopt,
             Self::Export { model, dir } => return Asked::Export { model, dir },
         })
     }

@@ -1,4 +1,5 @@
-//! Runs a command where it can be run: at the server that is named, here if nobody holds the store, else at its holder.
+//! Runs a command where it can be run: at the server that is named, here if it only reads or nobody holds the store, else at
+//! the holder.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -10,8 +11,8 @@ use reqwest::{Method, Response};
 
 use super::args::Asked;
 use super::export::{self, Source};
-use super::{Answer, Command, Output, Verb, error, print, run};
-use crate::{Holder, OpenError, Store};
+use super::{Answer, Command, Data, Output, Verb, error, print, read, run};
+use crate::{Holder, OpenError, ReadStore, Store};
 
 /// How long to wait for a holder without an address, such as another `registry` command, to end or to get one.
 const PATIENCE: Duration = Duration::from_secs(5);
@@ -22,7 +23,7 @@ pub async fn execute(verb: Verb, dir: &Path, options: &ServerOptions, output: Ou
     let answer = match verb.asks() {
         Asked::Command(command) => ask(command, dir, options).await,
         Asked::Export { model, dir: into } => {
-            with(dir, options, async |place| export(place, &model, &into).await).await
+            with(dir, options, true, async |place| export(place, &model, &into).await).await
         }
     };
     // A closed pipe (`| head`) is no failure of the command.
@@ -32,12 +33,32 @@ pub async fn execute(verb: Verb, dir: &Path, options: &ServerOptions, output: Ou
 
 /// Runs a command on the store in `dir`, or at the server of `options`.
 pub async fn ask(command: Command, dir: &Path, options: &ServerOptions) -> Answer {
-    with(dir, options, async |place| place.ask(&command).await).await
+    if command == Command::Adopt {
+        return adopt(dir, options).await;
+    }
+    with(dir, options, command.only_reads(), async |place| place.ask(&command).await).await
+}
+
+/// Only here: there is no server yet that could be asked.
+async fn adopt(dir: &Path, options: &ServerOptions) -> Answer {
+    match options.connect() {
+        Ok(None) => {}
+        Ok(Some(_)) => {
+            let hint = "run it on the machine of the store, with `--store` and without a server";
+            return Answer::refused(error("invalid", "a server has no store to adopt", Some(hint)));
+        }
+        Err(e) => return refused(&e),
+    }
+    match Store::adopt(dir, Holder::this_process("registry adopt")).await {
+        Ok(store) => Answer::done(Data::Adopted { store: store.id().clone() }),
+        Err(e) => Answer::from(&e),
+    }
 }
 
 /// Where commands are run.
 enum Place {
     Here(Box<Store>),
+    Reading(ReadStore),
     At(Server),
 }
 
@@ -53,6 +74,7 @@ impl Place {
     async fn ask(&self, command: &Command) -> Result<Answer, Missed> {
         match self {
             Self::Here(store) => Ok(run(command.clone(), store, &user()).await),
+            Self::Reading(store) => Ok(read(command.clone(), store).await),
             Self::At(server) => {
                 let sent = server.request(Method::POST, "/v1/registry").json(command).send().await;
                 match check(sent).await? {
@@ -78,8 +100,14 @@ async fn check(sent: Result<Response, reqwest::Error>) -> Result<Result<Response
     })))
 }
 
-/// Finds the place for `work`, and waits where it is about to be free.
-async fn with(dir: &Path, options: &ServerOptions, work: impl AsyncFn(&Place) -> Result<Answer, Missed>) -> Answer {
+/// Finds the place for `work`, and waits where it is about to be free. Work that only reads needs nobody to be free.
+async fn with(
+    dir: &Path,
+    options: &ServerOptions,
+    only_reads: bool,
+    work: impl AsyncFn(&Place) -> Result<Answer, Missed>,
+) -> Answer {
+    let internal = |_| Answer::refused(error("internal", "the store did not answer", None));
     match options.connect() {
         Ok(None) => {}
         Ok(Some(server)) => {
@@ -91,12 +119,17 @@ async fn with(dir: &Path, options: &ServerOptions, work: impl AsyncFn(&Place) ->
         }
         Err(e) => return refused(&e),
     }
+    if only_reads {
+        return match ReadStore::open(dir).await {
+            Ok(store) => work(&Place::Reading(store)).await.unwrap_or_else(internal),
+            Err(e) => Answer::from(&e),
+        };
+    }
     let until = Instant::now() + PATIENCE;
     loop {
         let busy = match Store::open_existing(dir, Holder::this_process("registry")).await {
             Ok(store) => {
-                let done = work(&Place::Here(Box::new(store))).await;
-                return done.unwrap_or_else(|_| Answer::refused(error("internal", "the store did not answer", None)));
+                return work(&Place::Here(Box::new(store))).await.unwrap_or_else(internal);
             }
             Err(e) => e,
         };
@@ -162,10 +195,8 @@ impl Source for Place {
         let damaged = |e: &dyn std::fmt::Display| error("damaged", e, Some("`registry fsck` checks the store"));
         let unwritten = |e: std::io::Error| error("storage", e, None);
         match self {
-            Self::Here(store) => {
-                let bytes = store.blobs().get(digest).map_err(|e| damaged(&e))?;
-                into(&bytes).map_err(unwritten)
-            }
+            Self::Here(store) => into(&store.blobs().get(digest).map_err(|e| damaged(&e))?).map_err(unwritten),
+            Self::Reading(store) => into(&store.blobs().get(digest).map_err(|e| damaged(&e))?).map_err(unwritten),
             Self::At(server) => {
                 let lost = |missed| {
                     let (Missed::NotThere(why) | Missed::Broken(why)) = missed;

@@ -24,7 +24,7 @@ pub use print::{render, show_error};
 use crate::catalog::{BEST, Expect, Gate, LATEST, Model, ModelRef, Promotion, Version};
 use crate::leaderboard::{self, Comparison, Leaderboard, Style};
 use crate::retention::{GRACE_MS, Plan};
-use crate::{LineageNode, OpenError, QueryError, Store, WriteError, fsck};
+use crate::{LineageNode, OpenError, QueryError, ReadStore, Store, StoreId, WriteError, fsck};
 
 /// What may be asked of a registry.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -102,6 +102,8 @@ pub enum Command {
         /// Minutes for which a fresh blob is safe.
         grace_minutes: Option<u32>,
     },
+    /// Makes one store of what is left after a loss. Only on a store that no process holds.
+    Adopt,
 }
 
 impl Command {
@@ -116,7 +118,22 @@ impl Command {
             | Self::Lineage { .. } => Scope::Read,
             Self::Promote { .. } | Self::Rollback { .. } => Scope::Promote,
             // Reads every byte of the store.
-            Self::Fsck | Self::Gc { .. } => Scope::Admin,
+            Self::Fsck | Self::Gc { .. } | Self::Adopt => Scope::Admin,
+        }
+    }
+
+    /// Whether it changes nothing in the store, so that it needs nobody who holds it.
+    pub fn only_reads(&self) -> bool {
+        match self {
+            Self::List
+            | Self::Show { .. }
+            | Self::History { .. }
+            | Self::Compare { .. }
+            | Self::Leaderboard { .. }
+            | Self::Lineage { .. }
+            | Self::Fsck => true,
+            Self::Gc { dry_run, .. } => *dry_run,
+            Self::Promote { .. } | Self::Rollback { .. } | Self::Adopt => false,
         }
     }
 }
@@ -146,6 +163,8 @@ pub enum Data {
     Fsck { report: fsck::Report },
     /// Of `gc`.
     Gc { dry_run: bool, plan: Plan },
+    /// Of `adopt`.
+    Adopted { store: StoreId },
     /// Of `export`.
     Exported { version: Version, dir: std::path::PathBuf, files: Vec<String> },
 }
@@ -193,6 +212,7 @@ impl From<QueryError> for Answer {
             QueryError::Invalid(_) => {
                 error("invalid", e, Some("`registry list` shows models, `registry show MODEL` their versions"))
             }
+            QueryError::Storage(_) => error("storage", e, None),
             QueryError::Database(_) | QueryError::Blob(_) => {
                 error("internal", e, Some("`registry fsck` checks the store"))
             }
@@ -211,7 +231,7 @@ impl From<WriteError> for Answer {
                 Some("nothing was changed; `registry show MODEL` lists every version with its metrics"),
             ),
             WriteError::NotFound(_) => error("not-found", e, Some("`registry list` shows what there is")),
-            WriteError::Storage(_) => error("storage", e, None),
+            WriteError::Storage(_) | WriteError::Superseded { .. } => error("storage", e, None),
             WriteError::Internal(_) => error("internal", e, Some("`registry fsck` checks the store")),
         })
     }
@@ -248,10 +268,17 @@ impl From<ApiError> for Answer {
 
 /// Runs a command on a store that this process holds, in the name of `actor`.
 pub async fn run(command: Command, store: &Store, actor: &str) -> Answer {
-    answer(command, store, actor).await.unwrap_or_else(|refused| *refused.0)
+    answer(command, store, Some((store, actor))).await.unwrap_or_else(|refused| *refused.0)
 }
 
-async fn answer(command: Command, store: &Store, actor: &str) -> Result<Answer, Refused> {
+/// Runs a command that only reads.
+pub async fn read(command: Command, store: &ReadStore) -> Answer {
+    answer(command, store, None).await.unwrap_or_else(|refused| *refused.0)
+}
+
+/// `holder` is `store` if this process holds it, and in whose name it is changed.
+async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &str)>) -> Result<Answer, Refused> {
+    let writes = || holder.ok_or_else(|| invalid("the command changes the store, which was opened for reading"));
     let data = match command {
         Command::List => Data::Models { models: store.models().await? },
         Command::Show { reference } => show(store, &reference).await?,
@@ -273,11 +300,13 @@ async fn answer(command: Command, store: &Store, actor: &str) -> Result<Answer, 
                     "`{model}` has several versions: say `{model}@best` or `{model}:VERSION`"
                 )));
             };
+            let (store, actor) = writes()?;
             let promotion = store.promote(&reference.model, pick, &alias, expect, require, &reason, actor).await?;
             Data::Promotion { promotion }
         }
         Command::Rollback { model, alias, to, expect, reason } => {
             let (model, alias): (ModelName, Alias) = (model.parse().map_err(invalid)?, alias.parse().map_err(invalid)?);
+            let (store, actor) = writes()?;
             let promotion = store.rollback(&model, &alias, to, expect, &reason, actor).await?;
             Data::Promotion { promotion }
         }
@@ -313,15 +342,18 @@ async fn answer(command: Command, store: &Store, actor: &str) -> Result<Answer, 
         }
         Command::Gc { dry_run, grace_minutes } => {
             let grace_ms = grace_minutes.map_or(GRACE_MS, |minutes| i64::from(minutes) * 60_000);
-            let plan = if dry_run { store.gc_plan(grace_ms).await? } else { store.gc(grace_ms).await? };
+            let plan = if dry_run { store.gc_plan(grace_ms).await? } else { writes()?.0.gc(grace_ms).await? };
             Data::Gc { dry_run, plan }
+        }
+        Command::Adopt => {
+            return Err(invalid("the store is open, so its parts belong together: nothing is to be adopted"));
         }
     };
     Ok(Answer::done(data))
 }
 
 /// The version that a reference names; a model alone stands for its best one, or its newest where no metric decides.
-async fn one(store: &Store, text: &str) -> Result<Version, Refused> {
+async fn one(store: &ReadStore, text: &str) -> Result<Version, Refused> {
     let reference: ModelRef = text.parse().map_err(invalid)?;
     if reference.pick.is_some() {
         return Ok(store.resolve(text).await?);
@@ -331,12 +363,12 @@ async fn one(store: &Store, text: &str) -> Result<Version, Refused> {
 }
 
 /// The data format that a version's VAE makes motion of, which is how the papers name their datasets.
-fn format_of(store: &Store, version: &Version) -> Option<String> {
+fn format_of(store: &ReadStore, version: &Version) -> Option<String> {
     let manifest = store.blobs().manifest(version.artifact).ok()?;
     bundle::format(&manifest).map(str::to_owned)
 }
 
-async fn leaderboard(store: &Store, of: &str, published: bool) -> Result<Leaderboard, Refused> {
+async fn leaderboard(store: &ReadStore, of: &str, published: bool) -> Result<Leaderboard, Refused> {
     if leaderboard::FORMATS.contains(&of) {
         let mut all = Vec::new();
         for model in store.models().await? {
@@ -351,7 +383,7 @@ async fn leaderboard(store: &Store, of: &str, published: bool) -> Result<Leaderb
     Ok(leaderboard::leaderboard(of.to_owned(), &versions, model.metric.as_deref(), format.as_deref()))
 }
 
-async fn known(store: &Store, name: &str) -> Result<Model, Refused> {
+async fn known(store: &ReadStore, name: &str) -> Result<Model, Refused> {
     let name: ModelName = name.parse().map_err(invalid)?;
     match store.model(&name).await? {
         Some(model) => Ok(model),
@@ -363,11 +395,11 @@ async fn known(store: &Store, name: &str) -> Result<Model, Refused> {
     }
 }
 
-fn exists(store: &Store, digest: Digest) -> Result<bool, Refused> {
+fn exists(store: &ReadStore, digest: Digest) -> Result<bool, Refused> {
     store.blobs().exists(digest).map_err(|e| Refused::from(QueryError::Blob(e.to_string())))
 }
 
-async fn show(store: &Store, text: &str) -> Result<Data, Refused> {
+async fn show(store: &ReadStore, text: &str) -> Result<Data, Refused> {
     let reference: ModelRef = text.parse().map_err(invalid)?;
     if reference.pick.is_none() {
         let model = known(store, reference.model.as_str()).await?;

@@ -170,6 +170,9 @@ pub fn render(data: &Data) -> String {
                 plan.kept
             )
         }
+        Data::Adopted { store } => {
+            format!("the parts are store {store} again; `registry fsck` says what is missing\n")
+        }
         Data::Exported { version, dir, files } => {
             format!("{}:{} is in `{}`: {}\n", version.model, version.version, dir.display(), files.join(", "))
         }

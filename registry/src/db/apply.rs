@@ -13,7 +13,8 @@ use sqlx::query_builder::Separated;
 use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 
 use super::write_error;
-use crate::blob::{BlobStore, ManifestError};
+use crate::blob::ManifestError;
+use crate::retention::{self, Vouched};
 use crate::{Write, WriteError, catalog, clock};
 
 type Result<T> = std::result::Result<T, WriteError>;
@@ -22,7 +23,7 @@ type Result<T> = std::result::Result<T, WriteError>;
 const ROWS: usize = 250;
 
 /// Does all of `writes`, or says why one of them is refused; then the caller rolls back.
-pub(crate) async fn apply(conn: &mut SqliteConnection, blobs: &BlobStore, writes: &[Write]) -> Result<()> {
+pub(crate) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: &[Write]) -> Result<()> {
     let mut fences = Fences::read(conn, writes).await?;
     let (mut entries, mut shards) = (Vec::new(), BTreeMap::new());
     for write in writes {
@@ -282,7 +283,15 @@ async fn add_logs(conn: &mut SqliteConnection, grant: &Grant, first: u64, lines:
 }
 
 /// The manifest, once all that it lists is there: before that, no row may name it.
-pub(crate) fn complete(blobs: &BlobStore, digest: Digest) -> Result<Manifest> {
+pub(crate) fn complete(blobs: &Vouched, digest: Digest) -> Result<Manifest> {
+    if blobs.named.is_noting() {
+        blobs.named.note([digest]);
+        if let Ok(manifest) = blobs.manifest(digest) {
+            let mut needs = manifest.files.values().map(|file| file.digest).collect();
+            retention::named(&manifest.meta, &mut needs);
+            blobs.named.note(needs);
+        }
+    }
     blobs.complete_manifest(digest).map_err(|e| match e {
         ManifestError::Blob(checkpoint::BlobError::NotFound(digest)) => WriteError::NotFound(format!(
             "blob {digest} is not in the store; upload a manifest and all that it lists before naming it"
@@ -337,7 +346,7 @@ struct Made<'a> {
     wall_s: f64,
 }
 
-async fn set_result(conn: &mut SqliteConnection, blobs: &BlobStore, made: &Made<'_>) -> Result<()> {
+async fn set_result(conn: &mut SqliteConnection, blobs: &Vouched, made: &Made<'_>) -> Result<()> {
     let (key, outputs) = (made.key.to_string(), json(made.outputs));
     let stored = one(conn, sqlx::query("SELECT outputs FROM stage_results WHERE key = ?").bind(&key)).await?;
     match stored.map(|row| row.get::<String, _>(0)) {
@@ -350,6 +359,7 @@ async fn set_result(conn: &mut SqliteConnection, blobs: &BlobStore, made: &Made<
         }
         None => {}
     }
+    blobs.named.note(made.inputs.values().copied());
     let now = clock::now_ms();
     let add = sqlx::query(
         "INSERT INTO stage_results (key, run, stage, kind, outputs, metrics, inputs, wall_s, at_ms) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",

@@ -4,22 +4,21 @@
 //! Each order stands in a savepoint of its own: one that is refused leaves no trace and does not fail its neighbours.
 //! Nobody is answered before the transaction is on disk.
 
-use std::path::PathBuf;
+use std::io;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
 use fail::fail_point;
 use protocol::stage::Keep;
 use protocol::{Alias, Digest, ModelName, TaskId};
-use sqlx::{Connection, SqliteConnection};
+use sqlx::{Connection, Row, SqliteConnection};
 use tokio::sync::{mpsc, oneshot};
 
-use super::{apply, open_writer, write_error};
-use crate::blob::BlobStore;
+use super::{apply, write_error};
 use crate::catalog::{Expect, Promotion};
+use crate::identity::Witness;
 use crate::lock::StoreLock;
-use crate::retention::{self, Plan};
-use crate::store::OpenError;
+use crate::retention::{self, Vouched};
 use crate::{Write, WriteError, catalog};
 
 /// Orders of one transaction at most. Beyond it the latency of the first grows and the share of the sync is small.
@@ -48,10 +47,8 @@ pub(crate) enum Order {
         digest: Digest,
         reason: Option<String>,
     },
-    /// Never part of a group: a blob must not go before the row that named it is gone for good.
-    Collect {
-        grace_ms: i64,
-    },
+    /// Forgets what a collection may take. From here on what rows come to name is noted.
+    BeginCollection,
 }
 
 /// What an order gives.
@@ -60,10 +57,18 @@ pub(crate) enum Done {
     Nothing,
     Promoted(Box<Promotion>),
     Pruned(Vec<Digest>),
-    Collected(Plan),
+    Begun(Vec<TaskId>),
 }
 
 type Answer = oneshot::Sender<Result<Done, WriteError>>;
+
+/// The connection that writes, and the epoch under which it may.
+#[derive(Debug)]
+pub(crate) struct Session {
+    pub(crate) conn: SqliteConnection,
+    pub(crate) epoch: u64,
+    pub(crate) witness: Witness,
+}
 
 /// The queue to the writer's thread.
 #[derive(Debug)]
@@ -73,39 +78,14 @@ pub(crate) struct Writer {
 }
 
 impl Writer {
-    /// Starts the thread and returns once the schema is up to date. The thread keeps the lock until its last commit.
-    pub(crate) async fn start(dir: PathBuf, blobs: BlobStore, lock: Arc<StoreLock>) -> Result<Self, OpenError> {
+    /// Starts the thread on an open database. It keeps the lock until its last commit.
+    pub(crate) fn start(session: Session, blobs: Vouched, lock: Arc<StoreLock>) -> io::Result<Self> {
         let (queue, orders) = mpsc::channel(QUEUE);
-        let (ready, opened) = oneshot::channel();
-        let path = dir.clone();
-        let thread = std::thread::Builder::new()
-            .name("registry-writer".into())
-            .spawn(move || {
-                let runtime = match tokio::runtime::Builder::new_current_thread().enable_all().build() {
-                    Ok(runtime) => runtime,
-                    Err(e) => {
-                        let _ = ready.send(Err(OpenError::Other { path: dir, message: e.to_string() }));
-                        return;
-                    }
-                };
-                runtime.block_on(async {
-                    let conn = match open_writer(&dir).await {
-                        Ok(conn) => conn,
-                        Err(e) => {
-                            // Gone only if the caller gave up opening.
-                            let _ = ready.send(Err(e));
-                            return;
-                        }
-                    };
-                    if ready.send(Ok(())).is_ok() {
-                        serve(conn, orders, &blobs).await;
-                    }
-                });
-                drop(lock);
-            })
-            .map_err(|e| OpenError::Other { path: path.clone(), message: format!("no thread for the writer: {e}") })?;
-        let ended = || OpenError::Other { path, message: "the writer ended while opening".into() };
-        opened.await.map_err(|_| ended())??;
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let thread = std::thread::Builder::new().name("registry-writer".into()).spawn(move || {
+            runtime.block_on(serve(session, orders, &blobs));
+            drop(lock);
+        })?;
         Ok(Self { queue: Some(queue), thread: Some(thread) })
     }
 
@@ -129,53 +109,79 @@ impl Drop for Writer {
     }
 }
 
-async fn serve(mut conn: SqliteConnection, mut orders: mpsc::Receiver<(Order, Answer)>, blobs: &BlobStore) {
+async fn serve(mut session: Session, mut orders: mpsc::Receiver<(Order, Answer)>, blobs: &Vouched) {
     let mut group = Vec::with_capacity(GROUP);
-    while orders.recv_many(&mut group, GROUP).await > 0 {
-        let collections: Vec<_> = group.extract_if(.., |(order, _)| matches!(order, Order::Collect { .. })).collect();
-        if !group.is_empty() {
-            commit(&mut conn, blobs, &mut group).await;
+    loop {
+        let received = if session.witness.is_behind() {
+            match tokio::time::timeout(Witness::EVERY, orders.recv_many(&mut group, GROUP)).await {
+                Ok(received) => received,
+                Err(_) => {
+                    session.witness.catch_up();
+                    continue;
+                }
+            }
+        } else {
+            orders.recv_many(&mut group, GROUP).await
+        };
+        if received == 0 {
+            break;
         }
-        for (order, answer) in collections {
-            let Order::Collect { grace_ms } = order else { continue };
-            let _ = answer.send(retention::collect(&mut conn, blobs, grace_ms).await.map(Done::Collected));
-        }
+        commit(&mut session, blobs, &mut group).await;
     }
-    if let Err(e) = conn.close().await {
+    session.witness.catch_up();
+    if let Err(e) = session.conn.close().await {
         tracing::warn!("closing the database: {e}");
     }
 }
 
-async fn commit(conn: &mut SqliteConnection, blobs: &BlobStore, group: &mut Vec<(Order, Answer)>) {
+async fn commit(session: &mut Session, blobs: &Vouched, group: &mut Vec<(Order, Answer)>) {
     let mut results = Vec::with_capacity(group.len());
-    let mut outcome = run_all(conn, blobs, group, &mut results).await;
+    let conn = &mut session.conn;
+    let mut outcome = run_all(conn, session.epoch, blobs, group, &mut results).await;
     if outcome.is_ok() {
         fail_point!("db::before_commit");
-        outcome = exec(conn, "COMMIT").await;
+        outcome = match (exec(conn, "COMMIT").await, outcome) {
+            (Ok(()), outcome) => outcome,
+            (Err(e), _) => Err(e),
+        };
         fail_point!("db::after_commit");
     }
-    if let Err(e) = outcome {
-        // Some errors (a full disk) have ended the transaction by themselves; then there is nothing to roll back.
-        let _ = exec(conn, "ROLLBACK").await;
-        for (_, answer) in group.drain(..) {
-            let _ = answer.send(Err(copy_of(&e)));
+    let commits = match outcome {
+        Ok(commits) => commits,
+        Err(e) => {
+            // Some errors (a full disk) have ended the transaction by themselves; then there is nothing to roll back.
+            let _ = exec(conn, "ROLLBACK").await;
+            for (_, answer) in group.drain(..) {
+                let _ = answer.send(Err(copy_of(&e)));
+            }
+            return;
         }
-        return;
-    }
+    };
     for ((_, answer), result) in group.drain(..).zip(results) {
         // A caller that has gone away finds its write stored; writes are idempotent.
         let _ = answer.send(result);
     }
+    session.witness.committed(commits);
 }
 
-/// Runs every order in its savepoint. An error here is one of the whole transaction.
+/// Counts the transaction, if no other process has opened the database since. Returns the count.
+async fn count(conn: &mut SqliteConnection, epoch: u64) -> Result<u64, WriteError> {
+    let count = sqlx::query("UPDATE store SET commits = commits + 1 WHERE epoch = ? RETURNING commits");
+    let row = count.bind(apply::int(epoch)).fetch_optional(conn).await.map_err(write_error)?;
+    let row = row.ok_or(WriteError::Superseded { epoch })?;
+    Ok(row.get::<i64, _>(0).unsigned_abs())
+}
+
+/// Runs every order in its savepoint; returns the transaction's number. An error here is one of the whole transaction.
 async fn run_all(
     conn: &mut SqliteConnection,
-    blobs: &BlobStore,
+    epoch: u64,
+    blobs: &Vouched,
     group: &[(Order, Answer)],
     results: &mut Vec<Result<Done, WriteError>>,
-) -> Result<(), WriteError> {
+) -> Result<u64, WriteError> {
     exec(conn, "BEGIN IMMEDIATE").await?;
+    let commits = count(conn, epoch).await?;
     for (order, _) in group {
         exec(conn, "SAVEPOINT o").await?;
         let result = run(conn, blobs, order).await;
@@ -188,10 +194,10 @@ async fn run_all(
         exec(conn, "RELEASE o").await?;
         results.push(result);
     }
-    Ok(())
+    Ok(commits)
 }
 
-async fn run(conn: &mut SqliteConnection, blobs: &BlobStore, order: &Order) -> Result<Done, WriteError> {
+async fn run(conn: &mut SqliteConnection, blobs: &Vouched, order: &Order) -> Result<Done, WriteError> {
     match order {
         Order::Write(writes) => apply::apply(conn, blobs, writes).await.map(|()| Done::Nothing),
         Order::Promote(order) => catalog::promote(conn, order).await.map(|p| Done::Promoted(Box::new(p))),
@@ -204,7 +210,11 @@ async fn run(conn: &mut SqliteConnection, blobs: &BlobStore, order: &Order) -> R
         Order::Pin { digest, reason } => {
             retention::pin(conn, blobs, *digest, reason.as_deref()).await.map(|()| Done::Nothing)
         }
-        Order::Collect { .. } => Err(WriteError::Internal("a collection cannot be part of a transaction".into())),
+        Order::BeginCollection => {
+            // Rows of this transaction before here are committed when the answer comes, which is when marking begins.
+            blobs.named.begin();
+            retention::forget_shards(conn).await.map(Done::Begun)
+        }
     }
 }
 
@@ -215,6 +225,7 @@ async fn exec(conn: &mut SqliteConnection, sql: &'static str) -> Result<(), Writ
 fn copy_of(e: &WriteError) -> WriteError {
     match e {
         WriteError::Storage(message) => WriteError::Storage(message.clone()),
+        WriteError::Superseded { epoch } => WriteError::Superseded { epoch: *epoch },
         e => WriteError::Internal(e.to_string()),
     }
 }

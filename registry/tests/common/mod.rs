@@ -35,6 +35,16 @@ pub fn fence(task: &str, fence: u64) -> Write {
     Write::Fence { task: TaskId::new(task), fence: Fence(fence) }
 }
 
+/// Something to be stored that nothing else refers to.
+pub fn note(what: impl Into<serde_json::Value>) -> Write {
+    Write::Journal(what.into())
+}
+
+/// All notes, in the order in which they were stored.
+pub async fn notes(store: &Store) -> Vec<serde_json::Value> {
+    store.journal_read().await.unwrap()
+}
+
 pub fn metrics(pairs: &[(&str, f64)]) -> BTreeMap<String, f64> {
     pairs.iter().map(|(key, value)| ((*key).to_owned(), *value)).collect()
 }

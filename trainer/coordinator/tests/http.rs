@@ -341,7 +341,8 @@ async fn p1_a_torn_journal_is_a_whole_beginning_of_itself() -> TestResult {
         let torn = tempfile::tempdir()?;
         std::fs::write(torn.path().join(main.file_name().ok_or("a name")?), &database)?;
         std::fs::write(torn.path().join(wal.file_name().ok_or("a name")?), &log[..cut])?;
-        let store = match Store::open(torn.path(), Holder::this_process("a test")).await {
+        // As if its user had decided to go on with what is left: opened as it is, the store would be refused.
+        let store = match Store::adopt(torn.path(), Holder::this_process("a test")).await {
             Ok(store) => store,
             // Cut before the tables were made: an empty place, not a damaged one.
             Err(error) => return Err(format!("cut at {cut} of {end}: {error}").into()),

@@ -127,6 +127,7 @@ impl ActorHandle {
         match result {
             Ok(_) => *trouble = None,
             Err(WriteError::Storage(message)) => *trouble = Some(message.clone()),
+            Err(error @ WriteError::Superseded { .. }) => *trouble = Some(error.to_string()),
             Err(_) => {}
         }
     }
@@ -379,7 +380,10 @@ impl Actor {
 fn refused_for_good(event: &Event, error: &WriteError) -> Option<Event> {
     let last = match error {
         WriteError::Conflict(message) | WriteError::Gate(message) | WriteError::NotFound(message) => message.clone(),
-        WriteError::StaleFence { .. } | WriteError::Storage(_) | WriteError::Internal(_) => return None,
+        WriteError::StaleFence { .. }
+        | WriteError::Superseded { .. }
+        | WriteError::Storage(_)
+        | WriteError::Internal(_) => return None,
     };
     match (event, error) {
         (Event::Bundled { key, .. }, _) => Some(Event::RegisterRefused { key: *key, message: last }),

@@ -158,6 +158,7 @@ impl From<WriteError> for Failure {
             WriteError::NotFound(_) => Self::new(StatusCode::NOT_FOUND, "not-found", message),
             WriteError::Storage(_) => Self::new(StatusCode::INSUFFICIENT_STORAGE, "storage", message)
                 .hint("free some space or make the store writable, then `trainer resume`"),
+            WriteError::Superseded { .. } => Self::new(StatusCode::SERVICE_UNAVAILABLE, "storage", message),
             WriteError::Internal(_) => Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", message),
         }
     }
@@ -179,7 +180,7 @@ impl From<QueryError> for Failure {
         match error {
             QueryError::NotFound(_) => Self::new(StatusCode::NOT_FOUND, "not-found", message),
             QueryError::Invalid(_) => Self::invalid(message),
-            QueryError::Database(_) | QueryError::Blob(_) => {
+            QueryError::Database(_) | QueryError::Blob(_) | QueryError::Storage(_) => {
                 Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", message)
             }
         }

@@ -44,7 +44,8 @@ async fn tell(actor_handle: &ActorHandle, event: Event) {
                 tracing::warn!(%error, "not stored; trying again");
                 if let registry::WriteError::Gate(_)
                 | registry::WriteError::Conflict(_)
-                | registry::WriteError::NotFound(_) = error
+                | registry::WriteError::NotFound(_)
+                | registry::WriteError::Superseded { .. } = error
                 {
                     return;
                 }
