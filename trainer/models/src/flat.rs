@@ -25,7 +25,7 @@ impl Entry {
 }
 
 /// Sequences whose fields are numbered: `main_3` is entry 3 of `main`.
-const SEQUENCES: [&str; 2] = ["main", "output_net"];
+const SEQUENCES: [&str; 3] = ["main", "output", "output_net"];
 
 /// Names and shapes in declaration order. Paths are the published names, but for entries of upstream's sequences, whose others
 /// have no parameters: `emb_proj` is `emb_proj.1`, and a field `main_3` is `main.3`.

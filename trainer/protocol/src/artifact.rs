@@ -25,6 +25,8 @@ pub enum ArtifactKind {
     Denoiser,
     /// Embeds captions and motions in one space.
     Evaluator,
+    /// Estimates the length of a motion from its caption.
+    Length,
     /// Metrics of an evaluation.
     Report,
     /// A registered model: everything `generate` needs.
@@ -45,6 +47,7 @@ impl ArtifactKind {
             Self::Latents => "latents",
             Self::Denoiser => "a denoiser",
             Self::Evaluator => "an evaluator",
+            Self::Length => "a length estimator",
             Self::Report => "a report",
             Self::Model => "a model",
             Self::Checkpoint => "a checkpoint",

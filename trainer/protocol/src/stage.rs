@@ -31,7 +31,7 @@ pub use identity::{Backend, StageIdentity};
 pub use kinds::{
     DataOpen, DataSynthetic, DistillLcm, DistillPcm, EncodeLatents, EvaluateLatentFid, EvaluateReconstruction,
     EvaluateT2m, EvaluatorNetwork, ImportEvaluator, MovementPhase, MultiModality, Promote, Register, StageSettings,
-    TextEmbed, TextEncoder, TrainEvaluator, TrainMld, TrainVae, VaeLoss, Windows,
+    TextEmbed, TextEncoder, TrainEvaluator, TrainLength, TrainMld, TrainVae, VaeLoss, Windows,
 };
 pub use neighbours::Neighbours;
 pub use network::{LatentShape, Network, Positions};

@@ -7,6 +7,7 @@ mod discriminator;
 mod embedding;
 mod evaluator;
 mod init;
+mod length;
 mod transformer;
 mod vae;
 
@@ -17,6 +18,7 @@ pub use evaluator::{
     BiGru, Conv, Deconv, Evaluator, EvaluatorConfig, MotionEncoder, MovementDecoder, MovementEncoder, TextEncoder,
 };
 pub use init::Init;
+pub use length::LengthEstimator;
 pub use transformer::{Attention, Block, Linear, Norm, SkipStack, StackConfig};
 pub use vae::{Posterior, Vae, VaeConfig};
 

@@ -133,9 +133,21 @@ fn numbers(dtype: Dtype, data: &[u8], name: &str) -> Vec<f64> {
         Dtype::I64 => {
             data.chunks_exact(8).map(|b| i64::from_le_bytes(b.try_into().expect("eight bytes")) as f64).collect()
         }
+        Dtype::F16 => data.chunks_exact(2).map(|b| half(u16::from_le_bytes([b[0], b[1]]))).collect(),
         Dtype::BOOL | Dtype::U8 => data.iter().map(|b| f64::from(*b)).collect(),
         other => panic!("`{name}` has the type {other:?}, which no fixture here has"),
     }
+}
+
+/// A float16's value.
+fn half(bits: u16) -> f64 {
+    let (sign, exponent, fraction) = (bits >> 15, i32::from(bits >> 10 & 31), f64::from(bits & 1023) / 1024.0);
+    let size = match exponent {
+        0 => fraction * 2.0_f64.powi(-14),
+        31 => panic!("a stored number is not finite"),
+        _ => (1.0 + fraction) * 2.0_f64.powi(exponent - 15),
+    };
+    if sign == 1 { -size } else { size }
 }
 
 pub fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {

@@ -1,7 +1,7 @@
 //! Networks, losses, one distillation step and the samplers against the published PyTorch modules.
 //!
 //! Driven by what is there: every folder of the fixtures whose name starts with a known prefix, every case its arrays
-//! name, sizes out of its `config.json`. `02_control*` and 05 to 07 hold networks that this crate does not have.
+//! name, sizes out of its `config.json`. `02_control*`, most of 05, and 06 and 07 hold networks that this crate does not have.
 //! Gates are those of the fixtures' README, for CPU.
 
 #[path = "../common/mod.rs"]
@@ -9,6 +9,7 @@ mod common;
 mod denoiser;
 mod distillation;
 mod evaluator;
+mod length;
 mod networks;
 mod samplers;
 mod vae;
@@ -21,7 +22,7 @@ const LOSS: f64 = 1e-5;
 #[test]
 fn parity_says_what_it_skips() {
     let Some(root) = common::shared("parity") else { return };
-    let covered = ["01_", "02_denoiser", "03_distill", "03_sampler", "04_evaluator", "08_pcm"];
+    let covered = ["01_", "02_denoiser", "03_distill", "03_sampler", "04_evaluator", "05_length_estimator", "08_pcm"];
     let skipped: Vec<String> = std::fs::read_dir(root)
         .expect("fixtures can be listed")
         .map(|entry| entry.expect("fixtures can be listed").path())

@@ -9,6 +9,7 @@ mod import;
 mod latent_data;
 mod latent_fid;
 mod lcm;
+mod length;
 mod mld;
 mod pcm;
 mod reconstruction;
@@ -77,7 +78,7 @@ macro_rules! runners {
 runners! {
     Plain: DataOpen, DataSynthetic, TextEmbed, ImportEvaluator;
     Map: EncodeLatents, EvaluateReconstruction, EvaluateLatentFid, EvaluateT2m;
-    Gang: TrainVae, TrainMld, DistillLcm, DistillPcm, TrainEvaluator;
+    Gang: TrainVae, TrainMld, DistillLcm, DistillPcm, TrainEvaluator, TrainLength;
 }
 
 /// Runs a plain stage.

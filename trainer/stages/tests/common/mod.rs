@@ -3,8 +3,8 @@
 use protocol::Steps;
 use protocol::stage::{
     Batch, DataSynthetic, Decay, DistillLcm, DistillPcm, Distillation, EncodeLatents, EvaluateLatentFid,
-    EvaluateReconstruction, LatentShape, Network, Optimizer, Sampler, StageSettings, TextEmbed, TrainMld, TrainVae,
-    Training,
+    EvaluateReconstruction, LatentShape, Network, Optimizer, Sampler, StageSettings, TextEmbed, TrainLength, TrainMld,
+    TrainVae, Training,
 };
 
 fn network() -> Network {
@@ -36,7 +36,7 @@ fn distillation(steps: u64) -> Distillation {
 /// Name, settings and inputs (field, stage).
 pub(crate) type Link = (&'static str, StageSettings, Vec<(&'static str, &'static str)>);
 
-/// Steps of the training stages, in order: vae, mld, lcm, pcm.
+/// Steps of the training stages, in order: vae, mld, lcm, pcm. The length estimator makes as many as the VAE.
 pub(crate) type Steps4 = [u64; 4];
 
 /// The stages in order.
@@ -68,6 +68,11 @@ pub(crate) fn chain(shards: usize, steps: Steps4) -> Vec<Link> {
     vec![
         ("dataset", StageSettings::DataSynthetic(data), vec![]),
         ("text", StageSettings::TextEmbed(TextEmbed::default()), vec![("dataset", "dataset")]),
+        (
+            "length",
+            StageSettings::TrainLength(TrainLength { training: training(steps[0]), ..TrainLength::default() }),
+            vec![("dataset", "dataset"), ("text", "text")],
+        ),
         ("vae", StageSettings::TrainVae(vae), vec![("dataset", "dataset")]),
         (
             "latents",

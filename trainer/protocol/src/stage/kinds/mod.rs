@@ -12,6 +12,7 @@ mod import_evaluator;
 mod register;
 mod text_embed;
 mod train_evaluator;
+mod train_length;
 mod train_mld;
 mod train_vae;
 
@@ -27,6 +28,7 @@ pub use import_evaluator::ImportEvaluator;
 pub use register::{Promote, Register};
 pub use text_embed::{TextEmbed, TextEncoder};
 pub use train_evaluator::{EvaluatorNetwork, MovementPhase, TrainEvaluator};
+pub use train_length::TrainLength;
 pub use train_mld::TrainMld;
 pub use train_vae::{TrainVae, VaeLoss, Windows};
 
@@ -44,6 +46,7 @@ super::spec::stage_kinds! {
     EvaluateReconstruction,
     EvaluateLatentFid,
     TrainEvaluator,
+    TrainLength,
     ImportEvaluator,
     EvaluateT2m,
     Register,

@@ -1,0 +1,68 @@
+//! `train.length`: how long the motion of a caption is. Source: MoMask's length estimator (Guo et al., CVPR 2024).
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::stage::{Batch, Decay, Neighbours, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training};
+use crate::{ArtifactKind, Steps};
+
+/// `train.length`: estimates the length of a motion from its caption.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct TrainLength {
+    /// Stage that gives the clips, whose lengths are learned.
+    pub dataset: String,
+    /// Stage that gives the caption embeddings.
+    pub text: String,
+    /// Dropout probability before the second and the third layer.
+    pub dropout: f64,
+    /// The rest. Published: 300 epochs of HumanML3D with batches of 64.
+    #[serde(flatten)]
+    pub training: Training,
+}
+
+impl Default for TrainLength {
+    fn default() -> Self {
+        Self {
+            dataset: "dataset".into(),
+            text: "text".into(),
+            dropout: 0.2,
+            training: Training {
+                steps: Steps(110_000),
+                batch: Batch { global: 64, slices: 1 },
+                lr: 1e-4,
+                warmup: Steps(0),
+                decay: Decay::Constant,
+                optimizer: Optimizer::default(),
+                max_grad_norm: 0.5,
+                stop: None,
+            },
+        }
+    }
+}
+
+impl StageSpec for TrainLength {
+    const KIND: &'static str = "train.length";
+    const SHAPE: Shape = Shape::Gang;
+    const OUTPUT: Output = Output { name: "length", kind: ArtifactKind::Length };
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![
+            Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
+            Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
+        ]
+    }
+
+    fn check(&self, p: &mut Problems) {
+        p.fraction("dropout", self.dropout, true);
+        self.training.check(p);
+    }
+
+    fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
+        stages.same_captions(p, &self.text, &self.dataset);
+    }
+
+    fn training(&mut self) -> Option<&mut Training> {
+        Some(&mut self.training)
+    }
+}

@@ -1,0 +1,147 @@
+//! `train.length`: how long the motion of a caption is. Source: MoMask's length estimator (Guo et al., CVPR 2024).
+//!
+//! A class is a movement of four frames; cross-entropy against `frames / 4`, with one of the clip's captions drawn for each step.
+//!
+//! Departs: every entry has its whole length, where the original shortens it by a movement now and then; a draw of a length gives at least
+//! one movement.
+
+use burn::tensor::activation::softmax;
+use burn::tensor::{Device, Tensor, TensorData};
+use models::flat;
+use models::kernels::Dropout;
+use models::names::to_bytes;
+use models::networks::{Init, LengthEstimator};
+use motion::Stream;
+use motion::dataset::Dataset;
+use protocol::stage::{DataFormat, Positions, Split, TrainLength};
+use protocol::{ArtifactKind, Seed};
+use serde::{Deserialize, Serialize};
+
+use super::{Gang, dropout_seed, group, no_clips, slice_gradient};
+use crate::artifacts::{self, Embeddings, MODEL_FILE, to_meta};
+use crate::context::{GangContext, Outcome, StageError};
+use crate::train::{GroupPlan, Objective, Order, SliceResult, TrainState, Trained, train};
+
+/// Meta of an artifact of kind `length`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct LengthMeta {
+    /// The data it was trained on.
+    format: DataFormat,
+    /// Text encoder, as in the embeddings' meta.
+    encoder: String,
+    /// Width of a caption embedding.
+    text_dim: usize,
+    /// Lengths told apart: class c is a motion of `c * unit` frames.
+    classes: usize,
+    /// Frames of one class.
+    unit: usize,
+}
+
+struct Lengths {
+    settings: TrainLength,
+    dataset: Dataset,
+    embeddings: Embeddings,
+    train: Vec<usize>,
+    order: Order,
+    network: LengthEstimator,
+    seed: Seed,
+    purpose: String,
+    dropout_seed: u64,
+    device: Device,
+}
+
+impl Objective for Lengths {
+    fn groups(&mut self) -> Vec<GroupPlan> {
+        vec![group("model", &self.network, &self.settings.training, 0.0)]
+    }
+
+    /// The second: frames between the mean of the predicted lengths and the true one.
+    fn terms(&self) -> &'static [&'static str] {
+        &["loss", "frames_off"]
+    }
+
+    fn load(&mut self, state: &TrainState) {
+        self.network = flat::write(self.network.clone(), &state.groups[0].params);
+    }
+
+    fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
+        let batch = self.settings.training.batch;
+        let range = self.order.slice(slice, batch.slices);
+        let picks = self.order.batch(step, |_| 0)[range].to_vec();
+        let (mut text, mut frames) = (Vec::new(), Vec::new());
+        for pick in &picks {
+            let entry = &self.dataset.entries[self.train[pick.example]];
+            let mut draw = Stream::new(self.seed, &format!("{}/caption", self.purpose), pick.place, 0);
+            let caption = entry.captions[draw.below(entry.captions.len())];
+            text.extend_from_slice(self.embeddings.captions.row(caption));
+            frames.push(entry.len);
+        }
+        let shape = [picks.len(), self.embeddings.null.len()];
+        let text = Tensor::<2>::from_data(TensorData::new(text, shape), &self.device);
+        let mut dropout = Dropout::new(self.settings.dropout, self.dropout_seed, step, slice as u64);
+        let logits = self.network.forward(text, &mut dropout);
+        let probabilities = softmax(logits.clone().inner(), 1).into_data();
+        let probabilities = probabilities.as_slice::<f32>().map_err(|e| StageError::Fault(format!("{e:?}")))?;
+        let mean = |row: &[f32]| -> f32 { row.iter().enumerate().map(|(class, p)| class as f32 * p).sum() };
+        let rows = probabilities.chunks_exact(LengthEstimator::CLASSES);
+        let off =
+            rows.zip(&frames).map(|(row, frames)| (mean(row) * LengthEstimator::UNIT as f32 - *frames as f32).abs());
+        let off = off.sum::<f32>() / batch.global as f32;
+        let classes: Vec<usize> =
+            frames.iter().map(|frames| LengthEstimator::class(*frames, LengthEstimator::CLASSES)).collect();
+        let loss = LengthEstimator::loss(logits, &classes) / batch.global as f32;
+        let (gradient, loss) = slice_gradient(&self.network, loss);
+        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss, off] })
+    }
+}
+
+impl Gang for TrainLength {
+    fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
+        let blobs = cx.blobs();
+        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
+        let dataset = artifacts::dataset(&*blobs, &manifest)?;
+        let (_, manifest) = artifacts::input(cx, "text", ArtifactKind::Embeddings)?;
+        let embeddings = Embeddings::read(&*blobs, &manifest)?;
+        if dataset.captions.len() != embeddings.meta.captions {
+            return Err(StageError::Input(format!(
+                "`dataset` has {} captions, `text` embeds {}; both must come from one dataset",
+                dataset.captions.len(),
+                embeddings.meta.captions
+            )));
+        }
+        let train_entries = dataset.entries_of(Split::Train);
+        if train_entries.is_empty() {
+            return Err(no_clips());
+        }
+        let meta = LengthMeta {
+            format: dataset.format,
+            encoder: embeddings.meta.encoder.clone(),
+            text_dim: embeddings.meta.dim,
+            classes: LengthEstimator::CLASSES,
+            unit: LengthEstimator::UNIT,
+        };
+        let (seed, purpose) = (cx.task().seed, cx.task().name.to_string());
+        let tracked = cx.device().autodiff();
+        let mut init = Init::new(seed, &format!("{purpose}/init"), Positions::Uniform, &tracked);
+        let mut objective = Lengths {
+            settings: self.clone(),
+            network: LengthEstimator::new(meta.text_dim, meta.classes, &mut init),
+            order: Order::new(seed, &purpose, train_entries.len(), self.training.batch.global, 1),
+            train: train_entries,
+            dataset,
+            embeddings,
+            seed,
+            purpose,
+            dropout_seed: dropout_seed(cx),
+            device: cx.device(),
+        };
+        match train(&mut objective, &self.training, cx)? {
+            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
+            Trained::Finished { state, metrics } => {
+                let bytes = to_bytes(&state.groups[0].entries, state.result(0));
+                let output = artifacts::publish(cx, ArtifactKind::Length, to_meta(&meta), MODEL_FILE, bytes)?;
+                Ok(Outcome::Finished { output, metrics })
+            }
+        }
+    }
+}
