@@ -232,7 +232,7 @@ pub(crate) fn mark_blobs(dir: &Path, id: &StoreId) -> io::Result<()> {
 }
 
 /// Replaces a small file: after a loss of power it holds the old bytes or the new ones.
-fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
+pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let fresh = path.with_extension("new");
     let mut file = File::create(&fresh)?;
     file.write_all(bytes)?;

@@ -6,6 +6,7 @@
 //!
 //! Not its job: who works on what (the coordinator), what tensors mean (the stages).
 
+pub mod backup;
 pub mod blob;
 pub mod catalog;
 pub mod cli;
@@ -18,6 +19,7 @@ pub mod leaderboard;
 mod lock;
 mod metrics;
 pub mod query;
+mod reserve;
 pub mod retention;
 mod store;
 mod write;

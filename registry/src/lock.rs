@@ -5,7 +5,7 @@ use std::fmt;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, Read};
 use std::os::unix::fs::FileExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
@@ -76,6 +76,43 @@ impl SharedLock {
             Ok(()) => Ok(Some(Self(file))),
             Err(TryLockError::WouldBlock) => Ok(None),
             Err(TryLockError::Error(e)) => Err(e),
+        }
+    }
+}
+
+/// Kept by whoever collects, alone, and by those who copy what a collection could take from under them.
+#[derive(Debug)]
+pub(crate) struct CollectionLock(#[expect(dead_code, reason = "the lock lasts as long as the file is open")] File);
+
+impl CollectionLock {
+    pub(crate) fn path(dir: &Path) -> PathBuf {
+        dir.join("collecting")
+    }
+
+    /// Waits until nobody copies, and keeps others from beginning.
+    pub(crate) async fn collect(dir: &Path) -> io::Result<Self> {
+        Self::wait(dir, File::try_lock).await
+    }
+
+    /// Waits until nobody collects, and keeps others from beginning.
+    pub(crate) async fn keep_away(dir: &Path) -> io::Result<Self> {
+        Self::wait(dir, File::try_lock_shared).await
+    }
+
+    async fn wait(dir: &Path, lock: fn(&File) -> Result<(), TryLockError>) -> io::Result<Self> {
+        let path = Self::path(dir);
+        let file = match File::open(&path) {
+            Err(e) if e.kind() == io::ErrorKind::NotFound => {
+                OpenOptions::new().write(true).create(true).truncate(false).open(&path)?
+            }
+            opened => opened?,
+        };
+        loop {
+            match lock(&file) {
+                Ok(()) => return Ok(Self(file)),
+                Err(TryLockError::Error(e)) => return Err(e),
+                Err(TryLockError::WouldBlock) => tokio::time::sleep(BETWEEN).await,
+            }
         }
     }
 }

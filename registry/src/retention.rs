@@ -25,6 +25,7 @@ use sqlx::{Connection, Row, SqliteConnection};
 
 use crate::blob::{BlobStore, ManifestError};
 use crate::db::apply::{int, run};
+use crate::lock::CollectionLock;
 use crate::query::{self, QueryError};
 use crate::{ReadStore, Store, WriteError, clock};
 
@@ -59,8 +60,10 @@ impl Store {
     /// Removes blobs that nothing needs and that were last put more than `grace_ms` ago; returns what went. Writes go on
     /// meanwhile. Killed in between it has removed only what nothing needs; the next one goes on.
     pub async fn gc(&self, grace_ms: i64) -> Result<Plan, WriteError> {
-        let _alone = self.collecting().await;
+        let lock = CollectionLock::collect(self.dir()).await;
+        let _alone = lock.map_err(|e| WriteError::Storage(format!("nothing was collected: no lock: {e}")))?;
         self.check_identity().await.map_err(|why| WriteError::Storage(format!("nothing was collected: {why}")))?;
+        crate::reserve::release_if_full(self.dir());
         let _noting = Noting(Arc::clone(self.named()));
         let forgotten = self.begin_collection().await?;
         let (rows, blobs, named) = (Rows::read(self).await?, self.blobs().clone(), Arc::clone(self.named()));
@@ -69,7 +72,9 @@ impl Store {
             let plan = plan(&blobs, &rows, &ages)?;
             sweep(&blobs, &rows, &ages, &named, plan)
         });
-        Ok(Plan { forget_shards: forgotten, ..plan.await? })
+        let plan = plan.await;
+        crate::reserve::keep(self.dir());
+        Ok(Plan { forget_shards: forgotten, ..plan? })
     }
 }
 
@@ -217,7 +222,7 @@ pub(crate) async fn roots(conn: &mut SqliteConnection) -> Result<Vec<(Digest, St
 }
 
 /// What a collection has to know of the rows, as of one moment.
-struct Rows {
+pub(crate) struct Rows {
     roots: BTreeMap<Digest, String>,
     /// What each artifact was made of.
     parents: HashMap<Digest, Vec<Digest>>,
@@ -237,7 +242,7 @@ impl Rows {
         Ok(rows)
     }
 
-    async fn of(conn: &mut SqliteConnection) -> Result<Self, QueryError> {
+    pub(crate) async fn of(conn: &mut SqliteConnection) -> Result<Self, QueryError> {
         let done = "SELECT task FROM shards WHERE run IN (SELECT run FROM runs WHERE state = 'finished') ORDER BY task";
         let done = sqlx::query(done).fetch_all(&mut *conn).await?;
         let forget_shards: Vec<_> =
@@ -303,6 +308,19 @@ fn mark(
         }
     }
     Ok(())
+}
+
+/// The blobs that the rows need, all of them there.
+pub(crate) fn needed(blobs: &BlobStore, rows: &Rows) -> Result<BTreeSet<Digest>, QueryError> {
+    for (root, why) in &rows.roots {
+        blobs.complete_manifest(*root).map_err(|e| QueryError::Blob(format!("{why}: {e}")))?;
+    }
+    let all = blobs.list().map_err(|e| QueryError::Blob(e.to_string()))?;
+    let mut marked = BTreeSet::new();
+    mark(blobs, rows, |digest| all.contains_key(&digest), rows.roots.keys().copied().collect(), &mut marked)?;
+    // What is mentioned need not be there; what roots list is, by now.
+    marked.retain(|digest| all.contains_key(digest));
+    Ok(marked)
 }
 
 fn plan(blobs: &BlobStore, rows: &Rows, ages: &Ages) -> Result<Plan, QueryError> {

@@ -6,6 +6,7 @@
 //!   witness          how many transactions the database has had, at least
 //!   blobs/IDENTITY   which store the blobs belong to
 //!   blobs/sha256/    bytes by digest
+//!   reserve          given up on a full disk, so that there is space to collect in
 //!   staging/         blobs on their way; emptied when the store is opened
 //!   lock             the operating system's lock, and who holds it
 //! ```
@@ -29,11 +30,9 @@ use crate::db::writer::{Done, Order, Session, Writer};
 use crate::db::{self, Opened};
 use crate::identity::{self, Found, Mismatch, StoreId, Verdict, Witness};
 use crate::lock::{Holder, SharedLock, StoreLock, Taken, network_filesystem};
+use crate::reserve::{self, OPEN_NEEDS_BYTES};
 use crate::retention::{Named, Vouched};
 use crate::{Write, WriteError, clock};
-
-/// Below this much free space nothing is opened for writing: the database's log would not fit.
-const OPEN_NEEDS_BYTES: u64 = 16 << 20;
 
 /// Why a store could not be opened. Nothing in it was changed.
 #[derive(Debug, thiserror::Error)]
@@ -141,7 +140,7 @@ impl OpenError {
             Self::NotEmpty { .. } => "choose a folder that is empty or does not exist with `--store`".into(),
             Self::NotAStore(_) => "`trainer run PIPELINE` makes one; name its folder with `--store`".into(),
             Self::ReadOnly { .. } => "make the folder writable for this user, or choose another with `--store`".into(),
-            Self::Full { .. } => "free some space, or choose a folder on another disk with `--store`".into(),
+            Self::Full { .. } => "`registry gc` removes what nothing needs, on a full disk too; or free some space otherwise".into(),
             Self::NetworkFilesystem { .. } => {
                 "choose a folder on a local disk with `--store`; workers on other machines need none, they talk to the server".into()
             }
@@ -191,7 +190,6 @@ struct Inner {
     writer: Writer,
     lock: Arc<StoreLock>,
     named: Arc<Named>,
-    collecting: tokio::sync::Mutex<()>,
 }
 
 impl std::ops::Deref for Store {
@@ -224,6 +222,11 @@ impl ReadStore {
         let readers = db::open_readers(&dir, closed.is_some());
         let opened_ms = clock::now_ms();
         Ok(Self(Arc::new(Reading { dir, id, opened_ms, blobs, readers, _closed: closed })))
+    }
+
+    /// Ends its connections to the database, which would otherwise end some time after the last clone is gone.
+    pub async fn close(self) {
+        self.0.readers.close().await;
     }
 
     /// The store's name, which no other store has.
@@ -265,7 +268,7 @@ impl Store {
             refuse_other_files(dir)?;
         }
         DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(|e| io(dir, e))?;
-        Self::take(dir, holder, false).await
+        Self::take(dir, holder, Purpose::Work).await
     }
 
     /// Opens a store that is there.
@@ -273,7 +276,7 @@ impl Store {
         if !db::is_there(dir) && found(dir)?.evidence().is_none() {
             return Err(OpenError::NotAStore(dir.to_owned()));
         }
-        Self::take(dir, holder, false).await
+        Self::take(dir, holder, Purpose::Work).await
     }
 
     /// Opens a store whose blobs are missing or whose database has gone back, and makes what is left one store again. What was lost
@@ -282,10 +285,18 @@ impl Store {
         if !db::is_there(dir) && found(dir)?.evidence().is_none() {
             return Err(OpenError::NotAStore(dir.to_owned()));
         }
-        Self::take(dir, holder, true).await
+        Self::take(dir, holder, Purpose::Adopt).await
     }
 
-    async fn take(dir: &Path, holder: Holder, adopt: bool) -> Result<Self, OpenError> {
+    /// Opens a store that is there to collect what nothing needs: on a full disk as well, which is when it has to be done.
+    pub async fn open_to_collect(dir: &Path, holder: Holder) -> Result<Self, OpenError> {
+        if !db::is_there(dir) && found(dir)?.evidence().is_none() {
+            return Err(OpenError::NotAStore(dir.to_owned()));
+        }
+        Self::take(dir, holder, Purpose::Collect).await
+    }
+
+    async fn take(dir: &Path, holder: Holder, purpose: Purpose) -> Result<Self, OpenError> {
         let io = |path: &Path, e: io::Error| OpenError::io(path, &e);
         let dir = dir.canonicalize().map_err(|e| io(dir, e))?;
         close_to_others(&dir).map_err(|e| io(&dir, e))?;
@@ -298,18 +309,22 @@ impl Store {
             Taken::Busy(holder) => return Err(OpenError::Busy { dir, holder }),
         };
         let free = free_bytes(&dir).map_err(|e| io(&dir, e))?;
-        if free < OPEN_NEEDS_BYTES {
+        if purpose == Purpose::Collect {
+            reserve::release_if_full(&dir);
+        } else if free < OPEN_NEEDS_BYTES {
             let message = format!("{free} bytes are free, {OPEN_NEEDS_BYTES} are needed");
             return Err(OpenError::Full { path: dir, message });
         }
         // Under the lock: nobody is making the store at the same time.
-        let Opened { mut conn, store: id, verdict } = db::open_writer(&dir, &found(&dir)?, adopt).await?;
+        let Opened { mut conn, store: id, verdict } =
+            db::open_writer(&dir, &found(&dir)?, purpose == Purpose::Adopt).await?;
         let blobs = BlobStore::new(Folder::open(&dir).map_err(|e| io(&dir, e))?);
         if let Verdict::New | Verdict::Unfinished(_) = verdict {
             identity::mark_blobs(&dir, &id).map_err(|e| io(&dir, e))?;
         }
         let stored = db::raise_epoch(&dir, &mut conn).await?;
         let witness = Witness::begin(&dir, &stored).map_err(|e| io(&dir, e))?;
+        reserve::keep(&dir);
         let session = Session { conn, epoch: stored.epoch, witness };
         let named = Arc::new(Named::default());
         let vouched = Vouched { blobs: blobs.clone(), named: Arc::clone(&named) };
@@ -317,7 +332,7 @@ impl Store {
         let readers = db::open_readers(&dir, false);
         let opened_ms = clock::now_ms();
         let read = ReadStore(Arc::new(Reading { dir, id, opened_ms, blobs, readers, _closed: None }));
-        Ok(Self(Arc::new(Inner { read, writer, lock, named, collecting: tokio::sync::Mutex::default() })))
+        Ok(Self(Arc::new(Inner { read, writer, lock, named })))
     }
 
     /// Tells other processes where this one answers requests.
@@ -392,11 +407,6 @@ impl Store {
         self.order(Order::Pin { digest, reason: None }).await.map(|_| ())
     }
 
-    /// Waits until no collection is under way, and keeps others from beginning.
-    pub(crate) async fn collecting(&self) -> tokio::sync::MutexGuard<'_, ()> {
-        self.0.collecting.lock().await
-    }
-
     /// What rows come to name while a collection is under way.
     pub(crate) fn named(&self) -> &Arc<Named> {
         &self.0.named
@@ -426,12 +436,20 @@ fn close_to_others(dir: &Path) -> io::Result<()> {
     Ok(())
 }
 
+/// What a store is opened for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Purpose {
+    Work,
+    Collect,
+    Adopt,
+}
+
 fn found(dir: &Path) -> Result<Found, OpenError> {
     Found::look(dir).map_err(|mismatch| OpenError::Mismatch { dir: dir.to_owned(), mismatch })
 }
 
 /// Names that a store's folder may have before its database is there.
-const OF_A_STORE: [&str; 5] = ["lock", "blobs", "staging", "witness", "witness.new"];
+const OF_A_STORE: [&str; 6] = ["lock", "blobs", "staging", "witness", "witness.new", "reserve"];
 
 /// A store is not made in a folder that holds something else.
 fn refuse_other_files(dir: &Path) -> Result<(), OpenError> {

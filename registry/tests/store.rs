@@ -436,3 +436,97 @@ async fn a_read_only_place_is_refused_as_such() {
     let error = Store::open(&closed.join("store"), Holder::this_process("t")).await.unwrap_err();
     assert!(matches!(error, OpenError::ReadOnly { .. }), "{error}");
 }
+
+fn put_before(dir: &std::path::Path, digest: Digest, minutes: u64) {
+    let hex = digest.hex();
+    let path = dir.join("blobs/sha256").join(&hex[..2]).join(&hex[2..]);
+    let at = std::time::SystemTime::now() - std::time::Duration::from_secs(minutes * 60);
+    let file = std::fs::File::options().append(true).open(path).unwrap();
+    file.set_times(std::fs::FileTimes::new().set_modified(at)).unwrap();
+}
+
+/// A coordinator that was restarted does not know what a worker that still holds its task had uploaded.
+#[tokio::test]
+async fn no_grace_does_not_reach_behind_a_restart_while_a_run_is_under_way() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = |state: &str| Write::Run {
+        run: "r".into(),
+        pipeline: json!({}),
+        source: String::new(),
+        state: state.into(),
+        idempotency_key: None,
+    };
+    let store = open(dir.path()).await;
+    store.write(vec![run("running")]).await.unwrap();
+    let uploaded = store.blobs().put(b"its outcome is on its way").unwrap();
+    let old = store.blobs().put(b"older than any upload waits").unwrap();
+    drop(store);
+    put_before(dir.path(), uploaded, 10);
+    put_before(dir.path(), old, 90);
+    let store = open(dir.path()).await;
+    assert_eq!(store.gc(0).await.unwrap().remove, [old]);
+    store.write(vec![run("finished")]).await.unwrap();
+    assert_eq!(store.gc(0).await.unwrap().remove, [uploaded]);
+}
+
+/// Rows that come to name an old blob while it is about to go keep it; the others go, and no write waits for the end.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn writes_go_on_while_garbage_is_collected_and_what_they_name_stays() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = open(dir.path()).await;
+    let artifacts: Vec<_> =
+        (0..300).map(|i| artifact(store.blobs(), ArtifactKind::Vae, &format!("artifact {i}"))).collect();
+    let collecting = tokio::spawn({
+        let store = store.clone();
+        async move { store.gc(-1000).await.unwrap() }
+    });
+    let mut named = Vec::new();
+    for (i, artifact) in artifacts.iter().enumerate() {
+        match store.write(vec![result(&format!("key {i}"), *artifact)]).await {
+            Ok(()) => named.push(*artifact),
+            Err(WriteError::NotFound(_)) => {}
+            Err(e) => panic!("{e}"),
+        }
+    }
+    let plan = collecting.await.unwrap();
+    assert!(plan.remove.iter().all(|gone| !named.contains(gone)), "nothing that a row names");
+    for artifact in named {
+        store.blobs().complete_manifest(artifact).unwrap();
+    }
+    assert!(store.fsck().await.unwrap().problems.is_empty());
+}
+
+/// Readers need nobody to let them in, hold nobody up, and leave no trace.
+#[tokio::test]
+async fn a_store_is_read_while_it_is_held_and_without_a_trace_while_it_is_not() {
+    let dir = tempfile::tempdir().unwrap();
+    let names = || {
+        let entries = std::fs::read_dir(dir.path()).unwrap();
+        let mut names: Vec<_> = entries.map(|entry| entry.unwrap().file_name()).collect();
+        names.sort();
+        names
+    };
+    let store = open(dir.path()).await;
+    let output = artifact(store.blobs(), ArtifactKind::Vae, "weights");
+    store.write(vec![result("k", output)]).await.unwrap();
+    let key = Digest::of(b"k");
+    let held = registry::ReadStore::open(dir.path()).await.unwrap();
+    assert!(held.stage_result(key).await.unwrap().is_some());
+    store.write(vec![result("later", output)]).await.unwrap();
+    assert!(held.stage_result(Digest::of(b"later")).await.unwrap().is_some(), "what was committed since is seen");
+    held.close().await;
+    drop(store);
+    // Reads once more until the writer's last connection has taken its log with it.
+    while dir.path().join("stride.db-wal").exists() {
+        tokio::task::yield_now().await;
+    }
+    let before = (names(), std::fs::read(dir.path().join("stride.db")).unwrap());
+    let free = registry::ReadStore::open(dir.path()).await.unwrap();
+    assert!(free.stage_result(key).await.unwrap().is_some());
+    assert!(free.fsck().await.unwrap().problems.is_empty());
+    let shared = registry::ReadStore::open(dir.path()).await.unwrap();
+    assert!(shared.runs().await.unwrap().is_empty());
+    drop((free, shared));
+    assert_eq!((names(), std::fs::read(dir.path().join("stride.db")).unwrap()), before);
+    open(dir.path()).await.write(vec![result("last", output)]).await.unwrap();
+}

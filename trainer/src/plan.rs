@@ -6,7 +6,7 @@ use coordinator::search::{Score, Search, Ticket};
 use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::sweep::{STATE_OUTPUT, rung_name};
 use protocol::{ArtifactKind, Digest, StageName, Steps, TaskId};
-use registry::{RunRow, StageResultRow, Store};
+use registry::{ReadStore, RunRow, StageResultRow};
 use serde::Serialize;
 use serde_json::Value;
 
@@ -48,7 +48,7 @@ struct Known {
     made_by: BTreeMap<StageName, String>,
 }
 
-async fn known(pipeline: &Pipeline, store: Option<&Store>) -> Result<Known> {
+async fn known(pipeline: &Pipeline, store: Option<&ReadStore>) -> Result<Known> {
     let mut known = Known { keys: BTreeMap::new(), outputs: BTreeMap::new(), made_by: BTreeMap::new() };
     for stage in &pipeline.stages {
         if stage.sweep.is_some() {
@@ -82,7 +82,7 @@ async fn best_of_sweep(
     pipeline: &Pipeline,
     stage: &PipelineStage,
     outputs: &BTreeMap<StageName, Digest>,
-    store: &Store,
+    store: &ReadStore,
 ) -> Result<Option<(Digest, StageResultRow)>> {
     let Some(sweep) = &stage.sweep else { return Ok(None) };
     let mut search = Search::new(sweep, &stage.settings, &stage.name, pipeline.seed);
@@ -120,7 +120,7 @@ async fn best_of_sweep(
 }
 
 /// Says what a run of `pipeline` on `store` would do; `None` is a store that does not exist yet.
-pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&Store>) -> Result<Plan> {
+pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&ReadStore>) -> Result<Plan> {
     let now = known(pipeline, store).await?;
     let mut earlier: Vec<(RunRow, Pipeline)> = Vec::new();
     if let Some(store) = store {
@@ -166,7 +166,7 @@ pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&Store>) -> Result<P
 async fn checkpoint(
     stage: &PipelineStage,
     key: Digest,
-    store: &Store,
+    store: &ReadStore,
     earlier: &[(RunRow, Pipeline)],
 ) -> Result<Option<String>> {
     for (row, pipeline) in earlier {

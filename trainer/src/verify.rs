@@ -14,7 +14,7 @@ use protocol::message::StageTask;
 use protocol::pipeline::{Pipeline, PipelineStage};
 use protocol::stage::Shape;
 use protocol::{Digest, Manifest, RunId, StageName, TaskId};
-use registry::{Holder, Store};
+use registry::ReadStore;
 use serde::Serialize;
 use stages::verify::{Rerun, rerun, state_digest};
 
@@ -49,7 +49,7 @@ struct Recorded {
 
 /// Verifies `steps` steps of every training stage of `pipeline` that the store in `dir` knows.
 pub(crate) async fn verify(pipeline: &Pipeline, dir: &Path, steps: u64, output: Output) -> Result<u8> {
-    let store = Store::open_existing(dir, Holder::this_process("trainer run --verify")).await?;
+    let store = ReadStore::open(dir).await?;
     let device = models::device::open(pipeline.backend, 0).map_err(|error| Problem::new(exit::USAGE, error))?;
     let mut outputs: BTreeMap<StageName, Digest> = BTreeMap::new();
     let mut all = Vec::new();
@@ -103,7 +103,7 @@ pub(crate) async fn verify(pipeline: &Pipeline, dir: &Path, steps: u64, output: 
 
 /// What the store has about a stage: of the run that made its value, or of the newest run with that pipeline.
 async fn recorded(
-    store: &Store,
+    store: &ReadStore,
     pipeline: &Pipeline,
     stage: &PipelineStage,
     inputs: BTreeMap<String, Digest>,

@@ -172,7 +172,7 @@ pub(crate) fn free_bytes(path: &Path) -> io::Result<u64> {
 fn full(path: &Path, needed: u64, free: u64) -> String {
     format!(
         "no space for {needed} bytes where `{}` lies: {free} bytes are free and {RESERVE_BYTES} are kept for the database; \
-         free some space (`registry gc` removes what nothing needs) and run the same command again",
+         `registry gc` removes what nothing needs, on a full disk too; then run the same command again",
         path.display()
     )
 }
@@ -191,8 +191,8 @@ fn error(did: &str, path: &Path, e: &io::Error) -> BlobError {
     let path = path.display();
     if is_full(e) {
         BlobError::Storage(format!(
-            "failed to {did} `{path}`: the disk is full or a quota is used up ({e}); free some space (`registry gc` removes \
-             what nothing needs) and run the same command again"
+            "failed to {did} `{path}`: the disk is full or a quota is used up ({e}); `registry gc` removes what \
+             nothing needs, on a full disk too; then run the same command again"
         ))
     } else if is_read_only(e) {
         BlobError::Storage(format!(

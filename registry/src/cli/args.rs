@@ -109,6 +109,19 @@ pub enum Verb {
     },
     /// Goes on with what is left of a store whose blobs are missing or whose database has gone back
     Adopt,
+    /// Makes or renews a backup of the store in a folder of this machine, while runs go on
+    Backup {
+        /// The folder: empty, missing, or an older backup of this store
+        dir: PathBuf,
+    },
+    /// Makes a store of a backup, once all of it was verified
+    Restore {
+        /// The backup's folder
+        backup: PathBuf,
+        /// The store's folder; it must be empty or missing
+        #[arg(long, value_name = "DIR")]
+        to: PathBuf,
+    },
     /// Copies a version's files to a folder
     Export {
         /// MODEL@ALIAS, MODEL@best or MODEL:VERSION
@@ -125,6 +138,10 @@ pub(super) enum Asked {
     Command(Command),
     /// Something that ends in this machine's files.
     Export { model: String, dir: PathBuf },
+    /// Likewise, and only of a store whose folder this machine has.
+    Backup { dir: PathBuf },
+    /// Likewise, of no store yet.
+    Restore { backup: PathBuf, to: PathBuf },
 }
 
 impl Verb {
@@ -148,6 +165,8 @@ impl Verb {
             Self::Fsck => Command::Fsck,
             Self::Gc { dry_run, grace } => Command::Gc { dry_run, grace_minutes: Some(grace) },
             Self::Adopt => Command::Adopt,
+            Self::Backup { dir } => return Asked::Backup { dir },
+            Self::Restore { backup, to } => return Asked::Restore { backup, to },
             Self::Export { model, dir } => return Asked::Export { model, dir },
         })
     }

@@ -23,8 +23,16 @@ pub async fn execute(verb: Verb, dir: &Path, options: &ServerOptions, output: Ou
     let answer = match verb.asks() {
         Asked::Command(command) => ask(command, dir, options).await,
         Asked::Export { model, dir: into } => {
-            with(dir, options, true, async |place| export(place, &model, &into).await).await
+            with(dir, options, Need::Read, async |place| export(place, &model, &into).await).await
         }
+        Asked::Backup { dir: into } => match local(options, "a backup is made on the machine of the store") {
+            Ok(()) => backup(dir, &into).await,
+            Err(refused) => *refused,
+        },
+        Asked::Restore { backup, to } => match crate::backup::restore(&backup, &to).await {
+            Ok(summary) => Answer::done(Data::Restored { summary, dir: to }),
+            Err(e) => Answer::from(e),
+        },
     };
     // A closed pipe (`| head`) is no failure of the command.
     let _ = print::show(&answer, output);
@@ -36,22 +44,58 @@ pub async fn ask(command: Command, dir: &Path, options: &ServerOptions) -> Answe
     if command == Command::Adopt {
         return adopt(dir, options).await;
     }
-    with(dir, options, command.only_reads(), async |place| place.ask(&command).await).await
+    with(dir, options, command.need(), async |place| place.ask(&command).await).await
 }
 
-/// Only here: there is no server yet that could be asked.
-async fn adopt(dir: &Path, options: &ServerOptions) -> Answer {
-    match options.connect() {
-        Ok(None) => {}
-        Ok(Some(_)) => {
-            let hint = "run it on the machine of the store, with `--store` and without a server";
-            return Answer::refused(error("invalid", "a server has no store to adopt", Some(hint)));
+/// What a place must be good for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Need {
+    Read,
+    Collect,
+    Write,
+}
+
+impl Command {
+    fn need(&self) -> Need {
+        match self {
+            command if command.only_reads() => Need::Read,
+            Self::Gc { .. } => Need::Collect,
+            _ => Need::Write,
         }
-        Err(e) => return refused(&e),
+    }
+}
+
+/// Refuses what can only be done where the store's folder is, if a server is named.
+fn local(options: &ServerOptions, why: &str) -> Result<(), Box<Answer>> {
+    match options.connect() {
+        Ok(None) => Ok(()),
+        Ok(Some(_)) => {
+            let hint = "run it there with `--store DIR`, and without a server";
+            Err(Box::new(Answer::refused(error("invalid", why, Some(hint)))))
+        }
+        Err(e) => Err(Box::new(refused(&e))),
+    }
+}
+
+/// Only here: a store that is not whole has no server.
+async fn adopt(dir: &Path, options: &ServerOptions) -> Answer {
+    if let Err(refused) = local(options, "a store is adopted on its machine") {
+        return *refused;
     }
     match Store::adopt(dir, Holder::this_process("registry adopt")).await {
         Ok(store) => Answer::done(Data::Adopted { store: store.id().clone() }),
         Err(e) => Answer::from(&e),
+    }
+}
+
+async fn backup(dir: &Path, into: &Path) -> Answer {
+    let store = match ReadStore::open(dir).await {
+        Ok(store) => store,
+        Err(e) => return Answer::from(&e),
+    };
+    match store.backup(into).await {
+        Ok(summary) => Answer::done(Data::BackedUp { summary, dir: into.to_owned() }),
+        Err(e) => Answer::from(e),
     }
 }
 
@@ -104,7 +148,7 @@ async fn check(sent: Result<Response, reqwest::Error>) -> Result<Result<Response
 async fn with(
     dir: &Path,
     options: &ServerOptions,
-    only_reads: bool,
+    need: Need,
     work: impl AsyncFn(&Place) -> Result<Answer, Missed>,
 ) -> Answer {
     let internal = |_| Answer::refused(error("internal", "the store did not answer", None));
@@ -119,7 +163,7 @@ async fn with(
         }
         Err(e) => return refused(&e),
     }
-    if only_reads {
+    if need == Need::Read {
         return match ReadStore::open(dir).await {
             Ok(store) => work(&Place::Reading(store)).await.unwrap_or_else(internal),
             Err(e) => Answer::from(&e),
@@ -127,7 +171,12 @@ async fn with(
     }
     let until = Instant::now() + PATIENCE;
     loop {
-        let busy = match Store::open_existing(dir, Holder::this_process("registry")).await {
+        let holder = Holder::this_process("registry");
+        let opened = match need {
+            Need::Collect => Store::open_to_collect(dir, holder).await,
+            Need::Read | Need::Write => Store::open_existing(dir, holder).await,
+        };
+        let busy = match opened {
             Ok(store) => {
                 return work(&Place::Here(Box::new(store))).await.unwrap_or_else(internal);
             }

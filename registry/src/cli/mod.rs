@@ -21,6 +21,7 @@ pub use args::{Output, Verb};
 pub use client::{ask, execute};
 pub use print::{render, show_error};
 
+use crate::backup::{BackupError, Summary};
 use crate::catalog::{BEST, Expect, Gate, LATEST, Model, ModelRef, Promotion, Version};
 use crate::leaderboard::{self, Comparison, Leaderboard, Style};
 use crate::retention::{GRACE_MS, Plan};
@@ -165,6 +166,10 @@ pub enum Data {
     Gc { dry_run: bool, plan: Plan },
     /// Of `adopt`.
     Adopted { store: StoreId },
+    /// Of `backup`.
+    BackedUp { summary: Summary, dir: std::path::PathBuf },
+    /// Of `restore`.
+    Restored { summary: Summary, dir: std::path::PathBuf },
     /// Of `export`.
     Exported { version: Version, dir: std::path::PathBuf, files: Vec<String> },
 }
@@ -244,6 +249,19 @@ impl From<&OpenError> for Answer {
             _ => "store",
         };
         Self::refused(error(code, e, Some(&e.hint())))
+    }
+}
+
+impl From<BackupError> for Answer {
+    fn from(e: BackupError) -> Self {
+        match e {
+            BackupError::Folder(_) => Self::refused(error("invalid", e, Some("name another folder"))),
+            BackupError::Damaged(_) => Self::refused(error("damaged", e, Some("`registry fsck` checks a store"))),
+            BackupError::Disk { .. } => {
+                Self::refused(error("storage", e, Some("see to the disk and run the same command again")))
+            }
+            BackupError::Query(e) => Self::from(e),
+        }
     }
 }
 

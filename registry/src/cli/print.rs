@@ -7,6 +7,7 @@ use protocol::message::ApiError;
 use serde_json::json;
 
 use super::{Answer, Data, Output};
+use crate::backup::Summary;
 use crate::catalog::{Action, Promotion, Version};
 use crate::clock::format_ms;
 use crate::leaderboard;
@@ -172,6 +173,16 @@ pub fn render(data: &Data) -> String {
         }
         Data::Adopted { store } => {
             format!("the parts are store {store} again; `registry fsck` says what is missing\n")
+        }
+        Data::BackedUp { summary, dir } => {
+            let Summary { store, at_ms, blobs, bytes } = summary;
+            let (at, bytes, dir) = (format_ms(*at_ms), size(*bytes), dir.display());
+            format!("store {store} of {at} is in `{dir}`: the database and {blobs} blobs ({bytes}), all verified\n")
+        }
+        Data::Restored { summary, dir } => {
+            let Summary { store, at_ms, blobs, bytes } = summary;
+            let (at, bytes, dir) = (format_ms(*at_ms), size(*bytes), dir.display());
+            format!("`{dir}` is store {store} as of {at}: {blobs} blobs ({bytes}), all verified\n")
         }
         Data::Exported { version, dir, files } => {
             format!("{}:{} is in `{}`: {}\n", version.model, version.version, dir.display(), files.join(", "))

@@ -170,6 +170,11 @@ pub(crate) fn open_readers(dir: &Path, closed: bool) -> SqlitePool {
     SqlitePoolOptions::new().max_connections(4).connect_lazy_with(reading(dir, closed))
 }
 
+/// A copy of a database that nobody writes to.
+pub(crate) async fn open_copy(path: &Path) -> Result<SqliteConnection, sqlx::Error> {
+    SqliteConnection::connect_with(&SqliteConnectOptions::new().filename(path).read_only(true).immutable(true)).await
+}
+
 fn reading(dir: &Path, closed: bool) -> SqliteConnectOptions {
     SqliteConnectOptions::new()
         .filename(path(dir))
@@ -260,7 +265,7 @@ fn open_error(path: &Path, e: &sqlx::Error) -> OpenError {
 pub(crate) fn write_error(e: sqlx::Error) -> WriteError {
     match code(&e) {
         Some(SQLITE_FULL) => WriteError::Storage(
-            "the disk is full: the database could not grow; free some space (`registry gc` removes what nothing needs) and \
+            "the disk is full: the database could not grow; `registry gc` removes what nothing needs, on a full disk too; then \
              run the same command again"
                 .into(),
         ),

@@ -14,7 +14,7 @@ use std::process::ExitCode;
 use access::ServerOptions;
 use clap::{Args, Parser, Subcommand};
 use protocol::StageName;
-use registry::{Holder, OpenError, Store};
+use registry::{Holder, OpenError, ReadStore, Store};
 
 use crate::client::Target;
 use crate::print::{self, Output};
@@ -273,7 +273,7 @@ async fn run_pipeline(args: RunArgs) -> Result<u8> {
 
 async fn show_plan(args: PlanArgs) -> Result<u8> {
     let file = pipeline_file::read_with_data(&args.pipeline.pipeline, &args.pipeline.set)?;
-    let store = match Store::open_existing(&args.store, Holder::this_process("trainer plan")).await {
+    let store = match ReadStore::open(&args.store).await {
         Ok(store) => Some(store),
         Err(OpenError::NotAStore(_)) => None,
         Err(error) => return Err(error.into()),

@@ -1,0 +1,371 @@
+//! A store in another folder, as it was at one moment, and back.
+//!
+//! ```text
+//! BACKUP/
+//!   backup.json         whose it is, of when, and what belongs to it, each with its digest; written last
+//!   stride-TIME.db      the database, copied by SQLite as of one moment
+//!   blobs/IDENTITY      which store the blobs belong to
+//!   blobs/sha256/       every blob that this database needs
+//! ```
+//!
+//! Any process that reads the store's folder makes it, whether or not another one holds the store and goes on working; only
+//! collection waits. A blob is linked where both
+//! folders are on one file system, else copied, and hashed either way. A second backup into the same folder adds what is new;
+//! until its `backup.json` is in place the one before is whole. One that was cut short is made again by the same command.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::{self, DirBuilder, File};
+use std::io::{self, ErrorKind, Read};
+use std::os::unix::fs::DirBuilderExt;
+use std::path::{Path, PathBuf};
+
+use protocol::Digest;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
+use sqlx::{Connection, Row};
+
+use crate::lock::CollectionLock;
+use crate::retention::{self, Rows};
+use crate::{BlobStore, QueryError, ReadStore, StoreId, clock, db, identity};
+
+const MANIFEST: &str = "backup.json";
+const FORMAT: u32 = 1;
+
+/// What a backup or a restored store holds.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Summary {
+    /// Whose it is.
+    pub store: StoreId,
+    /// Of when, in milliseconds since 1970.
+    pub at_ms: i64,
+    /// Blobs in it.
+    pub blobs: u64,
+    /// Their bytes.
+    pub bytes: u64,
+}
+
+/// Why there is no backup, or nothing was restored.
+#[derive(Debug, thiserror::Error)]
+pub enum BackupError {
+    /// The folder is not one for it.
+    #[error("{0}")]
+    Folder(String),
+    /// What is to be copied is not whole.
+    #[error("{0}")]
+    Damaged(String),
+    /// The disk.
+    #[error("{did} `{}`: {cause}", path.display())]
+    Disk {
+        /// What was tried.
+        did: &'static str,
+        /// On what.
+        path: PathBuf,
+        /// Why it failed.
+        cause: io::Error,
+    },
+    /// The database.
+    #[error(transparent)]
+    Query(#[from] QueryError),
+}
+
+impl From<sqlx::Error> for BackupError {
+    fn from(e: sqlx::Error) -> Self {
+        Self::Query(e.into())
+    }
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+struct Manifest {
+    format: u32,
+    store: StoreId,
+    at_ms: i64,
+    /// The database's file, its length and its digest.
+    database: String,
+    database_bytes: u64,
+    database_digest: Digest,
+    /// Blobs with their lengths.
+    blobs: BTreeMap<Digest, u64>,
+}
+
+impl Manifest {
+    fn read(dir: &Path) -> Result<Option<Self>, BackupError> {
+        let path = dir.join(MANIFEST);
+        let text = match fs::read_to_string(&path) {
+            Ok(text) => text,
+            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(None),
+            Err(cause) => return Err(BackupError::Disk { did: "cannot read", path, cause }),
+        };
+        let manifest: Self = serde_json::from_str(&text)
+            .map_err(|e| BackupError::Damaged(format!("`{}` does not read: {e}", path.display())))?;
+        if manifest.format != FORMAT {
+            let found = manifest.format;
+            return Err(BackupError::Folder(format!(
+                "`{}` has format {found}, this build reads {FORMAT}",
+                path.display()
+            )));
+        }
+        Ok(Some(manifest))
+    }
+
+    fn summary(&self) -> Summary {
+        let (blobs, bytes) = (self.blobs.len() as u64, self.blobs.values().sum());
+        Summary { store: self.store.clone(), at_ms: self.at_ms, blobs, bytes }
+    }
+}
+
+fn disk(did: &'static str, path: &Path) -> impl FnOnce(io::Error) -> BackupError {
+    let path = path.to_owned();
+    move |cause| BackupError::Disk { did, path, cause }
+}
+
+fn make_dir(path: &Path) -> Result<(), BackupError> {
+    DirBuilder::new().recursive(true).mode(0o700).create(path).map_err(disk("cannot make", path))
+}
+
+fn sync(path: &Path) -> Result<(), BackupError> {
+    File::open(path).and_then(|file| file.sync_all()).map_err(disk("cannot sync", path))
+}
+
+fn blob_path(dir: &Path, digest: Digest) -> PathBuf {
+    let hex = digest.hex();
+    dir.join("blobs/sha256").join(&hex[..2]).join(&hex[2..])
+}
+
+fn names(dir: &Path) -> Result<Vec<String>, BackupError> {
+    let entries = match fs::read_dir(dir) {
+        Ok(entries) => entries,
+        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(e) => return Err(disk("cannot list", dir)(e)),
+    };
+    entries
+        .map(|entry| Ok(entry.map_err(disk("cannot list", dir))?.file_name().to_string_lossy().into_owned()))
+        .collect()
+}
+
+/// The digest and the length of a file, read part by part.
+fn hashed(path: &Path) -> io::Result<(Digest, u64)> {
+    let (mut file, mut hasher, mut bytes) = (File::open(path)?, Sha256::new(), 0);
+    let mut part = vec![0; 1 << 20];
+    loop {
+        let read = file.read(&mut part)?;
+        if read == 0 {
+            break;
+        }
+        hasher.update(&part[..read]);
+        bytes += read as u64;
+    }
+    let hex: String = hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
+    let digest = format!("sha256:{hex}").parse().map_err(|e| io::Error::other(format!("{e}")))?;
+    Ok((digest, bytes))
+}
+
+fn expect(path: &Path, digest: Digest) -> Result<u64, BackupError> {
+    let (found, bytes) = hashed(path).map_err(disk("cannot read", path))?;
+    if found == digest {
+        return Ok(bytes);
+    }
+    Err(BackupError::Damaged(format!("`{}` is damaged: its bytes hash to {found}, not to {digest}", path.display())))
+}
+
+impl ReadStore {
+    /// Makes or renews a backup in `to`, which is empty, missing, or holds an older backup of this store.
+    pub async fn backup(&self, to: &Path) -> Result<Summary, BackupError> {
+        let path = CollectionLock::path(self.dir());
+        let _nothing_goes = CollectionLock::keep_away(self.dir()).await.map_err(disk("cannot lock", &path))?;
+        self.check_identity().await.map_err(BackupError::Damaged)?;
+        let absolute = std::path::absolute(to).map_err(disk("cannot find", to))?;
+        // The nearest folder that is there, with links followed; the rest of the path is still to be made.
+        let there = absolute.ancestors().find_map(|path| path.canonicalize().ok()).unwrap_or_default();
+        if there.starts_with(self.dir()) || self.dir().starts_with(&absolute) {
+            return Err(BackupError::Folder(format!("`{}` and the store lie in each other", to.display())));
+        }
+        prepare(self, to)?;
+        let to = to.canonicalize().map_err(disk("cannot find", to))?;
+        let at_ms = clock::now_ms();
+        let database = format!("stride-{at_ms}.db");
+        let copy = to.join(&database);
+        let mut conn = self.readers().acquire().await?;
+        sqlx::query("VACUUM INTO ?").bind(copy.to_string_lossy().into_owned()).execute(&mut *conn).await?;
+        drop(conn);
+        sync(&copy)?;
+
+        let mut conn = db::open_copy(&copy).await?;
+        let rows = Rows::of(&mut conn).await;
+        let checked: String = sqlx::query("PRAGMA integrity_check").fetch_one(&mut conn).await?.try_get(0)?;
+        conn.close().await?;
+        if checked != "ok" {
+            return Err(BackupError::Damaged(format!("the database is damaged: {checked}")));
+        }
+        let (rows, blobs, from, store) = (rows?, self.blobs().clone(), self.dir().to_owned(), self.id().clone());
+        let ended = |e: tokio::task::JoinError| BackupError::Damaged(format!("the copying ended early: {e}"));
+        let work = move || {
+            let needed = retention::needed(&blobs, &rows)?;
+            let blobs = copy_blobs(&blobs, &from, &to, needed)?;
+            let (database_digest, database_bytes) = hashed(&copy).map_err(disk("cannot read", &copy))?;
+            let manifest = Manifest { format: FORMAT, store, at_ms, database, database_bytes, database_digest, blobs };
+            let text = serde_json::to_string_pretty(&manifest).unwrap_or_default();
+            let path = to.join(MANIFEST);
+            identity::write_whole(&path, text.as_bytes()).map_err(disk("cannot write", &path))?;
+            remove_what_is_over(&to, &manifest)?;
+            Ok(manifest.summary())
+        };
+        tokio::task::spawn_blocking(work).await.map_err(ended)?
+    }
+}
+
+/// Makes the folder one that a backup of this store may be in.
+fn prepare(store: &ReadStore, to: &Path) -> Result<(), BackupError> {
+    let names = names(to)?;
+    let is_ours = matches!(identity::beside_blobs(to), Ok(Some(id)) if id == *store.id());
+    let is_store = names.iter().any(|name| name == db::FILE || name == "lock");
+    if !names.is_empty() && (!is_ours || is_store) {
+        return Err(BackupError::Folder(format!(
+            "`{}` is neither empty nor an older backup of this store",
+            to.display()
+        )));
+    }
+    make_dir(&to.join("blobs/sha256"))?;
+    identity::mark_blobs(to, store.id()).map_err(disk("cannot write to", to))
+}
+
+fn copy_blobs(
+    blobs: &BlobStore,
+    from: &Path,
+    to: &Path,
+    needed: BTreeSet<Digest>,
+) -> Result<BTreeMap<Digest, u64>, BackupError> {
+    let (mut copied, mut shards) = (BTreeMap::new(), BTreeSet::new());
+    for digest in needed {
+        let target = blob_path(to, digest);
+        if target.exists()
+            && let Ok(bytes) = expect(&target, digest)
+        {
+            copied.insert(digest, bytes);
+            continue;
+        }
+        let shard = target.parent().unwrap_or(to).to_owned();
+        if shards.insert(shard.clone()) {
+            make_dir(&shard)?;
+        }
+        copied.insert(digest, copy_blob(blobs, &blob_path(from, digest), &target, digest)?);
+    }
+    shards.iter().try_for_each(|shard| sync(shard))?;
+    sync(&to.join("blobs/sha256"))?;
+    sync(to)?;
+    Ok(copied)
+}
+
+/// Links or copies a blob; it has its name only once it is whole.
+fn copy_blob(blobs: &BlobStore, source: &Path, target: &Path, digest: Digest) -> Result<u64, BackupError> {
+    let part = target.with_extension("part");
+    let _ = fs::remove_file(&part);
+    if fs::hard_link(source, &part).is_err() {
+        if source.is_file() {
+            fs::copy(source, &part).map_err(disk("cannot write", &part))?;
+        } else {
+            let bytes = blobs.get(digest).map_err(|e| BackupError::Damaged(e.to_string()))?;
+            fs::write(&part, bytes).map_err(disk("cannot write", &part))?;
+        }
+    }
+    let bytes = expect(&part, digest)?;
+    sync(&part)?;
+    fs::rename(&part, target).map_err(disk("cannot write", target))?;
+    Ok(bytes)
+}
+
+/// Removes what only an older backup in the same folder needed.
+fn remove_what_is_over(to: &Path, manifest: &Manifest) -> Result<(), BackupError> {
+    let remove = |path: &Path| fs::remove_file(path).map_err(disk("cannot remove", path));
+    for name in names(to)? {
+        if name.starts_with("stride-") && name != manifest.database {
+            remove(&to.join(name))?;
+        }
+    }
+    let blobs = to.join("blobs/sha256");
+    for shard in names(&blobs)? {
+        for name in names(&blobs.join(&shard))? {
+            let digest = format!("sha256:{shard}{name}").parse::<Digest>();
+            if !digest.is_ok_and(|digest| manifest.blobs.contains_key(&digest)) {
+                remove(&blobs.join(&shard).join(name))?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Makes a store of a backup in `to`, which is missing or empty. The store appears under its name once all of it was verified.
+pub async fn restore(backup: &Path, to: &Path) -> Result<Summary, BackupError> {
+    let Some(manifest) = Manifest::read(backup)? else {
+        return Err(BackupError::Folder(format!(
+            "there is no finished backup in `{}`: `{MANIFEST}` is missing",
+            backup.display()
+        )));
+    };
+    if !names(to)?.is_empty() {
+        return Err(BackupError::Folder(format!(
+            "`{}` is not empty; a store is restored into a folder of its own",
+            to.display()
+        )));
+    }
+    let to = std::path::absolute(to).map_err(disk("cannot find", to))?;
+    let (Some(parent), Some(name)) = (to.parent(), to.file_name()) else {
+        return Err(BackupError::Folder(format!("`{}` cannot be a store's folder", to.display())));
+    };
+    make_dir(parent)?;
+    let fresh = parent.join(format!(".{}.restoring", name.to_string_lossy()));
+    match fs::remove_dir_all(&fresh) {
+        Err(e) if e.kind() != ErrorKind::NotFound => return Err(disk("cannot remove", &fresh)(e)),
+        _ => {}
+    }
+    let made = verified(backup, &fresh, &manifest).await;
+    if let Err(e) = made {
+        // What went wrong matters more than how cleaning up goes; the next try cleans up as well.
+        let _ = fs::remove_dir_all(&fresh);
+        return Err(e);
+    }
+    fs::rename(&fresh, &to).map_err(disk("cannot make", &to))?;
+    sync(parent)?;
+    Ok(manifest.summary())
+}
+
+/// Makes a store of a backup in `fresh`, and checks it as `fsck` does.
+async fn verified(backup: &Path, fresh: &Path, manifest: &Manifest) -> Result<(), BackupError> {
+    let (from, to, parts) = (backup.to_owned(), fresh.to_owned(), manifest.clone());
+    let ended = |e: tokio::task::JoinError| BackupError::Damaged(format!("the copying ended early: {e}"));
+    tokio::task::spawn_blocking(move || copy_back(&from, &to, &parts)).await.map_err(ended)??;
+    let unsound = |problem: String| {
+        BackupError::Damaged(format!("the backup is not whole, and no store was made of it: {problem}"))
+    };
+    let read = ReadStore::open(fresh).await.map_err(|e| unsound(e.to_string()))?;
+    let problems = read.fsck().await?.problems;
+    read.close().await;
+    match problems.first() {
+        None => Ok(()),
+        Some(first) => Err(unsound(format!("{} problems; the first: {first}", problems.len()))),
+    }
+}
+
+fn copy_back(backup: &Path, fresh: &Path, manifest: &Manifest) -> Result<(), BackupError> {
+    let copy = |from: &Path, to: &Path, digest: Digest| {
+        // Not linked: a store must not share its files with what is to bring it back.
+        fs::copy(from, to).map_err(disk("cannot copy", from))?;
+        expect(to, digest)?;
+        sync(to)
+    };
+    make_dir(&fresh.join("blobs/sha256"))?;
+    copy(&backup.join(&manifest.database), &fresh.join(db::FILE), manifest.database_digest)?;
+    let mut shards = BTreeSet::new();
+    for digest in manifest.blobs.keys() {
+        let to = blob_path(fresh, *digest);
+        let shard = to.parent().unwrap_or(fresh).to_owned();
+        if shards.insert(shard.clone()) {
+            make_dir(&shard)?;
+        }
+        copy(&blob_path(backup, *digest), &to, *digest)?;
+    }
+    identity::mark_blobs(fresh, &manifest.store).map_err(disk("cannot write to", fresh))?;
+    File::create(fresh.join("lock")).map_err(disk("cannot write to", fresh))?;
+    shards.iter().try_for_each(|shard| sync(shard))?;
+    sync(&fresh.join("blobs/sha256"))?;
+    sync(fresh)
+}
