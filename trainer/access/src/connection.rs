@@ -112,8 +112,8 @@ pub fn explain(error: &reqwest::Error) -> String {
     let advice = [
         ("InvalidContentType", "it does not speak TLS there: is it `http://`?"),
         ("UnknownIssuer", "its certificate is signed by nobody who is trusted: is --ca the right file?"),
-        ("NotValidForName", "its certificate is for another name: ask it by a name that stands in the certificate"),
-        ("Expired", "its certificate has expired"),
+        ("not valid for name", "its certificate is for another name: ask it by a name that stands in the certificate"),
+        ("certificate expired", "make a new one, or set the clock"),
     ];
     match advice.iter().find(|(sign, _)| text.contains(sign)) {
         Some((_, advice)) => format!("{text}; {advice}"),

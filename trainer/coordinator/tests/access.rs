@@ -1,5 +1,5 @@
 //! Who is let in, and what those who are not can cost: tokens, scopes, names, TLS, and crowds of strangers.
-#![allow(clippy::unwrap_used, reason = "a test may panic")]
+#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a test may panic, and prints what it measured")]
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};

@@ -15,4 +15,4 @@ pub const SUBMISSION_BYTES: usize = 8 << 20;
 /// Bytes of a blob.
 pub const BLOB_BYTES: usize = 8 << 30;
 /// Bytes of all calls together, blobs excepted, that are in memory at a time; more wait.
-pub const CALLS_BYTES: usize = 128 << 20;
+pub const CALLS_BYTES: usize = 32 << 20;

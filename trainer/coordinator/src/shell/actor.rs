@@ -89,10 +89,14 @@ impl ActorHandle {
 
     /// Submits a pipeline.
     pub(crate) async fn submit(&self, submit: Submit) -> Result<RunId, Refused> {
-        let pipeline: Pipeline = serde_json::from_value(submit.pipeline).map_err(|e| {
-            Rejected::Invalid(format!("the pipeline does not parse: {e}; was it made by another build?"))
-        })?;
-        pipeline.check().map_err(Rejected::Invalid)?;
+        // Beside the threads that answer heartbeats: a large one takes a while.
+        let read = effects::blocking(move || {
+            let pipeline: Pipeline = serde_json::from_value(submit.pipeline)
+                .map_err(|e| format!("the pipeline does not parse: {e}; was it made by another build?"))?;
+            pipeline.check()?;
+            Ok(pipeline)
+        });
+        let pipeline = read.await.map_err(Rejected::Invalid)?;
         let event = Event::Submit {
             pipeline: Box::new(pipeline),
             source: submit.source,

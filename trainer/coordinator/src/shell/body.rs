@@ -19,7 +19,7 @@ use super::effects::blocking;
 
 /// How long a body may say nothing.
 const SILENCE: Duration = Duration::from_secs(30);
-/// Larger bodies are parsed beside the threads that answer heartbeats.
+/// Larger bodies wait for memory, and are parsed beside the threads that answer heartbeats.
 const LARGE: usize = 64 << 10;
 
 /// A body that ends with an error when its sender pauses for too long.
@@ -87,10 +87,15 @@ impl<S: Sync, T: DeserializeOwned + Send + 'static> FromRequest<S> for Message<T
             let message = "expected `content-type: application/json`".to_owned();
             return Err(Failure::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "invalid", message));
         }
-        // As much as it may become if it does not say how long it is.
+        // As much as it may become if it does not say how long it is. Small ones, heartbeats among them, queue behind nobody.
         let most = HttpBody::size_hint(request.body()).upper().and_then(|most| usize::try_from(most).ok());
-        let kibibytes = most.unwrap_or(route.body).min(route.body).div_ceil(1 << 10);
-        let permit = gate.bodies.clone().acquire_many_owned(u32::try_from(kibibytes).unwrap_or(u32::MAX)).await;
+        let most = most.unwrap_or(route.body).min(route.body);
+        let permit = if most > LARGE {
+            let kibibytes = u32::try_from(most.div_ceil(1 << 10)).unwrap_or(u32::MAX);
+            Some(gate.bodies.clone().acquire_many_owned(kibibytes).await)
+        } else {
+            None
+        };
         let bytes = axum::body::to_bytes(request.into_body(), route.body).await.map_err(|e| unread(&e, route.body))?;
         let parsed = if bytes.len() > LARGE {
             blocking(move || serde_json::from_slice(&bytes)).await

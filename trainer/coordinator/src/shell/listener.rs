@@ -9,7 +9,7 @@ use std::convert::Infallible;
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::body::Body;
 use axum::extract::Request;
@@ -35,6 +35,8 @@ const HEAD_BYTES: usize = 64 << 10;
 const HANDSHAKE: Duration = Duration::from_secs(10);
 /// How long to wait when there is no descriptor for another connection.
 const PAUSE: Duration = Duration::from_millis(20);
+/// So long a stranger may stay whoever comes: time to show a token. A flood of newcomers waits meanwhile.
+const GRACE: Duration = Duration::from_millis(50);
 
 /// How many connections there may be, and how long one may say nothing.
 #[derive(Debug, Clone)]
@@ -73,7 +75,13 @@ struct Crowd {
     open: AtomicUsize,
     next: AtomicU64,
     /// By arrival.
-    strangers: Mutex<BTreeMap<u64, Arc<Notify>>>,
+    strangers: Mutex<BTreeMap<u64, Stranger>>,
+}
+
+#[derive(Debug)]
+struct Stranger {
+    since: Instant,
+    leave: Arc<Notify>,
 }
 
 /// One connection, as its requests see it.
@@ -91,22 +99,30 @@ impl Crowd {
         let full = self.open.load(Ordering::Relaxed) >= self.limits.most;
         if full || strangers.len() >= self.limits.strangers {
             match strangers.pop_first() {
-                Some((_, oldest)) => oldest.notify_one(),
+                Some((_, oldest)) => oldest.leave.notify_one(),
                 None if full => return None,
                 None => {}
             }
         }
         self.open.fetch_add(1, Ordering::Relaxed);
         let (id, leave) = (self.next.fetch_add(1, Ordering::Relaxed), Arc::new(Notify::new()));
-        strangers.insert(id, Arc::clone(&leave));
+        strangers.insert(id, Stranger { since: Instant::now(), leave: Arc::clone(&leave) });
         Some(Arc::new(Peer { id, crowd: Arc::clone(self), leave }))
     }
 
     /// Sends the oldest stranger away.
     fn make_room(&self) {
         if let Some((_, oldest)) = self.strangers.lock().unwrap_or_else(PoisonError::into_inner).pop_first() {
-            oldest.notify_one();
+            oldest.leave.notify_one();
         }
+    }
+
+    /// How long the next newcomer waits so that the stranger who goes for it has had its time.
+    fn wait(&self) -> Option<Duration> {
+        let strangers = self.strangers.lock().unwrap_or_else(PoisonError::into_inner);
+        let full = strangers.len() >= self.limits.strangers || self.open.load(Ordering::Relaxed) >= self.limits.most;
+        let oldest = strangers.first_key_value().filter(|_| full)?.1;
+        GRACE.checked_sub(oldest.since.elapsed()).filter(|wait| !wait.is_zero())
     }
 }
 
@@ -171,6 +187,9 @@ async fn accept(listener: Listener, router: axum::Router, crowd: Arc<Crowd>) {
             }
         };
         while connections.try_join_next().is_some() {}
+        while let Some(wait) = crowd.wait() {
+            tokio::time::sleep(wait).await;
+        }
         let Some(peer) = crowd.enter() else {
             connections.spawn(async move {
                 let _ = tokio::time::timeout(HANDSHAKE, turn_away(stream)).await;
