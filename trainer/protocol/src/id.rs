@@ -136,6 +136,13 @@ pub fn is_name(text: &str) -> bool {
         && bytes.all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
 }
 
+/// Whether `text` names a stage that a user writes: `[a-z][a-z0-9_-]*`, at most 64. Names that the program makes have dots.
+pub fn is_stage_name(text: &str) -> bool {
+    is_name(text)
+        && text.starts_with(|c: char| c.is_ascii_lowercase())
+        && text.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || matches!(b, b'_' | b'-'))
+}
+
 impl FromStr for ModelName {
     type Err = ParseNameError;
 

@@ -64,6 +64,16 @@ pub enum Domain {
     LogUniform(f64, f64),
 }
 
+impl Domain {
+    /// How many values it lists.
+    pub fn choices(&self) -> usize {
+        match self {
+            Self::Choice(values) => values.len(),
+            Self::Uniform(..) | Self::LogUniform(..) => 0,
+        }
+    }
+}
+
 /// Values of the searched settings by their path, such as `adversarial` or `network.width`.
 pub type Values = BTreeMap<String, Value>;
 
@@ -89,7 +99,7 @@ pub struct Sweep {
 }
 
 /// More trials than this are a mistake.
-pub const MAX_TRIALS: usize = 10_000;
+pub const MAX_TRIALS: usize = crate::limits::TRIALS;
 
 impl Sweep {
     /// Steps after which trials are compared; the last is `budget`, the steps of the stage.

@@ -26,21 +26,22 @@ pub struct Diagnostic {
     pub message: String,
     /// What to do.
     pub help: Option<String>,
-    /// The text of the line.
-    pub text: String,
+    /// The part of the line around the column, at most 110 characters and two ellipses.
+    pub excerpt: String,
+    /// Where the caret stands below it, from 1.
+    pub caret: usize,
 }
 
 impl fmt::Display for Diagnostic {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { source, line, column, message, text, .. } = self;
+        let Self { source, line, column, message, excerpt, caret, .. } = self;
         if source.starts_with("--set ") {
             write!(f, "{source}: {message}")?;
         } else {
             writeln!(f, "{source}:{line}:{column}: {message}")?;
-            let (shown, shift) = window(text, *column);
             let number = line.to_string();
-            writeln!(f, "  {number} | {shown}")?;
-            write!(f, "  {:>width$} | {:>caret$}", "", "^", width = number.len(), caret = shift)?;
+            writeln!(f, "  {number} | {excerpt}")?;
+            write!(f, "  {:>width$} | {:>caret$}", "", "^", width = number.len())?;
         }
         if let Some(help) = &self.help {
             write!(f, "\n    = {help}")?;
@@ -50,8 +51,15 @@ impl fmt::Display for Diagnostic {
 }
 
 /// The part of a line around a column, at most 110 characters, and where the caret stands in it.
-fn window(text: &str, column: usize) -> (String, usize) {
-    let characters: Vec<char> = text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+pub(super) fn window(text: &str, column: usize) -> (String, usize) {
+    // A line may be as long as the file, which is not copied for each of its mistakes.
+    let skipped = column.saturating_sub(256);
+    let part = text.chars().skip(skipped).take(512).map(|c| if c.is_control() { ' ' } else { c });
+    let (shown, caret) = window_of(part.collect(), column - skipped);
+    if skipped > 0 && !shown.starts_with("...") { (format!("...{shown}"), caret + 3) } else { (shown, caret) }
+}
+
+fn window_of(characters: Vec<char>, column: usize) -> (String, usize) {
     let column = column.clamp(1, characters.len() + 1);
     if characters.len() <= 110 {
         return (characters.into_iter().collect(), column);
@@ -63,7 +71,7 @@ fn window(text: &str, column: usize) -> (String, usize) {
     (format!("{before}{shown}{after}"), column - from + before.len())
 }
 
-/// All mistakes of a file, in the order of their places. Never empty as an error.
+/// The mistakes of a file, in the order of their places, the first [`limits::MISTAKES`](crate::limits::MISTAKES) of them. Never empty as an error.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Diagnostics(pub Vec<Diagnostic>);
 

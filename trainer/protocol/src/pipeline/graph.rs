@@ -5,7 +5,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::rules::Problems;
 use super::{PipelineStage, StageInput};
 use crate::stage::{Neighbours, Register, StageSettings};
-use crate::{ArtifactKind, StageName};
+use crate::sweep::Domain;
+use crate::{ArtifactKind, StageName, limits};
+
+/// Stages that a message lists.
+const LISTED: usize = 20;
 
 /// Problems by stage.
 pub(super) type ByStage = BTreeMap<StageName, Problems>;
@@ -78,36 +82,69 @@ fn cycle(stages: &[PipelineStage], placed: &BTreeSet<&StageName>) -> Vec<StageNa
     path
 }
 
+/// What all stages together may ask for. The problem is one of the stage with which a bound is passed.
+pub(super) fn check_totals(stages: &[PipelineStage], found: &mut ByStage) {
+    let (mut shards, mut trials, mut values) = (0_u64, 0_usize, 0_usize);
+    let most_values = limits::SWEPT_VALUES.min(limits::SWEPT_CHECKS / stages.len().max(1));
+    for stage in stages {
+        let before = (shards, trials, values);
+        shards += u64::from(stage.settings.shards());
+        if let Some(sweep) = &stage.sweep {
+            trials += sweep.trials();
+            values += sweep.space.values().map(Domain::choices).sum::<usize>();
+        }
+        let p = found.entry(stage.name.clone()).or_default();
+        if before.0 <= limits::PIPELINE_SHARDS && shards > limits::PIPELINE_SHARDS {
+            let message = format!("the pipeline has more than {} shards up to here", limits::PIPELINE_SHARDS);
+            p.add("shards", message, "take fewer, larger ones");
+        }
+        if before.1 <= limits::TRIALS && trials > limits::TRIALS {
+            let message = format!("the pipeline's sweeps have more than {} trials up to here", limits::TRIALS);
+            p.add("sweep.trials", message, "search in several pipelines");
+        }
+        if before.2 <= most_values && values > most_values {
+            let message = format!("the pipeline's sweeps list more than {most_values} values up to here");
+            p.add("sweep.space", message, "search a range with `uniform`, or in several pipelines");
+        }
+    }
+}
+
 /// References that lead nowhere, or to another kind of thing.
 pub(super) fn check_references(stages: &[PipelineStage], found: &mut ByStage) {
+    let by_name: BTreeMap<&StageName, &PipelineStage> = stages.iter().map(|stage| (&stage.name, stage)).collect();
     for stage in stages {
         for input in &stage.inputs {
             let problems = found.entry(stage.name.clone()).or_default();
             let what = input.kind.noun();
-            let giving: Vec<&str> = stages
-                .iter()
-                .filter(|other| other.settings.output().kind == input.kind && other.name != stage.name)
-                .map(|other| other.name.as_str())
-                .collect();
-            let help = if giving.is_empty() {
-                format!("no stage gives {what}; add one")
-            } else {
-                format!("stages that give {what}: {}", super::schema::list_keys(giving.iter().copied()))
+            let giving = || {
+                let other = stages.iter().filter(|other| other.settings.output().kind == input.kind);
+                other.map(|other| other.name.as_str()).filter(|name| *name != stage.name.as_str())
             };
-            match stages.iter().find(|other| other.name == input.stage) {
+            let help = || {
+                let names: Vec<&str> = giving().take(LISTED).collect();
+                match giving().count() {
+                    0 => format!("no stage gives {what}; add one"),
+                    more if more > LISTED => {
+                        let names = super::schema::list_keys(names);
+                        format!("stages that give {what}: {names} and {} more", more - LISTED)
+                    }
+                    _ => format!("stages that give {what}: {}", super::schema::list_keys(names)),
+                }
+            };
+            match by_name.get(&input.stage).copied() {
                 None if input.stage.as_str().is_empty() => {
                     problems.add(
                         &input.field,
                         format!("`{}` is empty; expected a stage that gives {what}", input.field),
-                        &help,
+                        &help(),
                     );
                 }
                 None => {
-                    let near = super::diagnostic::nearest(input.stage.as_str(), giving.iter().copied());
+                    let near = super::diagnostic::nearest(input.stage.as_str(), giving().take(10 * LISTED));
                     let question = near.map(|near| format!("; did you mean `{near}`?")).unwrap_or_default();
                     let message =
                         format!("`{}` names the stage `{}`, which does not exist{question}", input.field, input.stage);
-                    problems.add(&input.field, message, &help);
+                    problems.add(&input.field, message, &help());
                 }
                 Some(other) if other.settings.output().kind != input.kind => {
                     let message = format!(
@@ -116,7 +153,7 @@ pub(super) fn check_references(stages: &[PipelineStage], found: &mut ByStage) {
                         other.settings.output().kind.noun(),
                         input.field
                     );
-                    problems.add(&input.field, message, &help);
+                    problems.add(&input.field, message, &help());
                 }
                 Some(_) => {}
             }

@@ -7,6 +7,7 @@
 mod diagnostic;
 mod graph;
 mod overrides;
+mod ranges;
 mod read;
 mod reference;
 mod rules;
@@ -15,18 +16,20 @@ mod sweep;
 mod trial;
 mod yaml;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
-use crate::stage::{Backend, ExternalFolder, Placement, StageIdentity, StageSettings, Target};
+use crate::stage::{Backend, ExternalFolder, Placement, Register, StageIdentity, StageSettings, Target};
 use crate::sweep::{Derived, Sweep};
-use crate::{ArtifactKind, Digest, Seed, StageName};
+use crate::{ArtifactKind, Digest, Seed, StageName, limits};
 
 pub use diagnostic::{Diagnostic, Diagnostics};
 pub use read::read;
 pub use reference::{json_schema, markdown};
 
+#[cfg(test)]
+mod range_tests;
 #[cfg(test)]
 mod sweep_tests;
 #[cfg(test)]
@@ -120,46 +123,36 @@ impl Pipeline {
     /// # Errors
     /// What does not hold, a line for each.
     pub fn check(&self) -> Result<(), String> {
+        self.check_size()?;
         let mut wrong = Vec::new();
-        if !crate::id::is_name(&self.name) {
-            wrong.push(format!("`{}` is not a pipeline name", self.name));
-        }
-        for settings in StageSettings::all() {
-            let known = settings.code_version();
-            if let Some(newer) = self.code_versions.get(settings.kind()).filter(|version| **version > known) {
-                let kind = settings.kind();
-                wrong.push(format!(
-                    "it has `{kind}` at code version {newer}, this program computes {known}; use one build for both"
-                ));
+        let computed = StageSettings::all();
+        for (kind, version) in &self.code_versions {
+            match computed.iter().find(|settings| settings.kind() == kind).map(StageSettings::code_version) {
+                Some(known) if *version <= known => {}
+                Some(known) => wrong.push(format!(
+                    "it has `{kind}` at code version {version}, this program computes {known}; use one build for both"
+                )),
+                None => wrong.push(format!("there is no kind `{}`", kind.escape_debug())),
             }
         }
         let mut found = graph::ByStage::new();
-        for (i, stage) in self.stages.iter().enumerate() {
-            if self.stages[..i].iter().any(|other| other.name == stage.name) {
+        let mut before: BTreeSet<&StageName> = BTreeSet::new();
+        for stage in &self.stages {
+            for input in stage.inputs.iter().filter(|input| !before.contains(&input.stage)) {
+                let read = shown(input.stage.as_str());
+                wrong.push(format!("stage `{}` reads `{read}`, which does not come before it", stage.name));
+            }
+            if !before.insert(&stage.name) {
                 wrong.push(format!("two stages are called `{}`", stage.name));
             }
-            let before = |input: &&StageInput| !self.stages[..i].iter().any(|other| other.name == input.stage);
-            for input in stage.inputs.iter().filter(before) {
-                wrong.push(format!("stage `{}` reads `{}`, which does not come before it", stage.name, input.stage));
-            }
-            if stage.derived.is_some() {
-                wrong.push(format!(
-                    "stage `{}` says that a sweep made it; sweeps are unfolded while a run goes on",
-                    stage.name
-                ));
-            }
-            let references = graph::references(&stage.settings);
-            if references.iter().any(|reference| !stage.inputs.contains(reference)) {
-                wrong.push(format!("the inputs of stage `{}` are not those of its settings", stage.name));
-            }
-            if trial::references(stage).iter().any(|reference| !stage.inputs.contains(reference)) {
-                wrong.push(format!("the inputs of stage `{}` are not those of its sweep", stage.name));
-            }
+            wrong.extend(stage.unfit_for_submission());
             let problems = &mut found.entry(stage.name.clone()).or_default().0;
             problems.extend(rules::stage(&stage.settings, &stage.placement));
             problems.extend(sweep::rules(stage));
         }
-        graph::check_references(&self.stages, &mut found);
+        if wrong.is_empty() {
+            graph::check_references(&self.stages, &mut found);
+        }
         if wrong.is_empty() && found.values().all(|problems| problems.0.is_empty()) {
             graph::check_agreement(&self.stages, &mut found);
             sweep::check_agreement(&self.stages, &mut found);
@@ -167,7 +160,35 @@ impl Pipeline {
         for (stage, problems) in &found {
             wrong.extend(problems.0.iter().map(|problem| format!("stage `{stage}`: {}", problem.message)));
         }
+        wrong.truncate(limits::MISTAKES);
         if wrong.is_empty() { Ok(()) } else { Err(wrong.join("\n")) }
+    }
+
+    /// Names and counts, before anything is done that takes longer the more there is.
+    fn check_size(&self) -> Result<(), String> {
+        if !crate::id::is_name(&self.name) {
+            return Err(format!("`{}` is not a pipeline name", shown(&self.name)));
+        }
+        if !(1..=limits::STAGES).contains(&self.stages.len()) {
+            return Err(format!("it has {} stages; expected 1 to {}", self.stages.len(), limits::STAGES));
+        }
+        for stage in &self.stages {
+            if !crate::id::is_stage_name(stage.name.as_str()) {
+                return Err(format!(
+                    "`{}` is not a stage name; expected a small letter, then small letters, digits, `_`, `-`, at most 64",
+                    shown(stage.name.as_str())
+                ));
+            }
+            if stage.inputs.len() > 2 * limits::LIST {
+                return Err(format!("stage `{}` has {} inputs", stage.name, stage.inputs.len()));
+            }
+        }
+        let mut found = graph::ByStage::new();
+        graph::check_totals(&self.stages, &mut found);
+        match found.values().flat_map(|problems| &problems.0).next() {
+            Some(problem) => Err(problem.message.clone()),
+            None => Ok(()),
+        }
     }
 
     /// The identity of `stage`, once the artifacts it reads are known: all that decides its value. `inputs` are artifacts by field; what the
@@ -192,6 +213,43 @@ impl Pipeline {
         let beyond = kinds.filter(|settings| settings.code_version() > FIRST_VERSION);
         self.code_versions = beyond.map(|settings| (settings.kind().to_owned(), settings.code_version())).collect();
     }
+}
+
+impl PipelineStage {
+    /// What a stage that was not read from a file may have wrong besides its settings.
+    fn unfit_for_submission(&self) -> Vec<String> {
+        let mut wrong = Vec::new();
+        let name = &self.name;
+        if self.derived.is_some() || self.settings.training().is_some_and(|training| training.stop.is_some()) {
+            wrong.push(format!("stage `{name}` says that a sweep made it; sweeps are unfolded while a run goes on"));
+        }
+        let (own, swept) = (graph::references(&self.settings), trial::references(self));
+        if own.iter().any(|reference| !self.inputs.contains(reference)) {
+            wrong.push(format!("the inputs of stage `{name}` are not those of its settings"));
+        }
+        if swept.iter().any(|reference| !self.inputs.contains(reference)) {
+            wrong.push(format!("the inputs of stage `{name}` are not those of its sweep"));
+        }
+        let added = |input: &StageInput| {
+            self.settings.get::<Register>().is_some() && input.field == format!("evaluations.{}", input.stage)
+        };
+        for input in self.inputs.iter().filter(|input| !own.contains(input) && !swept.contains(input) && !added(input))
+        {
+            let (field, stage) = (shown(&input.field), shown(input.stage.as_str()));
+            wrong.push(format!("stage `{name}` reads `{stage}` as `{field}`, of which its settings know nothing"));
+        }
+        let folders = self.settings.folders();
+        for field in self.external.keys().filter(|field| folders.iter().all(|folder| folder.field != **field)) {
+            let field = shown(field);
+            wrong.push(format!("stage `{name}` has a digest of `{field}`, which it does not read"));
+        }
+        wrong
+    }
+}
+
+/// A text from outside, for a message: its beginning, without control characters.
+fn shown(text: &str) -> String {
+    yaml::shortened(text).escape_debug().to_string()
 }
 
 /// The code version of every kind that has not changed yet.

@@ -4,7 +4,8 @@ use serde_json::Value;
 
 use super::diagnostic::{Position, nearest};
 use super::schema::list_keys;
-use super::yaml::{self, Content, Entry, Node};
+use super::yaml::{self, Budget, Content, Entry, Node};
+use crate::limits;
 
 /// The keys of a pipeline.
 pub(super) const TOP_KEYS: [&str; 6] = ["name", "seed", "backend", "dataset", "text", "stages"];
@@ -13,12 +14,18 @@ pub(super) const TOP_KEYS: [&str; 6] = ["name", "seed", "backend", "dataset", "t
 ///
 /// # Errors
 /// What is wrong with the override.
-pub(super) fn apply(root: &mut Node, text: &str, source: usize) -> Result<(), String> {
+pub(super) fn apply(root: &mut Node, text: &str, source: usize, budget: &mut Budget) -> Result<(), String> {
     let at = Position { source, line: 1, column: 1 };
     let Some((path, value)) = text.split_once('=') else {
         return Err("expected `key.path=value`, such as `stages.vae.lr=1e-4`".into());
     };
     let mut keys: Vec<&str> = path.trim().split('.').collect();
+    if keys.len() > limits::PIPELINE_DEPTH {
+        return Err(format!("its path has {} keys; at most {} are read", keys.len(), limits::PIPELINE_DEPTH));
+    }
+    if let Some(long) = keys.iter().find(|key| key.len() > limits::KEY_BYTES) {
+        return Err(format!("its path has a key of {} bytes; at most {} are read", long.len(), limits::KEY_BYTES));
+    }
     if keys.iter().any(|key| key.is_empty()) {
         return Err(format!("`{path}` is not a path of keys; expected such as `stages.vae.lr`"));
     }
@@ -41,9 +48,9 @@ pub(super) fn apply(root: &mut Node, text: &str, source: usize) -> Result<(), St
     let value = if value.trim().is_empty() {
         Node { at, value: Content::Scalar { value: Value::Null, text: String::new(), plain: true } }
     } else {
-        yaml::parse(value, source).map_err(|mistakes| {
+        yaml::parse(value, source, budget).map_err(|mistakes| {
             let first = mistakes.into_iter().next().map_or_else(String::new, |mistake| mistake.message);
-            format!("the value `{value}` does not parse: {first}")
+            format!("the value `{}` does not parse: {first}", yaml::shortened(value))
         })?
     };
     put(root, &keys, value, at, path.trim())
@@ -75,7 +82,7 @@ fn put(node: &mut Node, keys: &[&str], value: Node, at: Position, path: &str) ->
             put(node, keys, value, at, path)
         }
         Content::Scalar { text, .. } => {
-            Err(format!("`{key}` in `{path}` leads into the value `{text}`, which has no keys"))
+            Err(format!("`{key}` in `{path}` leads into the value `{}`, which has no keys", yaml::shortened(text)))
         }
     }
 }

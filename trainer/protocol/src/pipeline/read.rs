@@ -6,13 +6,14 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::diagnostic::{Diagnostic, Diagnostics, Position, nearest};
+use super::diagnostic::{Diagnostic, Diagnostics, Position, nearest, window};
 use super::overrides::{self, TOP_KEYS};
 use super::rules::{self, Problem};
 use super::schema::{Mistake, list_keys, overlay};
-use super::yaml::{self, Content, Entry, Node};
+use super::yaml::{self, Budget, Content, Entry, Node};
 use super::{Pipeline, PipelineStage, graph};
-use crate::id::is_name;
+use crate::id::{is_name, is_stage_name};
+use crate::limits;
 use crate::stage::{Backend, DataOpen, DataSynthetic, Placement, StageSettings, TextEmbed};
 use crate::sweep::Sweep;
 use crate::{Seed, StageName};
@@ -30,14 +31,17 @@ pub fn read(file: &str, text: &str, sets: &[String]) -> Result<Pipeline, Diagnos
         return Ok(pipeline);
     }
     reader.mistakes.sort_by_key(|mistake| mistake.at);
+    reader.mistakes.truncate(limits::MISTAKES);
     let lines: Vec<&str> = text.lines().collect();
     let render = |mistake: Mistake| {
         let Position { source, line, column } = mistake.at;
         let (source, text) = match source.checked_sub(1).and_then(|i| sets.get(i)) {
-            Some(set) => (format!("--set {set}"), set.clone()),
-            None => (file.to_owned(), lines.get(line - 1).copied().unwrap_or_default().to_owned()),
+            Some(set) => (format!("--set {}", window(set, 1).0), set.as_str()),
+            None => (file.to_owned(), lines.get(line - 1).copied().unwrap_or_default()),
         };
-        Diagnostic { source, line, column, path: mistake.path, message: mistake.message, help: mistake.help, text }
+        let (excerpt, caret) = window(text, column);
+        let Mistake { path, message, help, .. } = mistake;
+        Diagnostic { source, line, column, path, message, help, excerpt, caret }
     };
     Err(Diagnostics(reader.mistakes.into_iter().map(render).collect()))
 }
@@ -84,7 +88,8 @@ impl Reader {
     }
 
     fn pipeline(&mut self, text: &str, sets: &[String]) -> Option<Pipeline> {
-        let mut root = match yaml::parse(text, 0) {
+        let mut budget = Budget::default();
+        let mut root = match yaml::parse(text, 0, &mut budget) {
             Ok(root) => root,
             Err(mistakes) => {
                 for mistake in mistakes {
@@ -99,8 +104,13 @@ impl Reader {
             self.mistake(root.at, "", format!("the document is {found}; expected a mapping"), Some(help));
             return None;
         }
+        if sets.len() > limits::OVERRIDES {
+            let message = format!("there are {} overrides; at most {} are read", sets.len(), limits::OVERRIDES);
+            self.mistake(root.at, "", message, Some("write them into the file".into()));
+            return None;
+        }
         for (i, set) in sets.iter().enumerate() {
-            if let Err(message) = overrides::apply(&mut root, set, i + 1) {
+            if let Err(message) = overrides::apply(&mut root, set, i + 1, &mut budget) {
                 self.mistake(Position { source: i + 1, line: 1, column: 1 }, "", message, None);
             }
         }
@@ -194,6 +204,10 @@ impl Reader {
             Some(entry) => match entry.value.map() {
                 Some([]) => {
                     self.mistake(entry.key_at, "stages", "`stages` is empty; expected at least one stage", None)
+                }
+                Some(entries) if entries.len() > limits::STAGES => {
+                    let message = format!("`stages` has {}; expected at most {}", entries.len(), limits::STAGES);
+                    self.mistake(entry.key_at, "stages", message, Some("split it into several pipelines".into()));
                 }
                 Some(entries) => {
                     for entry in entries {
@@ -379,6 +393,7 @@ impl Reader {
         }
 
         let mut found = BTreeMap::new();
+        graph::check_totals(&stages, &mut found);
         graph::check_references(&stages, &mut found);
         if !all_read {
             // A stage that could not be read may be what a reference is looking for.
@@ -460,11 +475,4 @@ fn stage(name: &str, settings: StageSettings, placement: Placement) -> PipelineS
     let inputs = graph::references(&settings);
     let external = BTreeMap::new();
     PipelineStage { name: name.into(), settings, placement, inputs, external, sweep: None, derived: None }
-}
-
-/// `[a-z][a-z0-9_-]*`, at most 64.
-fn is_stage_name(text: &str) -> bool {
-    is_name(text)
-        && text.starts_with(|c: char| c.is_ascii_lowercase())
-        && text.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || matches!(b, b'_' | b'-'))
 }

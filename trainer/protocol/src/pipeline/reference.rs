@@ -372,7 +372,7 @@ mod tests {
                 continue;
             }
             let text = std::fs::read_to_string(&path).unwrap();
-            let value = yaml::parse(&text, 0).unwrap().to_json().unwrap();
+            let value = yaml::parse(&text, 0, &mut yaml::Budget::default()).unwrap().to_json().unwrap();
             fits(&schema, &value, &schema).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
             for (name, stage) in value["stages"].as_object().unwrap() {
                 for (key, wrong) in

@@ -1,5 +1,6 @@
 //! What must hold of one stage alone: what its kind says, and where it runs. What concerns several stages is in `graph`.
 
+use super::ranges;
 use crate::stage::{Placement, StageSettings};
 pub(super) use crate::stage::{Problem, Problems};
 
@@ -8,6 +9,9 @@ pub(super) fn stage(settings: &StageSettings, placement: &Placement) -> Vec<Prob
     let mut problems = Problems::default();
     settings.check(&mut problems);
     placement.check(&mut problems);
+    for settings in [serde_json::to_value(settings), serde_json::to_value(placement)].iter().flatten() {
+        ranges::check(&mut problems, settings);
+    }
     problems.0
 }
 

@@ -16,7 +16,8 @@ use super::read::Reader;
 use super::rules::{self, Problem, Problems};
 use super::schema::{list_keys, overlay, unknown_key};
 use super::yaml::{Content, Entry, Node};
-use crate::stage::{Mode, StageSettings};
+use crate::limits;
+use crate::stage::{Mode, Placement, StageSettings};
 use crate::sweep::{Domain, MAX_TRIALS, Rungs, SearchKind, Sweep, Values, judged_field, setting, with_values};
 use crate::{ArtifactKind, StageName};
 
@@ -332,9 +333,21 @@ fn nested(keys: &[String], item: &Node) -> Node {
 /// Everything that can be said of a stage's sweep without looking at other stages.
 pub(super) fn rules(stage: &PipelineStage) -> Vec<Problem> {
     let mut problems = Problems::default();
-    let (p, Some(sweep), Some(training)) = (&mut problems, &stage.sweep, stage.settings.training()) else {
+    let (p, Some(sweep)) = (&mut problems, &stage.sweep) else { return problems.0 };
+    let Some(training) = stage.settings.training() else {
+        p.add("sweep", format!("`{}` does not train; only training stages are swept", stage.settings.kind()), "");
         return problems.0;
     };
+    space_rules(p, stage, sweep);
+    if judged_field(&sweep.evaluate, stage.settings.output().kind).is_none()
+        || sweep.evaluate.output().kind != ArtifactKind::Report
+    {
+        let (judge, gives) = (sweep.evaluate.kind(), stage.settings.output().kind.noun());
+        p.add("sweep.evaluate", format!("`{judge}` does not measure {gives}"), "");
+    }
+    if !p.0.is_empty() {
+        return problems.0;
+    }
     if sweep.metric.trim().is_empty() {
         p.add("sweep.metric", "`metric` is missing: the value of `evaluate` that decides which trial is best", "");
     }
@@ -376,8 +389,8 @@ pub(super) fn rules(stage: &PipelineStage) -> Vec<Problem> {
                 format!("`rungs.first` is {first}; expected fewer steps than the stage's {steps}, and at least 1");
             p.add("sweep.rungs.first", message, "the steps after which trials are compared for the first time");
         }
-        if factor < 2 {
-            p.add("sweep.rungs.factor", format!("`rungs.factor` is {factor}; expected at least 2"), "");
+        if !(2..=1000).contains(&factor) {
+            p.add("sweep.rungs.factor", format!("`rungs.factor` is {factor}; expected 2 to 1000"), "");
         }
     } else if sweep.rungs != Rungs::default() {
         let message = format!("`rungs` are for `asha`; with `{}` every trial trains to the end", sweep.search.name());
@@ -399,9 +412,39 @@ pub(super) fn rules(stage: &PipelineStage) -> Vec<Problem> {
             }
         }
     }
-    let judge = rules::stage(&sweep.evaluate, &stage.placement);
-    p.0.extend(judge.into_iter().filter(|problem| !problem.field.starts_with("workers")).map(in_judge));
+    // What is wrong with the stage's placement is said there.
+    p.0.extend(rules::stage(&sweep.evaluate, &Placement::default()).into_iter().map(in_judge));
     problems.0
+}
+
+/// What the reader makes sure of, for a sweep that came as JSON: each path is a setting that may be searched, each domain has values.
+fn space_rules(p: &mut Problems, stage: &PipelineStage, sweep: &Sweep) {
+    let settings = sweep.space.len();
+    if !(1..=limits::SWEPT_SETTINGS).contains(&settings) {
+        let message = format!("`space` has {settings} settings; expected 1 to {}", limits::SWEPT_SETTINGS);
+        p.add("sweep.space", message, "");
+    }
+    if sweep.metric.len() > limits::KEY_BYTES || sweep.metric.contains(char::is_control) {
+        p.add("sweep.metric", "`metric` is not the name of a value", "such as `latent_fid`");
+    }
+    let mut settings = stage.settings.clone();
+    let references: Vec<String> = settings.refs().into_iter().map(|reference| reference.field.into_owned()).collect();
+    for (path, domain) in &sweep.space {
+        let field = format!("sweep.space.{path}");
+        let found = setting(&stage.settings, path).filter(|value| !value.is_object());
+        if found.is_none() || path == "kind" || path == "steps" || references.contains(path) {
+            p.add(&field, format!("`{}` is not a setting that can be searched", path.escape_debug()), "");
+            continue;
+        }
+        let sound = match domain {
+            Domain::Choice(values) => (1..=limits::SWEPT_VALUES).contains(&values.len()),
+            Domain::Uniform(low, high) => low < high && low.is_finite() && high.is_finite(),
+            Domain::LogUniform(low, high) => 0.0 < *low && low < high && high.is_finite(),
+        };
+        if !sound {
+            p.add(&field, format!("`{path}` has no values to try, or more than {}", limits::SWEPT_VALUES), "");
+        }
+    }
 }
 
 /// The values of a domain that are tried before anything runs, with their places below it.

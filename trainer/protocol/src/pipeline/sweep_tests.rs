@@ -45,7 +45,7 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
     ("trials: 24", "parallel: 0", "13:17", &["`parallel` is 0"]),
     ("first: 100,", "first: 900,", "14:22", &["fewer steps than the stage's 900"]),
     ("{first: 100, factor: 3}", "{factor: 3}", "14:14", &["`rungs.first` is 0"]),
-    ("factor: 3", "factor: 1", "14:35", &["`rungs.factor` is 1; expected at least 2"]),
+    ("factor: 3", "factor: 1", "14:35", &["`rungs.factor` is 1; expected 2 to 1000"]),
     ("search: asha", "search: random", "14:14", &["`rungs` are for `asha`"]),
     ("        skip:", "        skp:", "17:9", &["unknown key `skp` in `space` of stage `pcm`; did you mean `skip`?"]),
     ("        skip: {choice: [50, 100]}", "        steps: {choice: [50]}", "17:9", &["`steps` cannot be searched"]),

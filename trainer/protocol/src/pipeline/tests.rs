@@ -299,6 +299,41 @@ fn bombs_are_refused() {
     assert!(read("p.yaml", &shared, &[]).is_ok());
 }
 
+/// What a small text may cost is bounded in bytes too, in the file and in overrides. Each of these took gigabytes, or a stack.
+#[test]
+fn a_small_text_does_not_become_a_large_one() {
+    let refused = |text: &str, part: &str| {
+        let error = read("p.yaml", text, &[]).expect_err(part);
+        let shown = error.to_string();
+        assert!(shown.contains(part), "{part}: {}", &shown[..shown.len().min(500)]);
+        assert!(shown.len() < 1 << 20, "{} bytes of messages", shown.len());
+    };
+    // One long text, repeated.
+    let long = "x".repeat(7_000);
+    refused(&format!("a: &a \"{long}\"\nb: [{}]\n", vec!["*a"; 10_000].join(",")), "bytes of text");
+    refused(&format!("a: \"{}\"", "x".repeat(500 << 10)), "a text of 512000 bytes");
+    refused(&format!("\"{}\": 1", "k".repeat(300)), "a key of 300 bytes");
+    // Anchors within anchors are copies too.
+    let nested = (0..60).map(|i| format!("&a{i} [")).collect::<String>() + &"x,".repeat(2_000) + &"]".repeat(60);
+    refused(&format!("a: {nested}"), "values once aliases are expanded");
+    // Every mistake shows its line; the line is the file.
+    let keys: Vec<String> = (0..9_000).map(|i| format!("unknown_{i}: 1")).collect();
+    refused(&format!("{{{}}}", keys.join(", ")), "unknown key `unknown_0`");
+    let many = read("p.yaml", &format!("{{{}}}", keys.join(", ")), &[]).unwrap_err();
+    assert_eq!(many.0.len(), crate::limits::MISTAKES);
+    let twice = format!("{{{}}}", vec!["a: 1"; 9_000].join(", "));
+    refused(&twice, "stands here a second time");
+    let stages: String = (0..1_001).map(|i| format!("  s{i}: {{kind: train.vae}}\n")).collect();
+    refused(&format!("name: p\ndataset: {{format: synthetic}}\nstages:\n{stages}"), "`stages` has 1001");
+
+    let set = |sets: Vec<String>| read("p.yaml", GOOD, &sets).unwrap_err().to_string();
+    assert!(set(vec![format!("vae.{}=1", vec!["a"; 30_000].join("."))]).contains("its path has 30001 keys"));
+    assert!(set(vec![format!("vae.{}=1", "a".repeat(300))]).contains("a key of 300 bytes"));
+    let bomb = format!("vae.lr=[&a {}, {}]", "x".repeat(1_000), vec!["*a"; 500].join(","));
+    assert!(set(vec![bomb; 40]).contains("once aliases are expanded"), "overrides share one budget");
+    assert!(set(vec!["seed=1".into(); 1_001]).contains("1001 overrides"));
+}
+
 /// Cut, doubled, swapped and overwritten bytes: any answer will do, but no panic.
 #[test]
 fn nothing_makes_the_reader_panic() {

@@ -1,8 +1,9 @@
 //! YAML as a tree whose every key and value knows where it stands.
 //!
 //! Built from the parser's events rather than from a ready-made document type, because we want every duplicate key with
-//! both its places, and limits before anything is allocated: 1 MiB of text, 64 levels, 20,000 nodes after aliases are
-//! expanded. Plain scalars follow the YAML 1.2 core schema, so `no` and `on` are texts.
+//! both its places, and bounds ([`limits`]) that hold before anything is allocated. An alias is a copy of what it names, so
+//! a [`Budget`] counts the values and the bytes of text of every copy, before it is made; a file and its overrides share one.
+//! Plain scalars follow the YAML 1.2 core schema, so `no` and `on` are texts.
 
 use std::collections::HashMap;
 
@@ -10,10 +11,24 @@ use saphyr_parser::{Event, Parser, ScalarStyle, ScanError, Span};
 use serde_json::{Number, Value};
 
 use super::diagnostic::Position;
+use crate::limits;
 
-const MAX_BYTES: usize = 1 << 20;
-const MAX_DEPTH: usize = 64;
-const MAX_NODES: usize = 20_000;
+/// What may still be read.
+#[derive(Debug)]
+pub(super) struct Budget(Size);
+
+impl Default for Budget {
+    fn default() -> Self {
+        Self(Size { values: limits::PIPELINE_VALUES, bytes: limits::PIPELINE_TEXT_BYTES })
+    }
+}
+
+/// What a value takes in memory.
+#[derive(Debug, Clone, Copy)]
+struct Size {
+    values: usize,
+    bytes: usize,
+}
 
 /// A value and where it begins.
 #[derive(Debug, Clone)]
@@ -69,6 +84,23 @@ impl Node {
         }
     }
 
+    fn size(&self) -> Size {
+        let mut size = Size { values: 1, bytes: 0 };
+        let mut add = |other: Size| {
+            size.values += other.values;
+            size.bytes += other.bytes;
+        };
+        match &self.value {
+            Content::Scalar { text, .. } => add(Size { values: 0, bytes: text.len() }),
+            Content::List(items) => items.iter().map(Self::size).for_each(add),
+            Content::Map(entries) => entries.iter().for_each(|entry| {
+                add(Size { values: 1, bytes: entry.key.len() });
+                add(entry.value.size());
+            }),
+        }
+        size
+    }
+
     /// As JSON; `None` if a number in it is not finite.
     pub(super) fn to_json(&self) -> Option<Value> {
         Some(match &self.value {
@@ -88,18 +120,21 @@ impl Node {
     /// For a message: `the text `x``, `the number 3`, `a list`.
     pub(super) fn describe(&self) -> String {
         match &self.value {
-            Content::Scalar { text, plain: true, .. } if is_not_finite(text) => format!("`{text}`"),
+            Content::Scalar { text, plain: true, .. } if is_not_finite(text) => format!("`{}`", shortened(text)),
             Content::Scalar { value: Value::Null, .. } => "nothing".into(),
             Content::Scalar { value: Value::Bool(flag), .. } => format!("the flag `{flag}`"),
-            Content::Scalar { value: Value::Number(_), text, .. } => format!("the number `{text}`"),
-            Content::Scalar { text, .. } => {
-                let short: String = text.chars().take(40).collect();
-                format!("the text `{short}{}`", if short.len() < text.len() { "..." } else { "" })
-            }
+            Content::Scalar { value: Value::Number(_), text, .. } => format!("the number `{}`", shortened(text)),
+            Content::Scalar { text, .. } => format!("the text `{}`", shortened(text)),
             Content::List(items) => format!("a list of {}", items.len()),
             Content::Map(_) => "a mapping".into(),
         }
     }
+}
+
+/// The beginning of a text, for a message.
+pub(super) fn shortened(text: &str) -> String {
+    let short: String = text.chars().take(40).collect();
+    if short.len() < text.len() { short + "..." } else { short }
 }
 
 /// `.nan`, `.inf`, `nan`, `inf`, or digits that overflow.
@@ -135,13 +170,13 @@ fn resolve(text: &str) -> Value {
 }
 
 /// Reads one document. `source` tells positions of different texts apart.
-pub(super) fn parse(text: &str, source: usize) -> Result<Node, Vec<YamlError>> {
+pub(super) fn parse(text: &str, source: usize, budget: &mut Budget) -> Result<Node, Vec<YamlError>> {
     let start = Position { source, line: 1, column: 1 };
     let fail = |message: String| vec![YamlError { at: start, message, help: None }];
-    if text.len() > MAX_BYTES {
-        return Err(fail(format!("the text has {} bytes; at most {MAX_BYTES} are read", text.len())));
+    if text.len() as u64 > limits::PIPELINE_BYTES {
+        return Err(fail(format!("the text has {} bytes; at most {} are read", text.len(), limits::PIPELINE_BYTES)));
     }
-    let mut builder = Builder { source, nodes: 0, anchors: HashMap::new(), mistakes: Vec::new() };
+    let mut builder = Builder { source, budget, anchors: HashMap::new(), mistakes: Vec::new() };
     let mut parser = Parser::new_from_str(text.strip_prefix('\u{feff}').unwrap_or(text));
     let mut root = None;
     loop {
@@ -181,14 +216,14 @@ enum Stop {
     Limit,
 }
 
-struct Builder {
+struct Builder<'b> {
     source: usize,
-    nodes: usize,
-    anchors: HashMap<usize, (Node, usize)>,
+    budget: &'b mut Budget,
+    anchors: HashMap<usize, (Node, Size)>,
     mistakes: Vec<YamlError>,
 }
 
-impl Builder {
+impl Builder<'_> {
     fn position(&self, span: Span) -> Position {
         // The parser counts lines from 1 and columns from 0.
         Position { source: self.source, line: span.start.line().max(1), column: span.start.col() + 1 }
@@ -212,13 +247,20 @@ impl Builder {
         self.mistakes.push(YamlError { at, message: format!("this is not YAML: {}", error.info()), help });
     }
 
-    fn count(&mut self, span: Span, nodes: usize) -> Result<(), Stop> {
-        self.nodes += nodes;
-        if self.nodes > MAX_NODES {
-            self.mistake(span, format!("the document has more than {MAX_NODES} values once aliases are expanded"));
-            return Err(Stop::Limit);
-        }
-        Ok(())
+    /// Takes `size` off the budget, or says that there is not so much left.
+    fn take(&mut self, span: Span, size: Size) -> Result<(), Stop> {
+        let left = &mut self.budget.0;
+        let (values, bytes) = (left.values.checked_sub(size.values), left.bytes.checked_sub(size.bytes));
+        let (what, limit) = match (values, bytes) {
+            (Some(values), Some(bytes)) => {
+                *left = Size { values, bytes };
+                return Ok(());
+            }
+            (None, _) => ("values", limits::PIPELINE_VALUES),
+            (_, None) => ("bytes of text", limits::PIPELINE_TEXT_BYTES),
+        };
+        self.mistake(span, format!("there are more than {limit} {what} once aliases are expanded"));
+        Err(Stop::Limit)
     }
 
     fn next<'a>(parser: &mut Parser<'a, saphyr_parser::StrInput<'a>>) -> Result<(Event<'a>, Span), Stop> {
@@ -237,27 +279,34 @@ impl Builder {
         depth: usize,
     ) -> Result<Node, Stop> {
         let at = self.position(span);
-        if depth > MAX_DEPTH {
-            self.mistake(span, format!("values are nested more than {MAX_DEPTH} deep"));
+        if depth > limits::PIPELINE_DEPTH {
+            self.mistake(span, format!("values are nested more than {} deep", limits::PIPELINE_DEPTH));
             return Err(Stop::Limit);
         }
-        let before = self.nodes;
-        self.count(span, 1)?;
         let (value, anchor) = match event {
             Event::Alias(id) => {
-                let Some((node, size)) = self.anchors.get(&id).cloned() else {
+                let Some(size) = self.anchors.get(&id).map(|(_, size)| *size) else {
                     self.mistake(span, "this alias refers to a value that contains it".into());
                     return Err(Stop::Limit);
                 };
-                self.count(span, size)?;
-                return Ok(node);
+                self.take(span, size)?;
+                return self.anchors.get(&id).map(|(node, _)| node.clone()).ok_or(Stop::Limit);
             }
             Event::Scalar(text, style, anchor, _) => {
+                if text.len() > limits::TEXT_BYTES {
+                    self.mistake(
+                        span,
+                        format!("a text of {} bytes; at most {} are read", text.len(), limits::TEXT_BYTES),
+                    );
+                    return Err(Stop::Limit);
+                }
+                self.take(span, Size { values: 1, bytes: text.len() })?;
                 let plain = style == ScalarStyle::Plain;
                 let value = if plain { resolve(&text) } else { Value::String(text.to_string()) };
                 (Content::Scalar { value, text: text.into_owned(), plain }, anchor)
             }
             Event::SequenceStart(anchor, _) => {
+                self.take(span, Size { values: 1, bytes: 0 })?;
                 let mut items = Vec::new();
                 loop {
                     let (event, span) = Self::next(parser)?;
@@ -268,7 +317,10 @@ impl Builder {
                 }
                 (Content::List(items), anchor)
             }
-            Event::MappingStart(anchor, _) => (Content::Map(self.entries(parser, depth)?), anchor),
+            Event::MappingStart(anchor, _) => {
+                self.take(span, Size { values: 1, bytes: 0 })?;
+                (Content::Map(self.entries(parser, depth)?), anchor)
+            }
             _ => {
                 self.mistake(span, "a value was expected here".into());
                 return Err(Stop::Limit);
@@ -276,7 +328,9 @@ impl Builder {
         };
         let node = Node { at, value };
         if anchor != 0 {
-            self.anchors.insert(anchor, (node.clone(), self.nodes - before));
+            let size = node.size();
+            self.take(span, size)?;
+            self.anchors.insert(anchor, (node.clone(), size));
         }
         Ok(node)
     }
@@ -287,7 +341,11 @@ impl Builder {
         depth: usize,
     ) -> Result<Vec<Entry>, Stop> {
         let mut entries: Vec<Entry> = Vec::new();
+        let mut lines: HashMap<String, usize> = HashMap::new();
         loop {
+            if self.mistakes.len() >= limits::MISTAKES {
+                return Err(Stop::Limit);
+            }
             let (event, span) = Self::next(parser)?;
             if matches!(event, Event::MappingEnd | Event::StreamEnd) {
                 return Ok(entries);
@@ -299,13 +357,17 @@ impl Builder {
                 self.mistake(span, "a key must be a text, not a list or a mapping".into());
                 continue;
             };
-            if let Some(first) = entries.iter().find(|entry| entry.key == text) {
-                let message =
-                    format!("the key `{text}` stands here a second time; the first is in line {}", first.key_at.line);
+            if text.len() > limits::KEY_BYTES {
+                self.mistake(span, format!("a key of {} bytes; at most {} are read", text.len(), limits::KEY_BYTES));
+                return Err(Stop::Limit);
+            }
+            if let Some(first) = lines.get(&text) {
+                let message = format!("the key `{text}` stands here a second time; the first is in line {first}");
                 let help = Some("keep one of the two".to_owned());
                 self.mistakes.push(YamlError { at: key.at, message, help });
                 continue;
             }
+            lines.insert(text.clone(), key.at.line);
             entries.push(Entry { key: text, key_at: key.at, value });
         }
     }

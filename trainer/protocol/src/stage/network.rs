@@ -4,6 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::Problems;
+use crate::limits;
 
 /// A model's size. The published networks: width 256, 9 layers, 4 heads, feed-forward 1024, dropout 0.1.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -38,9 +39,13 @@ impl Network {
             ("network.feed_forward", self.feed_forward),
         ] {
             p.positive(field, value);
-            if value > 65_536 {
-                p.add(field, format!("`{field}` is {value}; expected at most 65536"), "");
-            }
+        }
+        // Four projections of attention and two of the feed-forward block.
+        let wide = self.width.saturating_mul(4).saturating_add(self.feed_forward.saturating_mul(2));
+        let parameters = self.width.saturating_mul(wide).saturating_mul(self.layers);
+        if parameters > limits::PARAMETERS && parameters < usize::MAX {
+            let message = format!("its layers have {parameters} parameters; expected at most {}", limits::PARAMETERS);
+            p.add("network", message, "take fewer layers, or narrower ones");
         }
         if self.layers > 0 && self.layers.is_multiple_of(2) {
             let message = format!("`network.layers` is {}; expected an odd number", self.layers);

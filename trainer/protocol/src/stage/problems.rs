@@ -1,5 +1,7 @@
 //! What does not hold of a stage, collected by its checks.
 
+use crate::limits;
+
 /// A rule that does not hold.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Problem {
@@ -51,8 +53,18 @@ impl Problems {
 
     /// Shards of a map stage.
     pub(crate) fn shards(&mut self, shards: usize) {
-        if !(1..=100_000).contains(&shards) {
-            self.add("shards", format!("`shards` is {shards}; expected 1 to 100000"), "");
+        if !(1..=limits::SHARDS).contains(&(shards as u64)) {
+            self.add("shards", format!("`shards` is {shards}; expected 1 to {}", limits::SHARDS), "");
+        }
+    }
+
+    /// What is kept in memory at once for all of `factors`.
+    pub(crate) fn product(&mut self, field: &str, factors: &[(&str, usize)], most: usize) {
+        let product = factors.iter().fold(1_usize, |product, (_, factor)| product.saturating_mul(*factor));
+        // A factor that is out of range by itself is said so where it stands.
+        if product > most && factors.iter().all(|(_, factor)| *factor <= most) {
+            let names = factors.iter().map(|(name, _)| format!("`{name}`")).collect::<Vec<_>>().join(" x ");
+            self.add(field, format!("{names} is {product}; expected at most {most}"), "");
         }
     }
 }

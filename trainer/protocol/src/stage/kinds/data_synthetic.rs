@@ -37,9 +37,6 @@ impl StageSpec for DataSynthetic {
 
     fn check(&self, p: &mut Problems) {
         p.positive("clips", self.clips);
-        if self.clips > 1_000_000 {
-            p.add("clips", format!("`clips` is {}; expected at most 1000000", self.clips), "");
-        }
         p.fraction("val", self.val, true);
         p.fraction("test", self.test, true);
         if (0.0..1.0).contains(&self.val) && (0.0..1.0).contains(&self.test) && self.val + self.test >= 1.0 {

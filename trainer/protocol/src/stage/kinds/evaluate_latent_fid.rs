@@ -70,6 +70,7 @@ impl StageSpec for EvaluateLatentFid {
         p.positive("repeats", self.repeats);
         p.positive("samples", self.samples);
         p.positive("components", self.components);
+        p.product("samples", &[("repeats", self.repeats), ("samples", self.samples)], 1_000);
         p.shards(self.shards);
     }
 
@@ -81,7 +82,7 @@ impl StageSpec for EvaluateLatentFid {
             stages.is_teacher(p, &self.teacher);
         }
         if let Some(latent) = stages.vae_of_latents(&self.latents).and_then(|vae| stages.latent(vae)) {
-            let size = latent.tokens * latent.dim;
+            let size = latent.tokens.saturating_mul(latent.dim);
             if self.components > size {
                 let message = format!("`components` is {}, but a latent has only {size} numbers", self.components);
                 p.add("components", message, "");

@@ -3,8 +3,8 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::ArtifactKind;
 use crate::stage::{Neighbours, Output, Problems, Ref, Sampler, Shape, Split, StageSpec};
+use crate::{ArtifactKind, limits};
 
 /// How different the motions of one caption are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -102,6 +102,11 @@ impl StageSpec for EvaluateT2m {
         p.positive("repeats", self.repeats);
         p.shards(self.shards);
         let MultiModality { captions, samples, pairs } = self.multimodality;
+        p.product(
+            "multimodality.samples",
+            &[("repeats", self.repeats), ("multimodality.captions", captions), ("multimodality.samples", samples)],
+            limits::EVALUATED_MOTIONS,
+        );
         if captions > 0 && !(1..=samples).contains(&pairs) {
             let message = format!("`multimodality.pairs` is {pairs}; expected 1 to `samples`, {samples}");
             p.add("multimodality.pairs", message, "");

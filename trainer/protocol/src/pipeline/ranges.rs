@@ -1,0 +1,172 @@
+//! The range of every numeric setting, by its path in the stage: what no network, no evaluation and no schedule needs more of.
+//!
+//! A bound is far above what the papers use and far below what ends in an overflow or in all of a machine's memory. Rules that depend on
+//! other settings stand in `rules`; these here need the path alone, so that one walk over the serialised settings checks them all and a test
+//! can try every one of them. The kinds share the table: one path means one thing.
+
+use serde_json::Value;
+
+use super::rules::{Problem, Problems};
+use crate::limits;
+
+/// The numbers that a setting may be, both ends included.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Range {
+    /// Whole numbers.
+    Whole(u64, u64),
+    /// Any numbers.
+    Real(f64, f64),
+}
+
+use Range::{Real, Whole};
+
+/// Range and unit by path; entries of a list have the path of the list.
+const RANGES: &[(&str, Range, &str)] = &[
+    // Data.
+    ("clips", Whole(1, 100_000), "clips"),
+    ("val", Real(0.0, 1.0), "of the clips"),
+    ("test", Real(0.0, 1.0), "of the clips"),
+    ("crops", Whole(1, 256), "crops of an entry"),
+    ("shards", Whole(1, limits::SHARDS), "shards"),
+    // Networks.
+    ("latent.tokens", Whole(1, 4_096), "tokens"),
+    ("latent.dim", Whole(1, 16_384), "numbers a token"),
+    ("network.width", Whole(1, 16_384), "channels"),
+    ("network.layers", Whole(1, 255), "layers"),
+    ("network.heads", Whole(1, 1_024), "heads"),
+    ("network.feed_forward", Whole(1, 65_536), "channels"),
+    ("network.dropout", Real(0.0, 1.0), ""),
+    ("network.movement", Whole(1, 4_096), "channels"),
+    ("network.motion", Whole(1, 4_096), "channels"),
+    ("network.text", Whole(1, 4_096), "channels"),
+    ("network.embedding", Whole(1, 4_096), "channels"),
+    ("guidance_dim", Whole(4, 16_384), "channels"),
+    // Training.
+    ("steps", Whole(1, 1_000_000_000), "steps"),
+    ("warmup", Whole(0, 1_000_000_000), "steps"),
+    ("batch.global", Whole(1, 65_536), "examples"),
+    ("batch.slices", Whole(1, 4_096), "slices"),
+    ("lr", Real(0.0, 1e3), ""),
+    ("discriminator_lr", Real(0.0, 1e3), ""),
+    ("optimizer.beta1", Real(0.0, 1.0), ""),
+    ("optimizer.beta2", Real(0.0, 1.0), ""),
+    ("optimizer.eps", Real(0.0, 1.0), ""),
+    ("optimizer.weight_decay", Real(0.0, 1e3), ""),
+    ("discriminator_optimizer.beta1", Real(0.0, 1.0), ""),
+    ("discriminator_optimizer.beta2", Real(0.0, 1.0), ""),
+    ("discriminator_optimizer.eps", Real(0.0, 1.0), ""),
+    ("discriminator_optimizer.weight_decay", Real(0.0, 1e3), ""),
+    ("max_grad_norm", Real(0.0, 1e6), ""),
+    ("ema", Real(0.0, 1.0), ""),
+    ("dropout", Real(0.0, 1.0), ""),
+    ("guidance_dropout", Real(0.0, 1.0), "of the captions"),
+    ("loss.feature", Real(0.0, 1e6), ""),
+    ("loss.joint", Real(0.0, 1e6), ""),
+    ("loss.velocity", Real(0.0, 1e6), ""),
+    ("loss.kl", Real(0.0, 1e6), ""),
+    ("loss.joint_from", Real(0.0, 1.0), "of the steps"),
+    ("windows.min", Whole(1, 10_000), "frames"),
+    ("windows.max", Whole(1, 10_000), "frames"),
+    ("windows.until", Real(0.0, 1.0), "of the steps"),
+    ("windows.batch", Whole(0, 65_536), "examples"),
+    ("movement.until", Real(0.0, 1.0), "of the steps"),
+    ("movement.window", Whole(1, 10_000), "frames"),
+    ("movement.batch", Whole(0, 65_536), "examples"),
+    ("movement.sparsity", Real(0.0, 1e6), ""),
+    ("movement.smoothness", Real(0.0, 1e6), ""),
+    ("emphasis", Real(0.0, 1e6), ""),
+    ("margin", Real(0.0, 1e6), ""),
+    // Distillation.
+    ("guidance", Real(0.0, 1e3), ""),
+    ("skip", Whole(1, 1_000), "timesteps"),
+    ("huber_c", Real(0.0, 1e6), ""),
+    ("phases", Whole(1, 1_000), "phases"),
+    ("adversarial", Real(0.0, 1e6), ""),
+    // Evaluation.
+    ("sampler.steps", Whole(1, 1_000), "steps"),
+    ("sampler.guidance", Real(0.0, 1e3), ""),
+    ("sampler.timesteps", Whole(0, 999), ""),
+    ("repeats", Whole(1, 100), "repeats"),
+    ("samples", Whole(1, 100), "samples of an entry"),
+    ("components", Whole(1, 4_096), "components"),
+    ("multimodality.captions", Whole(0, 1_000), "captions"),
+    ("multimodality.samples", Whole(0, 1_000), "samples of a caption"),
+    ("multimodality.pairs", Whole(0, 1_000), "pairs of a caption"),
+    // Placement.
+    ("workers.min", Whole(1, 10_000), "workers"),
+    ("workers.max", Whole(0, 10_000), "workers"),
+    ("checkpoint.every", Whole(0, 1_000_000_000), "steps"),
+    ("checkpoint.keep.latest", Whole(1, 10_000), "checkpoints"),
+    ("checkpoint.keep.best", Whole(0, 10_000), "checkpoints"),
+];
+
+/// The range of the setting at `path`, and what it counts. One that the table does not name, such as a new kind's, keeps a range in which
+/// nothing overflows; `number` tells whether it is a whole one.
+pub(super) fn range(path: &str, number: &Value) -> (Range, &'static str) {
+    let general = if number.is_f64() { Real(-1e9, 1e9) } else { Whole(0, 65_536) };
+    let found = RANGES.iter().find(|(of, ..)| *of == path);
+    found.map_or((general, ""), |(_, range, unit)| (*range, *unit))
+}
+
+impl Range {
+    /// Whether `value`, a JSON number, lies in it.
+    fn holds(self, value: &Value) -> bool {
+        match self {
+            Whole(from, to) => value.as_u64().is_some_and(|value| (from..=to).contains(&value)),
+            Real(from, to) => value.as_f64().is_some_and(|value| (from..=to).contains(&value)),
+        }
+    }
+
+    fn describe(self, unit: &str) -> String {
+        let range = match self {
+            Whole(from, to) => format!("{from} to {to}"),
+            Real(from, to) => format!("a number from {from} to {to}"),
+        };
+        if unit.is_empty() { range } else { format!("{range} {unit}") }
+    }
+}
+
+/// Adds what is out of range in `settings`, as JSON; a field that `p` has a problem of already is left alone.
+pub(super) fn check(p: &mut Problems, settings: &Value) {
+    let mut found = Problems::default();
+    walk(&mut found, "", "", settings);
+    let known = |problem: &Problem| p.0.iter().any(|other| other.field == problem.field);
+    let new: Vec<Problem> = found.0.into_iter().filter(|problem| !known(problem)).collect();
+    p.0.extend(new);
+}
+
+/// `field` is where `value` stands, with indices; `path` is the same without them.
+fn walk(p: &mut Problems, field: &str, path: &str, value: &Value) {
+    match value {
+        Value::Object(map) => {
+            for (key, value) in map {
+                let below = |parent: &str| if parent.is_empty() { key.clone() } else { format!("{parent}.{key}") };
+                walk(p, &below(field), &below(path), value);
+            }
+        }
+        Value::Array(items) if items.len() > limits::LIST => {
+            p.add(field, format!("`{path}` has {} entries; expected at most {}", items.len(), limits::LIST), "");
+        }
+        Value::Array(items) => {
+            // What is wrong with a list of numbers is said of the list, as its other rules do.
+            let texts = items.iter().any(Value::is_string);
+            for (i, item) in items.iter().enumerate() {
+                let field = if texts { format!("{field}[{i}]") } else { field.to_owned() };
+                walk(p, &field, path, item);
+            }
+        }
+        Value::String(text) if text.len() > limits::TEXT_BYTES => {
+            p.add(field, format!("`{path}` has {} bytes; expected at most {}", text.len(), limits::TEXT_BYTES), "");
+        }
+        Value::String(text) if text.contains(char::is_control) => {
+            p.add(field, format!("`{path}` holds a control character, {}", text.escape_debug()), "write it without");
+        }
+        Value::Number(_) => {
+            let (range, unit) = range(path, value);
+            if !range.holds(value) {
+                p.add(field, format!("`{path}` is {value}; expected {}", range.describe(unit)), "");
+            }
+        }
+        Value::String(_) | Value::Bool(_) | Value::Null => {}
+    }
+}
