@@ -10,10 +10,11 @@ use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::path::Path;
 
-use protocol::Digest;
 use protocol::stage::DataFormat;
+use protocol::{Digest, limits};
 
-use crate::dataset::{OpenError, Problem, ProblemKind, Split};
+use crate::dataset::{MANY_PROBLEMS, OpenError, Problem, ProblemKind, Split, is_clip_id};
+use crate::files;
 
 /// The digest of what is in the folder `path`; all that is missing or unreadable at once otherwise.
 pub fn folder_digest(path: &Path, format: DataFormat) -> Result<Digest, OpenError> {
@@ -28,16 +29,31 @@ pub fn folder_digest(path: &Path, format: DataFormat) -> Result<Digest, OpenErro
     let mut ids = BTreeSet::new();
     for split in Split::ALL {
         let name = format!("{split}.txt");
-        let Some(bytes) = hash(path, &name, true, &mut listing, &mut problems) else { continue };
-        let text = String::from_utf8_lossy(&bytes);
-        ids.extend(text.lines().map(str::trim).filter(|id| !id.is_empty()).map(str::to_owned));
+        let file = path.join(&name);
+        let bytes = files::read(&file, limits::CLIP_LIST_BYTES);
+        if let Ok(bytes) = &bytes {
+            let text = String::from_utf8_lossy(bytes);
+            ids.extend(text.lines().map(str::trim).filter(|id| !id.is_empty()).map(str::to_owned));
+        }
+        problems.extend(add(&mut listing, &name, &file, true, bytes.map(|bytes| Digest::of(&bytes))));
     }
     for name in ["Mean.npy", "Std.npy"] {
-        hash(path, name, true, &mut listing, &mut problems);
+        let file = path.join(name);
+        problems.extend(add(&mut listing, name, &file, true, files::digest(&file)));
     }
     for id in &ids {
-        hash(path, &format!("new_joint_vecs/{id}.npy"), false, &mut listing, &mut problems);
-        hash(path, &format!("texts/{id}.txt"), false, &mut listing, &mut problems);
+        if !is_clip_id(id) {
+            let what = format!("{}: `{}` is not a clip id", path.display(), id.escape_debug());
+            problems.push(Problem { kind: ProblemKind::Text, what });
+            continue;
+        }
+        for name in [format!("new_joint_vecs/{id}.npy"), format!("texts/{id}.txt")] {
+            let file = path.join(&name);
+            problems.extend(add(&mut listing, &name, &file, false, files::digest(&file)));
+        }
+        if problems.len() > MANY_PROBLEMS {
+            break;
+        }
     }
     if problems.is_empty() {
         Ok(Digest::of(listing.as_bytes()))
@@ -47,50 +63,36 @@ pub fn folder_digest(path: &Path, format: DataFormat) -> Result<Digest, OpenErro
 }
 
 /// The digest of a file, or of all files in a folder and below it by their paths. Times and permissions do not count.
+///
+/// # Errors
+/// What stands in the way, with its path.
 pub fn files_digest(path: &Path) -> std::io::Result<Digest> {
-    if path.is_file() {
-        return Ok(Digest::of(&std::fs::read(path)?));
+    if !path.is_dir() {
+        return files::digest(path);
     }
     let mut listing = "stride/files/1\n".to_owned();
-    let mut folders = vec![path.to_owned()];
-    let mut files = BTreeSet::new();
-    while let Some(folder) = folders.pop() {
-        for entry in std::fs::read_dir(&folder)? {
-            let entry = entry?.path();
-            if entry.is_dir() {
-                folders.push(entry);
-            } else {
-                files.insert(entry);
-            }
-        }
-    }
-    for file in files {
+    for file in files::tree(path)? {
         let name = file.strip_prefix(path).unwrap_or(&file).to_string_lossy().replace('\\', "/");
-        let digest = Digest::of(&std::fs::read(&file)?).hex();
+        let named = |error: std::io::Error| std::io::Error::new(error.kind(), format!("{}: {error}", file.display()));
+        let digest = files::digest(&file).map_err(named)?.hex();
         writeln!(listing, "{name}\0{digest}").expect("a string takes all that is written");
     }
     Ok(Digest::of(listing.as_bytes()))
 }
 
-/// Adds one file's line to `listing` and gives its bytes. A missing file is a problem only if it is `needed`.
-fn hash(root: &Path, name: &str, needed: bool, listing: &mut String, problems: &mut Vec<Problem>) -> Option<Vec<u8>> {
-    let file = root.join(name);
-    let bytes = match std::fs::read(&file) {
-        Ok(bytes) => Some(bytes),
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound && !needed => None,
+/// Adds one file's line to `listing`. A missing file is a problem only if it is `needed`.
+fn add(listing: &mut String, name: &str, file: &Path, needed: bool, found: std::io::Result<Digest>) -> Option<Problem> {
+    let digest = match found {
+        Ok(digest) => digest.hex(),
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound && !needed => "absent".to_owned(),
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
             let what = format!("{}: no such file; a dataset folder needs it", file.display());
-            problems.push(Problem { kind: ProblemKind::Missing, what });
-            return None;
+            return Some(Problem { kind: ProblemKind::Missing, what });
         }
-        Err(e) => {
-            problems.push(Problem { kind: ProblemKind::Io, what: format!("{}: {e}", file.display()) });
-            return None;
-        }
+        Err(e) => return Some(Problem { kind: ProblemKind::Io, what: format!("{}: {e}", file.display()) }),
     };
-    let digest = bytes.as_deref().map_or_else(|| "absent".to_owned(), |bytes| Digest::of(bytes).hex());
     writeln!(listing, "{name}\0{digest}").expect("a string takes all that is written");
-    bytes
+    None
 }
 
 #[cfg(test)]
@@ -131,6 +133,24 @@ mod tests {
         fs::write(dir.path().join("new_joint_vecs/b.npy"), "3").unwrap();
         assert_ne!(digest(), second);
         assert_ne!(digest(), folder_digest(dir.path(), DataFormat::Kit).unwrap());
+    }
+
+    #[test]
+    fn what_is_no_file_is_named_and_not_waited_for() {
+        let dir = folder();
+        let pipe = dir.path().join("new_joint_vecs/b.npy");
+        fs::remove_file(&pipe).unwrap();
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        fs::create_dir(dir.path().join("texts/c.txt")).unwrap();
+        let error = folder_digest(dir.path(), DataFormat::Humanml3d).unwrap_err().to_string();
+        assert!(error.contains("b.npy: is a named pipe; expected a file"), "{error}");
+        assert!(error.contains("c.txt: is a folder; expected a file"), "{error}");
+        assert!(files_digest(&pipe).unwrap_err().to_string().contains("is a named pipe"));
+        let error = files_digest(dir.path()).unwrap_err().to_string();
+        assert!(error.contains("new_joint_vecs/b.npy: is a named pipe"), "{error}");
+        fs::write(dir.path().join("train.txt"), "../../../etc/passwd\na\u{1b}[31m\n").unwrap();
+        let error = folder_digest(dir.path(), DataFormat::Humanml3d).unwrap_err().to_string();
+        assert!(error.contains("`../../../etc/passwd` is not a clip id") && !error.contains('\u{1b}'), "{error}");
     }
 
     #[test]

@@ -9,6 +9,7 @@
 pub mod dataset;
 pub mod draw;
 pub mod features;
+pub mod files;
 pub mod folder_digest;
 pub mod npy;
 pub mod quaternion;

@@ -4,10 +4,13 @@
 //! message instead of wrong numbers.
 
 use std::fs;
-use std::io::Write as _;
+use std::io::{Error, ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 
 use npyz::{DType, NpyHeader, Order, TypeChar, WriterBuilder as _};
+use protocol::limits;
+
+use crate::files;
 
 /// An array as it lay in the file, row-major.
 #[derive(Debug, Clone, PartialEq)]
@@ -75,22 +78,24 @@ impl NpyError {
     }
 }
 
-/// Reads an f32 array.
+/// Reads an f32 array, one clip's features.
 pub fn read(file: &Path) -> Result<Array, NpyError> {
-    let bytes = fs::read(file).map_err(|source| NpyError::Io { file: file.into(), source })?;
+    let bytes = files::read(file, limits::CLIP_BYTES).map_err(|source| NpyError::Io { file: file.into(), source })?;
     parse(file, &bytes, false)
 }
 
 /// Reads an f32 or f64 array; f64 is rounded. For statistics, which published sets store either way.
 pub fn read_any_float(file: &Path) -> Result<Array, NpyError> {
-    let bytes = fs::read(file).map_err(|source| NpyError::Io { file: file.into(), source })?;
+    let bytes = files::read(file, limits::ARRAY_BYTES).map_err(|source| NpyError::Io { file: file.into(), source })?;
     parse(file, &bytes, true)
 }
 
 /// Reads an array from bytes; `file` only names it in errors.
 pub fn parse(file: &Path, bytes: &[u8], allow_f64: bool) -> Result<Array, NpyError> {
+    let header_error = |source| NpyError::Header { file: file.into(), source };
+    check_header(bytes).map_err(|what| header_error(Error::new(ErrorKind::InvalidData, what)))?;
     let mut rest = bytes;
-    let header = NpyHeader::from_reader(&mut rest).map_err(|source| NpyError::Header { file: file.into(), source })?;
+    let header = NpyHeader::from_reader(&mut rest).map_err(header_error)?;
     let expected = if allow_f64 { "f32 or f64 (<f4, <f8)" } else { "f32 (<f4)" };
     let wrong_type = |found: String| NpyError::Type { file: file.into(), found, expected };
     let width = match header.dtype() {
@@ -110,14 +115,41 @@ pub fn parse(file: &Path, bytes: &[u8], allow_f64: bool) -> Result<Array, NpyErr
     if found != expected {
         return Err(NpyError::Size { file: file.into(), shape: header.shape().to_vec(), expected, found });
     }
-    let shape = header.shape().iter().map(|n| *n as usize).collect();
+    let shape: Vec<usize> = header.shape().iter().map(|n| *n as usize).collect();
     let body = npyz::NpyFile::with_header(header, rest);
     let data = if width == 4 {
         body.into_vec::<f32>()
     } else {
         body.into_vec::<f64>().map(|v| v.into_iter().map(|x| x as f32).collect())
     };
-    Ok(Array { shape, data: data.map_err(|source| NpyError::Header { file: file.into(), source })? })
+    Ok(Array { shape, data: data.map_err(header_error)? })
+}
+
+/// What the header's reader takes on trust: how long it is, for which it makes room, and a shape, whose axes it multiplies.
+fn check_header(bytes: &[u8]) -> Result<(), String> {
+    let [b'\x93', b'N', b'U', b'M', b'P', b'Y', major, _, rest @ ..] = bytes else {
+        return Err("it does not begin as one".into());
+    };
+    let (length, rest) = match (major, rest) {
+        (1, [a, b, rest @ ..]) => (u32::from(u16::from_le_bytes([*a, *b])), rest),
+        (2 | 3, [a, b, c, d, rest @ ..]) => (u32::from_le_bytes([*a, *b, *c, *d]), rest),
+        (1..=3, _) => return Err("its header is cut off".into()),
+        (other, _) => return Err(format!("version {other}, expected 1 to 3")),
+    };
+    if length as usize > limits::ARRAY_HEADER_BYTES {
+        return Err(format!("a header of {length} bytes, expected at most {}", limits::ARRAY_HEADER_BYTES));
+    }
+    let header = rest.get(..length as usize).ok_or("its header is cut off")?;
+    let header = String::from_utf8_lossy(header);
+    for after in header.split("shape").skip(1) {
+        let axes = after.split_once('(').and_then(|(_, axes)| axes.split_once(')')).map_or("", |(axes, _)| axes);
+        let axes = axes.split(',').map(str::trim).filter(|axis| !axis.is_empty());
+        let mut numbers = axes.map(|axis| axis.parse::<u64>().map_err(|_| "a shape that is not made of numbers"));
+        numbers.try_fold(1_u64, |product, axis| {
+            product.checked_mul(axis?).ok_or("a shape with more elements than can be counted")
+        })?;
+    }
+    Ok(())
 }
 
 /// An f32 array as the bytes of a `.npy` file.
@@ -153,5 +185,64 @@ mod tests {
             "{cut}"
         );
         assert!(matches!(parse(file, b"hello", false), Err(NpyError::Header { .. })));
+    }
+
+    /// A file of `version` whose header is `header` and says that it has `length` bytes.
+    fn with_header(version: u8, length: u32, header: &[u8], data: &[u8]) -> Vec<u8> {
+        let mut bytes = b"\x93NUMPY".to_vec();
+        bytes.extend([version, 0]);
+        match version {
+            1 => bytes.extend((length as u16).to_le_bytes()),
+            _ => bytes.extend(length.to_le_bytes()),
+        }
+        bytes.extend(header);
+        bytes.extend(data);
+        bytes
+    }
+
+    #[test]
+    fn a_header_that_asks_for_much_gets_nothing() {
+        let file = Path::new("clip.npy");
+        let refuse = |bytes: &[u8], part: &str| {
+            let said = parse(file, bytes, true).unwrap_err().to_string();
+            assert!(said.contains(part), "{part}: {said}");
+        };
+        refuse(&with_header(2, u32::MAX, b"{}", b""), "a header of 4294967295 bytes");
+        refuse(&with_header(1, 900, b"{}", b""), "cut off");
+        refuse(&with_header(9, 2, b"{}", b""), "version 9");
+        let shaped = |shape: &str, data: &[u8]| {
+            let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n");
+            with_header(1, header.len() as u32, header.as_bytes(), data)
+        };
+        let most = u64::MAX;
+        refuse(&shaped(&format!("({most}, {most})"), b""), "more elements than can be counted");
+        refuse(&shaped("(4611686018427387904, 4)", b""), "more elements than can be counted");
+        refuse(&shaped("(0xffffffffffffffff, 2)", b""), "not made of numbers");
+        refuse(&shaped(&format!("({most},)"), b""), "truncated");
+        // Axes of zero ask for nothing, whatever the others are.
+        assert_eq!(parse(file, &shaped("(0, 9000000000)", b""), false).unwrap().data, [0.0; 0]);
+        let nested = "(".repeat(900);
+        assert!(parse(file, &with_header(1, 900, nested.as_bytes(), b""), false).is_err());
+    }
+
+    proptest::proptest! {
+        /// Any answer will do, but no panic and no more memory than the file has.
+        #[test]
+        fn no_bytes_break_the_reader(
+            bytes in proptest::collection::vec(proptest::prelude::any::<u8>(), 0..300),
+            cut in 0_usize..200,
+            at in 0_usize..200,
+            byte in proptest::prelude::any::<u8>(),
+        ) {
+            let file = Path::new("clip.npy");
+            let _ = parse(file, &bytes, true);
+            let mut good = to_bytes(&[2, 9], &[1.0; 18]).unwrap();
+            let place = at % good.len();
+            good[place] = byte;
+            good.truncate(good.len() - cut % good.len());
+            if let Ok(array) = parse(file, &good, true) {
+                proptest::prop_assert!(array.data.len() <= 18);
+            }
+        }
     }
 }

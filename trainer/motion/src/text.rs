@@ -1,11 +1,13 @@
 //! Captions: the line grammar of the `texts/` folder, the token form of the evaluators, and the built-in embedding.
 //!
 //! A line is `caption#token token ...#from#to`, a token `word/POS`, the times seconds (`nan` reads as 0). Both times 0
-//! mean that the caption describes the whole clip. Source of grammar, classes and word lists: the HumanML3D and
+//! mean that the caption describes the whole clip. As in the published loaders, fields behind the times are not looked at, and a caption whose
+//! times make no range is not used; see [`Oddity`]. Source of grammar, classes and word lists: the HumanML3D and
 //! text-to-motion data definitions.
 
 use std::path::{Path, PathBuf};
 
+use protocol::limits;
 use serde::{Deserialize, Serialize};
 
 /// Width of [`hashed_embedding`].
@@ -58,24 +60,30 @@ impl Caption {
         (!self.is_whole()).then_some(((self.from_s * fps) as usize, (self.to_s * fps) as usize))
     }
 
-    /// Reads one line. The error says what is wrong, without file and line.
+    /// Reads one line, whatever range its times make. The error says what is wrong, without file and line.
     pub fn parse(line: &str) -> Result<Self, String> {
-        let fields: Vec<&str> = line.trim().split('#').collect();
-        let [text, tokens, from, to] = fields[..] else {
-            return Err(format!("{} field(s) separated by `#`, expected 4", fields.len()));
+        if line.len() > limits::CAPTION_BYTES {
+            return Err(format!("{} bytes, at most {} are read", line.len(), limits::CAPTION_BYTES));
+        }
+        let mut fields = line.trim().split('#');
+        let (Some(text), Some(tokens), Some(from), Some(to)) =
+            (fields.next(), fields.next(), fields.next(), fields.next())
+        else {
+            return Err(format!("{} field(s) separated by `#`, expected 4", line.trim().split('#').count()));
         };
         if text.trim().is_empty() {
             return Err("the caption is empty".into());
         }
         let tokens: Vec<String> = tokens.split_whitespace().map(str::to_owned).collect();
         if let Some(token) = tokens.iter().find(|t| split_token(t).is_none()) {
-            return Err(format!("token `{token}` is not `word/POS`"));
+            return Err(format!("token `{}` is not `word/POS`", token.escape_debug()));
         }
-        let (from_s, to_s) = (seconds(from)?, seconds(to)?);
-        if (from_s, to_s) != (0.0, 0.0) && to_s <= from_s {
-            return Err(format!("the time range {from_s} to {to_s} s is empty"));
-        }
-        Ok(Self { text: text.to_owned(), tokens, from_s, to_s })
+        Ok(Self { text: text.to_owned(), tokens, from_s: seconds(from)?, to_s: seconds(to)? })
+    }
+
+    /// Whether its times describe the whole clip or a part of it.
+    fn has_range(&self) -> bool {
+        self.is_whole() || (self.from_s >= 0.0 && self.from_s < self.to_s && self.to_s.is_finite())
     }
 
     /// The line that [`Caption::parse`] reads.
@@ -85,14 +93,9 @@ impl Caption {
 }
 
 fn seconds(text: &str) -> Result<f64, String> {
-    let value: f64 = text.trim().parse().map_err(|_| format!("time `{text}` is not a number of seconds"))?;
-    if value.is_nan() {
-        return Ok(0.0);
-    }
-    if !value.is_finite() || value < 0.0 {
-        return Err(format!("time `{text}` is not a number of seconds from 0 on"));
-    }
-    Ok(value)
+    let value: f64 =
+        text.trim().parse().map_err(|_| format!("time `{}` is not a number of seconds", text.escape_debug()))?;
+    Ok(if value.is_nan() { 0.0 } else { value })
 }
 
 /// Word and POS of a token that has exactly these two parts.
@@ -100,16 +103,46 @@ pub fn split_token(token: &str) -> Option<(&str, &str)> {
     token.split_once('/').filter(|(word, pos)| !word.is_empty() && !pos.is_empty() && !pos.contains('/'))
 }
 
-/// Reads a text file: line number and caption of every line that is not blank, or every line that does not parse.
-pub fn parse_file(file: &Path, content: &str) -> Result<Vec<(usize, Caption)>, Vec<TextError>> {
-    let (mut captions, mut errors) = (vec![], vec![]);
+/// What the published loaders pass over in silence.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Oddity {
+    /// The times make no range: the caption is not used. As the line has them.
+    Times(String),
+    /// The line has so many fields: those behind the fourth are not looked at.
+    ExtraFields(usize),
+}
+
+/// What a text file gives, by line.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Texts {
+    /// Captions that describe a clip or a part of it.
+    pub captions: Vec<(usize, Caption)>,
+    /// What is odd about which line.
+    pub odd: Vec<(usize, Oddity)>,
+}
+
+/// Reads a text file: every line that is not blank, or every line that does not parse.
+pub fn parse_file(file: &Path, content: &str) -> Result<Texts, Vec<TextError>> {
+    let (mut texts, mut errors) = (Texts::default(), vec![]);
     for (i, line) in content.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
-        match Caption::parse(line) {
-            Ok(caption) => captions.push((i + 1, caption)),
-            Err(what) => errors.push(TextError { file: file.into(), line: i + 1, what }),
+        let caption = match Caption::parse(line) {
+            Ok(caption) => caption,
+            Err(what) => {
+                errors.push(TextError { file: file.into(), line: i + 1, what });
+                continue;
+            }
+        };
+        let fields = line.trim().split('#').count();
+        if fields > 4 {
+            texts.odd.push((i + 1, Oddity::ExtraFields(fields)));
+        }
+        if caption.has_range() {
+            texts.captions.push((i + 1, caption));
+        } else {
+            texts.odd.push((i + 1, Oddity::Times(format!("{} to {} s", caption.from_s, caption.to_s))));
         }
     }
-    if errors.is_empty() { Ok(captions) } else { Err(errors) }
+    if errors.is_empty() { Ok(texts) } else { Err(errors) }
 }
 
 /// Tokens as the evaluators take them: `sos/OTHER`, at most 20 tokens, `eos/OTHER`, filled up to 22 with `unk/OTHER`;
@@ -258,13 +291,60 @@ mod tests {
             ("a#a#0.0#0.0", "`a` is not"),
             ("a#a/b/c#0.0#0.0", "`a/b/c`"),
             ("a#a/DET#zero#0.0", "`zero`"),
-            ("a#a/DET#-1#0.0", "from 0 on"),
-            ("a#a/DET#3#2", "empty"),
+            (&format!("{}#a/DET#0#0", "a".repeat(9_000)), "9010 bytes"),
         ] {
             let error = Caption::parse(line).unwrap_err();
             assert!(error.contains(part), "{line}: {error}");
         }
         let errors = parse_file(Path::new("texts/1.txt"), "a#a/DET#0#0\n\nb#b\n").unwrap_err();
         assert!(errors[0].to_string().starts_with("texts/1.txt:3: 2 field(s)"), "{}", errors[0]);
+    }
+
+    #[test]
+    fn what_upstream_passes_over_is_passed_over_and_told() {
+        let lines = [
+            "whole#whole/ADJ#0.0#nan",
+            "part#part/NOUN#1.0#4.5",
+            "inverted#a/DET#4.5#1.0",
+            "empty#a/DET#2#2",
+            "negative#a/DET#-1#3",
+            "endless#a/DET#0#inf",
+            "more#a/DET#0.0#0.0#5#x",
+            "both#a/DET#3#1#0",
+        ];
+        let texts = parse_file(Path::new("1.txt"), &lines.join("\n")).unwrap();
+        let used: Vec<(usize, &str)> = texts.captions.iter().map(|(line, c)| (*line, c.text.as_str())).collect();
+        assert_eq!(used, [(1, "whole"), (2, "part"), (7, "more")]);
+        let times = |line, range: &str| (line, Oddity::Times(range.to_owned()));
+        let expected = [
+            times(3, "4.5 to 1 s"),
+            times(4, "2 to 2 s"),
+            times(5, "-1 to 3 s"),
+            times(6, "0 to inf s"),
+            (7, Oddity::ExtraFields(6)),
+            (8, Oddity::ExtraFields(5)),
+            times(8, "3 to 1 s"),
+        ];
+        assert_eq!(texts.odd, expected);
+    }
+
+    proptest::proptest! {
+        /// A line is read or explained; what is read has a range that frames can be cut by.
+        #[test]
+        fn no_line_breaks_the_reader(
+            line in "\\PC{0,40}(#[a-z/ ]{0,20}){0,2}(#(nan|inf|-?[0-9]{0,3}(\\.[0-9]{0,3})?|1e400)){0,4}",
+            junk in "(?s).{0,60}",
+        ) {
+            for line in [&line, &junk] {
+                let _ = Caption::parse(line);
+                if let Ok(texts) = parse_file(Path::new("1.txt"), line) {
+                    for (_, caption) in texts.captions {
+                        if let Some((from, to)) = caption.frames(20.0) {
+                            proptest::prop_assert!(from <= to);
+                        }
+                    }
+                }
+            }
+        }
     }
 }

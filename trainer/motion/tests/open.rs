@@ -146,6 +146,74 @@ fn what_the_rules_leave_out_is_reported() {
     assert!(report.to_string().contains("too short, train (1)"));
 }
 
+/// What the published loaders skip in silence is skipped, and told with file and line.
+#[test]
+fn odd_captions_are_left_out_and_listed() {
+    let (folder, ids) = folder();
+    let text = folder.path().join(format!("texts/{}.txt", ids[0]));
+    let lines = ["whole#whole/ADJ#0#0", "inverted#a/DET#4#1", "more#a/DET#0#0#9", "past#a/DET#900#901"];
+    fs::write(&text, lines.join("\n")).unwrap();
+    fs::write(folder.path().join(format!("texts/{}.txt", ids[1])), "inverted#a/DET#4#1\n").unwrap();
+    let (dataset, report) = Dataset::open(folder.path(), DataFormat::Humanml3d).unwrap();
+    let reasons: Vec<_> = report.skips.iter().map(|s| (s.id.as_str(), s.reason.clone())).collect();
+    let inverted = |line| SkipReason::CaptionTimes { line, range: "4 to 1 s".into() };
+    assert_eq!(
+        reasons,
+        [
+            (ids[0].as_str(), inverted(2)),
+            (ids[0].as_str(), SkipReason::ExtraFields { line: 3, fields: 5 }),
+            (ids[0].as_str(), SkipReason::CaptionRange { line: 4, frames: 0 }),
+            (ids[1].as_str(), inverted(1)),
+            (ids[1].as_str(), SkipReason::NoCaption),
+        ]
+    );
+    let entry = dataset.entries.iter().find(|e| e.id == ids[0]).unwrap();
+    let captions: Vec<&str> = entry.captions.iter().map(|c| dataset.captions[*c].text.as_str()).collect();
+    assert_eq!(captions, ["whole", "more"]);
+    let shown = report.to_string();
+    assert!(shown.contains(&format!("texts/{}.txt:2 (4 to 1 s)", ids[0])), "{shown}");
+    assert!(shown.contains(&format!("texts/{}.txt:3 (5 fields)", ids[0])), "{shown}");
+}
+
+/// Pipes, circles of links, sockets and folders where files should be: each is named at once, none is waited for.
+#[test]
+fn what_is_no_file_is_named() {
+    let (folder, ids) = folder();
+    let motion = |i: usize| folder.path().join(format!("new_joint_vecs/{}.npy", ids[i]));
+    let text = |i: usize| folder.path().join(format!("texts/{}.txt", ids[i]));
+    let fifo = |path: &Path| {
+        fs::remove_file(path).unwrap();
+        assert!(std::process::Command::new("mkfifo").arg(path).status().unwrap().success());
+    };
+    fifo(&motion(0));
+    fifo(&text(1));
+    fs::remove_file(motion(2)).unwrap();
+    fs::create_dir(motion(2)).unwrap();
+    fs::remove_file(motion(3)).unwrap();
+    std::os::unix::fs::symlink(motion(3), motion(3)).unwrap();
+    fs::remove_file(text(4)).unwrap();
+    let _socket = std::os::unix::net::UnixListener::bind(text(4)).unwrap();
+    fs::write(text(5), format!("{}#a/DET#0#0", "a".repeat(2 << 20))).unwrap();
+    let error = open_error(folder.path());
+    assert_eq!(error.problems.len(), 6, "{error}");
+    for (path, part) in [
+        (motion(0), "is a named pipe; expected a file"),
+        (text(1), "is a named pipe; expected a file"),
+        (motion(2), "is a folder; expected a file"),
+        (motion(3), "symbolic link"),
+        (text(4), "is a socket; expected a file"),
+        (text(5), "has more than 1048576 bytes"),
+    ] {
+        let wanted = path.display().to_string();
+        let line =
+            error.problems.iter().find(|p| p.what.contains(&wanted)).unwrap_or_else(|| panic!("{wanted}: {error}"));
+        assert!(line.kind == ProblemKind::Io && line.what.contains(part), "{line}");
+    }
+    fifo(&folder.path().join("train.txt"));
+    fifo(&folder.path().join("Mean.npy"));
+    expect(&open_error(folder.path()), ProblemKind::Io, &["train.txt: is a named pipe", "Mean.npy: is a named pipe"]);
+}
+
 #[test]
 fn nothing_to_train_on_is_an_error() {
     let (folder, ids) = folder();

@@ -9,9 +9,9 @@ use std::path::Path;
 
 use checkpoint::Blobs;
 use motion::dataset::Caption;
-use motion::npy;
 use motion::text::{MAX_TOKENS, POS_CLASSES, hashed_word, padded_tokens, pos_class, split_token};
-use protocol::{Digest, Manifest};
+use motion::{files, npy};
+use protocol::{Digest, Manifest, limits};
 use pytorch_reader::{PickleValue, PytorchReader};
 use serde::{Deserialize, Serialize};
 
@@ -91,6 +91,10 @@ impl Words {
         };
         let file = folder.join("our_vab_idx.pkl");
         let wanted = "expected a pickled dict from word to row";
+        let (_, length) = files::open(&file).map_err(|e| bad(&file, e.to_string()))?;
+        if length > limits::VOCABULARY_BYTES {
+            return Err(bad(&file, format!("has {length} bytes; at most {} are read", limits::VOCABULARY_BYTES)));
+        }
         let value = PytorchReader::read_pickle_data(&file, None).map_err(|e| bad(&file, format!("{e}; {wanted}")))?;
         let PickleValue::Dict(dict) = value else { return Err(bad(&file, wanted.into())) };
         let mut index = HashMap::with_capacity(dict.len());
@@ -99,7 +103,11 @@ impl Words {
                 PickleValue::Int(row) if usize::try_from(row).is_ok_and(|row| row < rows) => {
                     index.insert(word, row as usize);
                 }
-                other => return Err(bad(&file, format!("`{word}` has the row {other:?}, expected 0 to {}", rows - 1))),
+                PickleValue::Int(row) => {
+                    let word = word.escape_debug();
+                    return Err(bad(&file, format!("`{word}` has the row {row}, but there are {rows} vectors")));
+                }
+                _ => return Err(bad(&file, format!("`{}` has no row; {wanted}", word.escape_debug()))),
             }
         }
         for word in ["sos", "eos", UNKNOWN] {

@@ -9,6 +9,8 @@
 //! * A caption whose two times are 0 belongs to the whole clip; any other becomes an entry of its own over frames
 //!   `trunc(from * fps) .. trunc(to * fps)`, under the same length rule. The loaders name such entries with random
 //!   letters; ours are named by their frames, so that the same folder always gives the same dataset.
+//! * A time range that is inverted, empty, negative or not finite cuts no frames upstream, and its caption is dropped; fields behind the times
+//!   are not looked at. Both are reported with file and line.
 //! * KIT times are read at KIT's 12.5 fps. (Some loaders use 20 for both. Published KIT texts carry no times, so no
 //!   published number depends on it, and seconds should be seconds.)
 //! * `007975` and `M007975` of HumanML3D are known to hold NaN in some builds. They are skipped by name then; NaN in any
@@ -16,15 +18,16 @@
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fmt;
-use std::fs;
 use std::path::{Path, PathBuf};
 
+use protocol::limits;
 use protocol::stage::DataFormat;
 
 use super::{Clip, Dataset, Entry, Split};
+use crate::files;
 use crate::npy::{self, NpyError};
 use crate::skeleton::Skeleton;
-use crate::text::{self, Caption};
+use crate::text::{self, Oddity, Texts};
 
 /// Clips of the published HumanML3D that hold NaN in some builds.
 const KNOWN_NOT_FINITE: [&str; 2] = ["007975", "M007975"];
@@ -40,6 +43,8 @@ pub struct OpenError {
 
 /// How many problems are printed one by one.
 const PRINTED: usize = 40;
+/// After so many nobody reads on.
+pub(crate) const MANY_PROBLEMS: usize = 1_000;
 
 impl fmt::Display for OpenError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -140,6 +145,20 @@ pub enum SkipReason {
         /// Frames in the range.
         frames: usize,
     },
+    /// The time range of a caption begins behind its end, or is no range from 0 on.
+    CaptionTimes {
+        /// Line of the text file.
+        line: usize,
+        /// As the line has it, in seconds.
+        range: String,
+    },
+    /// A caption line has fields behind its times; the caption itself is used.
+    ExtraFields {
+        /// Line of the text file.
+        line: usize,
+        /// Fields of the line, 4 expected.
+        fields: usize,
+    },
     /// Listed twice in one split.
     Repeated,
     /// One of the published clips that are known to hold NaN.
@@ -156,6 +175,8 @@ impl SkipReason {
             Self::NoText => "no file in texts",
             Self::NoCaption => "no usable caption",
             Self::CaptionRange { .. } => "caption dropped: its time range is too short or too long",
+            Self::CaptionTimes { .. } => "caption dropped: its time range is inverted, empty or not from 0 on",
+            Self::ExtraFields { .. } => "fields behind a caption's times not looked at",
             Self::Repeated => "listed twice",
             Self::KnownNotFinite => "known to hold NaN",
         }
@@ -175,12 +196,14 @@ pub struct Skip {
 
 impl fmt::Display for Skip {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}", self.id)?;
+        let id = &self.id;
         match &self.reason {
-            SkipReason::TooShort { frames, min } => write!(f, " ({frames} frames, needs {min})"),
-            SkipReason::TooLong { frames, bound } => write!(f, " ({frames} frames, must be below {bound})"),
-            SkipReason::CaptionRange { line, frames } => write!(f, " line {line} ({frames} frames)"),
-            _ => Ok(()),
+            SkipReason::TooShort { frames, min } => write!(f, "{id} ({frames} frames, needs {min})"),
+            SkipReason::TooLong { frames, bound } => write!(f, "{id} ({frames} frames, must be below {bound})"),
+            SkipReason::CaptionRange { line, frames } => write!(f, "texts/{id}.txt:{line} ({frames} frames)"),
+            SkipReason::CaptionTimes { line, range } => write!(f, "texts/{id}.txt:{line} ({range})"),
+            SkipReason::ExtraFields { line, fields } => write!(f, "texts/{id}.txt:{line} ({fields} fields)"),
+            _ => write!(f, "{id}"),
         }
     }
 }
@@ -239,7 +262,7 @@ impl fmt::Display for OpenReport {
 
 /// What reading one listed clip gave.
 enum Loaded {
-    Clip { frames: usize, features: Vec<f32>, captions: Vec<(usize, Caption)> },
+    Clip { frames: usize, features: Vec<f32>, texts: Texts },
     Skip(SkipReason),
     Bad(Vec<Problem>),
 }
@@ -281,6 +304,11 @@ impl Dataset {
             problems.push(p);
             vec![]
         });
+        let listed: usize = lists.iter().map(|(_, ids)| ids.len()).sum();
+        if listed > limits::CLIPS {
+            let what = format!("{}: its lists have {listed} clips, at most {} are read", path.display(), limits::CLIPS);
+            problems.push(Problem::new(ProblemKind::Text, what));
+        }
         if !problems.is_empty() {
             return Err(fail(problems));
         }
@@ -318,6 +346,7 @@ impl Dataset {
         let mut shared = vec![];
         // Where a clip that is already stored lies, and its captions by line.
         let mut stored: HashMap<String, (usize, Vec<(usize, usize)>)> = HashMap::new();
+        let mut odd: HashMap<String, Vec<SkipReason>> = HashMap::new();
         for (split, ids) in lists {
             let mut listed = HashSet::new();
             for id in ids {
@@ -330,16 +359,18 @@ impl Dataset {
                     skip(reason.clone());
                     continue;
                 }
-                if let Some(Loaded::Clip { frames, features, captions }) = loaded.remove(id.as_str()) {
-                    let lines = captions.iter().map(|(line, _)| *line);
+                if let Some(Loaded::Clip { frames, features, texts }) = loaded.remove(id.as_str()) {
+                    let lines = texts.captions.iter().map(|(line, _)| *line);
                     let lines = lines.zip(self.captions.len()..).collect();
-                    self.captions.extend(captions.into_iter().map(|(_, caption)| caption));
+                    self.captions.extend(texts.captions.into_iter().map(|(_, caption)| caption));
+                    odd.insert(id.clone(), texts.odd.into_iter().map(left_out).collect());
                     stored.insert(id.clone(), (self.clips.len(), lines));
                     self.clips.push(Clip { id: id.clone(), frames, features });
                 } else {
                     shared.push(id.clone());
                 }
                 let Some((clip, lines)) = stored.get(id) else { continue };
+                odd.get(id).into_iter().flatten().cloned().for_each(&mut skip);
                 let frames = self.clips[*clip].frames;
                 let mut whole = vec![];
                 let mut parts: Vec<Entry> = vec![];
@@ -415,22 +446,45 @@ impl Dataset {
 
 /// Ids of a list, stripped, without blank lines.
 fn read_list(file: &Path) -> Result<Vec<String>, Vec<Problem>> {
-    let content = fs::read_to_string(file).map_err(|e| {
+    let content = files::read(file, limits::CLIP_LIST_BYTES).map_err(|e| {
         let (kind, hint) = match e.kind() {
             std::io::ErrorKind::NotFound => (ProblemKind::Missing, "; expected a list with one clip id a line"),
             _ => (ProblemKind::Io, ""),
         };
         vec![Problem::new(kind, format!("{}: {e}{hint}", file.display()))]
     })?;
+    let content = String::from_utf8(content)
+        .map_err(|_| vec![Problem::new(ProblemKind::Text, format!("{}: not UTF-8 text", file.display()))])?;
     let lines = || content.lines().enumerate().map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.is_empty());
     let bad: Vec<Problem> = lines()
-        .filter(|(_, id)| id.contains(['/', '\\', '\0']) || id.starts_with('.'))
+        .filter(|(_, id)| !is_clip_id(id))
+        .take(MANY_PROBLEMS)
         .map(|(n, id)| {
-            let what = format!("{}:{n}: `{id}` is not a clip id; expected a file name without folder", file.display());
+            let id: String = id.chars().take(80).collect();
+            let what = format!(
+                "{}:{n}: `{}` is not a clip id; expected a file name without folder",
+                file.display(),
+                id.escape_debug()
+            );
             Problem::new(ProblemKind::Text, what)
         })
         .collect();
     if bad.is_empty() { Ok(lines().map(|(_, id)| id.to_owned()).collect()) } else { Err(bad) }
+}
+
+/// Whether `id` with an ending is the name of a file in a folder, and can be shown.
+pub(crate) fn is_clip_id(id: &str) -> bool {
+    id.len() <= limits::CLIP_NAME_BYTES
+        && !id.starts_with('.')
+        && !id.contains(|c: char| matches!(c, '/' | '\\') || c.is_control())
+}
+
+/// What the report says of an odd line.
+fn left_out((line, oddity): (usize, Oddity)) -> SkipReason {
+    match oddity {
+        Oddity::Times(range) => SkipReason::CaptionTimes { line, range },
+        Oddity::ExtraFields(fields) => SkipReason::ExtraFields { line, fields },
+    }
 }
 
 fn read_statistic(file: &Path, skeleton: &Skeleton, positive: bool) -> Result<Vec<f32>, Problem> {
@@ -473,13 +527,13 @@ fn load(root: &Path, id: &str, skeleton: &Skeleton) -> Loaded {
         Err(e) if e.is_missing() => return Loaded::Skip(SkipReason::NoMotion),
         motion => motion.map_err(Problem::from),
     };
-    let text = match fs::read(&text_file) {
+    let text = match files::read(&text_file, limits::CAPTIONS_BYTES) {
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Loaded::Skip(SkipReason::NoText),
         text => parse_text(&text_file, text),
     };
     let motion = motion.and_then(|array| check_motion(&motion_file, array, skeleton));
-    let (array, captions) = match (motion, text) {
-        (Ok(motion), Ok(captions)) => (motion, captions),
+    let (array, texts) = match (motion, text) {
+        (Ok(motion), Ok(texts)) => (motion, texts),
         (motion, text) => {
             return Loaded::Bad(motion.err().into_iter().chain(text.err().into_iter().flatten()).collect());
         }
@@ -506,10 +560,10 @@ fn load(root: &Path, id: &str, skeleton: &Skeleton) -> Loaded {
             ),
         )]);
     }
-    Loaded::Clip { frames, features: array.data, captions }
+    Loaded::Clip { frames, features: array.data, texts }
 }
 
-fn parse_text(file: &Path, content: std::io::Result<Vec<u8>>) -> Result<Vec<(usize, Caption)>, Vec<Problem>> {
+fn parse_text(file: &Path, content: std::io::Result<Vec<u8>>) -> Result<Texts, Vec<Problem>> {
     let content = content.map_err(|e| vec![Problem::new(ProblemKind::Io, format!("{}: {e}", file.display()))])?;
     let content = String::from_utf8(content).map_err(|e| {
         let line = e.as_bytes()[..e.utf8_error().valid_up_to()].iter().filter(|b| **b == b'\n').count() + 1;

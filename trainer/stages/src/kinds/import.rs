@@ -3,16 +3,21 @@
 //! Read are `text_mot_match/model/finest.tar`, a torch pickle of three state dicts beside optimizer states, or `finest.safetensors` in its
 //! place with `text_encoder.`, `motion_encoder.` and `movement_encoder.` before the names; and `Comp_*/meta/{mean,std}.npy`, the statistics that its
 //! motions are normalised with. Sizes are read off the shapes. Nothing in a pickle is run.
+//!
+//! The files are somebody else's. What they declare is held against what they hold before memory is asked for: an archive unpacks to no more than
+//! its own length, the tensors of a pickle take no more than the file, and the network that the shapes describe has no more parameters than the
+//! file.
 
 use std::collections::{BTreeMap, HashMap};
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use models::flat::layout;
 use models::names::{from_bytes, to_bytes};
 use models::networks::{Evaluator, EvaluatorConfig, Init};
-use motion::{Skeleton, npy};
-use protocol::Seed;
+use motion::{Skeleton, files, npy};
 use protocol::stage::{ImportEvaluator, Positions};
+use protocol::{Seed, limits};
 use pytorch_reader::{DType, PytorchReader};
 use safetensors::SafeTensors;
 
@@ -24,6 +29,11 @@ use crate::words::{CLASSES, WORD_WIDTH, Words};
 
 /// The state dicts of the pickle.
 const PARTS: [&str; 3] = ["text_encoder", "motion_encoder", "movement_encoder"];
+
+/// The published ones have 49.
+const MAX_TENSORS: usize = 1_000;
+/// Bytes that name so many, with room.
+const MAX_HEADER: u64 = 1 << 20;
 
 impl Plain for ImportEvaluator {
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
@@ -45,6 +55,7 @@ impl Plain for ImportEvaluator {
                 "it reads words of width {word} in {classes} classes, expected {WORD_WIDTH} in {CLASSES}"
             )));
         }
+        check_parameters(&config, &bytes).map_err(refuse)?;
         let (mean, std) = (statistic(folder, "mean.npy", skeleton)?, statistic(folder, "std.npy", skeleton)?);
         if let Some(i) = std.iter().position(|s| !(*s > 0.0 && s.is_finite())) {
             return Err(StageError::Input(format!(
@@ -76,13 +87,15 @@ impl Plain for ImportEvaluator {
 fn weights(folder: &Path) -> Result<(PathBuf, Vec<u8>), StageError> {
     let below = folder.join("text_mot_match/model");
     for base in [&below, folder] {
+        let is_there = |path: &Path| path.symlink_metadata().is_ok();
         let safe = base.join("finest.safetensors");
-        if safe.is_file() {
-            let bytes = std::fs::read(&safe).map_err(|e| StageError::Input(format!("{}: {e}", safe.display())))?;
+        if is_there(&safe) {
+            let bytes = files::read(&safe, limits::WEIGHTS_BYTES);
+            let bytes = bytes.map_err(|e| StageError::Input(format!("{}: {e}", safe.display())))?;
             return Ok((safe, bytes));
         }
         let pickle = base.join("finest.tar");
-        if pickle.is_file() {
+        if is_there(&pickle) {
             let bytes = unpickle(&pickle).map_err(|e| StageError::Input(format!("{}: {e}", pickle.display())))?;
             return Ok((pickle, bytes));
         }
@@ -96,28 +109,73 @@ fn weights(folder: &Path) -> Result<(PathBuf, Vec<u8>), StageError> {
 
 /// The three state dicts of a torch file.
 fn unpickle(file: &Path) -> Result<Vec<u8>, String> {
-    let mut all = Tensors::default();
+    let length = check_container(file)?;
+    let mut tensors = Vec::new();
     for part in PARTS {
         let reader = PytorchReader::with_top_level_key(file, part)
             .map_err(|e| format!("no state dict `{part}`: {e}; expected {}", PARTS.join(", ")))?;
-        for (name, tensor) in reader.into_tensors() {
-            let bytes = tensor.read().map_err(|e| format!("`{part}.{name}`: {e}"))?;
-            let values: Vec<f32> = match tensor.dtype() {
-                DType::F32 => bytes.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect(),
-                DType::F64 => bytes.as_chunks::<8>().0.iter().map(|b| f64::from_le_bytes(*b) as f32).collect(),
-                other => return Err(format!("`{part}.{name}` is {other:?}, expected F32")),
-            };
-            all = all.with(&format!("{part}.{name}"), tensor.shape().to_vec(), values);
-        }
+        tensors.extend(reader.into_tensors().into_iter().map(|(name, tensor)| (format!("{part}.{name}"), tensor)));
+    }
+    if tensors.len() > MAX_TENSORS {
+        return Err(format!("{} tensors; expected at most {MAX_TENSORS}", tensors.len()));
+    }
+    // A tensor may repeat one number, and several may share one storage.
+    let declared = tensors.iter().fold(0_u64, |sum, (_, tensor)| sum.saturating_add(tensor.byte_len() as u64));
+    if declared > length {
+        return Err(format!("its tensors take {declared} bytes, the file has {length}"));
+    }
+    let mut all = Tensors::default();
+    for (name, tensor) in tensors {
+        let bytes = tensor.read().map_err(|e| format!("`{name}`: {e}"))?;
+        let values: Vec<f32> = match tensor.dtype() {
+            DType::F32 => bytes.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect(),
+            DType::F64 => bytes.as_chunks::<8>().0.iter().map(|b| f64::from_le_bytes(*b) as f32).collect(),
+            other => return Err(format!("`{name}` is {other:?}, expected F32")),
+        };
+        all = all.with(&name, tensor.shape().to_vec(), values);
     }
     all.to_bytes().map_err(|e| e.to_string())
 }
 
+/// The length of a file that a pickle reader may open: a regular file, not too large, and no archive that unpacks to more than it is.
+/// `torch.save` writes archives that are not compressed.
+fn check_container(path: &Path) -> Result<u64, String> {
+    let (mut file, length) = files::open(path).map_err(|e| e.to_string())?;
+    if length > limits::WEIGHTS_BYTES {
+        return Err(format!("has {length} bytes; at most {} are read", limits::WEIGHTS_BYTES));
+    }
+    let mut magic = [0; 2];
+    if file.read_exact(&mut magic).is_err() || &magic != b"PK" {
+        return Ok(length);
+    }
+    let mut archive = zip::ZipArchive::new(file).map_err(|e| e.to_string())?;
+    let mut unpacked = 0_u64;
+    for i in 0..archive.len() {
+        unpacked = unpacked.saturating_add(archive.by_index_raw(i).map_err(|e| e.to_string())?.size());
+    }
+    if unpacked > length {
+        return Err(format!(
+            "unpacks to {unpacked} bytes, but has {length}; expected an archive as `torch.save` writes it"
+        ));
+    }
+    Ok(length)
+}
+
 /// Sizes out of shapes.
 fn sizes(bytes: &[u8]) -> Result<EvaluatorConfig, String> {
+    let header = bytes.first_chunk::<8>().map_or(0, |length| u64::from_le_bytes(*length));
+    if header > MAX_HEADER {
+        return Err(format!("a header of {header} bytes; expected at most {MAX_HEADER}"));
+    }
     let file = SafeTensors::deserialize(bytes).map_err(|e| e.to_string())?;
+    if file.len() > MAX_TENSORS {
+        return Err(format!("{} tensors; expected at most {MAX_TENSORS}", file.len()));
+    }
     let shapes: HashMap<String, Vec<usize>> =
         file.iter().map(|(name, view)| (name.to_owned(), view.shape().to_vec())).collect();
+    if let Some((name, shape)) = shapes.iter().find(|(_, shape)| shape.contains(&0)) {
+        return Err(format!("`{}` has shape {shape:?}, which holds nothing", name.escape_debug()));
+    }
     let dim = |name: &str, axis: usize| {
         let found = shapes.get(name).and_then(|shape| shape.get(axis)).copied();
         found.ok_or_else(|| format!("no tensor `{name}` with {} axes", axis + 1))
@@ -134,6 +192,29 @@ fn sizes(bytes: &[u8]) -> Result<EvaluatorConfig, String> {
     })
 }
 
+/// Refuses shapes that describe a larger network than the file holds, before it is made.
+fn check_parameters(config: &EvaluatorConfig, bytes: &[u8]) -> Result<(), String> {
+    let wide = |n: usize| n as u128;
+    let linear = |from: u128, to: u128| (from + 1).saturating_mul(to);
+    let encoder = |input: usize, width: usize| {
+        let (input, width) = (wide(input), wide(width));
+        let gru = linear(width, width).saturating_mul(12);
+        linear(input, width) + gru + linear(2 * width, width) + linear(width, wide(config.embedding)) + 4 * width
+    };
+    let convolution = |from: usize, to: usize| linear(4 * wide(from), wide(to));
+    let described = linear(wide(config.classes), wide(config.word))
+        + encoder(config.word, config.text_hidden)
+        + encoder(config.movement, config.motion_hidden)
+        + convolution(config.features, config.movement_hidden)
+        + convolution(config.movement_hidden, config.movement)
+        + linear(wide(config.movement), wide(config.movement));
+    let held = wide(bytes.len() / 4);
+    if described > held {
+        return Err(format!("its shapes describe a network of {described} parameters, but it holds at most {held}"));
+    }
+    Ok(())
+}
+
 /// A statistic in `meta`, or in the `meta` of the one `Comp_*` folder.
 fn statistic(folder: &Path, name: &str, skeleton: &Skeleton) -> Result<Vec<f32>, StageError> {
     let missing = |what: String| StageError::Input(format!("{}: {what}", folder.display()));
@@ -143,7 +224,7 @@ fn statistic(folder: &Path, name: &str, skeleton: &Skeleton) -> Result<Vec<f32>,
         .filter(|path| path.file_name().is_some_and(|n| n.to_string_lossy().starts_with("Comp_")))
         .chain([folder.to_owned()])
         .map(|path| path.join("meta").join(name))
-        .filter(|path| path.is_file())
+        .filter(|path| path.symlink_metadata().is_ok())
         .collect();
     found.sort();
     let [file] = &found[..] else {
@@ -162,4 +243,149 @@ fn statistic(folder: &Path, name: &str, skeleton: &Skeleton) -> Result<Vec<f32>,
         )));
     }
     Ok(array.data)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write as _;
+
+    use models::flat;
+
+    use super::*;
+
+    fn config() -> EvaluatorConfig {
+        EvaluatorConfig {
+            features: 8,
+            movement_hidden: 6,
+            movement: 5,
+            motion_hidden: 7,
+            word: 9,
+            classes: 3,
+            text_hidden: 4,
+            embedding: 10,
+        }
+    }
+
+    /// A small evaluator as safetensors.
+    fn small() -> Vec<u8> {
+        let device = burn::tensor::Device::flex();
+        let network = Evaluator::new(&config(), &mut Init::new(Seed(0), "small", Positions::Uniform, &device));
+        to_bytes(&layout(&network), &flat::read(&network))
+    }
+
+    /// The tensors of `small`, some with other shapes.
+    fn reshaped(change: &dyn Fn(&str, &mut Vec<usize>)) -> Vec<u8> {
+        let bytes = small();
+        let file = SafeTensors::deserialize(&bytes).unwrap();
+        let mut all = Tensors::default();
+        for (name, view) in file.iter() {
+            let mut shape = view.shape().to_vec();
+            change(name, &mut shape);
+            let values = vec![0.5; shape.iter().product()];
+            all = all.with(name, shape, values);
+        }
+        all.to_bytes().unwrap()
+    }
+
+    #[test]
+    fn the_parameters_that_shapes_describe_are_counted_exactly() {
+        let bytes = small();
+        let found = sizes(&bytes).unwrap();
+        assert_eq!(found, config());
+        let file = SafeTensors::deserialize(&bytes).unwrap();
+        let held: usize = file.iter().map(|(_, view)| view.data().len()).sum();
+        check_parameters(&found, &vec![0; held]).unwrap();
+        let said = check_parameters(&found, &vec![0; held - 4]).unwrap_err();
+        assert!(said.contains(&format!("{} parameters", held / 4)), "{said}");
+    }
+
+    #[test]
+    fn shapes_that_ask_for_more_than_the_file_are_refused_before_anything_is_made() {
+        // An axis of zero holds nothing, so that the others cost nothing.
+        let empty = reshaped(&|name, shape| {
+            if name.ends_with("hidden") {
+                *shape = vec![2, 0, 1 << 40];
+            }
+        });
+        assert!(sizes(&empty).unwrap_err().contains("which holds nothing"));
+        // First states are a row, the matrices behind them its square.
+        let wide = reshaped(&|name, shape| {
+            if name == "motion_encoder.hidden" {
+                shape[2] = 1 << 20;
+            }
+        });
+        let config = sizes(&wide).unwrap();
+        assert_eq!(config.motion_hidden, 1 << 20);
+        let said = check_parameters(&config, &wide).unwrap_err();
+        assert!(said.contains("describe a network of"), "{said}");
+        let mut long = small();
+        long[..8].copy_from_slice(&(90_u64 << 20).to_le_bytes());
+        assert!(sizes(&long).unwrap_err().contains("a header of 94371840 bytes"));
+    }
+
+    #[test]
+    fn an_archive_that_unpacks_to_more_than_it_is_is_not_unpacked() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("finest.tar");
+        let mut archive = zip::ZipWriter::new(std::fs::File::create(&path).unwrap());
+        let packed = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Deflated);
+        for name in ["archive/data.pkl", "archive/data/0"] {
+            archive.start_file(name, packed).unwrap();
+            archive.write_all(&vec![0; 8 << 20]).unwrap();
+        }
+        archive.finish().unwrap();
+        let said = unpickle(&path).unwrap_err();
+        assert!(said.contains("unpacks to 16777216 bytes"), "{said}");
+        std::fs::remove_file(&path).unwrap();
+        assert!(std::process::Command::new("mkfifo").arg(&path).status().unwrap().success());
+        assert!(unpickle(&path).unwrap_err().contains("is a named pipe"));
+        let said = weights(folder.path()).unwrap_err().to_string();
+        assert!(said.contains("finest.tar: is a named pipe; expected a file"), "{said}");
+    }
+
+    /// Overwritten, cut and doubled bytes: any answer will do, but no panic.
+    #[test]
+    fn no_bytes_break_the_importer() {
+        let mut state = 0x9e37_79b9_7f4a_7c15_u64;
+        let mut next = move |bound: usize| {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            (state % bound.max(1) as u64) as usize
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("finest.tar");
+        let mut archive = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+        let stored = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
+        for (name, bytes) in
+            [("archive/data.pkl", &b"\x80\x02}q\x00X\x0c\x00\x00\x00text_encoder}s."[..]), ("archive/data/0", &[0; 64])]
+        {
+            archive.start_file(name, stored).unwrap();
+            archive.write_all(bytes).unwrap();
+        }
+        let (archive, weights) = (archive.finish().unwrap().into_inner(), small());
+        for round in 0..600 {
+            let mut bytes = if round % 2 == 0 { archive.clone() } else { weights.clone() };
+            // What matters stands in headers, at the ends of the files.
+            let head = if round % 4 == 1 { 4_000 } else { bytes.len() };
+            for _ in 0..=next(4) {
+                let at = next(head.min(bytes.len()));
+                match next(4) {
+                    0 => bytes.truncate(at),
+                    1 => bytes.splice(at..at, [b'9'; 3]).for_each(drop),
+                    _ if !bytes.is_empty() => {
+                        let at = at.min(bytes.len() - 1);
+                        bytes[at] = [0, 0xff, b'9', b'0', b'"', 0x7f][next(6)];
+                    }
+                    _ => {}
+                }
+            }
+            if round % 2 == 0 {
+                std::fs::write(&path, &bytes).unwrap();
+                let _ = unpickle(&path);
+            } else if let Ok(config) = sizes(&bytes) {
+                let _ = check_parameters(&config, &bytes);
+            }
+        }
+    }
 }
