@@ -1,5 +1,6 @@
 //! The `registry` command: on a store's folder, or through the server that holds it. All logic is in `registry::cli`.
 
+use std::io::Write as _;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -33,7 +34,8 @@ fn main() -> ExitCode {
     let runtime = match tokio::runtime::Runtime::new() {
         Ok(runtime) => runtime,
         Err(e) => {
-            eprintln!("error: no runtime: {e}");
+            // Without a reader there is nobody to tell.
+            let _ = writeln!(std::io::stderr(), "error: no runtime: {e}");
             return ExitCode::FAILURE;
         }
     };

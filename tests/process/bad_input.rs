@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::path::Path;
+use std::process::Command;
 
 use cluster_tests::{Bench, wait_for};
 
@@ -109,7 +110,21 @@ fn a_broken_dataset_folder_is_named_file_by_file() {
     fs::write(&clip, &narrow).expect("written");
     run(&data, &[&first, "263", "251"]);
 
+    // A pipe in a file's place is named, not waited for.
+    fs::remove_file(&clip).expect("removed");
+    assert!(Command::new("mkfifo").arg(&clip).status().expect("mkfifo runs").success());
+    run(&data, &[&format!("{first}.npy: is a named pipe; expected a file")]);
+    fs::remove_file(&clip).expect("removed");
+
+    // What a file holds does not reach the terminal as it is.
     fs::write(&clip, &good).expect("written");
+    let list = fs::read_to_string(data.join("val.txt")).expect("a list");
+    fs::write(data.join("val.txt"), "\u{1b}[2J\u{1b}]0;title\u{7}\n").expect("written");
+    let path = format!("dataset.path={}", data.display());
+    let said = bench.run(&["run", &config, "--set", &path]).expect_code(2);
+    assert!(said.stderr.contains("is not a clip id") && !said.stderr.contains('\u{1b}'), "{:?}", said.stderr);
+    fs::write(data.join("val.txt"), list).expect("written");
+
     let caption = data.join(format!("texts/{first}.txt"));
     fs::write(&caption, "a person walks.#a/DET person/NOUN#0.0#0.0\nno fields here\n").expect("written");
     run(&data, &[&format!("{first}.txt:2")]);

@@ -1,12 +1,13 @@
 //! A pipeline file on disk: read, checked, and its dataset folders looked at, all before a store is opened.
 
+use std::io::Read as _;
 use std::path::Path;
 
 use motion::Dataset;
 use motion::folder_digest::{files_digest, folder_digest};
 use protocol::pipeline::{self, Pipeline, PipelineStage};
 use protocol::stage::{DataFormat, ExternalFolder};
-use protocol::{Digest, StageName};
+use protocol::{Digest, StageName, limits};
 
 use crate::problem::{Problem, Result};
 
@@ -20,7 +21,7 @@ pub(crate) struct PipelineFile {
 /// Reads and validates the file alone.
 pub(crate) fn read(path: &Path, sets: &[String]) -> Result<PipelineFile> {
     let name = path.display().to_string();
-    let source = std::fs::read_to_string(path).map_err(|error| {
+    let source = read_text(path).map_err(|error| {
         let problem = Problem::usage(format!("cannot read the pipeline `{name}`: {error}"));
         if error.kind() == std::io::ErrorKind::NotFound {
             problem.hint("shipped pipelines are in `configs/`; `trainer run configs/quickstart.yaml` needs no data")
@@ -34,6 +35,17 @@ pub(crate) fn read(path: &Path, sets: &[String]) -> Result<PipelineFile> {
         problem.hint("nothing was run and nothing was stored")
     })?;
     Ok(PipelineFile { pipeline, source })
+}
+
+/// A pipeline may come through a pipe (`<(...)`), so that only its end says how long it is.
+fn read_text(path: &Path) -> std::io::Result<String> {
+    let mut bytes = Vec::new();
+    std::fs::File::open(path)?.take(limits::PIPELINE_BYTES + 1).read_to_end(&mut bytes)?;
+    let refuse = |what: String| std::io::Error::new(std::io::ErrorKind::InvalidData, what);
+    if bytes.len() as u64 > limits::PIPELINE_BYTES {
+        return Err(refuse(format!("it has more than {} bytes", limits::PIPELINE_BYTES)));
+    }
+    String::from_utf8(bytes).map_err(|error| refuse(format!("it is no UTF-8 text: {}", error.utf8_error())))
 }
 
 /// Reads the file and digests the dataset folders it names.

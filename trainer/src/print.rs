@@ -1,9 +1,13 @@
 //! All that the command prints. stdout is data, stderr is for people.
+//!
+//! Whatever is printed goes through [`printable`], for much of it comes from files and other people's machines. A reader that has left is no
+//! failure of the command: what it would have read is dropped, and the exit code stays.
 
 use std::io::{IsTerminal, Write};
 
 use clap::ValueEnum;
 use comfy_table::{ContentArrangement, Table, presets};
+use protocol::printable;
 use serde::Serialize;
 
 use crate::problem::Problem;
@@ -21,19 +25,19 @@ pub(crate) enum Output {
 /// Data.
 pub(crate) fn out(text: &str) {
     // A closed pipe (`| head`) is no failure of the command.
-    let _ = writeln!(std::io::stdout().lock(), "{text}");
+    let _ = writeln!(std::io::stdout().lock(), "{}", printable(text));
 }
 
 /// One line of a stream; ends the process quietly when nobody reads any more.
 pub(crate) fn line(text: &str) {
-    if writeln!(std::io::stdout().lock(), "{text}").is_err() {
+    if writeln!(std::io::stdout().lock(), "{}", printable(text)).is_err() {
         std::process::exit(0);
     }
 }
 
 /// A message.
 pub(crate) fn note(text: &str) {
-    let _ = writeln!(std::io::stderr().lock(), "{text}");
+    let _ = writeln!(std::io::stderr().lock(), "{}", printable(text));
 }
 
 /// One JSON object on stdout.

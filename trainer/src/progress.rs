@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
-use protocol::StageName;
 use protocol::message::{RunView, StageState, StageView};
+use protocol::{StageName, printable};
 
 use crate::print;
 
@@ -40,7 +40,7 @@ impl Progress {
     pub(crate) fn note(&self, text: &str) {
         match &self.bars {
             // Without a terminal any more there is nobody to tell.
-            Some(bars) => drop(bars.println(text)),
+            Some(bars) => drop(bars.println(printable(text))),
             None => print::note(text),
         }
     }
@@ -183,7 +183,7 @@ pub(crate) fn values(stage: &StageView, count: usize) -> String {
     let first = FIRST.iter().filter_map(|key| stage.metrics.get_key_value(*key));
     let others = stage.metrics.iter().filter(|(key, _)| !FIRST.contains(&key.as_str()) && !end(key));
     let shown = first.chain(others).take(count).map(|(key, value)| format!("{key} {}", print::number(*value)));
-    shown.collect::<Vec<_>>().join("  ")
+    printable(&shown.collect::<Vec<_>>().join("  ")).into_owned()
 }
 
 #[cfg(test)]

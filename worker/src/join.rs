@@ -81,8 +81,9 @@ impl JoinError {
 pub fn init_logging() {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    // A second subscriber is refused; the first one's lines are as good.
-    let _ = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(false).try_init();
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(false);
+    // A second subscriber is refused; the first one's lines are as good. A line that nobody reads any more is dropped, without a panic.
+    let _ = log.log_internal_errors(false).try_init();
 }
 
 /// Works for a coordinator until that says to leave or the process is asked to end.

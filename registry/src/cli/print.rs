@@ -4,6 +4,7 @@ use std::io::{self, Write};
 
 use comfy_table::{ContentArrangement, Table, presets};
 use protocol::message::ApiError;
+use protocol::printable;
 use serde_json::json;
 
 use super::{Answer, Data, Output};
@@ -23,7 +24,7 @@ pub(super) fn show(answer: &Answer, output: Output) -> io::Result<()> {
                 format!("{value:#}\n")
             }
         };
-        io::stdout().lock().write_all(text.as_bytes())?;
+        io::stdout().lock().write_all(printable(&text).as_bytes())?;
     }
     answer.error.as_ref().map_or(Ok(()), |error| show_error(error, output))
 }
@@ -32,10 +33,10 @@ pub(super) fn show(answer: &Answer, output: Output) -> io::Result<()> {
 pub fn show_error(error: &ApiError, output: Output) -> io::Result<()> {
     let mut stderr = io::stderr().lock();
     match output {
-        Output::Json => writeln!(stderr, "{:#}", json!({ "error": error })),
+        Output::Json => writeln!(stderr, "{}", printable(&format!("{:#}", json!({ "error": error })))),
         Output::Table => {
-            writeln!(stderr, "error: {}", error.message)?;
-            error.hint.as_ref().map_or(Ok(()), |hint| writeln!(stderr, "\nhint: {hint}"))
+            writeln!(stderr, "error: {}", printable(&error.message))?;
+            error.hint.as_ref().map_or(Ok(()), |hint| writeln!(stderr, "\nhint: {}", printable(hint)))
         }
     }
 }

@@ -185,11 +185,12 @@ pub(crate) fn main(cli: Cli) -> ExitCode {
     ExitCode::from(code)
 }
 
-/// Warnings on stderr, more by `RUST_LOG`.
+/// Warnings on stderr, more by `RUST_LOG`. A log line that nobody reads any more is dropped: told of it, the subscriber would print that, fail
+/// again, and panic in the middle of what it logs for.
 fn init_logging() {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).log_internal_errors(false).init();
 }
 
 impl Verb {
