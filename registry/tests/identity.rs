@@ -8,7 +8,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use common::{artifact, note, notes, open, version};
+use common::{artifact, note, notes, open, try_open, version};
 use protocol::ArtifactKind;
 use registry::{Holder, Mismatch, OpenError, Store, WriteError};
 use serde_json::json;
@@ -33,8 +33,13 @@ fn blobs(dir: &Path) -> Vec<PathBuf> {
 }
 
 async fn mismatch(dir: &Path) -> Mismatch {
-    let new = Store::open(dir, holder()).await.unwrap_err();
-    let existing = Store::open_existing(dir, holder()).await.unwrap_err();
+    let new = try_open(dir).await.unwrap_err();
+    let existing = loop {
+        match Store::open_existing(dir, holder()).await.unwrap_err() {
+            OpenError::Busy { .. } => tokio::task::yield_now().await,
+            refused => break refused,
+        }
+    };
     match (new, existing) {
         (OpenError::Mismatch { mismatch, .. }, OpenError::Mismatch { mismatch: again, .. }) => {
             assert_eq!(mismatch, again);
@@ -125,7 +130,12 @@ async fn a_lost_log_is_noticed() {
     assert!(matches!(&lost, Mismatch::WentBack { found, known, .. } if found < known), "{lost}");
     refused_by_the_commands(&grown, "has gone back");
 
-    let adopted = Store::adopt(&grown, holder()).await.unwrap();
+    let adopted = loop {
+        match Store::adopt(&grown, holder()).await {
+            Err(OpenError::Busy { .. }) => tokio::task::yield_now().await,
+            adopted => break adopted.unwrap(),
+        }
+    };
     assert_eq!(adopted.id(), store.id());
     drop(adopted);
     open(&grown).await.write(vec![note("goes on")]).await.unwrap();

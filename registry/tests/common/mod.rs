@@ -5,11 +5,22 @@ use std::collections::BTreeMap;
 
 use protocol::message::Grant;
 use protocol::{ArtifactKind, Attempt, Digest, Fence, FileEntry, Incarnation, Manifest, TaskId};
-use registry::{BlobStore, Holder, Store, Write};
+use registry::{BlobStore, Holder, OpenError, Store, Write};
 use serde_json::json;
 
+/// Opens a store. A process that another test is starting right now may have a copy of a lock that was let go.
+pub async fn try_open(dir: &std::path::Path) -> Result<Store, OpenError> {
+    let until = std::time::Instant::now() + std::time::Duration::from_secs(10);
+    loop {
+        match Store::open(dir, Holder::this_process("test")).await {
+            Err(OpenError::Busy { .. }) if std::time::Instant::now() < until => tokio::task::yield_now().await,
+            opened => return opened,
+        }
+    }
+}
+
 pub async fn open(dir: &std::path::Path) -> Store {
-    Store::open(dir, Holder::this_process("test")).await.unwrap()
+    try_open(dir).await.unwrap()
 }
 
 /// Uploads an artifact of one file.
