@@ -1,17 +1,25 @@
 -- Owner: registry (written by the coordinator through `registry::Write`).
--- The coordinator's journal, the runs it tells of, and the fence of every task.
+-- What the coordinator has decided, the runs it tells of, and the fence of every task.
 
-CREATE TABLE IF NOT EXISTS journal (
-    seq   INTEGER PRIMARY KEY AUTOINCREMENT,
+-- One row holds the facts of one decision. A snapshot stands for all up to its number, which then go.
+CREATE TABLE IF NOT EXISTS facts (
+    seq   INTEGER PRIMARY KEY,
     at_ms INTEGER NOT NULL,
-    event TEXT    NOT NULL CHECK (json_valid(event))
+    facts TEXT    NOT NULL CHECK (json_valid(facts))
 ) STRICT;
 
-CREATE TRIGGER IF NOT EXISTS journal_is_never_edited BEFORE UPDATE ON journal
-BEGIN SELECT RAISE(ABORT, 'the journal is append-only'); END;
+CREATE TRIGGER IF NOT EXISTS facts_are_never_edited BEFORE UPDATE ON facts
+BEGIN SELECT RAISE(ABORT, 'facts are never edited'); END;
 
-CREATE TRIGGER IF NOT EXISTS journal_is_never_cut BEFORE DELETE ON journal
-BEGIN SELECT RAISE(ABORT, 'the journal is append-only'); END;
+CREATE TRIGGER IF NOT EXISTS facts_go_only_behind_a_snapshot BEFORE DELETE ON facts
+WHEN old.seq > (SELECT coalesce(max(seq), 0) FROM snapshots)
+BEGIN SELECT RAISE(ABORT, 'facts go only once a snapshot stands for them'); END;
+
+CREATE TABLE IF NOT EXISTS snapshots (
+    seq   INTEGER PRIMARY KEY,
+    at_ms INTEGER NOT NULL,
+    state TEXT    NOT NULL CHECK (json_valid(state))
+) STRICT;
 
 CREATE TABLE IF NOT EXISTS runs (
     run             TEXT    PRIMARY KEY,
@@ -20,8 +28,20 @@ CREATE TABLE IF NOT EXISTS runs (
     state           TEXT    NOT NULL,
     idempotency_key TEXT    UNIQUE,
     created_ms      INTEGER NOT NULL,
-    updated_ms      INTEGER NOT NULL
+    updated_ms      INTEGER NOT NULL,
+    -- Set when it ends: as clients see it; as the coordinator takes it up again.
+    view            TEXT    CHECK (json_valid(view)),
+    archive         TEXT    CHECK (json_valid(archive))
 ) STRICT;
+
+-- What there is of a stage's value that no run in the coordinator's memory waits for: tries, shards, checkpoints.
+CREATE TABLE IF NOT EXISTS executions (
+    key       TEXT    PRIMARY KEY,
+    run       TEXT    NOT NULL,
+    stage     TEXT    NOT NULL,
+    execution TEXT    NOT NULL CHECK (json_valid(execution)),
+    at_ms     INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
 
 -- A write that carries a grant is stored only while the grant's fence equals this one.
 CREATE TABLE IF NOT EXISTS fences (

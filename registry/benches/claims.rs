@@ -1,4 +1,4 @@
-//! How many claims (a fence and a journal entry, on disk before the answer) the store takes in a second, by how many callers
+//! How many claims (a fence and a fact, on disk before the answer) the store takes in a second, by how many callers
 //! wait at once. `cargo bench -p registry`; numbers in ARCHITECTURE.md are from this.
 
 use std::io::Write as _;
@@ -23,8 +23,10 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
                 tokio::spawn(async move {
                     for fence in 1..=each {
                         let task = TaskId::new(format!("r{round}/s/{caller}"));
-                        let writes =
-                            vec![Write::Fence { task, fence: Fence(fence) }, Write::Journal(json!({ "fence": fence }))];
+                        let writes = vec![
+                            Write::Fence { task, fence: Fence(fence) },
+                            Write::Facts { seq: fence, facts: json!({ "fence": fence }).to_string() },
+                        ];
                         store.write(writes).await?;
                     }
                     Ok::<_, registry::WriteError>(())

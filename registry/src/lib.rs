@@ -1,4 +1,4 @@
-//! What is kept: blobs, the coordinator's journal, metrics, checkpoints, stage results, model versions and aliases.
+//! What is kept: blobs, what the coordinator decided, metrics, checkpoints, stage results, model versions and aliases.
 //!
 //! [`Store`] is the whole. What may be written is data ([`Write`]); a call of [`Store::write`] is one transaction that also
 //! checks the fences of the tasks it writes about, and returns once it would survive a loss of power. A blob is stored
@@ -26,9 +26,10 @@ mod write;
 
 pub use blob::BlobStore;
 pub use catalog::{Expect, Gate, Model, ModelRef, Pick, Promotion, Version};
+pub use db::apply::two_states;
 pub use identity::{Mismatch, StoreId};
 pub use lock::Holder;
 pub use metrics::{Curve, Point};
-pub use query::{CheckpointRow, LineageNode, LogRow, QueryError, RunRow, StageResultRow};
+pub use query::{CheckpointRow, EndedRow, LineageNode, LogRow, QueryError, Recovery, RunRow, StageResultRow};
 pub use store::{OpenError, ReadStore, Store};
 pub use write::{Write, WriteError};

@@ -64,6 +64,24 @@ pub struct RunRow {
     pub updated_ms: i64,
 }
 
+/// What a coordinator recovers from, each with the number of its decision.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Recovery {
+    /// The newest snapshot.
+    pub snapshot: Option<(u64, String)>,
+    /// Facts, oldest first; those after the snapshot count.
+    pub facts: Vec<(u64, String)>,
+}
+
+/// What is kept of a run that ended. What each says is the coordinator's business; see [`Write::RunEnded`](crate::Write::RunEnded).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EndedRow {
+    /// The run as clients see it.
+    pub view: String,
+    /// The run as the coordinator takes it up again.
+    pub archive: String,
+}
+
 /// A stage's value.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageResultRow {
@@ -149,17 +167,60 @@ impl ReadStore {
         Ok(self.readers().acquire().await?)
     }
 
-    /// The journal's events in the order they were written.
-    pub async fn journal_read(&self) -> Result<Vec<Value>> {
+    /// What a coordinator recovers from.
+    pub async fn recovery(&self) -> Result<Recovery> {
         let mut conn = self.connection().await?;
-        let rows = sqlx::query("SELECT seq, event FROM journal ORDER BY seq").fetch_all(&mut *conn).await?;
-        rows.iter()
-            .map(|row| {
-                let (seq, event): (i64, String) = (row.try_get(0)?, row.try_get(1)?);
-                serde_json::from_str(&event)
-                    .map_err(|e| QueryError::Blob(format!("journal entry {seq} is no JSON: {e}")))
-            })
-            .collect()
+        // One statement is one moment of the database; two might see a snapshot and no longer the facts before it.
+        let all = "SELECT 0 AS kind, seq, state AS text FROM (SELECT * FROM snapshots ORDER BY seq DESC LIMIT 1) \
+                   UNION ALL SELECT 1, seq, facts FROM facts ORDER BY kind, seq";
+        let mut recovery = Recovery::default();
+        for row in sqlx::query(all).fetch_all(&mut *conn).await? {
+            let (kind, seq, text): (i64, i64, String) = (row.try_get(0)?, row.try_get(1)?, row.try_get(2)?);
+            match kind {
+                0 => recovery.snapshot = Some((seq.unsigned_abs(), text)),
+                _ => recovery.facts.push((seq.unsigned_abs(), text)),
+            }
+        }
+        Ok(recovery)
+    }
+
+    /// What is kept of a run that ended; `None` while it has never ended.
+    pub async fn ended(&self, run: &RunId) -> Result<Option<EndedRow>> {
+        let mut conn = self.connection().await?;
+        let find = sqlx::query("SELECT view, archive FROM runs WHERE run = ? AND view IS NOT NULL");
+        let row = find.bind(run.as_str()).fetch_optional(&mut *conn).await?;
+        let ended = |row: SqliteRow| Ok(EndedRow { view: row.try_get(0)?, archive: row.try_get(1)? });
+        row.map(ended).transpose()
+    }
+
+    /// The views of runs that ended, as JSON, with their runs; oldest first. Of more than `limit` the newest.
+    pub async fn ended_views(&self, limit: u32) -> Result<Vec<(RunId, String)>> {
+        let mut conn = self.connection().await?;
+        let find = "SELECT run, view FROM (SELECT rowid AS number, run, view FROM runs WHERE view IS NOT NULL \
+                    ORDER BY rowid DESC LIMIT ?) ORDER BY number";
+        let rows = sqlx::query(find).bind(limit).fetch_all(&mut *conn).await?;
+        rows.iter().map(|row| Ok((RunId::new(row.try_get::<String, _>(0)?), row.try_get(1)?))).collect()
+    }
+
+    /// Under whose names the logs and values behind stage keys are stored: those of the value, or of what there is of it.
+    pub async fn sources(&self, keys: &[Digest]) -> Result<BTreeMap<Digest, (RunId, StageName)>> {
+        let mut conn = self.connection().await?;
+        let find = "SELECT key, run, stage FROM executions WHERE key IN (SELECT value FROM json_each(?1)) \
+                    UNION ALL SELECT key, run, stage FROM stage_results WHERE key IN (SELECT value FROM json_each(?1))";
+        let rows = sqlx::query(find).bind(crate::db::apply::json(&keys)).fetch_all(&mut *conn).await?;
+        let source = |row: &SqliteRow| -> Result<_> {
+            let (run, stage): (String, String) = (row.try_get("run")?, row.try_get("stage")?);
+            Ok((digest(row, "key")?, (RunId::new(run), StageName::new(stage))))
+        };
+        // A value that is there stands behind what was left on the way to it.
+        rows.iter().map(source).collect()
+    }
+
+    /// What a coordinator left of a stage's value when nobody waited for it any more, as JSON.
+    pub async fn archived_execution(&self, key: Digest) -> Result<Option<String>> {
+        let mut conn = self.connection().await?;
+        let find = sqlx::query("SELECT execution FROM executions WHERE key = ?").bind(key.to_string());
+        Ok(find.fetch_optional(&mut *conn).await?.map(|row| row.try_get(0)).transpose()?)
     }
 
     /// The value stored under a stage key.

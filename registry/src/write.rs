@@ -12,8 +12,21 @@ use serde_json::Value;
 /// One row or change.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Write {
-    /// Appends an event to the coordinator's journal; recovery replays them in order.
-    Journal(Value),
+    /// Appends the facts of one decision of the coordinator; recovery applies them in order.
+    Facts {
+        /// The decision's number: one more than that of the decision before. A number that is taken is refused, so that of two
+        /// coordinators on one store only one goes on.
+        seq: u64,
+        /// JSON; what it says is the coordinator's business.
+        facts: String,
+    },
+    /// The coordinator's state after decision `seq`. Older snapshots and the facts that it stands for go.
+    Snapshot {
+        /// The newest decision that it holds.
+        seq: u64,
+        /// JSON.
+        state: String,
+    },
     /// Sets a task's fence; it must be larger than the one stored.
     Fence {
         /// The task.
@@ -21,7 +34,7 @@ pub enum Write {
         /// Its new fence.
         fence: Fence,
     },
-    /// A run and its pipeline, so that queries need not replay the journal.
+    /// A run that was submitted, and its pipeline.
     Run {
         /// Which.
         run: RunId,
@@ -33,6 +46,36 @@ pub enum Write {
         state: String,
         /// Unique when given.
         idempotency_key: Option<String>,
+    },
+    /// A run that goes on in another state.
+    RunState {
+        /// Which.
+        run: RunId,
+        /// As above.
+        state: String,
+    },
+    /// A run that ended, and with it all that is asked about it from now on: the coordinator forgets it.
+    RunEnded {
+        /// Which.
+        run: RunId,
+        /// As above.
+        state: String,
+        /// The run as clients see it, as JSON.
+        view: String,
+        /// The run as the coordinator takes it up again, as JSON.
+        archive: String,
+    },
+    /// What there is of a stage's value that nobody waits for any more: tries, shards, checkpoints. `None`: there is nothing, or
+    /// somebody has taken it up.
+    Archive {
+        /// The stage's key.
+        key: Digest,
+        /// Whose tasks they are: under these names its logs and values are stored.
+        run: RunId,
+        /// As above.
+        stage: StageName,
+        /// JSON.
+        execution: Option<String>,
     },
     /// Values by step; stored once per (task, attempt, key, step) however often they are sent.
     Metrics {
@@ -127,9 +170,15 @@ impl Write {
             | Self::Checkpoint { grant, .. }
             | Self::Shard { grant, .. } => Some(grant),
             Self::StageResult { grant, .. } => grant.as_ref(),
-            Self::Journal(_) | Self::Fence { .. } | Self::Run { .. } | Self::Version { .. } | Self::Promote { .. } => {
-                None
-            }
+            Self::Facts { .. }
+            | Self::Snapshot { .. }
+            | Self::Fence { .. }
+            | Self::Run { .. }
+            | Self::RunState { .. }
+            | Self::RunEnded { .. }
+            | Self::Archive { .. }
+            | Self::Version { .. }
+            | Self::Promote { .. } => None,
         }
     }
 }

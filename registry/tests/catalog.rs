@@ -181,7 +181,7 @@ async fn the_log_and_the_versions_cannot_be_edited_even_by_hand() {
     let dir = tempfile::tempdir().unwrap();
     let (store, _) = with_versions(dir.path(), &[0.1]).await;
     promote(&store, "m:1", "prod", None, &[]).await.unwrap();
-    store.write(vec![common::fence("r/s", 1), Write::Journal(serde_json::json!(1))]).await.unwrap();
+    store.write(vec![common::fence("r/s", 1), common::note(serde_json::json!(1))]).await.unwrap();
     drop(store);
     let path = dir.path().join("stride.db");
     let mut conn = sqlx::SqliteConnection::connect(&format!("sqlite:{}", path.display())).await.unwrap();
@@ -190,8 +190,8 @@ async fn the_log_and_the_versions_cannot_be_edited_even_by_hand() {
         "DELETE FROM promotions",
         "UPDATE versions SET artifact = 'x'",
         "DELETE FROM versions",
-        "DELETE FROM journal",
-        "UPDATE journal SET event = '2'",
+        "DELETE FROM facts",
+        "UPDATE facts SET facts = '2'",
         "UPDATE fences SET fence = 0",
     ] {
         assert!(sqlx::query(edit).execute(&mut conn).await.is_err(), "{edit}");

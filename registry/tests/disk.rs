@@ -8,7 +8,7 @@ mod common;
 use std::path::PathBuf;
 
 use checkpoint::BlobError;
-use registry::{Holder, OpenError, Store, Write, WriteError};
+use registry::{Holder, OpenError, Store, WriteError};
 use serde_json::json;
 
 fn folder(variable: &str) -> Option<PathBuf> {
@@ -24,7 +24,7 @@ async fn a_full_disk_is_a_storage_error_and_loses_nothing() {
     let Some(disk) = folder("STRIDE_SMALL_DISK") else { return };
     let dir = tempfile::tempdir_in(&disk).unwrap();
     let store = common::open(dir.path()).await;
-    store.write(vec![Write::Journal(json!("before"))]).await.unwrap();
+    store.write(vec![common::note(json!("before"))]).await.unwrap();
 
     let mut stored = Vec::new();
     let error = loop {
@@ -45,7 +45,7 @@ async fn a_full_disk_is_a_storage_error_and_loses_nothing() {
         }
     }
     let event = json!("x".repeat(8 << 20));
-    let error = store.write(vec![Write::Journal(event)]).await.unwrap_err();
+    let error = store.write(vec![common::note(event)]).await.unwrap_err();
     assert!(matches!(&error, WriteError::Storage(m) if m.contains("full")), "{error:?}");
     drop(store);
     let error = Store::open(dir.path(), Holder::this_process("t")).await.unwrap_err();
@@ -60,8 +60,8 @@ async fn a_full_disk_is_a_storage_error_and_loses_nothing() {
 
     std::fs::remove_file(&ballast).unwrap();
     let store = common::open(dir.path()).await;
-    assert_eq!(store.journal_read().await.unwrap(), [json!("before")]);
-    store.write(vec![Write::Journal(json!("after"))]).await.unwrap();
+    assert_eq!(common::notes(&store).await, [json!("before")]);
+    store.write(vec![common::note(json!("after"))]).await.unwrap();
     assert!(store.fsck().await.unwrap().problems.is_empty());
 }
 

@@ -30,8 +30,14 @@ fn child() {
         let store = open(&dir.join("store")).await;
         let task = TaskId::new("r/s");
         let from = store.latest_checkpoint(&task).await.unwrap().map_or(0, |c| c.step);
-        let granted = store.journal_read().await.unwrap().len() as u64 + 1;
-        store.write(vec![fence("r/s", granted), Write::Journal(json!({ "granted": granted }))]).await.unwrap();
+        let granted = common::notes(&store).await.len() as u64 + 1;
+        store
+            .write(vec![
+                fence("r/s", granted),
+                Write::Facts { seq: granted, facts: json!({ "granted": granted }).to_string() },
+            ])
+            .await
+            .unwrap();
         for step in from + 1..=STEPS {
             // Shares a part with every other checkpoint, as frozen weights are shared.
             store.blobs().put(b"frozen").unwrap();

@@ -26,8 +26,8 @@ async fn an_old_fence_refuses_the_whole_call_and_not_its_neighbours() {
     store.write(vec![fence(task, 2)]).await.unwrap();
     let stale = Write::Metrics { grant: grant(task, 1), rows: rows(0..3, 1.0) };
     let (refused, stored) = tokio::join!(
-        store.write(vec![Write::Journal(json!("from the refused")), stale]),
-        store.write(vec![Write::Journal(json!("from the neighbour"))])
+        store.write(vec![common::note(json!("from the refused")), stale]),
+        store.write(vec![common::note(json!("from the neighbour"))])
     );
     match refused.unwrap_err() {
         WriteError::StaleFence { task, current, carried } => {
@@ -36,7 +36,7 @@ async fn an_old_fence_refuses_the_whole_call_and_not_its_neighbours() {
         e => panic!("{e}"),
     }
     stored.unwrap();
-    assert_eq!(store.journal_read().await.unwrap(), [json!("from the neighbour")]);
+    assert_eq!(common::notes(&store).await, [json!("from the neighbour")]);
     assert!(store.metrics(&"r".into(), &"vae".into(), None, 0).await.unwrap().is_empty());
 }
 
@@ -121,13 +121,13 @@ proptest! {
             let mut pending = Vec::new();
             for (i, step) in steps.iter().enumerate() {
                 let write = match step {
-                    Step::Grant => { newest += 1; vec![fence("r/s", newest), Write::Journal(json!({"granted": newest}))] }
+                    Step::Grant => { newest += 1; vec![fence("r/s", newest), common::note(json!({"granted": newest}))] }
                     Step::Write { back } => {
                         let carried = newest.saturating_sub(*back);
                         let row = MetricRow { step: i as u64, key: "k".into(), value: 0.0 };
                         vec![
                             Write::Metrics { grant: grant("r/s", carried), rows: vec![row] },
-                            Write::Journal(json!({"written": carried})),
+                            common::note(json!({"written": carried})),
                         ]
                     }
                 };
@@ -136,9 +136,9 @@ proptest! {
                 if i % 3 == 0 { tokio::task::yield_now().await; }
             }
             for write in pending { let _ = write.await.unwrap(); }
-            // The journal is that one order; a grant may itself have come late and been refused.
+            // The facts are that one order; a grant may itself have come late and been refused.
             let mut current = 0;
-            for event in store.journal_read().await.unwrap() {
+            for event in common::notes(&store).await {
                 if let Some(granted) = event["granted"].as_u64() {
                     assert!(granted > current);
                     current = granted;
@@ -308,7 +308,11 @@ async fn shards_go_once_their_run_is_finished_and_pins_stay() {
         store.write(vec![Write::Shard { grant: grant(task, 1), output }]).await.unwrap();
     }
     store.pin(second, "to look at").await.unwrap();
-    assert!(store.gc(-1000).await.unwrap().remove.is_empty(), "a failed run may be resumed");
+    for state in ["failed", "cancelled", "paused", "running"] {
+        store.write(vec![run(state)]).await.unwrap();
+        assert!(store.gc(-1000).await.unwrap().remove.is_empty(), "a {state} run may go on");
+        assert_eq!(store.shards(&"r".into()).await.unwrap().len(), 2, "a {state} run may go on");
+    }
     store.write(vec![run("finished")]).await.unwrap();
     assert_eq!(store.gc(-1000).await.unwrap().remove.len(), 2);
     assert!(store.shards(&"r".into()).await.unwrap().is_empty());
@@ -358,9 +362,9 @@ async fn a_second_open_says_who_and_works_once_the_first_is_gone() {
     for part in ["trainer run quickstart.yaml", &std::process::id().to_string(), "http://127.0.0.1:7070"] {
         assert!(message.contains(part), "{message}");
     }
-    first.write(vec![Write::Journal(json!(1))]).await.unwrap();
+    first.write(vec![common::note(json!(1))]).await.unwrap();
     drop(first);
-    assert_eq!(open(dir.path()).await.journal_read().await.unwrap(), [json!(1)]);
+    assert_eq!(common::notes(&open(dir.path()).await).await, [json!(1)]);
 }
 
 #[tokio::test]
@@ -373,7 +377,7 @@ async fn p16_of_many_that_open_at_once_each_gets_it_or_learns_that_it_is_busy() 
             tokio::spawn(async move {
                 loop {
                     match Store::open(&path, Holder::this_process("one of many")).await {
-                        Ok(store) => return store.write(vec![Write::Journal(json!(0))]).await.unwrap(),
+                        Ok(store) => return store.write(vec![common::note(json!(0))]).await.unwrap(),
                         Err(OpenError::Busy { .. }) => tokio::task::yield_now().await,
                         Err(e) => panic!("{e}"),
                     }
@@ -384,7 +388,7 @@ async fn p16_of_many_that_open_at_once_each_gets_it_or_learns_that_it_is_busy() 
     for open in opens {
         open.await.unwrap();
     }
-    assert_eq!(open(dir.path()).await.journal_read().await.unwrap().len(), 16);
+    assert_eq!(common::notes(&open(dir.path()).await).await.len(), 16);
 }
 
 #[tokio::test]

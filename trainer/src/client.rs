@@ -122,7 +122,12 @@ impl Client {
     }
 
     pub(crate) async fn runs(&self) -> Result<Vec<RunView>> {
-        self.get("/v1/runs").await
+        self.newest_runs(1_000_000).await
+    }
+
+    /// Runs that go on, and of those that ended the newest `ended`.
+    async fn newest_runs(&self, ended: u32) -> Result<Vec<RunView>> {
+        self.get(&format!("/v1/runs?limit={ended}")).await
     }
 
     pub(crate) async fn run(&self, run: &RunId) -> Result<RunView> {
@@ -172,7 +177,7 @@ impl Client {
 
     /// The run that `text` means: its name, a unique beginning of it, or `@last`.
     pub(crate) async fn find(&self, text: &str) -> Result<RunView> {
-        let runs = self.runs().await?;
+        let runs = if text == "@last" { self.newest_runs(1).await? } else { self.runs().await? };
         let not_found = |message: String| Problem::new(exit::NOT_FOUND, anyhow::anyhow!("{message}"));
         if text == "@last" {
             return runs.into_iter().next_back().ok_or_else(|| {

@@ -100,7 +100,7 @@ impl From<coordinator::StartError> for Problem {
             coordinator::StartError::Listen { .. } => {
                 Self::new(exit::USAGE, error).hint("choose another address with --bind; port 0 takes a free one")
             }
-            coordinator::StartError::Replay(_) => Self::new(exit::FAILED, error)
+            coordinator::StartError::Recover(_) => Self::new(exit::FAILED, error)
                 .hint("go on with the build that wrote it, or use another --store; `registry` still reads this one"),
             _ => Self::new(exit::FAILED, error),
         }

@@ -98,14 +98,13 @@ pub(crate) async fn run(work: Work, options: Options) -> Result<u8> {
     let mut fleet = None;
     let watched = watch(&handle, &run, &pipeline, &options, &mut progress, &mut fleet, &mut stop).await;
     progress.finish();
-    let view = handle.run_view(&run);
+    let view = handle.run_view(&run).await;
     if let Some(fleet) = &mut fleet {
         fleet.kill().await;
     }
     handle.shutdown().await;
     let end = watched?;
-    let view =
-        view.ok_or_else(|| Problem::new(exit::FAULT, anyhow::anyhow!("run `{run}` is gone from its coordinator")))?;
+    let view = view.map_err(|error| Problem::new(exit::FAULT, error))?;
     Ok(report(&view, &pipeline, &end, &options))
 }
 
@@ -150,7 +149,7 @@ async fn watch(
 ) -> Result<End> {
     let mut changes = handle.changes();
     loop {
-        let Some(view) = handle.run_view(run) else { return Ok(End::Final) };
+        let Ok(view) = handle.run_view(run).await else { return Ok(End::Final) };
         progress.update(&view);
         if view.state.is_final() {
             return Ok(End::Final);
@@ -221,7 +220,7 @@ async fn drain(
     let deadline = Instant::now() + PATIENCE;
     let mut changes = handle.changes();
     loop {
-        if let Some(view) = handle.run_view(run) {
+        if let Ok(view) = handle.run_view(run).await {
             progress.update(&view);
         }
         let alive = match fleet {

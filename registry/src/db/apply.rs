@@ -8,7 +8,6 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::message::{Grant, MetricRow};
 use protocol::{Digest, Fence, Manifest, TaskId};
-use serde_json::Value;
 use sqlx::query_builder::Separated;
 use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 
@@ -25,21 +24,35 @@ const ROWS: usize = 250;
 /// Does all of `writes`, or says why one of them is refused; then the caller rolls back.
 pub(crate) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: &[Write]) -> Result<()> {
     let mut fences = Fences::read(conn, writes).await?;
-    let (mut entries, mut shards) = (Vec::new(), BTreeMap::new());
+    let (mut decisions, mut shards) = (Vec::new(), BTreeMap::new());
     for write in writes {
         if let Some(grant) = write.grant() {
             fences.check(grant)?;
         }
         match write {
-            Write::Journal(event) => entries.push(event),
+            Write::Facts { seq, facts } => decisions.push((*seq, facts.as_str())),
+            Write::Snapshot { seq, state } => set_snapshot(conn, *seq, state).await?,
             Write::Fence { task, fence } => fences.raise(task, *fence)?,
             Write::Run { run, pipeline, source, state, idempotency_key } => {
                 set_run(conn, run.as_str(), &pipeline.to_string(), source, state, idempotency_key.as_deref()).await?;
+            }
+            Write::RunState { run: of, state } => {
+                let set = sqlx::query("UPDATE runs SET state = ?, updated_ms = ? WHERE run = ?");
+                run(conn, set.bind(state).bind(clock::now_ms()).bind(of.as_str())).await?;
+            }
+            Write::RunEnded { run: of, state, view, archive } => {
+                let set = sqlx::query("UPDATE runs SET state = ?, updated_ms = ?, view = ?, archive = ? WHERE run = ?");
+                let set = set.bind(state).bind(clock::now_ms()).bind(view).bind(archive);
+                run(conn, set.bind(of.as_str())).await?;
+            }
+            Write::Archive { key, run: of, stage, execution } => {
+                set_archive(conn, *key, of.as_str(), stage.as_str(), execution.as_deref()).await?;
             }
             Write::Metrics { grant, rows } => add_metrics(conn, grant, rows).await?,
             Write::Logs { grant, first, lines } => add_logs(conn, grant, *first, lines).await?,
             Write::Checkpoint { grant, step, manifest, metrics } => {
                 complete(blobs, *manifest)?;
+                one_checkpoint_a_step(conn, &grant.task, *step, *manifest).await?;
                 let insert = sqlx::query(
                     "INSERT INTO checkpoints (task, attempt, step, manifest, metrics, at_ms) VALUES (?, ?, ?, ?, ?, ?) \
                      ON CONFLICT DO NOTHING",
@@ -82,7 +95,7 @@ pub(crate) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
             }
         }
     }
-    add_entries(conn, &entries).await?;
+    add_facts(conn, &decisions).await?;
     add_shards(conn, &shards).await?;
     fences.write(conn).await
 }
@@ -199,12 +212,67 @@ impl Fences {
     }
 }
 
-async fn add_entries(conn: &mut SqliteConnection, entries: &[&Value]) -> Result<()> {
+async fn add_facts(conn: &mut SqliteConnection, decisions: &[(u64, &str)]) -> Result<()> {
     let now = clock::now_ms();
-    let values = |row: &mut Separated<'_, Sqlite, &'static str>, event: &&Value| {
-        row.push_bind(now).push_bind(event.to_string());
+    if let Some((first, _)) = decisions.first() {
+        let find =
+            "SELECT max(coalesce((SELECT max(seq) FROM facts), 0), coalesce((SELECT max(seq) FROM snapshots), 0))";
+        let newest: i64 = one(conn, sqlx::query(find)).await?.map_or(0, |row| row.get(0));
+        if newest >= int(*first) {
+            return Err(WriteError::Internal(format!(
+                "decision {first} is in the store already (the newest is {newest}): does another coordinator hold it?"
+            )));
+        }
+    }
+    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (seq, facts): &(u64, &str)| {
+        row.push_bind(int(*seq)).push_bind(now).push_bind((*facts).to_owned());
     };
-    insert(conn, "INSERT INTO journal (at_ms, event) ", entries, values, "").await
+    insert(conn, "INSERT INTO facts (seq, at_ms, facts) ", decisions, values, "").await
+}
+
+/// Facts that a snapshot stands for go with the snapshot before it.
+async fn set_snapshot(conn: &mut SqliteConnection, seq: u64, state: &str) -> Result<()> {
+    let set = sqlx::query(
+        "INSERT INTO snapshots (seq, at_ms, state) VALUES (?, ?, ?) ON CONFLICT (seq) DO UPDATE SET state = excluded.state",
+    );
+    run(conn, set.bind(int(seq)).bind(clock::now_ms()).bind(state)).await?;
+    run(conn, sqlx::query("DELETE FROM snapshots WHERE seq < ?").bind(int(seq))).await?;
+    run(conn, sqlx::query("DELETE FROM facts WHERE seq <= ?").bind(int(seq))).await.map(|_| ())
+}
+
+async fn set_archive(
+    conn: &mut SqliteConnection,
+    key: Digest,
+    of: &str,
+    stage: &str,
+    execution: Option<&str>,
+) -> Result<()> {
+    let Some(execution) = execution else {
+        return run(conn, sqlx::query("DELETE FROM executions WHERE key = ?").bind(key.to_string())).await.map(|_| ());
+    };
+    let set = sqlx::query(
+        "INSERT INTO executions (key, run, stage, execution, at_ms) VALUES (?, ?, ?, ?, ?) ON CONFLICT (key) DO UPDATE \
+         SET run = excluded.run, stage = excluded.stage, execution = excluded.execution, at_ms = excluded.at_ms",
+    );
+    run(conn, set.bind(key.to_string()).bind(of).bind(stage).bind(execution).bind(clock::now_ms())).await.map(|_| ())
+}
+
+/// A step of a task has one state. Two are a promise broken, and going on from either would hide it.
+async fn one_checkpoint_a_step(conn: &mut SqliteConnection, task: &TaskId, step: u64, manifest: Digest) -> Result<()> {
+    let find = "SELECT manifest FROM checkpoints WHERE task = ? AND step = ? AND manifest <> ?";
+    let find = sqlx::query(find).bind(task.as_str()).bind(int(step)).bind(manifest.to_string());
+    match one(conn, find).await?.map(|row| row.get::<String, _>(0)) {
+        Some(stored) => Err(WriteError::Conflict(two_states(task, step, &stored, &manifest.to_string()))),
+        None => Ok(()),
+    }
+}
+
+/// What is said of two checkpoints of one step that differ.
+pub fn two_states(task: &TaskId, step: u64, stored: &str, now: &str) -> String {
+    format!(
+        "task `{task}` has checkpoint {stored} at step {step}; now it is {now}: the same step was computed twice with \
+         different results, which should be impossible"
+    )
 }
 
 async fn set_run(

@@ -311,12 +311,12 @@ async fn main() -> Result {
             opened => break opened?,
         }
     };
-    let entries = store.journal_read().await?.len();
+    let entries = store.recovery().await?.facts.len();
     let begun = Instant::now();
     let handle = Coordinator::start(store, Config { alone: false, park: false, ..Config::embedded() }).await?;
     let took = begun.elapsed();
     let rate = entries as f64 / took.as_secs_f64();
-    writeln!(out, "a restart came back from a journal of {entries} entries in {took:.2?}: {rate:.0} a second")?;
+    writeln!(out, "a restart came back from {entries} decisions after a snapshot in {took:.2?}: {rate:.0} a second")?;
     handle.shutdown().await;
     Ok(())
 }

@@ -1,6 +1,6 @@
 //! What happens to the coordinator, and what it wants done about it.
 //!
-//! An [`Event`] is a fact that recovery can replay: it is journaled with the [`Moment`] it was decided at. What a worker
+//! An [`Event`] is decided once and never again: what is kept are the facts that came of it ([`Fact`](crate::Fact)). What a worker
 //! merely says (a poll, a tick of the clock) is an [`Observation`]; [`observe`](crate::observe) turns it into events when
 //! it means something, so that heartbeats cost no disk write.
 
@@ -12,6 +12,9 @@ use protocol::stage::Keep;
 use protocol::{Digest, Fence, Incarnation, RunId, StageName, TaskId, WorkerId};
 use registry::Write;
 use serde::{Deserialize, Serialize};
+
+use crate::state::execution::StageExecution;
+use crate::state::run::Run;
 
 /// Milliseconds since 1970. Handed in, never read.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -31,8 +34,8 @@ impl Millis {
     }
 }
 
-/// When an event is decided, and the randomness it may use. Both are journaled, so that a replay decides the same.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+/// When an event is decided, and the randomness it may use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Moment {
     /// The time.
     pub now: Millis,
@@ -41,8 +44,7 @@ pub struct Moment {
 }
 
 /// What a client asks of a run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Control {
     /// Lease back; work yields.
     Pause,
@@ -61,9 +63,8 @@ pub struct Known {
     pub metrics: BTreeMap<String, f64>,
 }
 
-/// A fact.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "event", rename_all = "kebab-case")]
+/// Something that happened, or that somebody asks for.
+#[derive(Debug, Clone, PartialEq)]
 pub enum Event {
     /// The coordinator started. Every lease gets one interval of grace.
     Started {
@@ -128,6 +129,15 @@ pub enum Event {
         run: RunId,
         /// What.
         action: Control,
+        /// The run as it was archived when it ended, for one that is not in memory.
+        archived: Option<Box<Run>>,
+    },
+    /// A worker has not been heard of for so long that nothing is lost with its name.
+    WorkerForgotten {
+        /// Who.
+        worker: WorkerId,
+        /// Which process.
+        incarnation: Incarnation,
     },
     /// The coordinator is about to stop: workers save and leave.
     Drain,
@@ -149,6 +159,10 @@ pub enum Event {
         key: Digest,
         /// Its value, if the store has it.
         known: Option<Known>,
+        /// Under whose names the value's logs and metrics are stored, if there is a value.
+        source: Option<(RunId, StageName)>,
+        /// What an earlier try has left, if there is no value.
+        archived: Option<Box<StageExecution>>,
     },
     /// The answer to [`Effect::Register`]: the model bundles are stored.
     Bundled {
@@ -176,12 +190,16 @@ pub enum Observation {
         /// What it said.
         poll: Poll,
     },
-    /// Time passed.
-    Tick,
+    /// The clock was looked at.
+    Tick {
+        /// How much later than it meant to, in milliseconds: then this whole process was stopped or starved and heard nobody. A wait
+        /// for the disk is not part of it, for polls are heard meanwhile.
+        overslept: u64,
+    },
 }
 
 /// A denoiser that a register stage makes a version of.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Candidate {
     /// The stage that made it.
     pub stage: StageName,

@@ -10,13 +10,14 @@
 //! | C5 | Fences, attempts and incarnations never go down; whoever gains or loses a task sees the fence go up. |
 //! | C6 | An accepted artifact of a task, and a done stage of a run, never change. |
 //! | C7 | A merge is held only once all shards are there. |
-//! | C8 | StageExecution that no running run waits for is drain_by down. |
+//! | C8 | What no running run waits for is asked to wind down. |
 //! | C9 | A stage is active or done only if everything it reads is done; an active stage has work that is not over. |
 //! | C10 | A run is finished exactly if all that was asked for is done, and failed only with a failed stage. |
 //! | C11 | While a small task is ready and not backing off, no worker of its backend is idle. |
 //! | C12 | A checkpoint's steps grow within a task. |
 //! | C13 | A stage that is swept has a searcher that is not over, and a place for each of its tickets. |
-//! | C14 | What is known twice agrees: which tasks are held or wait, where a task is, what a worker holds, who holds nothing. |
+//! | C14 | What is known twice agrees: which tasks are held or wait, where a task is, what a worker holds, who holds nothing, which stages are active, who uses an execution. |
+//! | C15 | Memory holds what may still matter: no ended run, and no execution that no run uses and nobody works on. |
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -59,7 +60,10 @@ pub fn check(state: &State) -> Vec<String> {
             }
         }
     }
-    for run in &state.runs {
+    for run in state.runs.values() {
+        if run.state.is_final() {
+            broken.push(format!("C15: `{}` is {:?} and still in memory", run.id, run.state));
+        }
         for (i, status) in run.stages.iter().enumerate() {
             if matches!(status, Status::Active { .. } | Status::Done { .. }) && run.inputs(i).is_none() {
                 broken.push(format!("C9: stage {i} of `{}` runs without its inputs", run.id));
@@ -99,12 +103,35 @@ fn check_index(state: &State) -> Vec<String> {
     let mut broken = Vec::new();
     let (mut places, mut holds) = (BTreeMap::new(), BTreeMap::new());
     for (key, execution) in &state.executions {
+        if execution.users.is_empty() && !execution.is_busy() {
+            broken.push(format!("C15: nobody uses execution {key}, nobody works on it, and it is still in memory"));
+        }
         if !execution.tasks.is_indexed() {
             broken.push(format!("C14: the index of execution {key} is not that of {:?}", execution.tasks));
         }
         for (i, task) in execution.tasks.iter().enumerate() {
             places.insert(&task.id, (*key, i));
             holds.extend(task.holders().iter().map(|member| (&member.worker, (*key, i))));
+        }
+    }
+    for run in state.runs.values() {
+        if !run.is_indexed() {
+            broken.push(format!("C14: the index of `{}` is wrong", run.id));
+        }
+        for (_, key) in run.all_active() {
+            let uses = run.all_active().filter(|(_, other)| *other == key).count();
+            let known = state.executions.get(&key).and_then(|execution| execution.users.get(&run.number));
+            if known.is_none_or(|known| *known < uses) {
+                broken.push(format!("C14: `{}` waits {uses} times for {key}, which knows of {known:?}", run.id));
+            }
+        }
+    }
+    for (key, execution) in &state.executions {
+        for (number, known) in &execution.users {
+            let uses = state.runs.get(number).map(|run| run.stages.iter().filter(|s| s.key() == Some(*key)).count());
+            if uses.is_none_or(|uses| uses < *known) {
+                broken.push(format!("C14: execution {key} is used {uses:?} times by run {number}, known is {known}"));
+            }
         }
     }
     if !places.iter().map(|(task, place)| (*task, place)).eq(state.tasks.iter()) {
@@ -141,12 +168,12 @@ fn check_task(state: &State, execution: &StageExecution, task: &Task, broken: &m
         broken.push(format!("C3: `{}` is held while its execution is {:?}", task.id, execution.state));
     }
     let names: BTreeSet<_> = holders.iter().map(|member| &member.worker).collect();
-    let range = execution.placement.workers;
+    let range = execution.range();
     let fits = match task.part {
         // Who winds down keeps its members, even if the run that asks has changed, and with it the bounds.
         Part::Gang => {
             let drain_by = matches!(task.lease, Lease::Held { drain_by: Some(_), .. });
-            let fits = range.max == 0 || holders.len() <= range.max.max(range.min);
+            let fits = holders.len() <= range.max;
             !holders.is_empty() && (fits || drain_by || state.draining)
         }
         Part::Alone | Part::Shard { .. } | Part::Merge => holders.len() == 1,
@@ -163,13 +190,19 @@ fn check_task(state: &State, execution: &StageExecution, task: &Task, broken: &m
 pub fn check_change(before: &State, after: &State) -> Vec<String> {
     let mut broken = check(after);
     for (name, worker) in before.workers.iter() {
-        if after.workers.get(name).is_none_or(|now| now.incarnation < worker.incarnation) {
-            broken.push(format!("C5: worker `{name}` lost its incarnation {}", worker.incarnation));
+        match after.workers.get(name) {
+            Some(now) if now.incarnation >= worker.incarnation => {}
+            // Its next process has a number that was never used.
+            None if after.incarnation >= worker.incarnation => {}
+            other => broken.push(format!("C5: worker `{name}` lost its incarnation {}: {other:?}", worker.incarnation)),
         }
     }
     for (key, execution) in &before.executions {
         let Some(now) = after.executions.get(key) else {
-            broken.push(format!("C5: execution {key} is forgotten"));
+            // Whatever comes in its place begins above every fence there was.
+            if execution.tasks.iter().any(|task| task.fence > after.fence) {
+                broken.push(format!("C5: execution {key} is forgotten, with fences above {}", after.fence));
+            }
             continue;
         };
         for task in &execution.tasks {
@@ -193,7 +226,10 @@ pub fn check_change(before: &State, after: &State) -> Vec<String> {
             }
         }
     }
-    for (run, now) in before.runs.iter().zip(&after.runs) {
+    if before.submitted > after.submitted {
+        broken.push(format!("C5: run numbers went from {} to {}", before.submitted, after.submitted));
+    }
+    for (run, now) in before.runs.iter().filter_map(|(number, run)| Some((run, after.runs.get(number)?))) {
         for (i, status) in run.stages.iter().enumerate() {
             if matches!(status, Status::Done { .. }) && now.stages[i] != *status {
                 broken.push(format!("C6: stage {i} of `{}` was done and changed", run.id));

@@ -1,7 +1,7 @@
 //! Who works on what, and whose results count.
 //!
-//! The crate has two halves. The pure one ([`decide`], [`observe`], [`state`], [`journal`]) is a function of state, time and
-//! event; it is tested under virtual time in microseconds. The thin one (the shell) is the HTTP server, the clock and the
+//! The crate has two halves. The pure one ([`decide`], [`observe`], [`state`], [`fact`], [`journal`]) is a function of state, time
+//! and event, whose result are facts; it is tested under virtual time in microseconds. The thin one (the shell) is the HTTP server, the clock and the
 //! runner of effects. The store is the fence: nothing here is trusted to notice in time that a worker lost its lease,
 //! because every write carries a fence that the transaction checks.
 //!
@@ -9,6 +9,7 @@
 
 pub mod decide;
 pub mod event;
+pub mod fact;
 pub mod invariants;
 pub mod journal;
 pub mod observe;
@@ -25,8 +26,10 @@ mod view;
 
 pub use decide::decide;
 pub use event::{Control, Effect, Event, Millis, Moment, Observation, Rejected};
+pub use fact::Fact;
 pub use observe::observe;
-pub use policy::Policy;
+pub use outcome::refused_for_good;
+pub use policy::{GrantOrder, Policy};
 pub use shell::{Config, Connections, Coordinator, Handle, Refused, StartError};
 pub use state::State;
 pub use view::WorkerView;

@@ -1,5 +1,5 @@
-//! What is heard, and what it means. Heartbeats change only [`Heard`](crate::state::Heard); the facts that follow from them
-//! are returned as events, to be decided and journaled one by one.
+//! What is heard, and what it means. Heartbeats change only [`Heard`](crate::state::Heard); what follows from them
+//! is returned as events, to be decided one by one.
 
 use std::sync::Arc;
 
@@ -11,16 +11,15 @@ use crate::state::State;
 use crate::state::task::Lease;
 use crate::state::worker::Presence;
 
-/// Takes note of `observation` and says which facts follow from it.
-pub fn observe(state: &mut State, now: Millis, observation: Observation) -> Result<Vec<Event>, Rejected> {
-    let now = now.max(state.now);
+/// Takes note of `observation`, which was made at `at`, and says which events follow from it.
+pub fn observe(state: &mut State, at: Millis, observation: Observation) -> Result<Vec<Event>, Rejected> {
     match observation {
-        Observation::Poll { worker, poll } => heard(state, now, worker, poll),
-        Observation::Tick => Ok(tick(state, now)),
+        Observation::Poll { worker, poll } => heard(state, at, worker, poll),
+        Observation::Tick { overslept } => Ok(tick(state, at, overslept)),
     }
 }
 
-/// Whether `poll` says no more than that its worker lives and how far it is: no fact follows from it.
+/// Whether `poll` says no more than that its worker lives and how far it is: nothing follows from it.
 pub fn is_quiet(state: &State, worker: &WorkerId, poll: &Poll) -> Result<bool, Rejected> {
     let known = state.process(worker, poll.incarnation)?;
     Ok(known.presence == Presence::Here && poll.doing.iter().all(|doing| doing.lost.is_empty()))
@@ -45,7 +44,8 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
             )));
         }
     }
-    Arc::make_mut(&mut state.heard.workers).insert(worker, now);
+    let heard = Arc::make_mut(&mut state.heard.workers).entry(worker).or_default();
+    *heard = now.max(*heard);
     for doing in poll.doing {
         let Ok((execution, task)) = state.task(&doing.grant.task) else { continue };
         let Ok(rank) = task.check(&doing.grant) else { continue };
@@ -61,31 +61,33 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
     Ok(events)
 }
 
-fn tick(state: &mut State, now: Millis) -> Vec<Event> {
-    // When the clock was not looked at for long, nobody was listening either: that is not the workers' fault. Who was heard
-    // meanwhile all the same gets no more than a lease from now.
-    let late = state.heard.ticked.map_or(0, |before| now.since(before));
-    if late > state.policy.lease_ms / 3 {
+/// What the clock means, looked at `at`. It may be taken up later than that, when the disk is slow: a lease is measured by when it was
+/// looked at, for until then polls were heard.
+fn tick(state: &mut State, at: Millis, overslept: u64) -> Vec<Event> {
+    let now = at.max(state.now);
+    // Who sleeps through his own alarm was not listening either: that is not the workers' fault. Who was heard meanwhile all the same
+    // gets no more than a lease from now.
+    if overslept > state.policy.lease_ms / 3 {
         for heard in Arc::make_mut(&mut state.heard.workers).values_mut() {
-            *heard = heard.after(late).min(now);
+            *heard = heard.after(overslept).min(at);
         }
     }
-    state.heard.ticked = Some(now);
     let mut events = Vec::new();
     let unheard: Vec<WorkerId> =
         state.workers.keys().filter(|name| !state.heard.workers.contains_key(*name)).cloned().collect();
     if !unheard.is_empty() {
-        Arc::make_mut(&mut state.heard.workers).extend(unheard.into_iter().map(|name| (name, now)));
+        Arc::make_mut(&mut state.heard.workers).extend(unheard.into_iter().map(|name| (name, at)));
     }
     for (name, worker) in state.workers.iter() {
-        match worker.presence {
-            Presence::Here | Presence::Suspect { .. } => {
-                let heard = state.heard.workers[name];
-                if now.since(heard) > state.policy.lease_ms {
-                    events.push(Event::LeaseExpired { worker: name.clone(), incarnation: worker.incarnation });
-                }
+        let (worker, incarnation, silent) = (name.clone(), worker.incarnation, at.since(state.heard.workers[name]));
+        match state.workers[name].presence {
+            Presence::Here | Presence::Suspect { .. } if silent > state.policy.lease_ms => {
+                events.push(Event::LeaseExpired { worker, incarnation });
             }
-            Presence::Silent | Presence::Gone => {}
+            Presence::Silent | Presence::Gone if silent > state.policy.forget_ms => {
+                events.push(Event::WorkerForgotten { worker, incarnation });
+            }
+            Presence::Here | Presence::Suspect { .. } | Presence::Silent | Presence::Gone => {}
         }
     }
     let open = state

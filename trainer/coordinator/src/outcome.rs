@@ -7,18 +7,21 @@
 //! | yielded | waits | refused | as above |
 //! | failed: infrastructure | tried again | the member leaves the gang | as above |
 //! | failed: fault | tried again | tried again | as above |
-//! | failed: input, diverged, memory, storage | final | final | as above |
+//! | failed: memory, others in the gang | tried without the member | tried without the member | as above |
+//! | failed: input, diverged, memory and alone, storage | final | final | as above |
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
-use protocol::message::{CommitCheckpoint, FailureClass, ReportOutcome, TaskOutcome};
+use protocol::message::{CommitCheckpoint, FailureClass, Grant, ReportOutcome, TaskOutcome};
 use protocol::stage::{Keep, StageSettings};
 use protocol::sweep::STATE_OUTPUT;
 use protocol::{Digest, WorkerId};
-use registry::Write;
+use registry::{Write, WriteError};
 
-use crate::decide::{Deciding, result};
-use crate::event::{Effect, Known, Rejected};
+use crate::decide::{Deciding, Loss, result};
+use crate::event::{Effect, Event, Known, Rejected};
+use crate::fact::Fact;
 use crate::state::execution::ExecutionState;
 use crate::state::task::{Lease, Part, Saved, Task};
 
@@ -31,6 +34,12 @@ impl Deciding<'_> {
         }
         match task.newest() {
             Some(newest) if newest.step == step && newest.manifest == manifest => return Ok(false),
+            Some(newest) if newest.step == step => {
+                let message = registry::two_states(&task.id, step, &newest.manifest.to_string(), &manifest.to_string());
+                let (key, _) = self.place(&grant.task)?;
+                self.fail_execution(key, message, false);
+                return Ok(true);
+            }
             Some(newest) if newest.step > step => {
                 return Err(Rejected::Conflict(format!(
                     "task `{}` has a checkpoint at step {} already; one at step {step} would go back",
@@ -42,7 +51,7 @@ impl Deciding<'_> {
         let keep = execution.placement.checkpoint.keep.clone();
         let (key, i) = self.place(&grant.task)?;
         let saved = Saved { step, manifest, metrics: metrics.clone() };
-        let dropped = self.state.change(key, i, |task| task.save(saved, &keep));
+        let dropped = self.change(key, i, |task| task.save(saved, &keep));
         if !dropped.is_empty() {
             self.effects.push(Effect::Prune { task: grant.task.clone(), keep });
         }
@@ -72,7 +81,7 @@ impl Deciding<'_> {
                 }
                 let now = self.now();
                 let soon = now.after(self.state.policy.backoff_ms);
-                self.state.change(key, i, |task| {
+                self.change(key, i, |task| {
                     let asked = matches!(task.lease, Lease::Held { drain_by: Some(_), .. });
                     task.give_back((!asked).then_some(soon));
                 });
@@ -81,6 +90,13 @@ impl Deciding<'_> {
                 let fault = match class {
                     FailureClass::Fault => true,
                     FailureClass::Infrastructure => false,
+                    // The others hold the same weights, but may hold them in more memory: they go on without this one.
+                    FailureClass::OutOfMemory if self.state.executions[&key].tasks[i].holders().len() > 1 => {
+                        self.change(key, i, |task| task.too_small.push(worker.clone()));
+                        self.take_from(key, i, std::slice::from_ref(&worker), Loss::Lost);
+                        self.accepted(key, i, &report);
+                        return Ok(true);
+                    }
                     FailureClass::Input
                     | FailureClass::Diverged
                     | FailureClass::OutOfMemory
@@ -103,7 +119,7 @@ impl Deciding<'_> {
     }
 
     fn accepted(&mut self, key: Digest, i: usize, report: &ReportOutcome) {
-        self.state.change(key, i, |task| task.reported = Some(report.clone()));
+        self.change(key, i, |task| task.reported = Some(report.clone()));
     }
 
     fn finished(
@@ -118,8 +134,8 @@ impl Deciding<'_> {
         let grant = report.grant.clone();
         let execution = &self.state.executions[&key];
         let state = left_state(&execution.settings, &execution.tasks[i])?;
-        self.state.change(key, i, |task| task.finish(output));
-        let execution = self.state.execution_mut(key);
+        self.change(key, i, |task| task.finish(output));
+        let execution = &self.state.executions[&key];
         if let Part::Shard { .. } = execution.tasks[i].part {
             self.writes.push(Write::Shard { grant, output });
             return Ok(());
@@ -129,12 +145,16 @@ impl Deciding<'_> {
         outputs.extend(state.map(|state| (STATE_OUTPUT.to_owned(), state)));
         let known = Known { outputs, metrics };
         let write = result(execution, Some(grant), &known, now);
-        execution.state = ExecutionState::Done { known, cached: false };
+        let keep = execution.placement.checkpoint.keep.clone();
+        self.record(Fact::ExecutionState {
+            key,
+            state: ExecutionState::Done { known: Arc::new(known), cached: false },
+        });
         self.writes.push(write);
         // The value is there: what an interrupted try would have gone on from is of no use any more, but for the last way
         // from one checkpoint to the next, which `trainer run --verify` walks again, and the best, if they were asked for.
-        if !self.state.change(key, i, |task| std::mem::take(&mut task.checkpoints)).is_empty() {
-            let keep = Keep { latest: 2, ..self.state.executions[&key].placement.checkpoint.keep.clone() };
+        if !self.change(key, i, |task| std::mem::take(&mut task.checkpoints)).is_empty() {
+            let keep = Keep { latest: 2, ..keep };
             self.effects.push(Effect::Prune { task: report.grant.task.clone(), keep });
         }
         Ok(())
@@ -157,4 +177,29 @@ fn left_state(settings: &StageSettings, task: &Task) -> Result<Option<Digest>, R
 
 fn only_rank_0(worker: &WorkerId, what: &str) -> Rejected {
     Rejected::Conflict(format!("worker `{worker}` is not rank 0 of its gang, which alone {what}"))
+}
+
+/// What happens instead of an event that the store refuses and always will.
+pub fn refused_for_good(event: &Event, error: &WriteError) -> Option<Event> {
+    let (message, is_missing) = match error {
+        WriteError::Conflict(message) | WriteError::Gate(message) => (message.clone(), false),
+        WriteError::NotFound(message) => (message.clone(), true),
+        WriteError::StaleFence { .. }
+        | WriteError::Superseded { .. }
+        | WriteError::Storage(_)
+        | WriteError::Internal(_) => return None,
+    };
+    let failed = |grant: &Grant| {
+        // What is missing was collected between its upload and its report, or never came: another try brings it, within the budget.
+        // Two values for one thing: the first promise is broken, and computing again would not mend it.
+        let class = if is_missing { FailureClass::Fault } else { FailureClass::Storage };
+        let outcome = TaskOutcome::Failed { class, message: message.clone() };
+        Some(Event::Outcome { report: ReportOutcome { grant: grant.clone(), outcome } })
+    };
+    match event {
+        Event::Bundled { key, .. } => Some(Event::RegisterRefused { key: *key, message }),
+        Event::Outcome { report } => failed(&report.grant),
+        Event::Checkpoint { commit } => failed(&commit.grant),
+        _ => None,
+    }
 }

@@ -1,5 +1,14 @@
 //! The numbers of coordination. Configuration, so that tests can vary them; the defaults are the promises.
 
+/// Which of several idle workers is served first. What comes of the work does not depend on it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum GrantOrder {
+    /// The first by name.
+    ByName,
+    /// The last by name.
+    ByNameBackwards,
+}
+
 /// Times, budgets and periods.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Policy {
@@ -17,6 +26,12 @@ pub struct Policy {
     pub backoff_ms: u64,
     /// Longest back-off. Milliseconds.
     pub backoff_max_ms: u64,
+    /// How long a worker's name is kept that is gone or silent. Milliseconds.
+    pub forget_ms: u64,
+    /// After how many decisions the state is stored as a whole and the facts before it go.
+    pub snapshot_every: u64,
+    /// Who is served first.
+    pub grants: GrantOrder,
     /// Faults of ours that a task survives.
     pub fault_budget: u32,
     /// Losses of workers and networks that a task survives.
@@ -33,6 +48,9 @@ impl Default for Policy {
             penalty_ms: 3_000,
             backoff_ms: 500,
             backoff_max_ms: 30_000,
+            forget_ms: 3_600_000,
+            snapshot_every: 4_000,
+            grants: GrantOrder::ByName,
             fault_budget: 5,
             infrastructure_budget: 100,
         }

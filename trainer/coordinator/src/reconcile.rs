@@ -1,48 +1,50 @@
-//! The part of `decide` that follows every event: stages take over what their work gave, stages whose inputs are there
+//! The part of `decide` that follows every event, for what the event touched: stages take over what their work gave, stages whose inputs are there
 //! begin, and work that nobody waits for is asked to wind down.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use protocol::Digest;
 use protocol::message::{RunState, StageState};
 use protocol::stage::{Register, Shape};
+use protocol::{Digest, StageName};
 
 use crate::decide::Deciding;
 use crate::event::{Effect, Millis};
+use crate::fact::Fact;
 use crate::register::Registration;
 use crate::state::execution::{ExecutionState, StageExecution};
-use crate::state::run::Status;
+use crate::state::run::{Run, Status};
 use crate::state::tasks::Tasks;
 
 impl Deciding<'_> {
-    /// Brings every run up to date with its works, until nothing moves.
+    /// Brings every run that was touched up to date with its executions, until nothing moves.
     pub(crate) fn reconcile(&mut self) {
-        for i in 0..self.state.runs.len() {
-            loop {
-                let mut moved = self.take_over_results(i);
-                moved |= self.sweep(i);
-                let settled = self.state.runs[i].settled();
-                if settled != self.state.runs[i].state {
-                    if settled == RunState::Failed {
-                        let run = Arc::make_mut(&mut self.state.runs[i]);
-                        let name = run.failed().map(|j| run.pipeline.stages[j].name.to_string()).unwrap_or_default();
-                        run.skip_rest(&format!("stage `{name}` failed"));
-                    }
-                    self.set_run_state(i, settled);
-                }
-                if !self.attach_ready(i) && !moved {
-                    break;
-                }
+        while let Some(number) = self.unsettled.pop_first() {
+            if !self.state.runs.contains_key(&number) {
+                continue;
             }
+            self.state.visits += 1;
+            self.take_over_results(number);
+            self.sweep(number);
+            let run = &self.state.runs[&number];
+            let (settled, parked) = (run.settled(), run.parked);
+            if settled != run.state {
+                if settled == RunState::Failed {
+                    let name = run.failed().map(|j| run.pipeline.stages[j].name.to_string()).unwrap_or_default();
+                    self.change_run(number, |run| run.skip_rest(&format!("stage `{name}` failed")));
+                }
+                self.set_run_state(number, settled, parked);
+            }
+            self.attach_ready(number);
+            // Whatever moved has touched the run, so it is looked at again.
         }
     }
 
-    fn take_over_results(&mut self, i: usize) -> bool {
+    fn take_over_results(&mut self, number: u64) {
         let now = self.now();
-        let mut moved = false;
-        for j in 0..self.state.runs[i].stages.len() {
-            let Status::Active { key } = self.state.runs[i].stages[j] else { continue };
+        let run = Arc::clone(&self.state.runs[&number]);
+        let mut stages = Vec::new();
+        for (j, key) in run.all_active() {
             self.count_time_of(key, now);
             let execution = &self.state.executions[&key];
             let status = match &execution.state {
@@ -55,42 +57,44 @@ impl Deciding<'_> {
                         (false, false) => StageState::Ran,
                     };
                     let wall_s = if *cached { 0.0 } else { execution.wall_s(now) };
-                    Status::Done { key, how, known: known.clone(), wall_s, attempt: execution.attempt() }
+                    Status::Done { key, how, known: Arc::clone(known), wall_s, attempt: execution.attempt() }
                 }
             };
-            Arc::make_mut(&mut self.state.runs[i]).stages[j] = status;
-            moved = true;
+            stages.push((j, status));
         }
-        moved
+        if !stages.is_empty() {
+            self.record(Fact::Stages { run: number, stages });
+        }
     }
 
     /// Starts the stages of a running run whose inputs are there.
-    fn attach_ready(&mut self, i: usize) -> bool {
-        if self.state.runs[i].state != RunState::Running {
-            return false;
+    fn attach_ready(&mut self, number: u64) {
+        let run = Arc::clone(&self.state.runs[&number]);
+        if run.state != RunState::Running {
+            return;
         }
-        let mut moved = false;
-        for j in 0..self.state.runs[i].stages.len() {
-            if self.state.runs[i].stages[j] == Status::Waiting
-                && let Some(inputs) = self.state.runs[i].inputs(j)
+        let mut stages = Vec::new();
+        for (j, status) in run.stages.iter().enumerate() {
+            if *status == Status::Waiting
+                && let Some(inputs) = run.inputs(j)
             {
-                let status = if self.state.runs[i].pipeline.stages[j].sweep.is_some() {
-                    self.begin_sweep(i, j)
+                let status = if run.pipeline.stages[j].sweep.is_some() {
+                    self.begin_sweep(number, j)
                 } else {
-                    self.attach(i, j, inputs)
+                    self.attach(&run, j, inputs)
                 };
-                Arc::make_mut(&mut self.state.runs[i]).stages[j] = status;
-                moved = true;
+                stages.push((j, status));
             }
         }
-        moved
+        if !stages.is_empty() {
+            self.record(Fact::Stages { run: number, stages });
+        }
     }
 
-    fn attach(&mut self, i: usize, j: usize, inputs: BTreeMap<String, Digest>) -> Status {
-        let run = Arc::clone(&self.state.runs[i]);
+    fn attach(&mut self, run: &Run, j: usize, inputs: BTreeMap<String, Digest>) -> Status {
         let stage = &run.pipeline.stages[j];
         let key = run.pipeline.identity(stage, &inputs).key();
-        let registration = match stage.settings.get::<Register>().map(|settings| Registration::gather(&run, settings)) {
+        let registration = match stage.settings.get::<Register>().map(|settings| Registration::gather(run, settings)) {
             Some(Ok(registration)) => Some(registration),
             Some(Err(message)) => return Status::Failed { key, message },
             None => {
@@ -98,19 +102,24 @@ impl Deciding<'_> {
                 None
             }
         };
-        match self.state.executions.contains_key(&key).then(|| self.state.execution_mut(key)) {
+        match self.state.executions.get(&key).cloned() {
             Some(execution) => {
-                execution.placement = stage.placement.clone();
-                match execution.state {
+                if execution.placement != stage.placement {
+                    self.record(Fact::ExecutionPlacement { key, placement: stage.placement.clone() });
+                }
+                let lost = match execution.state {
                     ExecutionState::Looking | ExecutionState::Open | ExecutionState::Bundling => {
                         return Status::Active { key };
                     }
-                    ExecutionState::Done { .. } => execution.want_again(true),
+                    ExecutionState::Done { .. } => true,
                     ExecutionState::Failed { .. } => {
-                        execution.resumed |= execution.has_something();
-                        execution.want_again(false);
+                        if execution.has_something() {
+                            self.resumed(key);
+                        }
+                        false
                     }
-                }
+                };
+                self.want_again(&execution, run, &stage.name, lost);
             }
             None => {
                 let execution = StageExecution {
@@ -129,40 +138,61 @@ impl Deciding<'_> {
                     wall_ms: 0,
                     busy_since: None,
                     resumed: false,
+                    users: BTreeMap::new(),
                 };
-                self.state.executions.insert(key, Arc::new(execution));
+                self.record(Fact::Execution { execution: Box::new(execution) });
             }
         }
         self.effects.push(Effect::Lookup { key });
         Status::Active { key }
     }
 
-    /// StageExecution that no running run waits for is asked to wind down; work that one waits for again carries on.
+    /// Wanted again after it was over: the store is asked first, and budgets are whole again.
+    fn want_again(&mut self, execution: &StageExecution, run: &Run, stage: &StageName, lost_value: bool) {
+        let key = execution.key;
+        if execution.tasks.is_empty() {
+            // Nothing was done here; what will be bears the name of who asks.
+            self.record(Fact::ExecutionSource { key, run: run.id.clone(), stage: stage.clone() });
+        }
+        for i in 0..execution.tasks.len() {
+            self.change(key, i, |task| if lost_value { task.reopen() } else { task.reset_budgets() });
+        }
+        self.record(Fact::ExecutionState { key, state: ExecutionState::Looking });
+    }
+
+    /// What no running run waits for is asked to wind down; what one waits for again carries on.
     pub(crate) fn drain(&mut self) {
         let deadline = self.now().after(self.state.policy.grace_ms);
-        let wanted: BTreeSet<Digest> = self.state.wanted().into_iter().collect();
-        for key in self.keys() {
-            let carry_on = wanted.contains(&key) && !self.state.draining;
-            if !self.state.executions[&key].tasks.all_draining(!carry_on) {
-                let held: Vec<usize> = self.state.executions[&key].tasks.held().collect();
-                for i in held {
-                    self.state.change(key, i, |task| task.drain((!carry_on).then_some(deadline)));
+        for key in self.touched.clone() {
+            let Some(execution) = self.state.executions.get(&key).cloned() else { continue };
+            if !execution.tasks.is_any_held() {
+                continue;
+            }
+            self.state.visits += 1;
+            let carry_on = !self.state.draining && self.state.is_wanted(&execution);
+            if !execution.tasks.all_draining(!carry_on) {
+                for i in execution.tasks.held() {
+                    self.change(key, i, |task| task.drain((!carry_on).then_some(deadline)));
                 }
             }
         }
     }
 
+    /// Starts or stops the count of seconds of what was touched.
     pub(crate) fn count_time(&mut self) {
         let now = self.now();
-        for key in self.keys() {
+        for key in self.touched.clone() {
             self.count_time_of(key, now);
         }
     }
 
     fn count_time_of(&mut self, key: Digest, now: Millis) {
-        let execution = &self.state.executions[&key];
-        if execution.is_busy() != execution.busy_since.is_some() {
-            self.state.execution_mut(key).count_time(now);
-        }
+        let Some(execution) = self.state.executions.get(&key) else { return };
+        let (wall_ms, busy_since) = match (execution.is_busy(), execution.busy_since) {
+            (true, None) => (execution.wall_ms, Some(now)),
+            (false, Some(since)) => (execution.wall_ms + now.since(since), None),
+            (true, Some(_)) | (false, None) => return,
+        };
+        self.record(Fact::ExecutionTime { key, wall_ms, busy_since });
     }
 }

@@ -9,13 +9,14 @@ use protocol::pipeline::Pipeline;
 use protocol::stage::{Mode, Register};
 use protocol::{Alias, ArtifactKind, Digest, ModelName, RunId, StageName};
 use registry::Write;
+use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use crate::event::{Candidate, Known};
 use crate::state::run::{Run, value};
 
 /// All that a register stage needs to know, once its inputs are there.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Registration {
     /// In the order of `from`.
     pub candidates: Vec<Candidate>,

@@ -36,23 +36,24 @@ enum Found {
 
 impl Deciding<'_> {
     /// Begins a sweep, or takes it up again.
-    pub(crate) fn begin_sweep(&mut self, i: usize, j: usize) -> Status {
-        let run = Arc::make_mut(&mut self.state.runs[i]);
-        if run.sweep(j).is_none() {
-            let stage = &run.pipeline.stages[j];
-            let sweep = stage.sweep.as_ref().expect("the stage has a sweep");
-            let search = Search::new(sweep, &stage.settings, &stage.name, run.pipeline.seed);
-            run.sweeps.push(Sweeping { stage: j, search, places: Vec::new(), failures: BTreeMap::new() });
-            unfold(run, run.sweeps.len() - 1);
+    pub(crate) fn begin_sweep(&mut self, number: u64, j: usize) -> Status {
+        if self.state.runs[&number].sweep(j).is_none() {
+            self.change_run(number, |run| {
+                let stage = &run.pipeline.stages[j];
+                let sweep = stage.sweep.as_ref().expect("the stage has a sweep");
+                let search = Search::new(sweep, &stage.settings, &stage.name, run.pipeline.seed);
+                let sweep = Sweeping { stage: j, search, places: Vec::new(), failures: BTreeMap::new() };
+                run.sweeps.push(Arc::new(sweep));
+                unfold(run, run.sweeps.len() - 1);
+            });
         }
         Status::Sweeping
     }
 
     /// Hands results to the searchers of a run, makes the stages that they ask for, and ends sweeps that are over.
-    pub(crate) fn sweep(&mut self, i: usize) -> bool {
-        let mut moved = false;
-        for k in 0..self.state.runs[i].sweeps.len() {
-            let run = &self.state.runs[i];
+    pub(crate) fn sweep(&mut self, number: u64) {
+        for k in 0..self.state.runs[&number].sweeps.len() {
+            let run = &self.state.runs[&number];
             let sweep = &run.sweeps[k];
             let under_way = matches!(run.state, RunState::Running | RunState::Paused);
             if !under_way || run.stages[sweep.stage] != Status::Sweeping {
@@ -65,49 +66,51 @@ impl Deciding<'_> {
             if found.is_empty() && !sweep.search.is_over() {
                 continue;
             }
-            moved = true;
-            let run = Arc::make_mut(&mut self.state.runs[i]);
-            for (ticket, place, found) in found {
-                match found {
-                    Found::Score(score, why) => {
-                        let sweep = &mut run.sweeps[k];
-                        if let (Some(why), Ticket::Rung { trial, .. }) = (why, sweep.search.tickets()[ticket]) {
-                            sweep.failures.insert(trial, why);
-                        }
-                        sweep.search.report(ticket, score);
-                        if run.stages[place + 1] == Status::Waiting {
-                            let reason = "there is nothing to evaluate".to_owned();
-                            run.stages[place + 1] = Status::Skipped { key: None, reason };
-                        }
-                    }
-                    Found::End { key, message } => run.stages[run.sweeps[k].stage] = Status::Failed { key, message },
+            self.change_run(number, |run| take_note(run, k, found));
+        }
+    }
+}
+
+/// Hands what was found to the searcher and makes what it asks for next.
+fn take_note(run: &mut Run, k: usize, found: Vec<(usize, usize, Found)>) {
+    for (ticket, place, found) in found {
+        match found {
+            Found::Score(score, why) => {
+                let sweep = Arc::make_mut(&mut run.sweeps[k]);
+                if let (Some(why), Ticket::Rung { trial, .. }) = (why, sweep.search.tickets()[ticket]) {
+                    sweep.failures.insert(trial, why);
+                }
+                sweep.search.report(ticket, score);
+                if run.stages[place + 1] == Status::Waiting {
+                    let reason = "there is nothing to evaluate".to_owned();
+                    run.set(place + 1, Status::Skipped { key: None, reason });
                 }
             }
-            unfold(run, k);
-            let stage = run.sweeps[k].stage;
-            if run.stages[stage] == Status::Sweeping && run.sweeps[k].search.is_over() {
-                run.stages[stage] = concluded(run, &run.sweeps[k]);
-            }
+            Found::End { key, message } => run.set(run.sweeps[k].stage, Status::Failed { key, message }),
         }
-        moved
+    }
+    unfold(run, k);
+    let stage = run.sweeps[k].stage;
+    if run.stages[stage] == Status::Sweeping && run.sweeps[k].search.is_over() {
+        run.set(stage, concluded(run, &run.sweeps[k]));
     }
 }
 
 /// Makes the stages of tickets that have none yet.
 fn unfold(run: &mut Run, k: usize) {
-    let Run { sweeps, pipeline, stages, .. } = run;
-    let sweep = &mut sweeps[k];
+    let first = run.pipeline.stages.len();
+    let mut new = Vec::new();
+    let sweep = Arc::make_mut(&mut run.sweeps[k]);
     while let Some(ticket) = sweep.search.tickets().get(sweep.places.len()).copied() {
         let Ticket::Rung { trial, rung } = ticket else {
             sweep.places.push(None);
             continue;
         };
         let stop = sweep.search.stop(rung).map(Steps);
-        match pipeline.stages[sweep.stage].rung(trial, rung, stop, &sweep.search.trials()[trial]) {
+        match run.pipeline.stages[sweep.stage].rung(trial, rung, stop, &sweep.search.trials()[trial]) {
             Ok(made) => {
-                sweep.places.push(Some(pipeline.stages.len()));
-                stages.extend([Status::Waiting, Status::Waiting]);
-                Arc::make_mut(pipeline).stages.extend(made);
+                sweep.places.push(Some(first + new.len()));
+                new.extend(made);
             }
             Err(message) => {
                 sweep.failures.insert(trial, message);
@@ -115,6 +118,9 @@ fn unfold(run: &mut Run, k: usize) {
                 sweep.search.report(sweep.places.len() - 1, Score::Failed);
             }
         }
+    }
+    if !new.is_empty() {
+        run.add_stages(new);
     }
 }
 
@@ -191,7 +197,8 @@ fn concluded(run: &Run, sweep: &Sweeping) -> Status {
             };
         }
     }
-    Status::Done { key: *key, how, known: Known { outputs, metrics }, wall_s: seconds, attempt: *attempt }
+    let known = Arc::new(Known { outputs, metrics });
+    Status::Done { key: *key, how, known, wall_s: seconds, attempt: *attempt }
 }
 
 impl State {

@@ -2,125 +2,18 @@
 //!
 //! What is here is exact where a process test could only measure: every moment is tried, and nothing waits.
 
-#[path = "simulation/pipelines.rs"]
-mod pipelines;
+#[allow(dead_code, reason = "not every test file uses all of it")]
+mod common;
 
 use coordinator::state::task::Lease;
-use coordinator::{
-    Control, Effect, Event, Millis, Moment, Observation, Policy, Rejected, State, decide, invariants, journal, observe,
-};
+use coordinator::{Control, Event, Millis, Observation, Policy, Rejected, observe};
 use protocol::message::{
-    Assignment, CommitCheckpoint, Doing, FailureClass, Grant, Join, PROTOCOL_VERSION, Poll, Progress, ReportOutcome,
-    RunState, StageState, TaskOutcome,
+    CommitCheckpoint, Doing, FailureClass, Grant, Poll, Progress, ReportOutcome, RunState, StageState, TaskOutcome,
 };
-use protocol::stage::{Backend, WorkerRange};
-use protocol::{Digest, Incarnation, RunId, WorkerId};
-use serde_json::Value;
+use protocol::stage::WorkerRange;
+use protocol::{Digest, RunId, WorkerId};
 
-/// A coordinator without a shell: one call after the other, at the times that the test says.
-struct ActorHandle {
-    state: State,
-    journal: Vec<Value>,
-    now: u64,
-}
-
-impl ActorHandle {
-    fn new(policy: Policy) -> Self {
-        Self { state: State::new(policy), journal: Vec::new(), now: 1_000_000 }
-    }
-
-    /// Decides and stores; lookups find nothing.
-    fn happen(&mut self, event: Event) -> Result<Vec<Effect>, Rejected> {
-        let moment = Moment { now: Millis(self.now), entropy: Digest::of(b"entropy") };
-        let before = self.state.clone();
-        let effects = decide(&mut self.state, moment, event)?;
-        let broken = invariants::check_change(&before, &self.state);
-        assert!(broken.is_empty(), "{broken:#?}");
-        for effect in &effects {
-            match effect {
-                Effect::Store(writes) => self.journal.extend(writes.iter().filter_map(|write| match write {
-                    registry::Write::Journal(entry) => Some(entry.clone()),
-                    _ => None,
-                })),
-                Effect::Lookup { key } => drop(self.happen(Event::LookedUp { key: *key, known: None })?),
-                _ => {}
-            }
-        }
-        Ok(effects)
-    }
-
-    fn hear(&mut self, observation: Observation) {
-        for event in observe(&mut self.state, Millis(self.now), observation).expect("heard") {
-            self.happen(event).expect("what follows from the clock is taken");
-        }
-    }
-
-    /// `kill -9`, and a new coordinator on the same store.
-    fn restart(&mut self, alone: bool) {
-        let policy = self.state.policy.clone();
-        self.state = journal::replay(policy, self.journal.clone()).expect("the journal replays");
-        self.happen(Event::Started { alone, park: false }).expect("starts");
-    }
-
-    fn submit(&mut self, until: &str, workers: WorkerRange) -> RunId {
-        let event = Event::Submit {
-            pipeline: Box::new(pipelines::quickstart(1, workers, &[])),
-            source: String::new(),
-            idempotency_key: None,
-            until: Some(until.into()),
-        };
-        let effects = self.happen(event).expect("submitted");
-        let run = effects.into_iter().find_map(|effect| match effect {
-            Effect::Submitted(run) => Some(run),
-            _ => None,
-        });
-        run.expect("a submission gives a run")
-    }
-
-    fn join(&mut self, name: &str) -> Incarnation {
-        let join = Join {
-            protocol: PROTOCOL_VERSION,
-            worker: name.into(),
-            pid: 1,
-            backend: Backend::Flex,
-            peer_address: format!("{name}:1"),
-        };
-        let effects = self.happen(Event::Join { join }).expect("joined");
-        let joined = effects.into_iter().find_map(|effect| match effect {
-            Effect::Joined(incarnation) => Some(incarnation),
-            _ => None,
-        });
-        joined.expect("a join gives an incarnation")
-    }
-
-    fn poll(&mut self, name: &str, incarnation: Incarnation) {
-        let poll = Poll { incarnation, doing: Vec::new(), version: 0 };
-        self.hear(Observation::Poll { worker: name.into(), poll });
-    }
-
-    fn assignment(&self, name: &str) -> Option<Assignment> {
-        let worker: WorkerId = name.into();
-        let incarnation = self.state.workers[&worker].incarnation;
-        self.state.desired(&worker, incarnation).expect("known").assignments.into_iter().next()
-    }
-
-    fn report(&mut self, assignment: &Assignment, outcome: TaskOutcome) {
-        let report = ReportOutcome { grant: assignment.grant.clone(), outcome };
-        self.happen(Event::Outcome { report }).expect("taken");
-    }
-
-    fn run_state(&self, run: &RunId) -> RunState {
-        self.state.run(run).expect("known").state
-    }
-
-    fn is_held(&self) -> bool {
-        self.state.executions.values().any(|execution| execution.is_busy())
-    }
-}
-
-fn failed(class: FailureClass) -> TaskOutcome {
-    TaskOutcome::Failed { class, message: "made up".into() }
-}
+use crate::common::{ActorHandle, failed, gang_of_three};
 
 /// Sampled: a worker that dies at each of 40 moments between two looks at the clock, 25 ms apart.
 #[test]
@@ -143,7 +36,7 @@ fn p3_the_task_of_a_dead_worker_is_another_s_within_16_seconds() {
             tick += policy.tick_ms;
             actor_handle.now = tick;
             actor_handle.poll("b", b);
-            actor_handle.hear(Observation::Tick);
+            actor_handle.tick();
             if let Some(taken) = actor_handle.assignment("b") {
                 break taken.grant;
             }
@@ -160,16 +53,6 @@ fn p3_the_task_of_a_dead_worker_is_another_s_within_16_seconds() {
         let refused = actor_handle.happen(Event::Outcome { report: refused });
         assert!(matches!(refused, Err(Rejected::StaleFence { .. })), "{refused:?}");
     }
-}
-
-/// A gang trains: its task's members by rank.
-fn gang_of_three(actor_handle: &mut ActorHandle) -> (RunId, [Incarnation; 3]) {
-    let run = actor_handle.submit("vae", WorkerRange { min: 1, max: 3 });
-    let a = actor_handle.join("a");
-    let dataset = actor_handle.assignment("a").expect("the only worker gets it");
-    actor_handle.report(&dataset, TaskOutcome::Finished { output: Digest::of(b"clips"), metrics: Default::default() });
-    let [b, c] = ["b", "c"].map(|name| actor_handle.join(name));
-    (run, [a, b, c])
 }
 
 #[test]
@@ -210,7 +93,7 @@ fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
         actor_handle.now += 1000;
         actor_handle.poll("b", b);
         actor_handle.poll("c", c);
-        actor_handle.hear(Observation::Tick);
+        actor_handle.tick();
     }
     assert_eq!(gang(&actor_handle), ["b", "c"].map(WorkerId::from));
 
@@ -222,7 +105,7 @@ fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
         observe(&mut actor_handle.state, Millis(actor_handle.now), Observation::Poll { worker: "a".into(), poll });
     let heard = heard.expect("it is known");
     assert!(matches!(&heard[..], [Event::WorkerBack { worker }] if worker.as_str() == "a"), "{heard:?}");
-    let view = actor_handle.state.view(actor_handle.state.run(&run).expect("known"), Millis(actor_handle.now));
+    let view = actor_handle.view(&run);
     let told: Vec<u64> = view.stages.iter().map(|stage| stage.progress.done).collect();
     assert!(!told.contains(&999), "{told:?}");
 
@@ -231,20 +114,20 @@ fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
     assert_eq!(gang(&actor_handle), ["b", "c"].map(WorkerId::from));
 }
 
-/// One gap of 8 s between two looks at the clock, as behind a slow disk: who was heard in it has a lease from then on, not a lease and 8 s.
+/// One gap of 8 s between two looks at the clock of a process that was stopped: who was heard in it has a lease from then on, not a lease and 8 s.
 #[test]
 fn p3_a_late_clock_gives_nobody_more_than_a_lease_from_now() {
     let mut actor_handle = ActorHandle::new(Policy::default());
     actor_handle.submit("dataset", WorkerRange::default());
     let a = actor_handle.join("a");
-    actor_handle.hear(Observation::Tick);
+    actor_handle.tick();
     actor_handle.now += 8000;
     actor_handle.poll("a", a);
-    actor_handle.hear(Observation::Tick);
+    actor_handle.hear(Observation::Tick { overslept: 7000 });
     let heard = actor_handle.now;
     while actor_handle.is_held() {
         actor_handle.now += 1000;
-        actor_handle.hear(Observation::Tick);
+        actor_handle.tick();
         assert!(
             actor_handle.now - heard <= 16_000,
             "still held {} ms after it was last heard",
@@ -265,16 +148,16 @@ fn p3_after_an_hour_without_a_coordinator_leases_get_one_interval_of_grace() {
         actor_handle.now += 3_600_000;
         actor_handle.restart(false);
         for _ in 0..back_after / 1000 {
-            actor_handle.hear(Observation::Tick);
+            actor_handle.tick();
             actor_handle.now += 1000;
         }
         actor_handle.poll("a", a);
-        actor_handle.hear(Observation::Tick);
+        actor_handle.tick();
         assert_eq!(actor_handle.assignment("a").expect("still its own").grant, held, "back after {back_after} ms");
         // Then silent for good: nothing stays with it.
         for _ in 0..17 {
             actor_handle.now += 1000;
-            actor_handle.hear(Observation::Tick);
+            actor_handle.tick();
         }
         assert!(!actor_handle.is_held(), "an orphan");
     }
@@ -316,14 +199,14 @@ fn p15_each_budget_allows_exactly_one_try_more_than_it_says() {
                 assert!(backoff <= policy.backoff_max_ms);
                 actor_handle.now += backoff - 1;
                 actor_handle.poll("a", a);
-                actor_handle.hear(Observation::Tick);
+                actor_handle.tick();
                 assert!(actor_handle.assignment("a").is_none(), "granted before {backoff} ms were over");
                 actor_handle.now += 1;
-                actor_handle.hear(Observation::Tick);
+                actor_handle.tick();
                 assert!(attempts < 50, "never given up");
             }
             assert_eq!(attempts - others, own + 1, "budgets {faults} and {losses}, failing by {class:?}");
-            let view = actor_handle.state.view(actor_handle.state.run(&run).expect("known"), Millis(actor_handle.now));
+            let view = actor_handle.view(&run);
             let message = view.stages[0].message.clone().unwrap_or_default();
             assert!(message.contains("gave up after") && message.contains("made up"), "{message}");
         }
@@ -343,17 +226,17 @@ fn p15_a_final_failure_is_not_tried_again() {
                 actor_handle.report(&assignment, failed(FailureClass::Fault));
                 actor_handle.now += actor_handle.state.policy.backoff_max_ms;
                 actor_handle.poll("a", a);
-                actor_handle.hear(Observation::Tick);
+                actor_handle.tick();
             }
             let assignment = actor_handle.assignment("a").expect("granted");
             actor_handle.report(&assignment, failed(class));
             assert_eq!(actor_handle.run_state(&run), RunState::Failed, "{class:?}");
-            let view = actor_handle.state.view(actor_handle.state.run(&run).expect("known"), Millis(actor_handle.now));
+            let view = actor_handle.view(&run);
             assert_eq!(view.stages[0].state, StageState::Failed);
             assert_eq!(view.stages[0].attempt.0, before + 1);
             assert!(actor_handle.assignment("a").is_none());
             // Asked for again, it begins again.
-            actor_handle.happen(Event::Control { run: run.clone(), action: Control::Resume }).expect("taken up");
+            actor_handle.control(&run, Control::Resume).expect("taken up");
             assert!(actor_handle.assignment("a").is_some());
         }
     }
@@ -363,9 +246,7 @@ fn p15_a_final_failure_is_not_tried_again() {
 fn in_state(state: RunState, held: bool) -> (ActorHandle, RunId) {
     let mut actor_handle = ActorHandle::new(Policy::default());
     let run = actor_handle.submit("dataset", WorkerRange::default());
-    let control = |actor_handle: &mut ActorHandle, action| {
-        actor_handle.happen(Event::Control { run: run.clone(), action }).expect("taken")
-    };
+    let control = |actor_handle: &mut ActorHandle, action| actor_handle.control(&run, action).expect("taken");
     if held || matches!(state, RunState::Finished | RunState::Failed) {
         actor_handle.join("a");
     }
@@ -410,7 +291,7 @@ fn p14_pause_resume_and_cancel_end_where_the_table_says_whoever_is_killed() {
                         // Nobody was answered, so the client asks again.
                         actor_handle.restart(false);
                     }
-                    let asked = actor_handle.happen(Event::Control { run: run.clone(), action });
+                    let asked = actor_handle.control(&run, action);
                     assert_eq!(asked.is_ok(), expected.is_some(), "{case}: {asked:?}");
                     if killed == "after" {
                         actor_handle.restart(false);
@@ -425,7 +306,7 @@ fn p14_pause_resume_and_cancel_end_where_the_table_says_whoever_is_killed() {
                             // It lives and polls, and does not do what it is told.
                             actor_handle.poll("a", actor_handle.state.workers[&"a".into()].incarnation);
                         }
-                        actor_handle.hear(Observation::Tick);
+                        actor_handle.tick();
                         let limit = actor_handle.state.policy.grace_ms + 5000;
                         assert!(actor_handle.now - begun <= limit, "{case}: still held after {limit} ms");
                     }
@@ -446,7 +327,7 @@ fn p14_a_drain_ends_though_a_worker_ignores_it() {
     for _ in 0..(actor_handle.state.policy.grace_ms / 1000 + 1) {
         actor_handle.now += 1000;
         actor_handle.poll("a", a);
-        actor_handle.hear(Observation::Tick);
+        actor_handle.tick();
     }
     let waits = |actor_handle: &ActorHandle| {
         let mut tasks = actor_handle.state.executions.values().flat_map(|execution| &execution.tasks);

@@ -7,14 +7,13 @@
 //! checkpoint cadence) live in [`Placement`] and stay out of the stage's key.
 //!
 //! A store outlives the build that wrote it. Every struct that has a `Default` fills in what an older build did not write; a field that
-//! joins one that has none ([`Training`], [`Batch`]) brings `#[serde(default)]` along. What that means for keys stands in `later`.
+//! joins one that has none ([`Training`], [`Batch`]) brings `#[serde(default)]` along.
 
 mod data;
 mod distillation;
 mod evaluation;
 mod identity;
 mod kinds;
-pub(crate) mod later;
 mod neighbours;
 mod network;
 mod placement;
@@ -114,7 +113,7 @@ impl StageSettings {
 
     /// The digest of all that decides a value, references left out.
     pub fn digest(&self) -> Digest {
-        crate::canonical::digest(&later::settings(&self.without_references()))
+        crate::canonical::digest(&self.without_references())
     }
 
     /// The stages it reads: field name, stage name, what that stage must give. `register` reads more (the evaluations

@@ -23,9 +23,11 @@ use std::sync::Arc;
 use protocol::stage::{Mode, StageSettings};
 use protocol::sweep::{SearchKind, Sweep, Values};
 use protocol::{Seed, StageName};
+use serde::{Deserialize, Serialize};
 
 /// A thing to do.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Ticket {
     /// Train a trial up to the end of a rung, and measure it.
     Rung {
@@ -39,7 +41,8 @@ pub enum Ticket {
 }
 
 /// How a rung of a trial ended.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Score {
     /// The metric, finite.
     Value(f64),
@@ -63,8 +66,19 @@ impl Score {
     }
 }
 
+/// What became of a searcher, without the rules by which: as they are kept.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Progress {
+    /// Tickets that were issued.
+    pub tickets: Vec<Ticket>,
+    /// Results that came, by ticket.
+    pub scores: Vec<(usize, Score)>,
+    /// Tickets whose results count now.
+    pub folded: usize,
+}
+
 /// A searcher and all that it knows.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Search {
     kind: SearchKind,
     mode: Mode,
@@ -72,7 +86,8 @@ pub struct Search {
     parallel: usize,
     rungs: Vec<u64>,
     /// Never changes; shared, because a decision copies the state.
-    trials: Arc<[Values]>,
+    #[serde(with = "crate::state::shared")]
+    trials: Arc<Vec<Values>>,
     tickets: Vec<Ticket>,
     /// By ticket; filled in any order.
     scores: Vec<Option<Score>>,
@@ -99,7 +114,7 @@ impl Search {
             factor: usize::try_from(sweep.rungs.factor.max(2)).unwrap_or(usize::MAX),
             parallel: sweep.parallel.max(1),
             rungs: sweep.rungs(budget),
-            trials: trials.into(),
+            trials: Arc::new(trials),
             tickets: Vec::new(),
             scores: Vec::new(),
             folded: 0,
@@ -162,6 +177,44 @@ impl Search {
     /// Whether nothing is under way and nothing will be.
     pub fn is_over(&self) -> bool {
         self.tickets[self.folded..].iter().all(|ticket| *ticket == Ticket::Idle) && self.next() == Ticket::Idle
+    }
+
+    /// What has become of it since `before`.
+    pub fn since(&self, before: &Self) -> Progress {
+        let tickets = self.tickets[before.tickets.len()..].to_vec();
+        let new = |(ticket, score): (usize, &Option<Score>)| {
+            let score = (*score)?;
+            let is_new = self.tickets[ticket] != Ticket::Idle && before.score(ticket).is_none();
+            is_new.then_some((ticket, score))
+        };
+        let scores = self.scores.iter().enumerate().filter_map(new).collect();
+        Progress { tickets, scores, folded: self.folded }
+    }
+
+    /// Takes note of what has become of it; asks no rule.
+    pub fn follow(&mut self, progress: &Progress) {
+        for ticket in &progress.tickets {
+            if let Ticket::Rung { trial, .. } = ticket
+                && let Some(issued) = self.issued.get_mut(*trial)
+            {
+                *issued += 1;
+            }
+            self.tickets.push(*ticket);
+            self.scores.push((*ticket == Ticket::Idle).then_some(Score::Failed));
+        }
+        for (ticket, score) in &progress.scores {
+            if let Some(place) = self.scores.get_mut(*ticket) {
+                *place = Some(*score);
+            }
+        }
+        while self.folded < progress.folded.min(self.tickets.len()) {
+            if let (Ticket::Rung { trial, .. }, Some(score)) = (self.tickets[self.folded], self.scores[self.folded])
+                && let Some(known) = self.known.get_mut(trial)
+            {
+                known.push(score);
+            }
+            self.folded += 1;
+        }
     }
 
     /// All tickets so far.

@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError, RwLock};
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
-use protocol::message::{FailureClass, Poll, ReportOutcome, Submit, TaskOutcome};
+use protocol::message::{Poll, RunView, Submit};
 use protocol::pipeline::Pipeline;
 use protocol::{Digest, RunId, WorkerId};
 use registry::{Store, Write, WriteError};
@@ -20,10 +20,11 @@ use tokio::task::JoinHandle;
 
 use super::{answer, effects};
 use crate::decide::decide;
-use crate::event::{Effect, Event, Millis, Moment, Observation, Rejected};
-use crate::invariants;
+use crate::event::{Control, Effect, Event, Millis, Moment, Observation, Rejected};
 use crate::observe::{is_quiet, observe};
+use crate::outcome::refused_for_good;
 use crate::state::State;
+use crate::{invariants, journal};
 
 /// How many events are decided together at most.
 const TOGETHER: usize = 128;
@@ -46,7 +47,8 @@ pub enum Refused {
 #[derive(Debug)]
 enum Ask {
     Event(Box<Event>, oneshot::Sender<Result<Vec<Effect>, Refused>>),
-    Observation(Observation, oneshot::Sender<Result<(), Refused>>),
+    /// With the time when it was made: the actor may get to it later, when the disk is slow.
+    Observation(Observation, Millis, oneshot::Sender<Result<(), Refused>>),
 }
 
 /// What is shared between the actor and those who ask it.
@@ -63,6 +65,14 @@ pub(crate) struct ActorHandle {
     pub(crate) store: Store,
 }
 
+/// What the tables keep of a run that ended.
+fn read<T: serde::de::DeserializeOwned>(run: &RunId, text: &str) -> Result<T, Refused> {
+    serde_json::from_str(text).map_err(|error| {
+        Rejected::Conflict(format!("what is kept of run `{run}` does not read: {error}; use the build that wrote it"))
+            .into()
+    })
+}
+
 impl ActorHandle {
     /// Decides an event; returns once it is stored.
     pub(crate) async fn decide(&self, event: Event) -> Result<Vec<Effect>, Refused> {
@@ -74,7 +84,7 @@ impl ActorHandle {
     /// Takes note of what was heard, and decides what follows from it.
     pub(crate) async fn observe(&self, observation: Observation) -> Result<(), Refused> {
         let (reply, receiver) = oneshot::channel();
-        self.asks.send(Ask::Observation(observation, reply)).await.map_err(|_| Refused::Stopped)?;
+        self.asks.send(Ask::Observation(observation, self.now(), reply)).await.map_err(|_| Refused::Stopped)?;
         answer(receiver).await
     }
 
@@ -100,14 +110,63 @@ impl ActorHandle {
         let event = Event::Submit {
             pipeline: Box::new(pipeline),
             source: submit.source,
-            idempotency_key: submit.idempotency_key,
+            idempotency_key: submit.idempotency_key.clone(),
             until: submit.until,
         };
-        let run = self.decide(event).await?.into_iter().find_map(|effect| match effect {
-            Effect::Submitted(run) => Some(run),
-            _ => None,
-        });
-        Ok(run.expect("a submission gives a run"))
+        let mut tries = 0;
+        loop {
+            // One that has ended is in the tables alone.
+            if let Some(key) = &submit.idempotency_key
+                && let Some(row) = self.store.run_by_key(key).await.map_err(WriteError::from)?
+            {
+                return Ok(row.run);
+            }
+            tries += 1;
+            match self.decide(event.clone()).await {
+                // Another one with this key came between the look and the event, and has ended already.
+                Err(Refused::Write(WriteError::Conflict(_))) if submit.idempotency_key.is_some() && tries < 3 => {}
+                decided => {
+                    let run = decided?.into_iter().find_map(|effect| match effect {
+                        Effect::Submitted(run) => Some(run),
+                        _ => None,
+                    });
+                    return Ok(run.expect("a submission gives a run"));
+                }
+            }
+        }
+    }
+
+    /// Asks something of a run, whether it is in memory or has ended.
+    pub(crate) async fn control(&self, run: &RunId, action: Control) -> Result<(), Refused> {
+        let mut tries = 0;
+        loop {
+            let archived = match self.state().run(run) {
+                Ok(_) => None,
+                Err(_) => match self.store.ended(run).await.map_err(WriteError::from)? {
+                    Some(row) => Some(Box::new(read(run, &row.archive)?)),
+                    None => None,
+                },
+            };
+            tries += 1;
+            let looked_too_early = archived.is_none();
+            match self.decide(Event::Control { run: run.clone(), action, archived }).await {
+                // It ended between the look and the event.
+                Err(Refused::Rejected(Rejected::NotFound(_))) if looked_too_early && tries < 3 => {}
+                decided => return decided.map(drop),
+            }
+        }
+    }
+
+    /// A run as clients see it, whether it is in memory or has ended.
+    pub(crate) async fn run_view(&self, run: &RunId) -> Result<RunView, Refused> {
+        let state = self.state();
+        match state.run(run) {
+            Ok(run) => Ok(state.view(run, self.now())),
+            Err(unknown) => match self.store.ended(run).await.map_err(WriteError::from)? {
+                Some(row) => read(run, &row.view),
+                None => Err(unknown.into()),
+            },
+        }
     }
 
     /// The newest published state.
@@ -215,7 +274,9 @@ pub(crate) fn start(store: Store, state: State) -> (Arc<ActorHandle>, JoinHandle
         clock: Clock::new(state.now),
         store,
     });
-    let actor = Actor { actor_handle: Arc::clone(&actor_handle), state, entropy: Entropy::new() };
+    let snapshot_at = state.seq;
+    let actor =
+        Actor { actor_handle: Arc::clone(&actor_handle), state, entropy: Entropy::new(), snapshot_at, snapshot: None };
     (actor_handle, tokio::spawn(actor.run(queue)))
 }
 
@@ -223,6 +284,10 @@ struct Actor {
     actor_handle: Arc<ActorHandle>,
     state: Arc<State>,
     entropy: Entropy,
+    /// The decision at which the newest snapshot was begun.
+    snapshot_at: u64,
+    /// A snapshot on its way.
+    snapshot: Option<JoinHandle<()>>,
 }
 
 impl Actor {
@@ -235,6 +300,7 @@ impl Actor {
                 ask = queue.recv() => ask,
             };
             let Some(first) = ask else { return };
+            self.snapshot_if_due();
             let mut asks = vec![first];
             while asks.len() < TOGETHER
                 && let Ok(more) = queue.try_recv()
@@ -249,9 +315,18 @@ impl Actor {
                 match ask {
                     // Whoever asked may have gone away meanwhile; what was decided stands.
                     Ask::Event(event, reply) => drop(reply.send(self.happen(*event).await)),
-                    Ask::Observation(observation, reply) => drop(reply.send(self.hear(observation).await)),
+                    Ask::Observation(observation, at, reply) => drop(reply.send(self.hear(observation, at).await)),
                 }
             }
+        }
+    }
+
+    /// Stores the state as a whole every so many decisions, beside whatever goes on.
+    fn snapshot_if_due(&mut self) {
+        let is_over = self.snapshot.as_ref().is_none_or(JoinHandle::is_finished);
+        if is_over && self.state.seq >= self.snapshot_at + self.state.policy.snapshot_every {
+            self.snapshot_at = self.state.seq;
+            self.snapshot = Some(tokio::spawn(snapshot(self.actor_handle.store.clone(), Arc::clone(&self.state))));
         }
     }
 
@@ -275,17 +350,16 @@ impl Actor {
         for ask in asks.iter() {
             decided.push(match ask {
                 Ask::Event(event, _) => self.decide_on(&mut next, (**event).clone(), &mut writes),
-                Ask::Observation(observation, _) => observe(&mut next, self.actor_handle.now(), observation.clone())
-                    .map(|events| {
-                        let mut follow = Vec::new();
-                        for event in events {
-                            match self.decide_on(&mut next, event, &mut writes) {
-                                Ok(mut effects) => follow.append(&mut effects),
-                                Err(rejected) => tracing::debug!(%rejected, "moot"),
-                            }
+                Ask::Observation(observation, at, _) => observe(&mut next, *at, observation.clone()).map(|events| {
+                    let mut follow = Vec::new();
+                    for event in events {
+                        match self.decide_on(&mut next, event, &mut writes) {
+                            Ok(mut effects) => follow.append(&mut effects),
+                            Err(rejected) => tracing::debug!(%rejected, "moot"),
                         }
-                        follow
-                    }),
+                    }
+                    follow
+                }),
             });
         }
         let durable = !writes.is_empty();
@@ -304,7 +378,7 @@ impl Actor {
             }
             match ask {
                 Ask::Event(_, reply) => drop(reply.send(decided.map_err(Refused::Rejected))),
-                Ask::Observation(_, reply) => drop(reply.send(decided.map(drop).map_err(Refused::Rejected))),
+                Ask::Observation(_, _, reply) => drop(reply.send(decided.map(drop).map_err(Refused::Rejected))),
             }
         }
         for effect in &effects {
@@ -331,8 +405,8 @@ impl Actor {
         Ok(effects)
     }
 
-    async fn hear(&mut self, observation: Observation) -> Result<(), Refused> {
-        let events = observe(Arc::make_mut(&mut self.state), self.actor_handle.now(), observation)?;
+    async fn hear(&mut self, observation: Observation, at: Millis) -> Result<(), Refused> {
+        let events = observe(Arc::make_mut(&mut self.state), at, observation)?;
         for event in events {
             match self.happen(event).await {
                 Ok(_) => {}
@@ -380,24 +454,13 @@ impl Actor {
     }
 }
 
-/// What happens instead of an event that the store refuses and always will.
-fn refused_for_good(event: &Event, error: &WriteError) -> Option<Event> {
-    let last = match error {
-        WriteError::Conflict(message) | WriteError::Gate(message) | WriteError::NotFound(message) => message.clone(),
-        WriteError::StaleFence { .. }
-        | WriteError::Superseded { .. }
-        | WriteError::Storage(_)
-        | WriteError::Internal(_) => return None,
-    };
-    match (event, error) {
-        (Event::Bundled { key, .. }, _) => Some(Event::RegisterRefused { key: *key, message: last }),
-        // Two values under one key: the first promise is broken, and computing again would not mend it.
-        (Event::Outcome { report }, WriteError::Conflict(_)) => Some(Event::Outcome {
-            report: ReportOutcome {
-                grant: report.grant.clone(),
-                outcome: TaskOutcome::Failed { class: FailureClass::Storage, message: last },
-            },
-        }),
-        _ => None,
+/// Stores `state` as a whole. Whatever happens meanwhile follows on it.
+pub(crate) async fn snapshot(store: Store, state: Arc<State>) {
+    let seq = state.seq;
+    let text = effects::blocking(move || journal::snapshot(&state)).await;
+    match store.write(vec![Write::Snapshot { seq, state: text }]).await {
+        Ok(()) => tracing::debug!(seq, "stored a snapshot"),
+        // The facts are there; only the next start takes longer.
+        Err(error) => tracing::warn!(seq, %error, "no snapshot"),
     }
 }

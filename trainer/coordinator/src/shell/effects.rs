@@ -4,10 +4,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use checkpoint::bundle::bundle;
-use protocol::Digest;
+use protocol::{Digest, RunId, StageName};
 use registry::{BlobStore, QueryError};
 use tokio::sync::watch;
-use tokio::time::MissedTickBehavior;
 
 use super::actor::{ActorHandle, Refused};
 use crate::event::{Candidate, Effect, Event, Known, Observation};
@@ -56,25 +55,41 @@ async fn tell(actor_handle: &ActorHandle, event: Event) {
 }
 
 async fn look_up(actor_handle: Arc<ActorHandle>, key: Digest) {
-    let known = loop {
-        match known(&actor_handle, key).await {
-            Ok(known) => break known,
+    let event = loop {
+        match looked_up(&actor_handle, key).await {
+            Ok(event) => break event,
             Err(error) => tracing::warn!(%key, %error, "cannot look up a stage"),
         }
         tokio::time::sleep(RETRY).await;
     };
-    tell(&actor_handle, Event::LookedUp { key, known }).await;
+    tell(&actor_handle, event).await;
+}
+
+async fn looked_up(actor_handle: &ActorHandle, key: Digest) -> Result<Event, QueryError> {
+    if let Some((known, source)) = known(actor_handle, key).await? {
+        return Ok(Event::LookedUp { key, known: Some(known), source: Some(source), archived: None });
+    }
+    let archived = actor_handle.store.archived_execution(key).await?;
+    let archived = archived.and_then(|text| match serde_json::from_str(&text) {
+        Ok(execution) => Some(execution),
+        Err(error) => {
+            tracing::warn!(%key, %error, "what an earlier try left does not read; the stage begins anew");
+            None
+        }
+    });
+    Ok(Event::LookedUp { key, known: None, source: None, archived })
 }
 
 /// A value counts as known only while all of it is there: an artifact that was removed is made again.
-async fn known(actor_handle: &ActorHandle, key: Digest) -> Result<Option<Known>, QueryError> {
+async fn known(actor_handle: &ActorHandle, key: Digest) -> Result<Option<(Known, (RunId, StageName))>, QueryError> {
     let Some(row) = actor_handle.store.stage_result(key).await? else { return Ok(None) };
     let (blobs, outputs) = (actor_handle.store.blobs().clone(), row.outputs.clone());
     let whole = blocking(move || outputs.values().all(|output| blobs.complete_manifest(*output).is_ok())).await;
     if !whole {
         tracing::warn!(%key, "a stage's value is known but not all of it is in the store; it is made again");
     }
-    Ok(whole.then_some(Known { outputs: row.outputs, metrics: row.metrics }))
+    let known = Known { outputs: row.outputs, metrics: row.metrics };
+    Ok(whole.then_some((known, (row.run, row.stage))))
 }
 
 async fn register(actor_handle: Arc<ActorHandle>, key: Digest, candidates: Vec<Candidate>) {
@@ -112,21 +127,29 @@ pub(crate) async fn blocking<T: Send + 'static>(execution: impl FnOnce() -> T + 
     }
 }
 
-/// Looks at the clock until the coordinator stops.
+/// Looks at the clock until the coordinator stops. It does not wait until what it saw is taken up, which takes as long as the disk
+/// does: only its own oversleeping says that this process heard nobody.
 pub(crate) async fn tick(actor_handle: Arc<ActorHandle>, every_ms: u64, mut stopped: watch::Receiver<bool>) {
-    let mut interval = tokio::time::interval(Duration::from_millis(every_ms.max(1)));
-    interval.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let every = Duration::from_millis(every_ms.max(1));
     let mut collected = tokio::time::Instant::now();
+    let (mut overslept, mut told) = (Duration::ZERO, None::<tokio::task::JoinHandle<()>>);
     loop {
+        let begun = tokio::time::Instant::now();
         tokio::select! {
             biased;
             _ = stopped.wait_for(|stop| *stop) => return,
-            _ = interval.tick() => {}
+            () = tokio::time::sleep(every) => {}
         }
-        match actor_handle.observe(Observation::Tick).await {
-            Ok(()) => {}
-            Err(Refused::Stopped) => return,
-            Err(error) => tracing::warn!(%error, "a tick was not stored; trying again"),
+        overslept += begun.elapsed().saturating_sub(every);
+        if told.as_ref().is_none_or(tokio::task::JoinHandle::is_finished) {
+            let actor_handle = Arc::clone(&actor_handle);
+            let overslept = u64::try_from(std::mem::take(&mut overslept).as_millis()).unwrap_or(u64::MAX);
+            told = Some(tokio::spawn(async move {
+                match actor_handle.observe(Observation::Tick { overslept }).await {
+                    Ok(()) | Err(Refused::Stopped) => {}
+                    Err(error) => tracing::warn!(%error, "a tick was not stored; trying again"),
+                }
+            }));
         }
         if collected.elapsed() > COLLECT_EVERY {
             collected = tokio::time::Instant::now();

@@ -25,7 +25,7 @@ use tokio::sync::{oneshot, watch};
 use tokio::task::JoinHandle;
 
 use crate::event::{Control, Event, Rejected};
-use crate::journal::{self, ReplayError};
+use crate::journal::{self, RecoverError};
 use crate::policy::Policy;
 use crate::view::WorkerView;
 
@@ -113,12 +113,12 @@ pub enum StartError {
         /// Why not.
         cause: std::io::Error,
     },
-    /// The journal cannot be read.
-    #[error("cannot read the journal: {0}")]
-    Journal(#[from] QueryError),
-    /// The journal cannot be replayed.
+    /// What was decided before cannot be read.
+    #[error("cannot read what was decided before: {0}")]
+    Read(#[from] QueryError),
+    /// What was decided before is not what this build understands.
     #[error("cannot recover: {0}")]
-    Replay(#[from] ReplayError),
+    Recover(#[from] RecoverError),
     /// The first event cannot be stored.
     #[error("cannot write to the store: {0}")]
     Store(#[from] WriteError),
@@ -142,10 +142,10 @@ impl From<Refused> for StartError {
 pub struct Coordinator;
 
 impl Coordinator {
-    /// Recovers from the journal of `store`, then listens.
+    /// Recovers from the snapshot and the facts in `store`, then listens.
     pub async fn start(store: Store, config: Config) -> Result<Handle, StartError> {
         config.check()?;
-        let state = journal::replay(config.policy.clone(), store.journal_read().await?)?;
+        let state = journal::recover(config.policy.clone(), &store.recovery().await?)?;
         let listen = |address| move |cause| StartError::Listen { address, cause };
         let main = Listener::bind(config.listen, config.tls.clone()).await.map_err(listen(config.listen))?;
         let address = main.address().map_err(listen(config.listen))?;
@@ -219,19 +219,12 @@ impl Handle {
 
     /// Pauses, resumes or cancels a run.
     pub async fn control(&self, run: &RunId, action: Control) -> Result<(), Refused> {
-        self.actor_handle.decide(Event::Control { run: run.clone(), action }).await.map(drop)
+        self.actor_handle.control(run, action).await
     }
 
-    /// A run as clients see it.
-    pub fn run_view(&self, run: &RunId) -> Option<RunView> {
-        let state = self.actor_handle.state();
-        state.run(run).ok().map(|run| state.view(run, self.actor_handle.now()))
-    }
-
-    /// All runs, oldest first.
-    pub fn runs(&self) -> Vec<RunView> {
-        let state = self.actor_handle.state();
-        state.runs.iter().map(|run| state.view(run, self.actor_handle.now())).collect()
+    /// A run as clients see it, whether it goes on or has ended.
+    pub async fn run_view(&self, run: &RunId) -> Result<RunView, Refused> {
+        self.actor_handle.run_view(run).await
     }
 
     /// All workers.
@@ -254,6 +247,11 @@ impl Handle {
         self.actor_handle.state().executions.values().any(|execution| execution.is_busy())
     }
 
+    /// How many facts this coordinator has recorded since it started.
+    pub fn facts(&self) -> u64 {
+        self.actor_handle.state().recorded
+    }
+
     /// Waits until something durable changed since the last call on this receiver.
     pub fn changes(&self) -> watch::Receiver<u64> {
         self.actor_handle.changes()
@@ -265,7 +263,7 @@ impl Handle {
         self.actor_handle.trouble()
     }
 
-    /// Stops at once. What was acknowledged is in the store; a later start goes on from there.
+    /// Stops at once. What was acknowledged is in the store; a later start goes on from there, and from a snapshot of the end.
     pub async fn shutdown(mut self) {
         let _ = self.stop.send(true);
         self.actor_handle.stop();
@@ -273,6 +271,7 @@ impl Handle {
             // Ended tasks and cancelled ones alike are what we want here.
             let _ = task.await;
         }
+        actor::snapshot(self.actor_handle.store.clone(), self.actor_handle.state()).await;
     }
 }
 

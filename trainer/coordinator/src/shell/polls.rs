@@ -17,7 +17,6 @@ pub(crate) async fn join(
     State(actor_handle): State<Arc<ActorHandle>>,
     Message(join): Message<Join>,
 ) -> Result<Json<Joined>, Failure> {
-    // Here and not in `decide`: the journal keeps the joins of earlier versions, and must replay.
     if join.protocol != PROTOCOL_VERSION {
         let message = format!(
             "worker `{}` speaks version {} of the protocol, this coordinator speaks {PROTOCOL_VERSION}; use one build for both",

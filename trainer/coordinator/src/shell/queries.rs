@@ -5,6 +5,8 @@ use std::sync::Arc;
 
 use access::Caller;
 use axum::extract::{Path, Query, State};
+use axum::http::header;
+use axum::response::IntoResponse;
 use axum::{Extension, Json};
 use protocol::message::{RunView, Submit};
 use protocol::{Digest, RunId, StageName};
@@ -16,8 +18,7 @@ use super::actor::ActorHandle;
 use super::api::Failure;
 use super::auth;
 use super::body::Message;
-use crate::event::{Control, Event, Rejected};
-use crate::state::execution::StageExecution;
+use crate::event::{Control, Rejected};
 use crate::view::WorkerView;
 
 /// The answer to `PUT /v1/blobs`.
@@ -51,6 +52,13 @@ fn default_lines() -> u32 {
     1000
 }
 
+/// `?limit=`.
+#[derive(Debug, Deserialize)]
+pub(crate) struct RunsQuery {
+    #[serde(default = "default_lines")]
+    limit: u32,
+}
+
 /// `?stage=&points=`.
 #[derive(Debug, Deserialize)]
 pub(crate) struct MetricQuery {
@@ -79,17 +87,35 @@ pub(crate) async fn submit(
     Ok(Json(Submitted { run: actor_handle.submit(submit).await? }))
 }
 
-pub(crate) async fn runs(State(actor_handle): State<Arc<ActorHandle>>) -> Json<Vec<RunView>> {
+/// Runs by submission: those in memory, and of those that ended the newest `limit`.
+pub(crate) async fn runs(
+    State(actor_handle): State<Arc<ActorHandle>>,
+    Query(query): Query<RunsQuery>,
+) -> Result<impl IntoResponse, Failure> {
+    // Read before the tables: a run that ends in between is in both, and not in neither.
     let (state, now) = (actor_handle.state(), actor_handle.now());
-    Json(state.runs.iter().map(|run| state.view(run, now)).collect())
+    let ended = actor_handle.store.ended_views(query.limit).await?;
+    let mut views: Vec<(u64, String)> = Vec::new();
+    for run in state.runs.values() {
+        let view = serde_json::to_string(&state.view(run, now));
+        views.push((run.number, view.map_err(|e| Failure::invalid(format!("run `{}`: {e}", run.id)))?));
+    }
+    for (run, view) in ended {
+        let number = crate::state::run::number_of(&run).unwrap_or_default();
+        if !state.runs.contains_key(&number) {
+            views.push((number, view));
+        }
+    }
+    views.sort_by_key(|(number, _)| *number);
+    let views: Vec<String> = views.into_iter().map(|(_, view)| view).collect();
+    Ok(([(header::CONTENT_TYPE, "application/json")], format!("[{}]", views.join(","))))
 }
 
 pub(crate) async fn run(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(run): Path<RunId>,
 ) -> Result<Json<RunView>, Failure> {
-    let state = actor_handle.state();
-    Ok(Json(state.view(state.run(&run)?, actor_handle.now())))
+    Ok(Json(actor_handle.run_view(&run).await?))
 }
 
 pub(crate) async fn control(
@@ -105,27 +131,35 @@ pub(crate) async fn control(
             return Err(Rejected::NotFound(message).into());
         }
     };
-    actor_handle.decide(Event::Control { run: run.clone(), action }).await?;
-    let state = actor_handle.state();
-    Ok(Json(state.view(state.run(&run)?, actor_handle.now())))
+    actor_handle.control(&run, action).await?;
+    Ok(Json(actor_handle.run_view(&run).await?))
 }
 
-/// The works behind the stages of a run that have begun, with the stages' names in this run: a stage that another run
-/// computes has its logs and values under that run's name.
-fn executions(
+/// By the name of a stage in this run: the run and the stage under whose names its logs and values are stored. A stage that another run
+/// computes has them under that run's name.
+async fn sources(
     actor_handle: &ActorHandle,
     run: &RunId,
     stage: Option<&StageName>,
-) -> Result<Vec<(StageName, Arc<StageExecution>)>, Failure> {
-    let state = actor_handle.state();
-    let run = state.run(run)?;
+) -> Result<Vec<(StageName, (RunId, StageName))>, Failure> {
+    let view = actor_handle.run_view(run).await?;
     if let Some(stage) = stage
-        && run.position(stage).is_none()
+        && !view.stages.iter().any(|known| known.name == *stage)
     {
-        return Err(Rejected::NotFound(format!("run `{}` has no stage `{stage}`", run.id)).into());
+        return Err(Rejected::NotFound(format!("run `{run}` has no stage `{stage}`")).into());
     }
-    let stages = run.pipeline.stages.iter().filter(|s| stage.is_none_or(|stage| s.name == *stage));
-    Ok(stages.filter_map(|s| Some((s.name.clone(), Arc::clone(state.execution_of(run, &s.name)?)))).collect())
+    let begun = view.stages.into_iter().filter(|known| stage.is_none_or(|stage| known.name == *stage));
+    let begun: Vec<(StageName, Digest)> = begun.filter_map(|known| Some((known.name, known.key?))).collect();
+    let state = actor_handle.state();
+    let left: Vec<Digest> =
+        begun.iter().map(|(_, key)| *key).filter(|key| !state.executions.contains_key(key)).collect();
+    let stored = if left.is_empty() { BTreeMap::new() } else { actor_handle.store.sources(&left).await? };
+    let source = |(name, key): (StageName, Digest)| {
+        let known = state.executions.get(&key).map(|execution| (execution.run.clone(), execution.stage.clone()));
+        let source = known.or_else(|| stored.get(&key).cloned()).unwrap_or_else(|| (run.clone(), name.clone()));
+        (name, source)
+    };
+    Ok(begun.into_iter().map(source).collect())
 }
 
 pub(crate) async fn logs(
@@ -134,8 +168,8 @@ pub(crate) async fn logs(
     Query(query): Query<LogQuery>,
 ) -> Result<Json<Vec<LogRow>>, Failure> {
     let mut rows = Vec::new();
-    for (_, execution) in executions(&actor_handle, &run, query.stage.as_ref())? {
-        rows.extend(actor_handle.store.logs(&execution.run, Some(&execution.stage), query.after, query.limit).await?);
+    for (_, source) in sources(&actor_handle, &run, query.stage.as_ref()).await? {
+        rows.extend(actor_handle.store.logs(&source.0, Some(&source.1), query.after, query.limit).await?);
     }
     rows.sort_by_key(|row| row.id);
     rows.truncate(query.limit as usize);
@@ -148,8 +182,8 @@ pub(crate) async fn metrics(
     Query(query): Query<MetricQuery>,
 ) -> Result<Json<StageMetrics>, Failure> {
     let mut stages = StageMetrics::new();
-    for (name, execution) in executions(&actor_handle, &run, query.stage.as_ref())? {
-        stages.insert(name, actor_handle.store.metrics(&execution.run, &execution.stage, None, query.points).await?);
+    for (name, source) in sources(&actor_handle, &run, query.stage.as_ref()).await? {
+        stages.insert(name, actor_handle.store.metrics(&source.0, &source.1, None, query.points).await?);
     }
     Ok(Json(stages))
 }

@@ -33,7 +33,7 @@ pub(crate) async fn metrics(
     State(actor_handle): State<Arc<ActorHandle>>,
     Message(batch): Message<MetricBatch>,
 ) -> Result<Json<()>, Failure> {
-    actor_handle.state().check_write(&batch.grant)?;
+    actor_handle.state().check_telemetry(&batch.grant)?;
     write(&actor_handle, Write::Metrics { grant: batch.grant, rows: batch.rows }).await
 }
 
@@ -41,7 +41,7 @@ pub(crate) async fn logs(
     State(actor_handle): State<Arc<ActorHandle>>,
     Message(batch): Message<LogBatch>,
 ) -> Result<Json<()>, Failure> {
-    actor_handle.state().check_write(&batch.grant)?;
+    actor_handle.state().check_telemetry(&batch.grant)?;
     write(&actor_handle, Write::Logs { grant: batch.grant, first: batch.first, lines: batch.lines }).await
 }
 

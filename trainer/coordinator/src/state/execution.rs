@@ -12,9 +12,11 @@
 //! and a run that is submitted again after a failure finds tasks, checkpoints and the seconds already spent.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
-use protocol::stage::{Backend, Placement, Shape, StageSettings};
-use protocol::{Attempt, Digest, RunId, Seed, StageName, TaskId};
+use protocol::stage::{Backend, Placement, Shape, StageSettings, WorkerRange};
+use protocol::{Attempt, Digest, Fence, RunId, Seed, StageName, TaskId};
+use serde::{Deserialize, Serialize};
 
 use super::task::{Part, Task};
 use super::tasks::Tasks;
@@ -22,7 +24,8 @@ use crate::event::{Known, Millis};
 use crate::register::Registration;
 
 /// How far the work is.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum ExecutionState {
     /// The store is asked whether it has the value.
     Looking,
@@ -33,7 +36,8 @@ pub enum ExecutionState {
     /// Done.
     Done {
         /// The value.
-        known: Known,
+        #[serde(with = "super::shared")]
+        known: Arc<Known>,
         /// The store had it already.
         cached: bool,
     },
@@ -47,7 +51,7 @@ pub enum ExecutionState {
 }
 
 /// The work of one stage.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageExecution {
     /// The stage's key.
     pub key: Digest,
@@ -79,17 +83,17 @@ pub struct StageExecution {
     pub busy_since: Option<Millis>,
     /// It went on from something that an earlier try had saved.
     pub resumed: bool,
+    /// The runs in memory that have stages with this key, and how many: those that came to it while it was in memory itself.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub users: BTreeMap<u64, usize>,
 }
 
 impl StageExecution {
-    /// Makes its tasks, if it has none yet.
-    pub fn open(&mut self) {
-        self.state = ExecutionState::Open;
-        if !self.tasks.is_empty() {
-            return;
-        }
-        let task = |shard, part| Task::new(TaskId::of(&self.run, &self.stage, shard), part);
-        self.tasks = Tasks::new(match self.settings.shape() {
+    /// The tasks that it consists of. Their fences begin above `fence`, so that a name that was used before and forgotten never bears a
+    /// fence again that somebody may still hold.
+    pub fn new_tasks(&self, fence: Fence) -> Vec<Task> {
+        let task = |shard, part| Task { fence, ..Task::new(TaskId::of(&self.run, &self.stage, shard), part) };
+        match self.settings.shape() {
             Shape::Plain => vec![task(None, Part::Alone)],
             Shape::Gang => vec![task(None, Part::Gang)],
             Shape::Map => {
@@ -99,7 +103,16 @@ impl StageExecution {
                 tasks
             }
             Shape::Registry => panic!("a register stage has no tasks: {self:?}"),
-        });
+        }
+    }
+
+    /// How many workers may train it together: a member without a slice of the batch would have nothing to do.
+    pub fn range(&self) -> WorkerRange {
+        let WorkerRange { min, max } = self.placement.workers;
+        let Some(training) = self.settings.training() else { return self.placement.workers };
+        let slices = training.batch.slices.max(1);
+        let max = if max == 0 { slices } else { max.max(min).min(slices) };
+        WorkerRange { min: min.min(slices), max }
     }
 
     /// The shards' artifacts in order, once all are there.
@@ -129,18 +142,6 @@ impl StageExecution {
         }
     }
 
-    /// Starts or stops the count of seconds.
-    pub fn count_time(&mut self, now: Millis) {
-        match (self.is_busy(), self.busy_since) {
-            (true, None) => self.busy_since = Some(now),
-            (false, Some(since)) => {
-                self.wall_ms += now.since(since);
-                self.busy_since = None;
-            }
-            (true, Some(_)) | (false, None) => {}
-        }
-    }
-
     /// Seconds of work up to `now`.
     pub fn wall_s(&self, now: Millis) -> f64 {
         let running = self.busy_since.map_or(0, |since| now.since(since));
@@ -155,13 +156,5 @@ impl StageExecution {
     /// Whether an earlier try left something to go on from.
     pub fn has_something(&self) -> bool {
         self.tasks.iter().any(|task| task.output().is_some() || task.newest().is_some())
-    }
-
-    /// Wanted again after it was over: the store is asked first, and budgets are whole again.
-    pub fn want_again(&mut self, lost_value: bool) {
-        self.state = ExecutionState::Looking;
-        for i in 0..self.tasks.len() {
-            self.tasks.change(i, |task| if lost_value { task.reopen() } else { task.reset_budgets() });
-        }
     }
 }

@@ -1,9 +1,18 @@
-//! All that the coordinator knows. Changed by `decide` and, for what need not survive a restart, by `observe`; read by
-//! everybody.
+//! All that the coordinator knows. Changed by facts alone ([`apply`](State::apply)) and, for what need not survive a restart, by
+//! `observe`; read by everybody.
+//!
+//! What is known twice, for speed, follows from the facts as well: who waits and who is held in an execution (`tasks::Tasks`), what a
+//! worker holds and which workers hold nothing, which runs use an execution, which stages of a run are active. Invariant C14.
+//!
+//! In memory is what may still matter: runs that have not ended, executions that one of them uses or that somebody works on, workers that
+//! were heard of lately. The rest is in the store's tables. Numbers of runs, incarnations and fences come from counters that only grow, so
+//! that nothing that was forgotten is mistaken for something new.
 
+mod apply;
 pub mod execution;
 pub mod gang;
 pub mod run;
+pub(crate) mod shared;
 pub mod task;
 pub mod tasks;
 pub mod worker;
@@ -12,8 +21,9 @@ use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::sync::Arc;
 
 use protocol::message::{Grant, Progress};
-use protocol::{Digest, Incarnation, RunId, StageName, TaskId, WorkerId};
+use protocol::{Digest, Fence, Incarnation, RunId, StageName, TaskId, WorkerId};
 
+pub use self::apply::Misfit;
 use self::execution::StageExecution;
 use self::run::Run;
 use self::task::Task;
@@ -28,34 +38,41 @@ pub struct Heard {
     pub workers: Arc<BTreeMap<WorkerId, Millis>>,
     /// What was last said about each task that is all of its work.
     pub progress: Arc<BTreeMap<TaskId, Arc<Progress>>>,
-    /// When the clock was last looked at.
-    pub ticked: Option<Millis>,
 }
 
 /// All that the coordinator knows. What may be large is shared between copies until one changes it, so a copy is cheap.
-///
-/// A task is changed by `State::change` alone, which keeps what is known twice, for speed, in step: who waits and who is
-/// held in a work (`tasks::Tasks`), what a worker holds, and which workers hold nothing.
 #[derive(Debug, Clone, Default)]
 pub struct State {
     /// Times and budgets.
     pub policy: Policy,
-    /// The time of the newest event.
+    /// Decisions so far, which is the number of the newest.
+    pub seq: u64,
+    /// The time of the newest decision.
     pub now: Millis,
+    /// Runs that were ever submitted.
+    pub submitted: u64,
+    /// The newest incarnation of any worker.
+    pub incarnation: Incarnation,
+    /// The newest fence of any task.
+    pub fence: Fence,
     /// Workers by name.
     pub workers: Arc<BTreeMap<WorkerId, Worker>>,
     /// Those of them that hold no task.
     pub unused: Arc<BTreeSet<WorkerId>>,
-    /// Runs in the order of submission; the first has number 1.
-    pub runs: Vec<Arc<Run>>,
-    /// Works by the stage's key.
+    /// Runs that have not ended, by number, which is the order of submission.
+    pub runs: BTreeMap<u64, Arc<Run>>,
+    /// Executions by the stage's key.
     pub executions: BTreeMap<Digest, Arc<StageExecution>>,
-    /// Which work a task is of, and its place there.
+    /// Which execution a task is of, and its place there.
     pub tasks: Arc<BTreeMap<TaskId, (Digest, usize)>>,
     /// About to stop: no grants, workers save and leave.
     pub draining: bool,
     /// What was merely heard.
     pub heard: Heard,
+    /// How many facts decisions have recorded since this process started.
+    pub recorded: u64,
+    /// How many runs, executions and workers decisions have looked at: what they cost, for tests that count it.
+    pub visits: u64,
 }
 
 impl State {
@@ -64,24 +81,24 @@ impl State {
         Self { policy, ..Self::default() }
     }
 
-    /// A run by name.
+    /// A run by name, if it has not ended.
     pub fn run(&self, run: &RunId) -> Result<&Arc<Run>, Rejected> {
-        self.runs
-            .iter()
-            .find(|r| r.id == *run)
-            .ok_or_else(|| Rejected::NotFound(format!("run `{run}` is not known; `trainer status` lists runs")))
+        run::number_of(run)
+            .and_then(|number| self.runs.get(&number))
+            .filter(|known| known.id == *run)
+            .ok_or_else(|| Rejected::NotFound(format!("run `{run}` is not known; `trainer status --all` lists runs")))
     }
 
-    /// The work and the task that a grant is about.
+    /// The execution and the task that a grant is about.
     pub fn task(&self, task: &TaskId) -> Result<(&StageExecution, &Task), Rejected> {
         let (key, i) = self.place(task)?;
         let execution = &self.executions[&key];
         Ok((execution, &execution.tasks[i]))
     }
 
-    /// The key of the work that a task is of, and its place there.
+    /// The key of the execution that a task is of, and its place there.
     pub(crate) fn place(&self, task: &TaskId) -> Result<(Digest, usize), Rejected> {
-        self.tasks.get(task).copied().ok_or_else(|| Rejected::NotFound(format!("task `{task}` is not known")))
+        self.tasks.get(task).copied().ok_or_else(|| Rejected::NotFound(format!("task `{task}` is not known, or over")))
     }
 
     /// Checks that a write's grant has not been superseded and that its process is not known to be over.
@@ -90,32 +107,13 @@ impl State {
         task.check_fence(grant)
     }
 
-    /// Changes a work; other copies of the state keep theirs.
-    pub(crate) fn execution_mut(&mut self, key: Digest) -> &mut StageExecution {
-        Arc::make_mut(self.executions.get_mut(&key).expect("executions are never forgotten"))
-    }
-
-    /// Changes a task; the only way to.
-    pub(crate) fn change<T>(&mut self, key: Digest, i: usize, change: impl FnOnce(&mut Task) -> T) -> T {
-        let execution = Arc::make_mut(self.executions.get_mut(&key).expect("executions are never forgotten"));
-        let before = execution.tasks[i].holders().to_vec();
-        let made = execution.tasks.change(i, change);
-        let after = execution.tasks[i].holders();
-        if before != after {
-            let (workers, unused) = (Arc::make_mut(&mut self.workers), Arc::make_mut(&mut self.unused));
-            let mut set = |name: &WorkerId, holds| {
-                // Whoever holds something has joined, and nobody is forgotten.
-                workers.get_mut(name).expect("holders are known").holds = holds;
-                if holds.is_none() {
-                    unused.insert(name.clone())
-                } else {
-                    unused.remove(name)
-                };
-            };
-            before.iter().for_each(|member| set(&member.worker, None));
-            after.iter().for_each(|member| set(&member.worker, Some((key, i))));
+    /// As [`check_write`](Self::check_write), for what a worker has to say about work that it has just ended: of a task that has left
+    /// memory the store alone knows the fence, and checks it.
+    pub fn check_telemetry(&self, grant: &Grant) -> Result<(), Rejected> {
+        match self.check_write(grant) {
+            Err(Rejected::NotFound(_)) => Ok(()),
+            checked => checked,
         }
-        made
     }
 
     /// The worker, if `incarnation` is its newest process.
@@ -140,15 +138,21 @@ impl State {
         Some((execution, &execution.tasks[i]))
     }
 
-    /// The keys of works that a running run waits for, in the order in which they are served: runs as submitted, stages
+    /// The keys of executions that a running run waits for, in the order in which they are served: runs as submitted, stages
     /// as in the pipeline.
     pub fn wanted(&self) -> Vec<Digest> {
         let mut seen = HashSet::new();
-        let active = self.runs.iter().flat_map(|run| run.active());
+        let active = self.runs.values().flat_map(|run| run.active());
         active.map(|(_, key)| key).filter(|key| seen.insert(*key)).collect()
     }
 
-    /// The work behind a stage of a run, if it has begun or was done here before.
+    /// Whether a running run waits for an execution.
+    pub fn is_wanted(&self, execution: &StageExecution) -> bool {
+        let waits = |run: &Arc<Run>| run.active().any(|(_, key)| key == execution.key);
+        execution.users.keys().filter_map(|number| self.runs.get(number)).any(waits)
+    }
+
+    /// The execution behind a stage of a run, if it has begun or was done here before.
     pub fn execution_of(&self, run: &Run, stage: &StageName) -> Option<&Arc<StageExecution>> {
         self.executions.get(&run.status(stage)?.key()?)
     }

@@ -11,19 +11,21 @@
 //! `-` is refused when a client asks for it. There is no state from which a run cannot be ended or, short of `Finished`,
 //! taken up again: finished stages are remembered by their keys, unfinished ones by their checkpoints.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use protocol::message::{RunState, StageState};
-use protocol::pipeline::Pipeline;
+use protocol::pipeline::{Pipeline, PipelineStage};
 use protocol::sweep::STATE_OUTPUT;
 use protocol::{ArtifactKind, Attempt, Digest, RunId, StageName};
+use serde::{Deserialize, Serialize};
 
 use crate::event::{Control, Known};
 use crate::search::Search;
 
 /// Where a stage of a run stands.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Status {
     /// Its inputs are not there yet.
     Waiting,
@@ -41,7 +43,8 @@ pub enum Status {
         /// `Ran`, `Cached` or `Resumed`.
         how: StageState,
         /// The value.
-        known: Known,
+        #[serde(with = "super::shared")]
+        known: Arc<Known>,
         /// Seconds of work.
         wall_s: f64,
         /// The try that made it.
@@ -83,7 +86,7 @@ impl Status {
 }
 
 /// A sweep under way or over.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Sweeping {
     /// The place of the swept stage.
     pub stage: usize,
@@ -96,8 +99,9 @@ pub struct Sweeping {
     pub failures: BTreeMap<usize, String>,
 }
 
-/// A run.
-#[derive(Debug, Clone, PartialEq)]
+/// A run that may go on. One that has ended is in the tables, and here no more.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(from = "Stored", into = "Stored")]
 pub struct Run {
     /// Its name.
     pub id: RunId,
@@ -107,8 +111,6 @@ pub struct Run {
     pub submitted: Arc<Pipeline>,
     /// What it executes: what was submitted, and behind it the stages that sweeps made.
     pub pipeline: Arc<Pipeline>,
-    /// The YAML as written.
-    pub source: String,
     /// The client's key.
     pub idempotency_key: Option<String>,
     /// The last stage asked for.
@@ -120,18 +122,91 @@ pub struct Run {
     /// Stage by stage, as in the pipeline.
     pub stages: Vec<Status>,
     /// Sweeps that have begun.
-    pub sweeps: Vec<Sweeping>,
+    pub sweeps: Vec<Arc<Sweeping>>,
+    /// Places by name. Follows from the pipeline.
+    places: Arc<HashMap<StageName, usize>>,
+    /// Places of active stages. Follows from the stages.
+    active: BTreeSet<usize>,
+}
+
+/// A run as it is kept.
+#[derive(Serialize, Deserialize)]
+struct Stored {
+    id: RunId,
+    number: u64,
+    submitted: Pipeline,
+    /// Stages that sweeps made.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    made: Vec<PipelineStage>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    idempotency_key: Option<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    until: Option<StageName>,
+    state: RunState,
+    #[serde(default)]
+    parked: bool,
+    stages: Vec<Status>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    sweeps: Vec<Sweeping>,
+}
+
+impl From<Run> for Stored {
+    fn from(run: Run) -> Self {
+        let made = run.pipeline.stages[run.submitted.stages.len()..].to_vec();
+        Self {
+            id: run.id,
+            number: run.number,
+            submitted: Arc::unwrap_or_clone(run.submitted),
+            made,
+            idempotency_key: run.idempotency_key,
+            until: run.until,
+            state: run.state,
+            parked: run.parked,
+            stages: run.stages,
+            sweeps: run.sweeps.into_iter().map(Arc::unwrap_or_clone).collect(),
+        }
+    }
+}
+
+impl From<Stored> for Run {
+    fn from(stored: Stored) -> Self {
+        let submitted = Arc::new(stored.submitted);
+        let mut run = Self {
+            id: stored.id,
+            number: stored.number,
+            pipeline: Arc::clone(&submitted),
+            submitted,
+            idempotency_key: stored.idempotency_key,
+            until: stored.until,
+            state: stored.state,
+            parked: stored.parked,
+            stages: Vec::new(),
+            sweeps: stored.sweeps.into_iter().map(Arc::new).collect(),
+            places: Arc::default(),
+            active: BTreeSet::new(),
+        };
+        run.places = Arc::new(places(&run.submitted.stages, 0).collect());
+        if !stored.made.is_empty() {
+            run.add_stages(stored.made);
+        }
+        run.stages = stored.stages;
+        run.active = run.active_places();
+        run
+    }
+}
+
+/// The number in a run's name, which ends in it.
+pub fn number_of(run: &RunId) -> Option<u64> {
+    run.as_str().rsplit('-').next()?.parse().ok()
+}
+
+fn places(stages: &[PipelineStage], first: usize) -> impl Iterator<Item = (StageName, usize)> + '_ {
+    stages.iter().enumerate().map(move |(i, stage)| (stage.name.clone(), first + i))
 }
 
 impl Run {
     /// A run that has just been submitted.
-    pub fn new(
-        number: u64,
-        pipeline: Arc<Pipeline>,
-        source: String,
-        key: Option<String>,
-        until: Option<StageName>,
-    ) -> Self {
+    pub fn new(number: u64, pipeline: Arc<Pipeline>, key: Option<String>, until: Option<StageName>) -> Self {
         let digest = pipeline.digest();
         let id = RunId::new(format!("{}-{}-{number}", pipeline.name, &digest.hex()[..8]));
         let wanted = wanted(&pipeline, until.as_ref());
@@ -142,20 +217,48 @@ impl Run {
             id,
             number,
             submitted: Arc::clone(&pipeline),
+            places: Arc::new(places(&pipeline.stages, 0).collect()),
             pipeline,
-            source,
             idempotency_key: key,
             until,
             state: RunState::Running,
             parked: false,
             stages,
             sweeps: Vec::new(),
+            active: BTreeSet::new(),
         }
+    }
+
+    /// Adds stages that a sweep made. Their statuses are added as well; they wait.
+    pub(crate) fn add_stages(&mut self, made: Vec<PipelineStage>) {
+        Arc::make_mut(&mut self.places).extend(places(&made, self.pipeline.stages.len()));
+        self.stages.resize(self.stages.len() + made.len(), Status::Waiting);
+        Arc::make_mut(&mut self.pipeline).stages.extend(made);
+    }
+
+    /// Where a stage stands from now on; the only way to change it.
+    pub(crate) fn set(&mut self, stage: usize, status: Status) {
+        match status {
+            Status::Active { .. } => self.active.insert(stage),
+            _ => self.active.remove(&stage),
+        };
+        self.stages[stage] = status;
+    }
+
+    fn active_places(&self) -> BTreeSet<usize> {
+        let is_active = |(i, status): (usize, &Status)| matches!(status, Status::Active { .. }).then_some(i);
+        self.stages.iter().enumerate().filter_map(is_active).collect()
+    }
+
+    /// Whether what is known twice agrees; invariant C14.
+    pub fn is_indexed(&self) -> bool {
+        let placed = |(i, stage): (usize, &PipelineStage)| self.places.get(&stage.name) == Some(&i);
+        self.active == self.active_places() && self.pipeline.stages.iter().enumerate().all(placed)
     }
 
     /// The place of a stage in the pipeline.
     pub fn position(&self, stage: &StageName) -> Option<usize> {
-        self.pipeline.stages.iter().position(|s| s.name == *stage)
+        self.places.get(stage).copied()
     }
 
     /// The status of a stage by name.
@@ -165,11 +268,13 @@ impl Run {
 
     /// The stages that this run has work under way for, with their keys. Paused and ended runs have none.
     pub fn active(&self) -> impl Iterator<Item = (usize, Digest)> + '_ {
-        let running = self.state == RunState::Running;
-        self.stages.iter().enumerate().filter_map(move |(i, status)| match status {
-            Status::Active { key } if running => Some((i, *key)),
-            _ => None,
-        })
+        let places = (self.state == RunState::Running).then_some(&self.active);
+        places.into_iter().flatten().filter_map(|i| Some((*i, self.stages[*i].key()?)))
+    }
+
+    /// As [`active`](Self::active), whatever state the run is in.
+    pub fn all_active(&self) -> impl Iterator<Item = (usize, Digest)> + '_ {
+        self.active.iter().filter_map(|i| Some((*i, self.stages[*i].key()?)))
     }
 
     /// The values of a stage's inputs by the field that names them, or `None` while one is missing.
@@ -229,18 +334,17 @@ impl Run {
     }
 
     /// The sweep of a stage, if it has begun.
-    pub fn sweep(&self, stage: usize) -> Option<&Sweeping> {
+    pub fn sweep(&self, stage: usize) -> Option<&Arc<Sweeping>> {
         self.sweeps.iter().find(|sweep| sweep.stage == stage)
     }
 
     /// Skips everything that is not over.
     pub fn skip_rest(&mut self, reason: &str) {
-        for status in &mut self.stages {
-            match status {
-                Status::Waiting | Status::Sweeping => {
-                    *status = Status::Skipped { key: None, reason: reason.to_owned() }
+        for i in 0..self.stages.len() {
+            match self.stages[i] {
+                Status::Waiting | Status::Sweeping | Status::Active { .. } => {
+                    self.set(i, Status::Skipped { key: self.stages[i].key(), reason: reason.to_owned() });
                 }
-                Status::Active { key } => *status = Status::Skipped { key: Some(*key), reason: reason.to_owned() },
                 Status::Done { .. } | Status::Failed { .. } | Status::Skipped { .. } => {}
             }
         }
@@ -257,9 +361,9 @@ impl Run {
                 }
             }
         }
-        for (i, status) in self.stages.iter_mut().enumerate() {
-            match status {
-                Status::Failed { .. } | Status::Skipped { .. } if wanted.contains(&i) => *status = Status::Waiting,
+        for i in 0..self.stages.len() {
+            match self.stages[i] {
+                Status::Failed { .. } | Status::Skipped { .. } if wanted.contains(&i) => self.set(i, Status::Waiting),
                 Status::Failed { .. }
                 | Status::Skipped { .. }
                 | Status::Waiting
@@ -320,14 +424,14 @@ mod tests {
             stages: vec![stage],
             code_versions: BTreeMap::new(),
         };
-        Run::new(1, Arc::new(pipeline), String::new(), None, None)
+        Run::new(1, Arc::new(pipeline), None, None)
     }
 
     #[test]
     fn the_table_in_the_header_is_what_the_code_does() {
         let key = Digest::of(b"");
         let failed = Status::Failed { key, message: String::new() };
-        let known = Known { outputs: BTreeMap::new(), metrics: BTreeMap::new() };
+        let known = Arc::new(Known { outputs: BTreeMap::new(), metrics: BTreeMap::new() });
         let done = Status::Done { key, how: StageState::Ran, known, wall_s: 0.0, attempt: Attempt(1) };
         for state in [RunState::Running, RunState::Paused, RunState::Finished, RunState::Failed, RunState::Cancelled] {
             let asked = |action| Run { state, ..run() }.after(action).map_or("-".to_owned(), |s| format!("{s:?}"));

@@ -16,11 +16,13 @@ use protocol::message::{Grant, Member, ReportOutcome};
 use protocol::stage::Keep;
 use protocol::{Attempt, Digest, Fence, Incarnation, TaskId, WorkerId};
 use registry::Write;
+use serde::{Deserialize, Serialize};
 
 use crate::event::{Millis, Rejected};
 
 /// What part of a stage a task is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Part {
     /// All of a plain stage.
     Alone,
@@ -38,7 +40,8 @@ pub enum Part {
 }
 
 /// Who has the right to a task.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Lease {
     /// Nobody.
     Waiting {
@@ -62,7 +65,7 @@ pub enum Lease {
 }
 
 /// A committed checkpoint.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Saved {
     /// Steps applied.
     pub step: u64,
@@ -73,7 +76,7 @@ pub struct Saved {
 }
 
 /// A task.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Task {
     /// Its name.
     pub id: TaskId,
@@ -87,10 +90,13 @@ pub struct Task {
     pub fence: Fence,
     /// Faults since it was last opened.
     pub faults: u32,
-    /// Losses since it was last opened.
+    /// Losses since something was last achieved: a task that makes progress may lose any number of workers.
     pub losses: u32,
     /// Failures since something was last achieved.
     pub streak: u32,
+    /// Workers that have not enough memory for it; they are not given it again.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub too_small: Vec<WorkerId>,
     /// Kept checkpoints, oldest first.
     pub checkpoints: Vec<Saved>,
     /// The report that was last accepted: a report that is sent twice is answered twice.
@@ -109,6 +115,7 @@ impl Task {
             faults: 0,
             losses: 0,
             streak: 0,
+            too_small: Vec::new(),
             checkpoints: Vec::new(),
             reported: None,
         }
@@ -206,6 +213,7 @@ impl Task {
     /// Gives it its restart budgets back.
     pub fn reset_budgets(&mut self) {
         (self.faults, self.losses, self.streak) = (0, 0, 0);
+        self.too_small.clear();
         if let Lease::Waiting { not_before } = &mut self.lease {
             *not_before = None;
         }
@@ -250,7 +258,7 @@ impl Task {
 
     /// Adds a checkpoint and drops those that `keep` does not keep; returns the dropped ones.
     pub fn save(&mut self, saved: Saved, keep: &Keep) -> Vec<Saved> {
-        self.streak = 0;
+        (self.streak, self.losses) = (0, 0);
         self.checkpoints.retain(|old| old.step < saved.step);
         self.checkpoints.push(saved);
         let stay = keep.kept(&self.checkpoints.iter().map(|saved| &saved.metrics).collect::<Vec<_>>());

@@ -5,10 +5,13 @@
 use std::collections::BTreeSet;
 use std::ops::Deref;
 
+use serde::{Deserialize, Serialize};
+
 use super::task::{Lease, Task};
 
 /// The tasks of a work.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(from = "Vec<Task>", into = "Vec<Task>")]
 pub struct Tasks {
     all: Vec<Task>,
     index: Index,
@@ -47,6 +50,18 @@ impl Index {
         let mut index = Self::default();
         tasks.iter().enumerate().for_each(|(i, task)| index.note(i, &task.lease, true));
         index
+    }
+}
+
+impl From<Vec<Task>> for Tasks {
+    fn from(all: Vec<Task>) -> Self {
+        Self::new(all)
+    }
+}
+
+impl From<Tasks> for Vec<Task> {
+    fn from(tasks: Tasks) -> Self {
+        tasks.all
     }
 }
 

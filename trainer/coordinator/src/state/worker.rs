@@ -15,10 +15,13 @@ use protocol::message::{Join, Member};
 use protocol::stage::Backend;
 use protocol::{Digest, Incarnation};
 
+use serde::{Deserialize, Serialize};
+
 use crate::event::Millis;
 
 /// Whether a worker can be given work.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Presence {
     /// Polls.
     Here,
@@ -75,7 +78,7 @@ impl Presence {
 }
 
 /// A worker's newest process.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Worker {
     /// Which process of that name.
     pub incarnation: Incarnation,
@@ -89,7 +92,8 @@ pub struct Worker {
     pub presence: Presence,
     /// How often peers could not reach this process; each time it stays out for longer.
     pub suspicions: u32,
-    /// What it holds: the key of a work, and a task's place there.
+    /// What it holds: the key of an execution, and a task's place there. Follows from the tasks.
+    #[serde(skip)]
     pub holds: Option<(Digest, usize)>,
 }
 
@@ -104,6 +108,14 @@ impl Worker {
             presence: Presence::Here,
             suspicions: 0,
             holds: None,
+        }
+    }
+
+    /// Whether it is not there, as far as anybody knows.
+    pub fn is_away(&self) -> bool {
+        match self.presence {
+            Presence::Silent | Presence::Gone => true,
+            Presence::Here | Presence::Suspect { .. } => false,
         }
     }
 

@@ -10,6 +10,7 @@ mod pipelines;
 mod random;
 mod store;
 mod sweeps;
+mod upgrade;
 mod wild;
 mod worker;
 mod world;
@@ -38,12 +39,7 @@ struct Tally {
 fn simulate(seed: u64) -> Tally {
     let mut world = World::new(seed);
     world.run();
-    Tally {
-        events: world.events,
-        runs: world.state.runs.len(),
-        restarts: world.store.journal.iter().filter(|entry| entry["event"] == "started").count(),
-        torn: world.torn,
-    }
+    Tally { events: world.events, runs: world.runs().len(), restarts: world.starts, torn: world.torn }
 }
 
 fn seeds_file() -> std::path::PathBuf {
@@ -145,6 +141,7 @@ fn two_runs_of_one_pipeline_compute_once_and_a_third_finds_everything() {
     assert!(states(0).iter().all(|state| *state == StageState::Ran), "{:?}", states(0));
     assert_eq!(states(0), states(1));
     assert!(states(2).iter().all(|state| *state == StageState::Cached), "{:?}", states(2));
-    let known: Vec<&Known> = world.state.runs.iter().filter_map(|run| run.stages.last()?.known()).collect();
+    let runs = world.runs();
+    let known: Vec<&Known> = runs.iter().filter_map(|run| run.stages.last()?.known()).collect();
     assert!(known.len() == 3 && known.iter().all(|k| *k == known[0]));
 }

@@ -1,44 +1,54 @@
-//! A store in memory: a transaction is taken whole or not at all, fences are checked inside.
+//! A store in memory: a transaction is taken whole or not at all, fences are checked inside. Blobs are names that are there or not.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
-use coordinator::event::Known;
-use protocol::message::Grant;
-use protocol::{Digest, Fence, RunId, TaskId};
-use registry::Write;
-use serde_json::Value;
+use coordinator::event::{Event, Known};
+use coordinator::state::run::Run;
+use coordinator::{State, journal};
+use protocol::message::{Grant, RunView};
+use protocol::{Digest, Fence, RunId, StageName, TaskId};
+use registry::{Recovery, Write};
 
 #[derive(Debug, Clone, Default)]
 pub(crate) struct FakeStore {
-    pub(crate) journal: Vec<Value>,
+    /// What a coordinator comes back from.
+    pub(crate) recovery: Recovery,
     pub(crate) fences: BTreeMap<TaskId, Fence>,
-    pub(crate) results: BTreeMap<Digest, Known>,
+    pub(crate) results: BTreeMap<Digest, (Known, RunId, StageName)>,
     pub(crate) runs: BTreeMap<RunId, String>,
+    pub(crate) keys: BTreeMap<String, RunId>,
+    /// Views and archives of runs that ended.
+    pub(crate) ended: BTreeMap<RunId, (String, String)>,
+    pub(crate) executions: BTreeMap<Digest, String>,
     pub(crate) shards: BTreeMap<TaskId, Digest>,
     pub(crate) versions: u64,
     pub(crate) promotions: u64,
     /// How often each task's end was accepted.
     pub(crate) accepted: BTreeMap<TaskId, u64>,
-    /// Gates hold unless they say `never`.
-    pub(crate) checkpoints: u64,
+    pub(crate) checkpoints: BTreeMap<(TaskId, u64), Digest>,
+    /// What was collected between its upload and the report that names it: whoever names it is refused.
+    pub(crate) collected: BTreeSet<Digest>,
 }
 
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Refusal {
+    /// Gates hold unless they say `never`.
     Gate,
     Full,
+    /// A blob that is named is not there.
+    Missing(Digest),
 }
 
 impl FakeStore {
     pub(crate) fn write(&mut self, writes: &[Write]) -> Result<(), Refusal> {
-        // The journal only grows: its new entries wait until nothing can be refused any more, so that it is not copied.
-        let journal = std::mem::take(&mut self.journal);
+        // Facts only come behind: they wait until nothing can be refused any more, so that they are not copied.
+        let recovery = std::mem::take(&mut self.recovery);
         let mut next = self.clone();
         let applied = writes.iter().try_for_each(|write| next.apply(write));
-        self.journal = journal;
+        self.recovery = recovery;
         applied?;
-        self.journal.append(&mut next.journal);
-        *self = Self { journal: std::mem::take(&mut self.journal), ..next };
+        self.recovery.facts.append(&mut next.recovery.facts);
+        *self = Self { recovery: std::mem::take(&mut self.recovery), ..next };
         Ok(())
     }
 
@@ -47,31 +57,57 @@ impl FakeStore {
         assert_eq!(self.fences.get(&grant.task), Some(&grant.fence), "a stale write got this far: {grant:?}");
     }
 
+    /// What a worker uploaded is there, unless it was collected before it was named; the next upload brings it back.
+    fn is_there(&self, digest: Digest) -> Result<(), Refusal> {
+        if self.collected.contains(&digest) { Err(Refusal::Missing(digest)) } else { Ok(()) }
+    }
+
     fn apply(&mut self, write: &Write) -> Result<(), Refusal> {
         match write {
-            Write::Journal(entry) => self.journal.push(entry.clone()),
+            Write::Facts { seq, facts } => self.recovery.facts.push((*seq, facts.clone())),
+            Write::Snapshot { .. } => unreachable!("the world takes snapshots by `snapshot`"),
             Write::Fence { task, fence } => {
                 let before = self.fences.insert(task.clone(), *fence);
                 assert!(before.is_none_or(|before| before < *fence), "the fence of {task} fell to {fence}");
             }
-            Write::Run { run, state, .. } => drop(self.runs.insert(run.clone(), state.clone())),
+            Write::Run { run, state, idempotency_key, .. } => {
+                let before = self.runs.insert(run.clone(), state.clone());
+                assert!(before.is_none(), "there are two runs {run}");
+                if let Some(key) = idempotency_key {
+                    let before = self.keys.insert(key.clone(), run.clone());
+                    assert!(before.is_none(), "two runs have the key {key}");
+                }
+            }
+            Write::RunState { run, state } => drop(self.runs.insert(run.clone(), state.clone())),
+            Write::RunEnded { run, state, view, archive } => {
+                self.runs.insert(run.clone(), state.clone());
+                self.ended.insert(run.clone(), (view.clone(), archive.clone()));
+            }
+            Write::Archive { key, execution, .. } => match execution {
+                Some(execution) => drop(self.executions.insert(*key, execution.clone())),
+                None => drop(self.executions.remove(key)),
+            },
             Write::Metrics { grant, .. } | Write::Logs { grant, .. } => self.check(grant),
-            Write::Checkpoint { grant, .. } => {
+            Write::Checkpoint { grant, step, manifest, .. } => {
                 self.check(grant);
-                self.checkpoints += 1;
+                self.is_there(*manifest)?;
+                let before = self.checkpoints.insert((grant.task.clone(), *step), *manifest);
+                assert!(before.is_none_or(|before| before == *manifest), "two states of step {step} of {}", grant.task);
             }
             Write::Shard { grant, output } => {
                 self.check(grant);
+                self.is_there(*output)?;
                 self.shards.insert(grant.task.clone(), *output);
                 *self.accepted.entry(grant.task.clone()).or_default() += 1;
             }
-            Write::StageResult { grant, key, outputs, metrics, .. } => {
+            Write::StageResult { grant, key, run, stage, outputs, metrics, .. } => {
                 if let Some(grant) = grant {
                     self.check(grant);
+                    outputs.values().try_for_each(|output| self.is_there(*output))?;
                     *self.accepted.entry(grant.task.clone()).or_default() += 1;
                 }
                 let known = Known { outputs: outputs.clone(), metrics: metrics.clone() };
-                let before = self.results.insert(*key, known);
+                let before = self.results.insert(*key, (known, run.clone(), stage.clone()));
                 assert!(before.is_none(), "stage {key} was done twice");
             }
             Write::Version { .. } => self.versions += 1,
@@ -83,5 +119,69 @@ impl FakeStore {
             }
         }
         Ok(())
+    }
+
+    /// The state as a whole; the facts before it go.
+    pub(crate) fn snapshot(&mut self, state: &State) {
+        self.recovery.snapshot = Some((state.seq, journal::snapshot(state)));
+        self.recovery.facts.retain(|(seq, _)| *seq > state.seq);
+    }
+
+    /// The answer to a lookup.
+    pub(crate) fn look_up(&self, key: Digest) -> Event {
+        let found = self.results.get(&key).cloned();
+        let archived = match &found {
+            Some(_) => None,
+            None => self.executions.get(&key).map(|text| serde_json::from_str(text).expect("an execution")),
+        };
+        let (known, source) = found.map(|(known, run, stage)| (known, (run, stage))).unzip();
+        Event::LookedUp { key, known, source, archived }
+    }
+
+    /// All that a coordinator goes on from, as JSON.
+    pub(crate) fn to_json(&self) -> String {
+        let results: Vec<_> = self.results.iter().map(|(key, (known, run, stage))| (key, known, run, stage)).collect();
+        let checkpoints: Vec<_> = self.checkpoints.iter().map(|((task, step), digest)| (task, step, digest)).collect();
+        let stored = serde_json::json!({
+            "snapshot": self.recovery.snapshot, "facts": self.recovery.facts, "fences": self.fences, "results": results,
+            "runs": self.runs, "keys": self.keys, "ended": self.ended, "executions": self.executions, "shards": self.shards,
+            "accepted": self.accepted, "checkpoints": checkpoints,
+        });
+        serde_json::to_string_pretty(&stored).expect("JSON") + "\n"
+    }
+
+    /// What [`to_json`](Self::to_json) wrote.
+    pub(crate) fn from_json(text: &str) -> Self {
+        type Result = (Digest, Known, RunId, StageName);
+        fn part<T: serde::de::DeserializeOwned>(stored: &mut serde_json::Value, name: &str) -> T {
+            serde_json::from_value(stored[name].take()).unwrap_or_else(|error| panic!("`{name}`: {error}"))
+        }
+        let mut stored: serde_json::Value = serde_json::from_str(text).expect("JSON");
+        let results = part::<Vec<Result>>(&mut stored, "results").into_iter();
+        let checkpoints = part::<Vec<(TaskId, u64, Digest)>>(&mut stored, "checkpoints").into_iter();
+        Self {
+            recovery: Recovery { snapshot: part(&mut stored, "snapshot"), facts: part(&mut stored, "facts") },
+            fences: part(&mut stored, "fences"),
+            results: results.map(|(key, known, run, stage)| (key, (known, run, stage))).collect(),
+            runs: part(&mut stored, "runs"),
+            keys: part(&mut stored, "keys"),
+            ended: part(&mut stored, "ended"),
+            executions: part(&mut stored, "executions"),
+            shards: part(&mut stored, "shards"),
+            accepted: part(&mut stored, "accepted"),
+            checkpoints: checkpoints.map(|(task, step, digest)| ((task, step), digest)).collect(),
+            ..Self::default()
+        }
+    }
+
+    /// A run as it was archived when it ended.
+    pub(crate) fn archived(&self, run: &RunId) -> Option<Box<Run>> {
+        let (_, archive) = self.ended.get(run)?;
+        Some(Box::new(serde_json::from_str(archive).expect("a run")))
+    }
+
+    pub(crate) fn view(&self, run: &RunId) -> Option<RunView> {
+        let (view, _) = self.ended.get(run)?;
+        Some(serde_json::from_str(view).expect("a view"))
     }
 }

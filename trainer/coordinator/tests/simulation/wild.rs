@@ -3,12 +3,14 @@
 use std::collections::BTreeMap;
 
 use coordinator::event::Known;
+use coordinator::state::execution::StageExecution;
+use coordinator::state::run::Run;
 use coordinator::{Control, Event, State};
 use protocol::message::{CommitCheckpoint, FailureClass, Grant, Join, PROTOCOL_VERSION, ReportOutcome, TaskOutcome};
 use protocol::stage::Backend;
 use protocol::{Digest, Fence, Incarnation, RunId, TaskId, WorkerId};
 
-pub(crate) fn events(state: &State) -> Vec<Event> {
+pub(crate) fn events(state: &State, ended: &[Run]) -> Vec<Event> {
     let mut events = vec![
         Event::Started { alone: false, park: false },
         Event::Started { alone: true, park: true },
@@ -31,17 +33,27 @@ pub(crate) fn events(state: &State) -> Vec<Event> {
         events.push(Event::LeaseExpired { worker: worker.clone(), incarnation });
         events.push(Event::LeaseExpired { worker: worker.clone(), incarnation: Incarnation(0) });
         events.push(Event::WorkerGone { worker: worker.clone() });
+        events.push(Event::WorkerForgotten { worker: worker.clone(), incarnation });
     }
     let no_run: RunId = "no-run".into();
-    for run in state.runs.iter().map(|run| &run.id).chain([&no_run]) {
+    for run in state.runs.values().map(|run| &run.id).chain([&no_run]) {
         for action in [Control::Pause, Control::Resume, Control::Cancel] {
-            events.push(Event::Control { run: run.clone(), action });
+            events.push(Event::Control { run: run.clone(), action, archived: None });
+        }
+    }
+    for run in ended {
+        for action in [Control::Pause, Control::Resume, Control::Cancel] {
+            let archived = Some(Box::new(run.clone()));
+            events.push(Event::Control { run: run.id.clone(), action, archived });
         }
     }
     let known = Known { outputs: BTreeMap::from([("x".into(), Digest::of(b"x"))]), metrics: BTreeMap::new() };
     for key in state.executions.keys().copied().chain([Digest::of(b"no key")]) {
-        events.push(Event::LookedUp { key, known: Some(known.clone()) });
-        events.push(Event::LookedUp { key, known: None });
+        let source = Some(("r-1".into(), "s".into()));
+        events.push(Event::LookedUp { key, known: Some(known.clone()), source, archived: None });
+        events.push(Event::LookedUp { key, known: None, source: None, archived: None });
+        let archived = state.executions.get(&key).map(|execution| Box::new(StageExecution::clone(execution)));
+        events.push(Event::LookedUp { key, known: None, source: None, archived });
         events.push(Event::Bundled { key, bundles: vec![Digest::of(b"1"), Digest::of(b"2")] });
         events.push(Event::Bundled { key, bundles: vec![] });
         events.push(Event::RegisterRefused { key, message: "no".into() });

@@ -5,9 +5,10 @@ mod steps;
 use std::collections::BTreeMap;
 
 use coordinator::observe::is_quiet;
-use coordinator::{Effect, Event, Millis, Moment, Observation, Policy, Rejected, State};
-use coordinator::{decide, invariants, journal, observe};
-use protocol::message::RunState;
+use coordinator::state::run::Run;
+use coordinator::{Control, Effect, Event, Millis, Moment, Observation, Policy, Rejected, State};
+use coordinator::{decide, invariants, journal, observe, refused_for_good};
+use protocol::message::{RunState, TaskOutcome};
 use protocol::stage::WorkerRange;
 use protocol::{Digest, RunId};
 
@@ -21,6 +22,7 @@ pub(crate) const CHAOS_MS: u64 = 180_000;
 const LIMIT_MS: u64 = 3_000_000;
 
 pub(crate) struct World {
+    pub(crate) policy: Policy,
     pub(crate) random: Random,
     pub(crate) now: Millis,
     pub(crate) store: FakeStore,
@@ -45,6 +47,24 @@ pub(crate) struct World {
     /// Only the first of them.
     pub(crate) once: bool,
     pub(crate) stored: u64,
+    /// Starts of the coordinator.
+    pub(crate) starts: usize,
+    /// Reports that named what was collected before.
+    pub(crate) missing: usize,
+    /// Until when nobody looks at the clock, and since when.
+    pub(crate) asleep: Option<(Millis, Millis)>,
+}
+
+/// What a worker uploaded before it reported this.
+fn named(event: &Event) -> Option<Digest> {
+    match event {
+        Event::Checkpoint { commit } => Some(commit.manifest),
+        Event::Outcome { report } => match report.outcome {
+            TaskOutcome::Finished { output, .. } => Some(output),
+            TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => None,
+        },
+        _ => None,
+    }
 }
 
 fn policy() -> Policy {
@@ -77,6 +97,7 @@ impl World {
             random,
             now: Millis(0),
             store: FakeStore::default(),
+            policy: policy(),
             state: State::new(policy()),
             up: true,
             back_at: Millis(0),
@@ -93,6 +114,9 @@ impl World {
             kills: None,
             once: false,
             stored: 0,
+            starts: 0,
+            missing: 0,
+            asleep: None,
         }
     }
 
@@ -105,6 +129,8 @@ impl World {
         self.events += 1;
         let moment = Moment { now: self.now, entropy: self.random.digest() };
         let mut next = self.state.clone();
+        let starts = matches!(event, Event::Started { .. });
+        let joins = matches!(event, Event::Join { .. });
         let decided = decide(&mut next, moment, event.clone());
         let mut effects = match decided {
             Ok(effects) => effects,
@@ -116,7 +142,8 @@ impl World {
         let broken = invariants::check_change(&self.state, &next);
         let what: String = format!("{event:?}").chars().take(300).collect();
         assert!(broken.is_empty(), "after {what} at {:?}: {broken:#?}", self.now);
-        if let Some(Effect::Store(_)) = effects.first() {
+        let wrote = matches!(effects.first(), Some(Effect::Store(_)));
+        if wrote {
             let Effect::Store(writes) = effects.remove(0) else { unreachable!() };
             if self.chaos() && self.random.chance(1) {
                 return Err(Refused::Store(Refusal::Full));
@@ -128,7 +155,23 @@ impl World {
                 self.crash();
                 return Err(Refused::Killed);
             }
-            self.store.write(&writes).map_err(Refused::Store)?;
+            if self.chaos() && self.random.chance(1) {
+                // The collector comes between an upload and the report that names it.
+                self.store.collected.extend(named(&event));
+            }
+            let written = self.store.write(&writes);
+            if let Err(Refusal::Missing(digest)) = written {
+                // Whoever tries again uploads it again.
+                self.store.collected.clear();
+                let error = registry::WriteError::NotFound(format!("blob {digest} is not in the store"));
+                self.missing += 1;
+                if let Some(instead) = refused_for_good(&event, &error) {
+                    self.happen(instead)?;
+                }
+                return Err(Refused::Store(Refusal::Missing(digest)));
+            }
+            self.store.collected.clear();
+            written.map_err(Refused::Store)?;
             if torn == Some(1) {
                 // It is durable, and nobody was told: the caller hears nothing, no other effect happens.
                 self.torn += 1;
@@ -141,9 +184,12 @@ impl World {
         }
         self.state = next;
         self.stored += 1;
+        self.starts += usize::from(starts);
+        if self.chaos() && self.random.chance(2) {
+            self.store.snapshot(&self.state);
+        }
         // Whoever never hears that it has joined joins for ever.
-        let spared: &[&str] = if self.once { &["started"] } else { &["started", "join"] };
-        let spared = self.store.journal.last().is_some_and(|entry| spared.iter().any(|event| entry["event"] == *event));
+        let spared = !wrote || starts || (joins && !self.once);
         if let Some((every, from)) = self.kills
             && !spared
             && self.stored >= from
@@ -153,9 +199,7 @@ impl World {
             if self.once {
                 self.kills = None;
             }
-            let recovered = journal::replay(policy(), self.store.journal.clone()).expect("the journal replays");
-            assert_eq!(durable(&recovered), durable(&self.state), "replay gives what was");
-            self.state = recovered;
+            self.recovered();
             self.happen(Event::Started { alone: false, park: false }).expect("starts again");
             return Err(Refused::Store(Refusal::Full));
         }
@@ -171,7 +215,7 @@ impl World {
     fn hear(&mut self, observation: Observation) -> Result<(), Refused> {
         let quiet = match &observation {
             Observation::Poll { worker, poll } => is_quiet(&self.state, worker, poll) == Ok(true),
-            Observation::Tick => false,
+            Observation::Tick { .. } => false,
         };
         let events = observe(&mut self.state, self.now, observation).map_err(Refused::Rejected)?;
         assert!(!quiet || events.is_empty(), "a poll from which nothing follows gave {events:?}");
@@ -187,7 +231,7 @@ impl World {
 
     fn perform(&mut self, effect: Effect) {
         let event = match &effect {
-            Effect::Lookup { key } => Event::LookedUp { key: *key, known: self.store.results.get(key).cloned() },
+            Effect::Lookup { key } => self.store.look_up(*key),
             Effect::Register { key, candidates } => Event::Bundled {
                 key: *key,
                 bundles: candidates.iter().map(|c| Digest::of(c.stage.as_str().as_bytes())).collect(),
@@ -212,10 +256,16 @@ impl World {
         self.effects.clear();
     }
 
-    fn recover(&mut self) {
-        let recovered = journal::replay(policy(), self.store.journal.clone()).expect("the journal replays");
-        assert_eq!(durable(&recovered), durable(&self.state), "replay gives what was");
+    /// What is stored is what was; whoever comes back goes on from it.
+    fn recovered(&mut self) {
+        let recovered =
+            journal::recover(self.policy.clone(), &self.store.recovery).expect("what is stored can be recovered");
+        assert_eq!(durable(&recovered), durable(&self.state), "recovery gives what was");
         self.state = recovered;
+    }
+
+    fn recover(&mut self) {
+        self.recovered();
         self.up = true;
         let alone = self.random.chance(30);
         if alone {
@@ -234,7 +284,7 @@ impl World {
     }
 
     pub(crate) fn is_over(&self) -> bool {
-        self.submissions.is_empty() && self.up && self.state.runs.iter().all(|run| run.state.is_final())
+        self.submissions.is_empty() && self.up && self.state.runs.is_empty()
     }
 
     pub(crate) fn run(&mut self) {
@@ -249,7 +299,7 @@ impl World {
             .filter(|task| task.is_held())
             .collect();
         assert!(self.is_over(), "not over after {LIMIT_MS} ms: {held:#?} {:#?}", self.workers);
-        for run in &self.state.runs {
+        for run in self.runs() {
             let never = format!("{:?}", run.pipeline).contains("never");
             let whole = run.until.is_none();
             let expected = match run.state {
@@ -258,19 +308,40 @@ impl World {
                 RunState::Finished => !(never && whole) || self.store.promotions > 0,
                 RunState::Running | RunState::Paused => false,
             };
-            assert!(expected, "{}: {:#?}", run.id, self.state.view(run, self.now));
+            assert!(expected, "{}: {:#?}", run.id, self.store.view(&run.id));
             let stored = serde_json::to_value(run.state).expect("a word");
             assert_eq!(stored.as_str(), self.store.runs.get(&run.id).map(String::as_str), "the row follows the state");
         }
         for (task, times) in &self.store.accepted {
             assert_eq!(*times, 1, "{task} was accepted {times} times");
         }
-        let recovered = journal::replay(policy(), self.store.journal.clone()).expect("the journal replays");
-        assert_eq!(durable(&recovered), durable(&self.state));
+        self.recovered();
+        let held: usize = self.state.executions.values().map(|execution| execution.tasks.held().count()).sum();
+        assert!(self.state.executions.len() <= held, "all that is left in memory is what workers are leaving");
     }
 
+    /// All runs, whether they go on or have ended, by submission.
+    pub(crate) fn runs(&self) -> Vec<Run> {
+        let ended = self.store.ended.keys().filter(|run| self.state.run(run).is_err());
+        let ended = ended.map(|run| *self.store.archived(run).expect("it ended"));
+        let mut runs: Vec<Run> = self.state.runs.values().map(|run| Run::clone(run)).chain(ended).collect();
+        runs.sort_by_key(|run| run.number);
+        runs
+    }
+
+    /// As clients see them.
     pub(crate) fn views(&self) -> Vec<protocol::message::RunView> {
-        self.state.runs.iter().map(|run| self.state.view(run, self.now)).collect()
+        let view = |run: Run| match self.state.run(&run.id) {
+            Ok(run) => self.state.view(run, self.now),
+            Err(_) => self.store.view(&run.id).expect("it ended"),
+        };
+        self.runs().into_iter().map(view).collect()
+    }
+
+    /// As the shell does: a run that has ended is handed in.
+    pub(crate) fn control(&mut self, run: &RunId, action: Control) -> Result<Vec<Effect>, Refused> {
+        let archived = if self.state.run(run).is_ok() { None } else { self.store.archived(run) };
+        self.happen(Event::Control { run: run.clone(), action, archived })
     }
 }
 
@@ -289,7 +360,8 @@ fn durable(state: &State) -> impl PartialEq + std::fmt::Debug + use<> {
         state.runs.clone(),
         state.executions.clone(),
         state.tasks.clone(),
-        state.draining,
-        state.now,
+        state.unused.clone(),
+        (state.draining, state.now, state.seq),
+        (state.submitted, state.incarnation, state.fence),
     )
 }

@@ -46,8 +46,8 @@ pub struct Pipeline {
     pub backend: Backend,
     /// Stages in topological order.
     pub stages: Vec<PipelineStage>,
-    /// Code versions of its kinds at the time it was read, those beyond 1. They stand here so that a journal that is replayed by a later
-    /// program makes the keys that it made.
+    /// Code versions of its kinds at the time it was read, those beyond 1. They stand here so that a run that goes on under a later
+    /// program keeps the keys that it has.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub code_versions: BTreeMap<String, u32>,
 }
@@ -98,7 +98,7 @@ impl Pipeline {
             let folders = stage.settings.refs().into_iter().filter(|found| !matches!(found.target, Target::Stage(_)));
             folders.for_each(|folder| folder.name.clear());
         }
-        crate::canonical::digest(&crate::stage::later::pipeline(&pipeline))
+        crate::canonical::digest(&pipeline)
     }
 
     /// Asks `digest` for the content of every folder outside the store that a stage reads, and keeps the answers by field.

@@ -483,7 +483,7 @@ fn a_pipeline_of_an_earlier_program_keeps_its_name_and_its_keys() {
     let read: Pipeline = serde_json::from_value(before.clone()).unwrap();
     read.check().unwrap();
     assert_eq!(read.digest(), crate::canonical::digest(&before), "runs are named by it");
-    assert_eq!(version(&read), 1, "a journal that is replayed makes the keys that it made");
+    assert_eq!(version(&read), 1, "a run that goes on keeps the keys that it has");
     let newer = Pipeline { code_versions: BTreeMap::from([("train.vae".to_owned(), 99)]), ..now };
     assert!(newer.check().unwrap_err().contains("`train.vae` at code version 99"));
 }

@@ -6,6 +6,7 @@ use protocol::message::RunState;
 use protocol::{Digest, WorkerId};
 
 use super::{Refused, World, durable};
+use crate::store::Refusal;
 use crate::wild;
 use crate::worker::{Answer, Call, FakeWorker, Saving};
 
@@ -57,6 +58,8 @@ impl World {
         };
         let answer = match answer {
             Ok(answer) => answer,
+            // What it named is gone; the try has failed.
+            Err(Refused::Store(Refusal::Missing(_))) => Answer::Refused(saving),
             Err(Refused::Store(_)) => Answer::Later,
             // The connection is gone with whoever held it.
             Err(Refused::Killed) => return,
@@ -101,17 +104,17 @@ impl World {
             }
             12..20 => self.workers[i].hung_until = self.now.after(self.random.below(40_000)),
             20..24 if self.up => self.crash(),
-            24..40 if self.up && !self.state.runs.is_empty() => {
-                let run = &self.state.runs[self.random.below(self.state.runs.len() as u64) as usize];
-                let run = run.id.clone();
+            24..40 if self.up && !self.store.runs.is_empty() => {
+                let run = self.random.below(self.store.runs.len() as u64) as usize;
+                let run = self.store.runs.keys().nth(run).expect("there are so many").clone();
                 let action = match self.random.below(5) {
                     0 | 1 => Control::Pause,
                     2 | 3 => Control::Resume,
                     _ => Control::Cancel,
                 };
                 // Whether it was taken shows in the state: a coordinator that is killed after the commit does not answer.
-                let _ = self.happen(Event::Control { run: run.clone(), action });
-                if action == Control::Cancel && self.state.run(&run).is_ok_and(|run| run.state == RunState::Cancelled) {
+                let _ = self.control(&run, action);
+                if action == Control::Cancel && self.store.runs[&run] == "cancelled" {
                     self.cancelled.push(run);
                 }
             }
@@ -135,9 +138,9 @@ impl World {
                 }
             }
             if self.up {
-                for run in self.state.runs.clone() {
+                for run in self.state.runs.values().cloned().collect::<Vec<_>>() {
                     if run.state == RunState::Paused && self.up {
-                        self.happen(Event::Control { run: run.id.clone(), action: Control::Resume }).expect("resumes");
+                        self.control(&run.id, Control::Resume).expect("resumes");
                     }
                 }
             }
@@ -167,6 +170,12 @@ impl World {
                 self.submissions.push((now.after(500), event));
                 continue;
             }
+            // The shell looks for the key in the tables first.
+            if let Event::Submit { idempotency_key: Some(key), .. } = &event
+                && self.store.keys.contains_key(key)
+            {
+                continue;
+            }
             match self.happen(event.clone()) {
                 Err(Refused::Store(_)) => self.submissions.push((now.after(500), event)),
                 // Whoever cannot know whether it was taken sends it again, under a key; without one, it may count twice.
@@ -188,14 +197,30 @@ impl World {
                 self.deliver(i, process, call);
             }
         }
-        if self.up && now.0.is_multiple_of(1000) && self.hear(Observation::Tick).is_err() {
-            // Stored at the next tick.
+        if self.chaos() && self.asleep.is_none() && self.random.chance(1) {
+            self.asleep = Some((now.after(self.random.below(12_000)), now));
+        }
+        match self.asleep {
+            Some((until, _)) if now < until => {}
+            Some((_, since)) => {
+                self.asleep = None;
+                // A slow disk or a process that was stopped: the clock knows which.
+                let overslept = if self.random.chance(50) { now.since(since) } else { 0 };
+                if self.up && self.hear(Observation::Tick { overslept }).is_err() {
+                    // Stored at the next tick.
+                }
+            }
+            None => {
+                if self.up && now.0.is_multiple_of(1000) && self.hear(Observation::Tick { overslept: 0 }).is_err() {
+                    // Stored at the next tick.
+                }
+            }
         }
     }
 
     /// Whatever could happen now, on copies: nothing panics, and the invariants hold.
     fn try_everything(&mut self) {
-        for event in wild::events(&self.state) {
+        for event in wild::events(&self.state, &self.runs()) {
             let moment = Moment { now: self.now, entropy: Digest::of(b"wild") };
             let mut next = self.state.clone();
             let result = decide(&mut next, moment, event.clone());

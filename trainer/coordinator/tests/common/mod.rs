@@ -1,0 +1,149 @@
+//! The pure half with a clock of its own, for tests that say exactly when what happens.
+
+#[path = "../simulation/pipelines.rs"]
+pub(crate) mod pipelines;
+#[path = "../simulation/store.rs"]
+pub(crate) mod store;
+
+use coordinator::{
+    Control, Effect, Event, Millis, Moment, Observation, Policy, Rejected, State, decide, invariants, journal, observe,
+};
+use protocol::message::{
+    Assignment, FailureClass, Join, PROTOCOL_VERSION, Poll, ReportOutcome, RunState, RunView, TaskOutcome,
+};
+use protocol::stage::{Backend, WorkerRange};
+use protocol::{Digest, Incarnation, RunId, WorkerId};
+
+/// A coordinator without a shell: one call after the other, at the times that the test says.
+pub(crate) struct ActorHandle {
+    pub(crate) state: State,
+    pub(crate) store: store::FakeStore,
+    pub(crate) now: u64,
+    pub(crate) entropy: Digest,
+}
+
+impl ActorHandle {
+    pub(crate) fn new(policy: Policy) -> Self {
+        Self {
+            state: State::new(policy),
+            store: store::FakeStore::default(),
+            now: 1_000_000,
+            entropy: Digest::of(b"entropy"),
+        }
+    }
+
+    /// Decides and stores; lookups find nothing.
+    pub(crate) fn happen(&mut self, event: Event) -> Result<Vec<Effect>, Rejected> {
+        let moment = Moment { now: Millis(self.now), entropy: self.entropy };
+        let before = self.state.clone();
+        let effects = decide(&mut self.state, moment, event)?;
+        let broken = invariants::check_change(&before, &self.state);
+        assert!(broken.is_empty(), "{broken:#?}");
+        for effect in &effects {
+            match effect {
+                Effect::Store(writes) => self.store.write(writes).expect("stored"),
+                Effect::Lookup { key } => drop(self.happen(self.store.look_up(*key))?),
+                _ => {}
+            }
+        }
+        Ok(effects)
+    }
+
+    pub(crate) fn hear(&mut self, observation: Observation) {
+        for event in observe(&mut self.state, Millis(self.now), observation).expect("heard") {
+            self.happen(event).expect("what follows from the clock is taken");
+        }
+    }
+
+    /// `kill -9`, and a new coordinator on the same store.
+    pub(crate) fn restart(&mut self, alone: bool) {
+        let policy = self.state.policy.clone();
+        self.state = journal::recover(policy, &self.store.recovery).expect("what is stored can be recovered");
+        self.happen(Event::Started { alone, park: false }).expect("starts");
+    }
+
+    pub(crate) fn submit(&mut self, until: &str, workers: WorkerRange) -> RunId {
+        let event = Event::Submit {
+            pipeline: Box::new(pipelines::quickstart(1, workers, &[])),
+            source: String::new(),
+            idempotency_key: None,
+            until: Some(until.into()),
+        };
+        let effects = self.happen(event).expect("submitted");
+        let run = effects.into_iter().find_map(|effect| match effect {
+            Effect::Submitted(run) => Some(run),
+            _ => None,
+        });
+        run.expect("a submission gives a run")
+    }
+
+    pub(crate) fn join(&mut self, name: &str) -> Incarnation {
+        let join = Join {
+            protocol: PROTOCOL_VERSION,
+            worker: name.into(),
+            pid: 1,
+            backend: Backend::Flex,
+            peer_address: format!("{name}:1"),
+        };
+        let effects = self.happen(Event::Join { join }).expect("joined");
+        let joined = effects.into_iter().find_map(|effect| match effect {
+            Effect::Joined(incarnation) => Some(incarnation),
+            _ => None,
+        });
+        joined.expect("a join gives an incarnation")
+    }
+
+    pub(crate) fn poll(&mut self, name: &str, incarnation: Incarnation) {
+        let poll = Poll { incarnation, doing: Vec::new(), version: 0 };
+        self.hear(Observation::Poll { worker: name.into(), poll });
+    }
+
+    pub(crate) fn assignment(&self, name: &str) -> Option<Assignment> {
+        let worker: WorkerId = name.into();
+        let incarnation = self.state.workers[&worker].incarnation;
+        self.state.desired(&worker, incarnation).expect("known").assignments.into_iter().next()
+    }
+
+    pub(crate) fn report(&mut self, assignment: &Assignment, outcome: TaskOutcome) {
+        let report = ReportOutcome { grant: assignment.grant.clone(), outcome };
+        self.happen(Event::Outcome { report }).expect("taken");
+    }
+
+    pub(crate) fn view(&self, run: &RunId) -> RunView {
+        match self.state.run(run) {
+            Ok(run) => self.state.view(run, Millis(self.now)),
+            Err(_) => self.store.view(run).expect("it ended"),
+        }
+    }
+
+    pub(crate) fn run_state(&self, run: &RunId) -> RunState {
+        self.view(run).state
+    }
+
+    pub(crate) fn control(&mut self, run: &RunId, action: Control) -> Result<Vec<Effect>, Rejected> {
+        let archived = if self.state.run(run).is_ok() { None } else { self.store.archived(run) };
+        self.happen(Event::Control { run: run.clone(), action, archived })
+    }
+
+    pub(crate) fn tick(&mut self) {
+        self.hear(Observation::Tick { overslept: 0 });
+    }
+
+    pub(crate) fn is_held(&self) -> bool {
+        self.state.executions.values().any(|execution| execution.is_busy())
+    }
+}
+
+pub(crate) fn failed(class: FailureClass) -> TaskOutcome {
+    TaskOutcome::Failed { class, message: "made up".into() }
+}
+
+/// A gang trains: its task's members by rank.
+pub(crate) fn gang_of_three(actor_handle: &mut ActorHandle) -> (RunId, [Incarnation; 3]) {
+    let run = actor_handle.submit("vae", WorkerRange { min: 1, max: 3 });
+    let a = actor_handle.join("a");
+    let dataset = actor_handle.assignment("a").expect("the only worker gets it");
+    actor_handle.report(&dataset, TaskOutcome::Finished { output: Digest::of(b"clips"), metrics: Default::default() });
+    let [b, c] = ["b", "c"].map(|name| actor_handle.join(name));
+    (run, [a, b, c])
+}

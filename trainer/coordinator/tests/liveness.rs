@@ -1,0 +1,418 @@
+//! What must not stop work, and what must not be remembered for ever, on the pure half with a clock of its own.
+
+#[allow(dead_code, reason = "not every test file uses all of it")]
+mod common;
+
+use coordinator::state::execution::ExecutionState;
+use coordinator::{Control, Event, Observation, Policy, journal, refused_for_good};
+use protocol::message::{
+    Assignment, CommitCheckpoint, FailureClass, ReportOutcome, Role, RunState, StageState, TaskOutcome,
+};
+use protocol::stage::WorkerRange;
+use protocol::{Digest, Incarnation, RunId, WorkerId, limits};
+use registry::WriteError;
+
+use crate::common::{ActorHandle, failed, gang_of_three, pipelines};
+
+/// Two workers; `a`, which holds the only task, is never heard again. The other polls every second until it has the task, while
+/// `tick` looks at the clock. How long that took.
+fn taken_after(mut tick: impl FnMut(&mut ActorHandle, u64)) -> u64 {
+    let mut actor_handle = ActorHandle::new(Policy::default());
+    actor_handle.submit("dataset", WorkerRange::default());
+    actor_handle.join("a");
+    let b = actor_handle.join("b");
+    let begun = actor_handle.now;
+    for second in 1..60 {
+        actor_handle.now = begun + second * 1000;
+        actor_handle.poll("b", b);
+        tick(&mut actor_handle, second);
+        if actor_handle.assignment("b").is_some() {
+            return actor_handle.now - begun;
+        }
+    }
+    panic!("never taken");
+}
+
+/// The actor gets to no tick for 6 s, three times in a row: polls are heard meanwhile, so nobody's lease is longer for it.
+#[test]
+fn p3_a_slow_disk_stretches_no_lease() {
+    let undisturbed = taken_after(|actor_handle, _| actor_handle.tick());
+    let stalled = taken_after(|actor_handle, second| {
+        if second > 18 || second % 6 == 0 {
+            actor_handle.tick();
+        }
+    });
+    assert!((16_000..=17_000).contains(&undisturbed), "{undisturbed}");
+    assert!(stalled <= 19_000, "noticed by the first look after the lease, not {stalled} ms after the loss");
+}
+
+/// A process that slept through 6 s heard nobody in them: that much longer everybody's lease is, and no more.
+#[test]
+fn p3_leniency_is_as_long_as_the_clock_overslept() {
+    let taken = taken_after(|actor_handle, second| match second {
+        11..17 => {}
+        17 => actor_handle.hear(Observation::Tick { overslept: 6000 }),
+        _ => actor_handle.tick(),
+    });
+    assert!((22_000..=23_000).contains(&taken), "15 s, 6 s, a tick and a back-off, not {taken} ms");
+}
+
+#[test]
+fn back_offs_are_half_a_second_doubled_up_to_half_a_minute() {
+    let policy = Policy::default();
+    let waits: Vec<u64> = (1..10).map(|failures| policy.backoff(failures)).collect();
+    assert_eq!(waits, [500, 1000, 2000, 4000, 8000, 16_000, 30_000, 30_000, 30_000]);
+}
+
+fn save(actor_handle: &mut ActorHandle, assignment: &Assignment, step: u64, manifest: &str) {
+    let (grant, manifest) = (assignment.grant.clone(), Digest::of(manifest.as_bytes()));
+    let commit = CommitCheckpoint { grant, step, manifest, metrics: Default::default() };
+    actor_handle.happen(Event::Checkpoint { commit }).expect("taken");
+}
+
+/// A worker trains to the next checkpoint and is lost, 250 times.
+#[test]
+fn p15_a_task_that_makes_progress_survives_any_number_of_losses() {
+    let mut actor_handle = ActorHandle::new(Policy::default());
+    let (run, _) = gang_of_three(&mut actor_handle);
+    for name in ["b", "c"] {
+        actor_handle.happen(Event::WorkerGone { worker: name.into() }).expect("taken");
+    }
+    for step in 1..=250 {
+        let assignment = actor_handle.assignment("a").expect("it trains");
+        save(&mut actor_handle, &assignment, step, &format!("step {step}"));
+        actor_handle.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
+        assert_eq!(actor_handle.run_state(&run), RunState::Running, "after loss {step}");
+        actor_handle.now += 40_000;
+        actor_handle.join("a");
+        actor_handle.tick();
+    }
+    // Without progress the budget is what it says.
+    let budget = Policy::default().infrastructure_budget;
+    for loss in 1..=budget {
+        assert_eq!(actor_handle.run_state(&run), RunState::Running, "after {loss} losses in a row");
+        actor_handle.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
+        actor_handle.now += 40_000;
+        actor_handle.join("a");
+        actor_handle.tick();
+    }
+    assert_eq!(actor_handle.run_state(&run), RunState::Failed);
+}
+
+fn members(actor_handle: &ActorHandle, name: &str) -> Vec<WorkerId> {
+    match actor_handle.assignment(name).map(|assignment| assignment.role) {
+        Some(Role::Member { members, .. }) => members.into_iter().map(|member| member.worker).collect(),
+        _ => Vec::new(),
+    }
+}
+
+/// Each member of a gang of three in turn, the first one included; the last one alone ends the stage.
+#[test]
+fn p15_a_member_out_of_memory_leaves_its_gang_to_the_others() {
+    for order in [["a", "b", "c"], ["c", "a", "b"], ["b", "c", "a"]] {
+        let mut actor_handle = ActorHandle::new(Policy::default());
+        let (run, _) = gang_of_three(&mut actor_handle);
+        for (i, name) in order.iter().enumerate() {
+            let assignment = actor_handle.assignment(name).expect("a member");
+            actor_handle.report(&assignment, failed(FailureClass::OutOfMemory));
+            let left: Vec<WorkerId> = order[i + 1..].iter().map(|name| WorkerId::from(*name)).collect();
+            if let Some(next) = left.first() {
+                assert_eq!(actor_handle.run_state(&run), RunState::Running, "{name} of {order:?}");
+                assert!(actor_handle.assignment(name).is_none(), "not taken into it again");
+                // Not when it polls, not when it joins anew.
+                let incarnation = actor_handle.join(name);
+                actor_handle.poll(name, incarnation);
+                let mut members = members(&actor_handle, next.as_str());
+                members.sort_unstable();
+                let mut left = left.clone();
+                left.sort_unstable();
+                assert_eq!(members, left);
+            }
+        }
+        assert_eq!(actor_handle.run_state(&run), RunState::Failed);
+        // Asked for again, everybody may try.
+        actor_handle.control(&run, Control::Resume).expect("taken up");
+        assert_eq!(members(&actor_handle, "a").len(), 3);
+    }
+}
+
+#[test]
+fn a_gang_has_no_more_members_than_a_batch_has_slices() {
+    for (slices, range) in
+        [(1, WorkerRange::default()), (2, WorkerRange { min: 1, max: 3 }), (2, WorkerRange { min: 3, max: 3 })]
+    {
+        let mut actor_handle = ActorHandle::new(Policy::default());
+        let mut pipeline = pipelines::quickstart(1, range, &[]);
+        for stage in &mut pipeline.stages {
+            if let Some(training) = stage.settings.training_mut() {
+                training.batch.slices = slices;
+            }
+        }
+        let submit = Event::Submit {
+            pipeline: Box::new(pipeline),
+            source: String::new(),
+            idempotency_key: None,
+            until: Some("vae".into()),
+        };
+        actor_handle.happen(submit).expect("submitted");
+        for name in ["a", "b", "c", "d"] {
+            actor_handle.join(name);
+        }
+        let dataset = actor_handle.assignment("a").expect("granted");
+        let output = Digest::of(b"clips");
+        actor_handle.report(&dataset, TaskOutcome::Finished { output, metrics: Default::default() });
+        assert_eq!(members(&actor_handle, "a").len(), slices, "{slices} slices and {range:?}");
+    }
+}
+
+/// A plain task's end, a gang's end and a gang's checkpoint, whose blobs were collected before they were named.
+#[test]
+fn what_names_a_missing_blob_is_a_failed_try_and_is_tried_again() {
+    for checkpoint in [None, Some(false), Some(true)] {
+        let mut actor_handle = ActorHandle::new(Policy::default());
+        let run = match checkpoint {
+            None => {
+                let run = actor_handle.submit("dataset", WorkerRange::default());
+                actor_handle.join("a");
+                run
+            }
+            Some(_) => gang_of_three(&mut actor_handle).0,
+        };
+        let mut tries = 0;
+        while actor_handle.run_state(&run) == RunState::Running {
+            let grant = actor_handle.assignment("a").expect("granted again").grant;
+            tries += 1;
+            let (output, metrics) = (Digest::of(b"gone"), Default::default());
+            let event = match checkpoint {
+                Some(true) => {
+                    Event::Checkpoint { commit: CommitCheckpoint { grant, step: 1, manifest: output, metrics } }
+                }
+                _ => {
+                    let outcome = TaskOutcome::Finished { output, metrics };
+                    Event::Outcome { report: ReportOutcome { grant, outcome } }
+                }
+            };
+            let error = WriteError::NotFound("blob is not in the store".into());
+            let instead = refused_for_good(&event, &error).expect("something happens instead");
+            actor_handle.happen(instead).expect("taken");
+            assert!(!actor_handle.is_held(), "an idle worker would hold it for ever");
+            actor_handle.now += 40_000;
+            for name in ["a", "b", "c"] {
+                if let Some(worker) = actor_handle.state.workers.get(&WorkerId::from(name)) {
+                    let incarnation = worker.incarnation;
+                    actor_handle.poll(name, incarnation);
+                }
+            }
+            actor_handle.tick();
+        }
+        assert_eq!(tries, Policy::default().fault_budget + 1, "within the budget");
+        assert_eq!(actor_handle.run_state(&run), RunState::Failed);
+    }
+}
+
+#[test]
+fn two_states_of_one_step_end_the_stage_and_are_both_named() {
+    let mut actor_handle = ActorHandle::new(Policy::default());
+    let (run, _) = gang_of_three(&mut actor_handle);
+    let assignment = actor_handle.assignment("a").expect("it trains");
+    save(&mut actor_handle, &assignment, 1, "one");
+    save(&mut actor_handle, &assignment, 1, "one");
+    assert_eq!(actor_handle.run_state(&run), RunState::Running, "the same is the same");
+    save(&mut actor_handle, &assignment, 1, "another");
+    let view = actor_handle.view(&run);
+    let stage = view.stages.iter().find(|stage| stage.state == StageState::Failed).expect("it failed");
+    let message = stage.message.clone().unwrap_or_default();
+    for digest in ["one", "another"] {
+        assert!(message.contains(&Digest::of(digest.as_bytes()).to_string()), "{message}");
+    }
+}
+
+/// Four generations of one gang under one entropy, and one under another.
+#[test]
+fn every_generation_has_a_secret_of_its_own() {
+    let mut secrets = Vec::new();
+    for entropy in ["one", "two"] {
+        let mut actor_handle = ActorHandle::new(Policy::default());
+        actor_handle.entropy = Digest::of(entropy.as_bytes());
+        gang_of_three(&mut actor_handle);
+        for next in ["b", "c", "d", "e"] {
+            match actor_handle.assignment("a").expect("it trains").role {
+                Role::Member { secret, .. } => secrets.push(secret),
+                role => panic!("{role:?}"),
+            }
+            if actor_handle.state.workers.contains_key(&WorkerId::from(next)) {
+                actor_handle.happen(Event::WorkerGone { worker: next.into() }).expect("taken");
+            } else {
+                actor_handle.join(next);
+            }
+        }
+    }
+    let mut distinct = secrets.clone();
+    distinct.sort_unstable();
+    distinct.dedup();
+    assert!(distinct.len() == secrets.len() && secrets.iter().all(|secret| secret.len() >= 32), "{secrets:?}");
+}
+
+fn submit(actor_handle: &mut ActorHandle, seed: u64) -> RunId {
+    let submit = Event::Submit {
+        pipeline: Box::new(pipelines::quickstart(seed, WorkerRange::default(), &[])),
+        source: String::new(),
+        idempotency_key: None,
+        until: None,
+    };
+    let effects = actor_handle.happen(submit).expect("submitted");
+    let run = effects.into_iter().find_map(|effect| match effect {
+        coordinator::Effect::Submitted(run) => Some(run),
+        _ => None,
+    });
+    run.expect("a submission gives a run")
+}
+
+/// Cancelled, failed and resumed runs: what an unfinished stage has comes back with whoever wants it, under numbers that were never used.
+#[test]
+fn an_ended_run_leaves_memory_and_is_taken_up_where_it_was() {
+    let mut actor_handle = ActorHandle::new(Policy::default());
+    let (run, _) = gang_of_three(&mut actor_handle);
+    let first = actor_handle.assignment("a").expect("it trains");
+    save(&mut actor_handle, &first, 3, "step 3");
+    actor_handle.control(&run, Control::Cancel).expect("taken");
+    assert!(actor_handle.state.runs.is_empty(), "it has ended");
+    assert!(actor_handle.is_held(), "its workers may still save");
+    actor_handle.report(&first, TaskOutcome::Yielded { at: 3 });
+    assert!(actor_handle.state.executions.is_empty() && actor_handle.state.tasks.is_empty());
+    assert_eq!(actor_handle.run_state(&run), RunState::Cancelled);
+
+    actor_handle.restart(false);
+    for name in ["a", "b", "c"] {
+        actor_handle.join(name);
+    }
+    actor_handle.control(&run, Control::Resume).expect("taken up");
+    let second = actor_handle.assignment("a").expect("it trains again");
+    assert_eq!(second.resume, Some(Digest::of(b"step 3")), "from where it was");
+    assert_eq!(second.grant.task, first.grant.task);
+    assert!(second.grant.fence > first.grant.fence && second.grant.attempt > first.grant.attempt);
+    actor_handle.control(&run, Control::Cancel).expect("taken");
+    actor_handle.report(&second, TaskOutcome::Yielded { at: 3 });
+
+    // Another run of the same: it finds the value of the first stage, and the checkpoint of the second.
+    let other = actor_handle.submit("vae", WorkerRange { min: 1, max: 3 });
+    assert_ne!(other, run);
+    let third = actor_handle.assignment("a").expect("it trains for another run");
+    assert_eq!(third.resume, Some(Digest::of(b"step 3")));
+    assert!(third.grant.attempt > second.grant.attempt);
+    let finished = TaskOutcome::Finished { output: Digest::of(b"vae"), metrics: Default::default() };
+    actor_handle.report(&third, finished);
+    let view = actor_handle.view(&other);
+    assert_eq!(view.state, RunState::Finished);
+    let states: Vec<StageState> = view.stages.iter().map(|stage| stage.state).take(3).collect();
+    assert_eq!(states, [StageState::Cached, StageState::Skipped, StageState::Resumed]);
+    assert!(actor_handle.state.executions.is_empty());
+}
+
+/// What a submission costs, counted: runs, executions and workers that decisions look at, and the size of the state.
+#[test]
+fn a_submission_costs_the_same_however_many_runs_have_ended() {
+    let mut actor_handle = ActorHandle::new(Policy::default());
+    let cost = |actor_handle: &mut ActorHandle, seeds: std::ops::Range<u64>| {
+        let (before, count) = (actor_handle.state.visits, seeds.end - seeds.start);
+        for seed in seeds {
+            let run = submit(actor_handle, seed);
+            actor_handle.control(&run, Control::Cancel).expect("taken");
+        }
+        ((actor_handle.state.visits - before) / count, journal::snapshot(&actor_handle.state).len())
+    };
+    let (visits, size) = cost(&mut actor_handle, 0..10);
+    cost(&mut actor_handle, 10..150);
+    let (later_visits, later_size) = cost(&mut actor_handle, 150..160);
+    assert_eq!(visits, later_visits);
+    assert!(later_size <= size + 20, "the state grew from {size} to {later_size} bytes");
+
+    // Runs that wait beside it are not looked at either, while nobody is idle.
+    for seed in 1000..1040 {
+        submit(&mut actor_handle, seed);
+    }
+    let (beside_visits, _) = cost(&mut actor_handle, 160..170);
+    assert_eq!(visits, beside_visits, "with 40 runs that wait");
+}
+
+#[test]
+fn a_worker_that_is_away_for_an_hour_leaves_memory_and_comes_back_as_another_process() {
+    let mut actor_handle = ActorHandle::new(Policy::default());
+    let old = actor_handle.join("a");
+    actor_handle.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
+    actor_handle.now += 3_590_000;
+    actor_handle.tick();
+    assert!(actor_handle.state.workers.contains_key(&WorkerId::from("a")));
+    actor_handle.now += 20_000;
+    actor_handle.tick();
+    assert!(actor_handle.state.workers.is_empty());
+    actor_handle.restart(false);
+    let new: Incarnation = actor_handle.join("a");
+    assert!(new > old, "{new} after {old}");
+}
+
+#[test]
+fn a_pipeline_of_more_than_a_thousand_stages_is_refused() {
+    let mut actor_handle = ActorHandle::new(Policy::default());
+    let mut pipeline = pipelines::quickstart(1, WorkerRange::default(), &[]);
+    let text = pipeline.stages.remove(1);
+    pipeline.stages = (0..=limits::STAGES)
+        .map(|i| protocol::pipeline::PipelineStage { name: format!("s{i}").as_str().into(), ..text.clone() })
+        .collect();
+    let mut take = |pipeline: &protocol::Pipeline| {
+        let event = Event::Submit {
+            pipeline: Box::new(pipeline.clone()),
+            source: String::new(),
+            idempotency_key: None,
+            until: Some("nowhere".into()),
+        };
+        actor_handle.happen(event).expect_err("refused").to_string()
+    };
+    pipeline.stages[0].inputs.clear();
+    for stage in &mut pipeline.stages {
+        stage.inputs.clear();
+    }
+    let refused = take(&pipeline);
+    assert!(refused.contains("1001 stages") && refused.contains("1000"), "{refused}");
+    assert!(pipeline.check().is_err_and(|refused| refused.contains("1001 stages")));
+    pipeline.stages.pop();
+    let refused = take(&pipeline);
+    assert!(refused.contains("nowhere"), "a thousand are taken: {refused}");
+}
+
+/// What another build wrote: a later minor version with what this one knows, one with what it does not, and another major version.
+#[test]
+fn what_is_stored_says_of_which_format_it_is() {
+    let mut actor_handle = ActorHandle::new(Policy::default());
+    let run = actor_handle.submit("dataset", WorkerRange::default());
+    actor_handle.join("a");
+    let recover = |stored: &registry::Recovery| journal::recover(Policy::default(), stored).map_err(|e| e.to_string());
+    let with = |from: &str, to: &str| {
+        let mut stored = actor_handle.store.recovery.clone();
+        let text = &mut stored.facts[1].1;
+        assert!(text.contains(from), "{text}");
+        *text = text.replace(from, to);
+        recover(&stored)
+    };
+    assert!(recover(&actor_handle.store.recovery).is_ok());
+    assert!(with("\"format\":[1,0]", "\"format\":[1,7]").is_ok());
+    let refused = with("\"format\":[1,0]", "\"format\":[2,0]").expect_err("another major version");
+    assert!(refused.contains("format 2.0") && refused.contains("1.x") && refused.contains("decision 2"), "{refused}");
+    let refused = with("\"execution-state\"", "\"horoscope\"").expect_err("an unknown kind");
+    assert!(refused.contains("horoscope") && refused.contains("decision 2"), "{refused}");
+    let mut stored = actor_handle.store.recovery.clone();
+    stored.facts.remove(1);
+    let refused = recover(&stored).expect_err("one is missing");
+    assert!(refused.contains("decision 3") && refused.contains("missing"), "{refused}");
+
+    // The same through a snapshot.
+    actor_handle.store.snapshot(&actor_handle.state);
+    let whole = recover(&actor_handle.store.recovery).expect("it opens");
+    assert!(
+        whole.run(&run).is_ok() && whole.executions.values().all(|execution| execution.state == ExecutionState::Open)
+    );
+    let (_, text) = actor_handle.store.recovery.snapshot.as_mut().expect("a snapshot");
+    *text = text.replace("\"format\":[1,0]", "\"format\":[3,1]");
+    let refused = recover(&actor_handle.store.recovery).expect_err("another major version");
+    assert!(refused.contains("format 3.1") && refused.contains("snapshot"), "{refused}");
+}
