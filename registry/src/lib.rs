@@ -13,6 +13,7 @@ pub mod cli;
 mod clock;
 mod db;
 pub mod failpoints;
+pub mod forget;
 pub mod fsck;
 mod identity;
 pub mod leaderboard;

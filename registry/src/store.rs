@@ -20,7 +20,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use protocol::stage::Keep;
-use protocol::{Alias, Digest, ModelName, TaskId};
+use protocol::{Alias, Digest, ModelName, RunId, TaskId};
 use sqlx::SqlitePool;
 
 use crate::blob::BlobStore;
@@ -28,6 +28,7 @@ use crate::blob::fs::{Folder, free_bytes, is_full, is_read_only};
 use crate::catalog::{Expect, Pick, PromoteOrder, Promotion, Which};
 use crate::db::writer::{Done, Order, Session, Writer};
 use crate::db::{self, Opened};
+use crate::forget::Forgotten;
 use crate::identity::{self, Found, Mismatch, StoreId, Verdict, Witness};
 use crate::lock::{Holder, SharedLock, StoreLock, Taken, network_filesystem};
 use crate::reserve::{self, OPEN_NEEDS_BYTES};
@@ -405,6 +406,14 @@ impl Store {
     /// Ends a pin.
     pub async fn unpin(&self, digest: Digest) -> Result<(), WriteError> {
         self.order(Order::Pin { digest, reason: None }).await.map(|_| ())
+    }
+
+    /// Forgets a run that has ended. Its blobs go with the next [`Self::gc`].
+    pub async fn forget(&self, run: &RunId) -> Result<Forgotten, WriteError> {
+        match self.order(Order::Forget(run.clone())).await? {
+            Done::Forgotten(gone) => Ok(gone),
+            done => Err(unexpected(&done)),
+        }
     }
 
     /// What rows come to name while a collection is under way.

@@ -534,3 +534,107 @@ async fn a_store_is_read_while_it_is_held_and_without_a_trace_while_it_is_not() 
     assert_eq!((names(), std::fs::read(dir.path().join("stride.db")).unwrap()), before);
     open(dir.path()).await.write(vec![result("last", output)]).await.unwrap();
 }
+
+/// A run with a stage `made` and a stage `spare`, each with a value, a checkpoint, a curve and a log.
+async fn finished_run(store: &Store, run: &str, state: &str) -> (Digest, Digest) {
+    let stage = |name: &str| {
+        let output = artifact(store.blobs(), ArtifactKind::Model, &format!("{run} {name}"));
+        let checkpoint = artifact(store.blobs(), ArtifactKind::Checkpoint, &format!("{run} {name} at 1"));
+        (name.to_owned(), output, checkpoint, Digest::of(format!("{run}/{name}").as_bytes()))
+    };
+    let stages = [stage("made"), stage("spare")];
+    let pipeline = json!({"stages": [{"name": "made"}, {"name": "spare"}]});
+    let (source, idempotency_key) = (String::new(), None);
+    store
+        .write(vec![Write::Run { run: run.into(), pipeline, source, state: "running".into(), idempotency_key }])
+        .await
+        .unwrap();
+    for (name, output, checkpoint, key) in &stages {
+        let task = format!("{run}/{name}");
+        let grant = || grant(&task, 1);
+        store
+            .write(vec![
+                fence(&task, 1),
+                Write::Metrics { grant: grant(), rows: rows(0..3, 1.0) },
+                Write::Logs { grant: grant(), first: 0, lines: vec!["line".into()] },
+                Write::Checkpoint { grant: grant(), step: 1, manifest: *checkpoint, metrics: BTreeMap::new() },
+                Write::StageResult {
+                    grant: Some(grant()),
+                    key: *key,
+                    run: run.into(),
+                    stage: name.as_str().into(),
+                    kind: "train.vae".into(),
+                    outputs: [("model".to_owned(), *output)].into(),
+                    metrics: BTreeMap::new(),
+                    inputs: BTreeMap::new(),
+                    wall_s: 1.0,
+                },
+            ])
+            .await
+            .unwrap();
+    }
+    if state != "running" {
+        let keys: Vec<_> = stages.iter().map(|(name, _, _, key)| json!({"name": name, "key": key})).collect();
+        let view = json!({"stages": keys}).to_string();
+        store
+            .write(vec![Write::RunEnded { run: run.into(), state: state.into(), view, archive: "{}".into() }])
+            .await
+            .unwrap();
+    }
+    (stages[0].3, stages[1].3)
+}
+
+#[tokio::test]
+async fn a_run_is_forgotten_but_not_what_models_are_made_of() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = open(dir.path()).await;
+    let (made, spare) = finished_run(&store, "old", "finished").await;
+    let model = store.stage_result(made).await.unwrap().unwrap().outputs["model"];
+    store.write(vec![common::version("m", model, 0.1)]).await.unwrap();
+    let gone = store.forget(&"old".into()).await.unwrap();
+    assert_eq!((gone.values, gone.lines, gone.checkpoints, gone.results), (3, 1, 1, 1));
+    assert_eq!(gone.kept, ["old/made"]);
+    assert!(store.runs().await.unwrap().is_empty());
+    assert!(store.stage_result(spare).await.unwrap().is_none());
+    assert_eq!(store.lineage(model).await.unwrap()[0].stage.as_deref(), Some("made"));
+    assert_eq!(store.gc(-1000).await.unwrap().remove.len(), 4, "the spare stage's model and its checkpoint");
+    assert!(store.fsck().await.unwrap().problems.is_empty());
+    assert!(matches!(store.forget(&"old".into()).await, Err(WriteError::NotFound(_))));
+}
+
+#[tokio::test]
+async fn what_other_runs_need_of_a_forgotten_run_stays_until_they_go_too() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = open(dir.path()).await;
+    let (made, spare) = finished_run(&store, "first", "finished").await;
+    // Another run has the first one's value `made`; a third one is under way and has stages of both names.
+    let run = |run: &str, stages| Write::Run {
+        run: run.into(),
+        pipeline: json!({ "stages": stages }),
+        source: String::new(),
+        state: "running".into(),
+        idempotency_key: None,
+    };
+    let view = json!({"stages": [{"name": "made", "key": made}]}).to_string();
+    store.write(vec![run("cached", json!([{"name": "made"}]))]).await.unwrap();
+    let ended = |run: &str, view: String| Write::RunEnded {
+        run: run.into(),
+        state: "finished".into(),
+        view,
+        archive: "{}".into(),
+    };
+    store.write(vec![ended("cached", view)]).await.unwrap();
+    store.write(vec![run("live", json!([{"name": "spare"}]))]).await.unwrap();
+    assert!(matches!(store.forget(&"live".into()).await, Err(WriteError::Conflict(m)) if m.contains("running")));
+
+    let gone = store.forget(&"first".into()).await.unwrap();
+    assert_eq!((gone.kept.as_slice(), gone.results), (&["first/made".to_owned(), "first/spare".to_owned()][..], 0));
+    store.write(vec![ended("live", json!({"stages": []}).to_string())]).await.unwrap();
+    store.forget(&"live".into()).await.unwrap();
+    assert!(store.stage_result(made).await.unwrap().is_some() && store.stage_result(spare).await.unwrap().is_none());
+    assert_eq!(store.ended_before(i64::MAX).await.unwrap(), ["cached".into()]);
+    store.forget(&"cached".into()).await.unwrap();
+    assert!(store.stage_result(made).await.unwrap().is_none(), "nobody needs it any more");
+    store.gc(-1000).await.unwrap();
+    assert!(store.blobs().list().unwrap().is_empty());
+}

@@ -109,6 +109,15 @@ pub enum Verb {
     },
     /// Goes on with what is left of a store whose blobs are missing or whose database has gone back
     Adopt,
+    /// Forgets runs that have ended, but not what models are made of or other runs need; `gc` then frees the space
+    Forget {
+        /// The run
+        #[arg(required_unless_present = "ended_before")]
+        run: Option<String>,
+        /// All runs that ended longer ago than this, such as `30d`, `12h` or `90m`
+        #[arg(long, value_name = "AGE", value_parser = age, conflicts_with = "run")]
+        ended_before: Option<i64>,
+    },
     /// Makes or renews a backup of the store in a folder of this machine, while runs go on
     Backup {
         /// The folder: empty, missing, or an older backup of this store
@@ -165,9 +174,29 @@ impl Verb {
             Self::Fsck => Command::Fsck,
             Self::Gc { dry_run, grace } => Command::Gc { dry_run, grace_minutes: Some(grace) },
             Self::Adopt => Command::Adopt,
+            Self::Forget { run: Some(run), .. } => Command::Forget { run },
+            Self::Forget { run: None, ended_before } => {
+                let age_ms = ended_before.unwrap_or(i64::MAX);
+                Command::ForgetEnded { before_ms: crate::clock::now_ms().saturating_sub(age_ms) }
+            }
             Self::Backup { dir } => return Asked::Backup { dir },
             Self::Restore { backup, to } => return Asked::Restore { backup, to },
             Self::Export { model, dir } => return Asked::Export { model, dir },
         })
     }
+}
+
+/// A time as people write it, in milliseconds.
+fn age(text: &str) -> Result<i64, String> {
+    let wrong = || {
+        format!("`{text}` is no age: expected a whole number of days, hours or minutes, such as `30d`, `12h` or `90m`")
+    };
+    let unit = match text.chars().last() {
+        Some('d') => 24 * 60 * 60 * 1000,
+        Some('h') => 60 * 60 * 1000,
+        Some('m') => 60 * 1000,
+        _ => return Err(wrong()),
+    };
+    let number: u32 = text[..text.len() - 1].parse().map_err(|_| wrong())?;
+    Ok(i64::from(number) * unit)
 }

@@ -14,7 +14,7 @@ mod print;
 use access::Scope;
 use checkpoint::bundle;
 use protocol::message::ApiError;
-use protocol::{Alias, Digest, Manifest, ModelName};
+use protocol::{Alias, Digest, Manifest, ModelName, RunId};
 use serde::{Deserialize, Serialize};
 
 pub use args::{Output, Verb};
@@ -23,6 +23,7 @@ pub use print::{render, show_error};
 
 use crate::backup::{BackupError, Summary};
 use crate::catalog::{BEST, Expect, Gate, LATEST, Model, ModelRef, Promotion, Version};
+use crate::forget::Forgotten;
 use crate::leaderboard::{self, Comparison, Leaderboard, Style};
 use crate::retention::{GRACE_MS, Plan};
 use crate::{LineageNode, OpenError, QueryError, ReadStore, Store, StoreId, WriteError, fsck};
@@ -103,6 +104,16 @@ pub enum Command {
         /// Minutes for which a fresh blob is safe.
         grace_minutes: Option<u32>,
     },
+    /// Forgets a run that has ended.
+    Forget {
+        /// Which.
+        run: String,
+    },
+    /// Forgets runs that ended before a time.
+    ForgetEnded {
+        /// In milliseconds since 1970.
+        before_ms: i64,
+    },
     /// Makes one store of what is left after a loss. Only on a store that no process holds.
     Adopt,
 }
@@ -119,7 +130,7 @@ impl Command {
             | Self::Lineage { .. } => Scope::Read,
             Self::Promote { .. } | Self::Rollback { .. } => Scope::Promote,
             // Reads every byte of the store.
-            Self::Fsck | Self::Gc { .. } | Self::Adopt => Scope::Admin,
+            Self::Fsck | Self::Gc { .. } | Self::Forget { .. } | Self::ForgetEnded { .. } | Self::Adopt => Scope::Admin,
         }
     }
 
@@ -134,7 +145,11 @@ impl Command {
             | Self::Lineage { .. }
             | Self::Fsck => true,
             Self::Gc { dry_run, .. } => *dry_run,
-            Self::Promote { .. } | Self::Rollback { .. } | Self::Adopt => false,
+            Self::Promote { .. }
+            | Self::Rollback { .. }
+            | Self::Forget { .. }
+            | Self::ForgetEnded { .. }
+            | Self::Adopt => false,
         }
     }
 }
@@ -166,6 +181,8 @@ pub enum Data {
     Gc { dry_run: bool, plan: Plan },
     /// Of `adopt`.
     Adopted { store: StoreId },
+    /// Of `forget`.
+    Forgotten { runs: Vec<(RunId, Forgotten)> },
     /// Of `backup`.
     BackedUp { summary: Summary, dir: std::path::PathBuf },
     /// Of `restore`.
@@ -362,6 +379,20 @@ async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &st
             let grace_ms = grace_minutes.map_or(GRACE_MS, |minutes| i64::from(minutes) * 60_000);
             let plan = if dry_run { store.gc_plan(grace_ms).await? } else { writes()?.0.gc(grace_ms).await? };
             Data::Gc { dry_run, plan }
+        }
+        Command::Forget { run } => {
+            let run = RunId::new(run);
+            let gone = writes()?.0.forget(&run).await?;
+            Data::Forgotten { runs: vec![(run, gone)] }
+        }
+        Command::ForgetEnded { before_ms } => {
+            let mut runs = Vec::new();
+            // One transaction each, so that other writes get in between.
+            for run in store.ended_before(before_ms).await? {
+                let gone = writes()?.0.forget(&run).await?;
+                runs.push((run, gone));
+            }
+            Data::Forgotten { runs }
         }
         Command::Adopt => {
             return Err(invalid("the store is open, so its parts belong together: nothing is to be adopted"));

@@ -11,6 +11,7 @@ use super::{Answer, Data, Output};
 use crate::backup::Summary;
 use crate::catalog::{Action, Promotion, Version};
 use crate::clock::format_ms;
+use crate::forget::Forgotten;
 use crate::leaderboard;
 
 /// Prints an answer.
@@ -174,6 +175,20 @@ pub fn render(data: &Data) -> String {
         }
         Data::Adopted { store } => {
             format!("the parts are store {store} again; `registry fsck` says what is missing\n")
+        }
+        Data::Forgotten { runs } if runs.is_empty() => "no run ended before that\n".into(),
+        Data::Forgotten { runs } => {
+            let mut text = String::new();
+            for (run, gone) in runs {
+                let Forgotten { values, lines, checkpoints, results, kept } = gone;
+                text += &format!(
+                    "forgot {run}: {values} values, {lines} log lines, {checkpoints} checkpoints, {results} results of stages\n"
+                );
+                for stage in kept {
+                    text += &format!("  {stage} stays: a model, a pin or another run needs it\n");
+                }
+            }
+            text + "`registry gc` removes what nothing needs any more\n"
         }
         Data::BackedUp { summary, dir } => {
             let Summary { store, at_ms, blobs, bytes } = summary;

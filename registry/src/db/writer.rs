@@ -10,12 +10,13 @@ use std::thread::JoinHandle;
 
 use fail::fail_point;
 use protocol::stage::Keep;
-use protocol::{Alias, Digest, ModelName, TaskId};
+use protocol::{Alias, Digest, ModelName, RunId, TaskId};
 use sqlx::{Connection, Row, SqliteConnection};
 use tokio::sync::{mpsc, oneshot};
 
 use super::{apply, write_error};
 use crate::catalog::{Expect, Promotion};
+use crate::forget::{self, Forgotten};
 use crate::identity::Witness;
 use crate::lock::StoreLock;
 use crate::retention::{self, Vouched};
@@ -47,6 +48,7 @@ pub(crate) enum Order {
         digest: Digest,
         reason: Option<String>,
     },
+    Forget(RunId),
     /// Forgets what a collection may take. From here on what rows come to name is noted.
     BeginCollection,
 }
@@ -58,6 +60,7 @@ pub(crate) enum Done {
     Promoted(Box<Promotion>),
     Pruned(Vec<Digest>),
     Begun(Vec<TaskId>),
+    Forgotten(Forgotten),
 }
 
 type Answer = oneshot::Sender<Result<Done, WriteError>>;
@@ -210,6 +213,7 @@ async fn run(conn: &mut SqliteConnection, blobs: &Vouched, order: &Order) -> Res
         Order::Pin { digest, reason } => {
             retention::pin(conn, blobs, *digest, reason.as_deref()).await.map(|()| Done::Nothing)
         }
+        Order::Forget(run) => forget::forget(conn, run).await.map(Done::Forgotten),
         Order::BeginCollection => {
             // Rows of this transaction before here are committed when the answer comes, which is when marking begins.
             blobs.named.begin();
