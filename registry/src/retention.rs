@@ -1,16 +1,16 @@
 //! What may go. Marks from roots, then sweeps what was not marked and is old enough; forgets checkpoints by policy.
 //!
 //! Roots: every version (so whatever an alias points at), every stage result, every checkpoint that was not pruned, every
-//! shard of a run that may still need it, every pin, and what held tasks have uploaded. From a root the mark follows the
+//! shard of a run that may still need it, and every pin. From a root the mark follows the
 //! manifest's files, digests in the manifest's own words (`meta`), and the lineage. A blob that was put within the grace
 //! period is never collected: the row that will name it may be on its way. After a restart nobody knows any more what a
 //! held task had uploaded before; so while a run is under way, blobs from before the restart have the usual grace however
 //! short a one was asked for.
 //!
 //! The writer goes on meanwhile. Marking reads one moment of the database; from just before that moment on the writer notes
-//! what new rows name ([`Named`]), and a blob is removed only while nobody can be noting it. A root whose manifest does not
+//! what new rows name (`Named`), and a blob is removed only while nobody can be noting it. A root whose manifest does not
 //! read stops the collection, for nobody can say what it needs; so does a database or a folder of blobs that is not the
-//! store's own any more ([`crate::identity`]).
+//! store's own any more.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::ops::Deref;
