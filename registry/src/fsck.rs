@@ -18,6 +18,9 @@ pub struct Report {
     pub references: u64,
     /// What is wrong, in words.
     pub problems: Vec<String>,
+    /// What lies in the store and is not part of it: strangers' files, and damaged blobs that were put aside and made anew.
+    #[serde(default)]
+    pub notes: Vec<String>,
 }
 
 impl ReadStore {
@@ -54,14 +57,21 @@ fn check(blobs: &BlobStore, roots: &[(Digest, String)]) -> Report {
             for entry in all.values() {
                 report.blobs += 1;
                 report.bytes += entry.bytes;
-                match blobs.get(entry.digest) {
+                match blobs.check(entry.digest) {
                     // Collected since the listing.
-                    Ok(_) | Err(checkpoint::BlobError::NotFound(_)) => {}
+                    Ok(()) | Err(checkpoint::BlobError::NotFound(_)) => {}
                     Err(e) => report.problems.push(e.to_string()),
                 }
             }
         }
         Err(e) => report.problems.push(e.to_string()),
+    }
+    match (blobs.strays(), blobs.aside()) {
+        (Ok(strays), Ok(aside)) => {
+            report.notes.extend(strays.iter().map(|path| format!("`{path}` is not the store's and is left alone")));
+            report.notes.extend(aside.iter().map(|path| format!("`{path}` is a damaged blob that was put aside")));
+        }
+        (Err(e), _) | (_, Err(e)) => report.problems.push(e.to_string()),
     }
     for (digest, why) in roots {
         report.references += 1;

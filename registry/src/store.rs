@@ -319,7 +319,7 @@ impl Store {
         // Under the lock: nobody is making the store at the same time.
         let Opened { mut conn, store: id, verdict } =
             db::open_writer(&dir, &found(&dir)?, purpose == Purpose::Adopt).await?;
-        let blobs = BlobStore::new(Folder::open(&dir).map_err(|e| io(&dir, e))?);
+        let blobs = BlobStore::open_folder(&dir).map_err(|e| io(&dir, e))?;
         if let Verdict::New | Verdict::Unfinished(_) = verdict {
             identity::mark_blobs(&dir, &id).map_err(|e| io(&dir, e))?;
         }

@@ -3,13 +3,18 @@
 
 mod common;
 
+use std::io::Read as _;
+use std::os::unix::fs::symlink;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use checkpoint::BlobError;
-use protocol::Digest;
+use checkpoint::{BlobError, Blobs};
+use common::power::Power;
+use protocol::{ArtifactKind, Digest, FileEntry, Manifest};
 use registry::blob::fs::Folder;
 use registry::blob::memory::Memory;
-use registry::blob::{Backend, BlobStore};
+use registry::blob::{Backend, BlobStore, ManifestError, PART_BYTES, ResumeError};
+use serde_json::json;
 
 fn what_was_put_is_read(store: &BlobStore) {
     for bytes in [&b""[..], b"a", &vec![7; 3 << 20]] {
@@ -20,16 +25,50 @@ fn what_was_put_is_read(store: &BlobStore) {
     }
 }
 
+/// Large enough to go to an object store in several parts.
+fn large_blobs_come_and_go_in_parts(store: &BlobStore) {
+    let bytes: Vec<u8> = (0..20 << 20).map(|i: u32| i.to_le_bytes()[(i % 4) as usize]).collect();
+    let digest = store.put_pieces(&[&bytes[..5], &bytes[5..9 << 20], &bytes[9 << 20..]]).unwrap();
+    assert_eq!(digest, Digest::of(&bytes));
+    let (mut reader, mut read) = (store.read(digest).unwrap(), Vec::new());
+    while let Some(part) = reader.next_part().unwrap() {
+        assert!(part.len() <= PART_BYTES);
+        read.extend(part);
+    }
+    assert!(read == bytes);
+    let mut rest = store.read_from(digest, (18 << 20) + 3).unwrap();
+    let mut read = Vec::new();
+    while let Some(part) = rest.next_part().unwrap() {
+        read.extend(part);
+    }
+    assert!(read == bytes[(18 << 20) + 3..]);
+    let opened = Blobs::open(store, digest).unwrap();
+    let mut middle = [0; 100];
+    opened.read_at(10 << 20, &mut middle).unwrap();
+    assert_eq!(middle, bytes[10 << 20..][..100]);
+    assert!(opened.read_at((20 << 20) - 99, &mut middle).is_err(), "past the end");
+}
+
 fn putting_twice_stores_once(store: &BlobStore) {
     let digest = store.put(b"twice").unwrap();
     assert_eq!(store.put(b"twice").unwrap(), digest);
     assert_eq!(store.list().unwrap().len(), 1);
 }
 
+fn what_is_put_again_is_young_again(store: &BlobStore) {
+    let digest = store.put(b"again").unwrap();
+    let first = store.list().unwrap()[&digest].put_ms;
+    std::thread::sleep(std::time::Duration::from_millis(20));
+    store.put(b"again").unwrap();
+    assert!(store.list().unwrap()[&digest].put_ms > first);
+}
+
 fn what_is_not_there_is_not_found(store: &BlobStore) {
     let digest = Digest::of(b"never put");
     assert!(matches!(store.get(digest), Err(BlobError::NotFound(missing)) if missing == digest));
+    assert!(matches!(store.verify(digest), Err(BlobError::NotFound(_))));
     assert!(!store.exists(digest).unwrap());
+    assert!(!store.reuse(digest).unwrap());
 }
 
 fn a_wrong_name_is_refused(store: &BlobStore) {
@@ -52,29 +91,135 @@ fn many_threads_put_the_same_and_others(store: &BlobStore) {
     let all = store.list().unwrap();
     assert_eq!(all.len(), 20 + 8 * 20);
     assert!(all.keys().all(|digest| store.get(*digest).is_ok()));
+    assert!(store.aside().unwrap().is_empty() && store.strays().unwrap().is_empty());
+}
+
+fn a_cut_upload_goes_on(store: &BlobStore) {
+    let bytes = vec![3; 100_000];
+    let (digest, grant) = (Digest::of(&bytes), common::grant("r/s", 1));
+    let total = bytes.len() as u64;
+    let mut arriving = store.take_up(&grant, digest, 0, total).unwrap();
+    arriving.write(&bytes[..60_000]).unwrap();
+    assert!(matches!(store.take_up(&grant, digest, 0, total), Err(ResumeError::Busy)), "one request at a time");
+    drop(arriving);
+    assert!(!store.exists(digest).unwrap(), "nothing is shown before all of it is there");
+    assert_eq!(store.staged(&grant, digest), 60_000);
+
+    // Of the next generation of the same gang, and of somebody else.
+    let next = common::grant("r/s", 2);
+    assert_eq!(store.staged(&next, digest), 60_000);
+    let other = protocol::message::Grant { worker: "other".into(), ..grant.clone() };
+    assert_eq!(store.staged(&other, digest), 0);
+
+    let wrong = store.take_up(&next, digest, 50_000, total);
+    assert!(matches!(wrong, Err(ResumeError::Offset { staged: 60_000, offset: 50_000 })));
+    let mut arriving = store.take_up(&next, digest, 60_000, total).unwrap();
+    arriving.write(&bytes[60_000..]).unwrap();
+    assert!(arriving.finish().unwrap());
+    assert_eq!(store.get(digest).unwrap(), bytes);
+    assert_eq!(store.staged(&next, digest), 0);
+    assert!(store.held().contains(&digest), "until its task is let go");
+    store.let_go(|_| false);
+    assert!(store.held().is_empty());
+
+    // More bytes than were announced, and other bytes, are refused and forgotten.
+    let mut arriving = store.take_up(&grant, Digest::of(b"abc"), 0, 3).unwrap();
+    assert!(matches!(arriving.write(b"abcd"), Err(BlobError::Refused(_))));
+    drop(arriving);
+    let mut arriving = store.take_up(&grant, Digest::of(b"abc"), 0, 3).unwrap();
+    arriving.write(b"abx").unwrap();
+    assert!(matches!(arriving.finish(), Err(BlobError::Corrupt { .. })));
+    assert_eq!(store.staged(&grant, Digest::of(b"abc")), 0);
+    drop(store.take_up(&grant, Digest::of(b"abc"), 0, 3).unwrap());
+    store.let_go(|_| false);
+    assert!(matches!(store.take_up(&grant, Digest::of(b"abc"), 1, 3), Err(ResumeError::Offset { staged: 0, .. })));
 }
 
 fn a_backend_moves_the_time_and_removes(backend: &dyn Backend) {
     let digest = Digest::of(b"x");
-    backend.write(digest, b"x").unwrap();
-    let first = backend.put_ms(digest).unwrap().unwrap();
+    let put = |bytes: &[u8]| {
+        let mut staged = backend.stage(bytes.len() as u64).unwrap();
+        staged.write(bytes).unwrap();
+        staged.commit(digest).unwrap()
+    };
+    assert!(put(b"x"));
+    let first = backend.stat(digest).unwrap().unwrap();
     std::thread::sleep(std::time::Duration::from_millis(20));
-    backend.touch(digest).unwrap();
-    assert!(backend.put_ms(digest).unwrap().unwrap() > first);
+    let touched = backend.touch(digest).unwrap();
+    assert!(touched.put_ms > first.put_ms);
+    assert_eq!(backend.stat(digest).unwrap().unwrap(), touched);
+
+    // A name that is taken is not given again.
+    assert!(!put(b"something else"));
+    let mut read = String::new();
+    backend.read(digest, 0).unwrap().read_to_string(&mut read).unwrap();
+    assert_eq!(read, "x");
+
+    backend.put_aside(digest).unwrap();
+    assert_eq!((backend.stat(digest).unwrap(), backend.aside().unwrap().len()), (None, 1));
+    assert!(put(b"x"));
     backend.remove(digest).unwrap();
     backend.remove(digest).unwrap();
-    assert_eq!(backend.size(digest).unwrap(), None);
-    assert_eq!(backend.put_ms(digest).unwrap(), None);
+    backend.put_aside(digest).unwrap();
+    assert_eq!(backend.stat(digest).unwrap(), None);
     assert!(backend.list().unwrap().is_empty());
+    assert_eq!(backend.aside().unwrap().len(), 1);
 }
 
-fn suite(fresh: impl Fn() -> Arc<dyn Backend>) {
+/// `damage` puts bytes in the place of a blob behind the store's back.
+fn damage_is_noticed_and_mended(store: &BlobStore, damage: &dyn Fn(Digest, &[u8])) {
+    let good = vec![5; 3 << 20];
+    let digest = store.put(&good).unwrap();
+    let mut bad = good.clone();
+    bad[1 << 20] ^= 1;
+    damage(digest, &bad);
+
+    // Read whole, in parts, and by a manifest; the last part is never handed out.
+    assert!(matches!(store.get(digest), Err(BlobError::Corrupt { expected, .. }) if expected == digest));
+    let mut manifest = Manifest::new(ArtifactKind::Vae, json!({}));
+    manifest.files.insert("weights".into(), FileEntry { digest, bytes: good.len() as u64 });
+    let manifest = store.put(&manifest.to_bytes()).unwrap();
+    assert!(store.complete_manifest(manifest).is_ok(), "lengths say nothing");
+    assert!(matches!(store.whole_manifest(manifest), Err(ManifestError::Blob(BlobError::Corrupt { .. }))));
+    damage(digest, &bad);
+    let mut reader = store.read(digest).unwrap();
+    let mut handed_out = 0;
+    let error = loop {
+        match reader.next_part() {
+            Ok(part) => handed_out += part.unwrap().len(),
+            Err(error) => break error,
+        }
+    };
+    assert!(matches!(error, BlobError::Corrupt { .. }) && handed_out < good.len(), "{handed_out} {error}");
+    assert!(matches!(store.read_from(digest, 10), Err(BlobError::Corrupt { .. })));
+    assert!(matches!(Blobs::open(store, digest), Err(BlobError::Corrupt { .. })));
+
+    // The good bytes take its place, and the bad ones are kept for somebody to look at.
+    store.put(&good).unwrap();
+    assert!(store.get(digest).unwrap() == good);
+    assert!(store.whole_manifest(manifest).is_ok());
+    assert_eq!(store.aside().unwrap().len(), 1);
+
+    // The same for a cut blob, and for an upload.
+    damage(digest, &good[..10]);
+    let grant = common::grant("r/s", 1);
+    let mut arriving = store.take_up(&grant, digest, 0, good.len() as u64).unwrap();
+    arriving.write(&good).unwrap();
+    assert!(arriving.finish().unwrap());
+    assert!(store.get(digest).unwrap() == good);
+    assert_eq!(store.aside().unwrap().len(), 2);
+}
+
+fn suite(fresh: &dyn Fn() -> Arc<dyn Backend>) {
     for check in [
         what_was_put_is_read,
+        large_blobs_come_and_go_in_parts,
         putting_twice_stores_once,
+        what_is_put_again_is_young_again,
         what_is_not_there_is_not_found,
         a_wrong_name_is_refused,
         many_threads_put_the_same_and_others,
+        a_cut_upload_goes_on,
     ] {
         check(&BlobStore::over(fresh()));
     }
@@ -83,40 +228,143 @@ fn suite(fresh: impl Fn() -> Arc<dyn Backend>) {
 
 #[test]
 fn memory() {
-    suite(|| Arc::new(Memory::default()));
+    suite(&|| Arc::new(Memory::default()));
+    let memory = Arc::new(Memory::default());
+    damage_is_noticed_and_mended(&BlobStore::over(memory.clone()), &|digest, bytes| memory.damage(digest, bytes));
 }
 
 #[test]
 fn folder() {
     let dir = tempfile::tempdir().unwrap();
     let next = std::sync::atomic::AtomicU32::new(0);
-    suite(|| {
+    let fresh = || {
         let path = dir.path().join(next.fetch_add(1, std::sync::atomic::Ordering::Relaxed).to_string());
         std::fs::create_dir(&path).unwrap();
-        Arc::new(Folder::open(&path).unwrap())
-    });
+        path
+    };
+    suite(&|| Arc::new(Folder::open(&fresh()).unwrap()));
+    let path = fresh();
+    let store = BlobStore::open_folder(&path).unwrap();
+    damage_is_noticed_and_mended(&store, &|digest, bytes| change(&blob_path(&path, digest), bytes));
+}
+
+fn blob_path(dir: &Path, digest: Digest) -> PathBuf {
+    dir.join("blobs/sha256").join(&digest.hex()[..2]).join(&digest.hex()[2..])
+}
+
+/// Writes a file, and waits until its time shows that: the clock of a file system may tick slowly.
+fn change(path: &Path, bytes: &[u8]) {
+    let before = std::fs::metadata(path).unwrap().modified().unwrap();
+    while {
+        std::fs::write(path, bytes).unwrap();
+        std::fs::metadata(path).unwrap().modified().unwrap() == before
+    } {}
+}
+
+/// What was hashed is not hashed again by the next process, unless it was written to.
+#[test]
+fn a_folder_remembers_what_was_verified() {
+    let dir = tempfile::tempdir().unwrap();
+    let digest = BlobStore::open_folder(dir.path()).unwrap().put(&[1; 100]).unwrap();
+    let path = blob_path(dir.path(), digest);
+    let store = BlobStore::open_folder(dir.path()).unwrap();
+    // Unreadable: only a blob that is remembered passes.
+    std::fs::rename(&path, dir.path().join("kept")).unwrap();
+    std::fs::rename(dir.path().join("kept"), &path).unwrap();
+    let renamed = store.verify(digest).unwrap();
+    assert_eq!(renamed.bytes, 100);
+    let again = BlobStore::open_folder(dir.path()).unwrap();
+    let lines = std::fs::read_to_string(dir.path().join("blobs/verified")).unwrap();
+    assert!(lines.contains(&format!("{digest} {}", renamed.stamp)), "{lines}");
+    change(&path, &[2; 100]);
+    assert!(matches!(again.verify(digest), Err(BlobError::Corrupt { .. })));
 }
 
 #[test]
-fn a_folder_detects_rot_and_mends_a_cut_blob() {
+fn a_folder_forgets_what_a_dead_process_staged_and_leaves_strangers_alone() {
     let dir = tempfile::tempdir().unwrap();
-    let store = BlobStore::new(Folder::open(dir.path()).unwrap());
-    let digest = store.put(b"some bytes").unwrap();
-    let path = dir.path().join("blobs/sha256").join(&digest.hex()[..2]).join(&digest.hex()[2..]);
-    std::fs::write(&path, b"some bytez").unwrap();
-    assert!(matches!(store.get(digest), Err(BlobError::Corrupt { .. })));
-    std::fs::write(&path, b"some").unwrap();
-    assert!(matches!(store.get(digest), Err(BlobError::Corrupt { .. })));
-    store.put(b"some bytes").unwrap();
-    assert_eq!(store.get(digest).unwrap(), b"some bytes");
+    let digest = BlobStore::open_folder(dir.path()).unwrap().put(b"a blob").unwrap();
+    let (staging, blobs) = (dir.path().join("staging"), dir.path().join("blobs/sha256"));
+    std::fs::write(staging.join("0.part"), b"half a bl").unwrap();
+    std::fs::create_dir(staging.join("1.part")).unwrap();
+    std::fs::write(staging.join("notes.txt"), b"mine").unwrap();
+    std::fs::write(blobs.join("notes.txt"), b"mine").unwrap();
+    std::fs::write(blobs.join(&digest.hex()[..2]).join("short"), b"mine").unwrap();
+    nix::unistd::mkfifo(&staging.join("pipe"), nix::sys::stat::Mode::S_IRWXU).unwrap();
+    symlink("/etc", blobs.join("ff")).unwrap();
+
+    let store = BlobStore::open_folder(dir.path()).unwrap();
+    assert!(!staging.join("0.part").exists());
+    assert_eq!(store.list().unwrap().keys().collect::<Vec<_>>(), [&digest]);
+    let strays = store.strays().unwrap();
+    assert_eq!(strays.len(), 6, "{strays:?}");
+    assert_eq!(store.get(digest).unwrap(), b"a blob");
+
+    // Under the name of a blob: neither followed nor waited for, and no obstacle.
+    let (piped, linked) = (Digest::of(b"piped"), Digest::of(b"linked"));
+    for digest in [piped, linked] {
+        std::fs::create_dir_all(blob_path(dir.path(), digest).parent().unwrap()).unwrap();
+    }
+    nix::unistd::mkfifo(&blob_path(dir.path(), piped), nix::sys::stat::Mode::S_IRWXU).unwrap();
+    std::fs::write(dir.path().join("elsewhere"), b"linked").unwrap();
+    symlink(dir.path().join("elsewhere"), blob_path(dir.path(), linked)).unwrap();
+    for digest in [piped, linked] {
+        assert!(matches!(store.get(digest), Err(BlobError::NotFound(_))));
+        assert!(!store.exists(digest).unwrap());
+    }
+    store.put(b"piped").unwrap();
+    store.put(b"linked").unwrap();
+    assert_eq!((store.get(piped).unwrap(), store.get(linked).unwrap()), (b"piped".to_vec(), b"linked".to_vec()));
+    assert_eq!(store.aside().unwrap().len(), 2);
+
+    // A link in the place of one of the store's own folders of blobs.
+    let (other, away) = ((0..).map(|i: u32| i.to_le_bytes()), dir.path().join("away"));
+    std::fs::create_dir(&away).unwrap();
+    let free =
+        other.map(|bytes| (bytes, Digest::of(&bytes))).find(|(_, digest)| !blobs.join(&digest.hex()[..2]).exists());
+    let (bytes, digest) = free.unwrap();
+    symlink(&away, blobs.join(&digest.hex()[..2])).unwrap();
+    store.put(&bytes).unwrap();
+    assert_eq!(store.get(digest).unwrap(), bytes);
+    assert!(std::fs::read_dir(&away).unwrap().next().is_none());
 }
 
 #[test]
-fn a_folder_forgets_what_a_dead_process_staged() {
+fn what_is_stored_outlives_a_loss_of_power() {
     let dir = tempfile::tempdir().unwrap();
-    drop(Folder::open(dir.path()).unwrap());
-    std::fs::write(dir.path().join("staging/0"), b"half a bl").unwrap();
-    let store = BlobStore::new(Folder::open(dir.path()).unwrap());
-    assert!(std::fs::read_dir(dir.path().join("staging")).unwrap().next().is_none());
-    assert!(store.list().unwrap().is_empty());
+    let power = Power::default();
+    let open = || BlobStore::new(Folder::open_on(dir.path(), Arc::new(power.clone())).unwrap());
+    let store = open();
+    let first = store.put(b"stored").unwrap();
+    power.lose();
+    let store = {
+        drop(store);
+        open()
+    };
+    assert_eq!(store.get(first).unwrap(), b"stored");
+
+    // Written by a process that was killed before its last sync, and put again. The folder was synced before.
+    let path = blob_path(dir.path(), Digest::of(b"put again"));
+    let _ = std::fs::create_dir(path.parent().unwrap());
+    power.ignore_syncs(true);
+    let second = store.put(b"put again").unwrap();
+    power.ignore_syncs(false);
+    store.put(b"put again").unwrap();
+    power.lose();
+    let store = {
+        drop(store);
+        open()
+    };
+    assert_eq!(store.get(second).unwrap(), b"put again");
+
+    // What was put aside does not come back under its name.
+    change(&blob_path(dir.path(), first), b"St0red");
+    store.put(b"stored").unwrap();
+    power.lose();
+    let store = {
+        drop(store);
+        open()
+    };
+    assert_eq!(store.get(first).unwrap(), b"stored");
+    assert_eq!(store.aside().unwrap().len(), 1);
 }

@@ -263,7 +263,12 @@ fn p2_a_worker_that_slept_past_its_lease_writes_nothing() {
     }
     let forged = format!("forged by {}", std::process::id());
     let reply = cluster
-        .call("PUT", "/v1/blobs", &[("x-stride-grant", &grant.to_string())], forged.as_bytes())
+        .call(
+            "PUT",
+            &format!("/v1/blobs/sha256:{}", "0".repeat(64)),
+            &[("x-stride-grant", &grant.to_string())],
+            forged.as_bytes(),
+        )
         .expect("answered");
     assert_eq!((reply.status, reply.body["code"].as_str()), (409, Some("stale-fence")), "blob");
 

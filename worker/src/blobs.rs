@@ -1,13 +1,18 @@
 //! The store's blobs over HTTP, in the name of one grant.
+//!
+//! Large blobs come and go in parts, and never lie in memory as a whole unless the stage asks for that. A cut transfer goes on
+//! where it was cut.
 
 use std::sync::Arc;
 
-use bytes::Bytes;
-use checkpoint::{BlobError, Blobs};
+use bytes::{Bytes, BytesMut};
+use checkpoint::{Blob, BlobError, Blobs};
 use protocol::Digest;
+use protocol::digest::Hasher;
+use protocol::message::Grant;
 
 use crate::active_assignment::ActiveAssignment;
-use crate::cache::Cache;
+use crate::cache::{Arriving, Cache, Cached};
 use crate::client::{CallError, Client};
 use crate::failpoints;
 use crate::retry::{self, GaveUp};
@@ -24,50 +29,124 @@ pub(crate) struct HttpBlobs {
 
 /// How often a blob that arrives damaged is fetched again.
 const DAMAGED: u32 = 2;
+/// How much is sent in one request.
+const PART_BYTES: usize = 8 << 20;
+/// Blobs up to this length are sent without asking what is there.
+const SMALL_BYTES: u64 = 64 << 10;
 
-impl Blobs for HttpBlobs {
-    fn get(&self, digest: Digest) -> Result<Arc<[u8]>, BlobError> {
+impl HttpBlobs {
+    /// The blob, from the cache or fetched into it.
+    fn cached(&self, digest: Digest) -> Result<Cached, BlobError> {
         if let Some(blob) = self.cache.get(digest) {
             return Ok(blob);
         }
         let mut damaged = 0;
         loop {
-            let bytes = retry::until_ended(&self.held, &format!("fetching blob {digest}"), |_| {
-                self.client.wait(self.client.get_blob(digest))
-            })
-            .map_err(|gave_up| error(gave_up, Some(digest)))?;
-            let found = Digest::of(&bytes);
-            if found == digest {
-                let blob: Arc<[u8]> = Arc::from(&*bytes);
-                self.cache.insert(digest, &blob);
-                return Ok(blob);
+            let mut arriving = None;
+            retry::until_ended(&self.held, &format!("fetching blob {digest}"), |_| self.fetch(digest, &mut arriving))
+                .map_err(|gave_up| error(gave_up, Some(digest)))?;
+            let arrived = arriving.ok_or_else(|| BlobError::Unavailable(format!("blob {digest} did not arrive")))?;
+            match arrived.finish(&self.cache)? {
+                Ok(blob) => return Ok(blob),
+                Err(found) => {
+                    damaged += 1;
+                    if damaged > DAMAGED {
+                        return Err(BlobError::Corrupt { expected: digest, found });
+                    }
+                    tracing::warn!("blob {digest} arrived damaged: its bytes hash to {found}; fetching it again");
+                }
             }
-            damaged += 1;
-            if damaged > DAMAGED {
-                return Err(BlobError::Corrupt { expected: digest, found });
-            }
-            tracing::warn!("blob {digest} arrived damaged: its bytes hash to {found}; fetching it again");
         }
     }
 
+    /// Fetches what is missing. Bytes that have arrived stay in `arriving` when the connection is cut.
+    fn fetch(&self, digest: Digest, arriving: &mut Option<Arriving>) -> Result<(), CallError> {
+        let offset = arriving.as_ref().map_or(0, Arriving::written);
+        let mut download = self.client.wait(self.client.get_blob(digest, offset))?;
+        let local = |e: std::io::Error| CallError::Storage(format!("blob {digest} cannot be kept here: {e}"));
+        let arriving = match arriving {
+            Some(arriving) => arriving,
+            None => arriving.insert(self.cache.arriving(digest, download.length()).map_err(local)?),
+        };
+        while let Some(bytes) = self.client.wait(download.next())? {
+            arriving.write(&bytes).map_err(local)?;
+        }
+        Ok(())
+    }
+
+    /// Sends what is missing.
+    fn send(&self, grant: &Grant, digest: Digest, bytes: u64, pieces: &[&[u8]]) -> Result<(), CallError> {
+        let mut offset = 0;
+        if bytes > SMALL_BYTES {
+            let there = self.client.wait(self.client.staged(grant, digest))?;
+            if there.stored {
+                return Ok(());
+            }
+            offset = there.staged;
+        }
+        loop {
+            let part = cut(pieces, offset);
+            let end = offset + part.len() as u64;
+            let there = self.client.wait(self.client.put_part(grant, digest, bytes, offset, part))?;
+            if there.stored {
+                return Ok(());
+            }
+            if there.staged != end || end == bytes {
+                return Err(CallError::Fault(format!(
+                    "{end} of {bytes} bytes of blob {digest} were sent, and {} have arrived",
+                    there.staged
+                )));
+            }
+            offset = end;
+        }
+    }
+}
+
+/// The bytes that begin at `offset`, at most [`PART_BYTES`].
+fn cut(pieces: &[&[u8]], offset: u64) -> Bytes {
+    let mut part = BytesMut::new();
+    let mut skip = offset;
+    for piece in pieces {
+        let begin = usize::try_from(skip).map_or(piece.len(), |skip| skip.min(piece.len()));
+        skip -= begin as u64;
+        let piece = &piece[begin..];
+        part.extend_from_slice(&piece[..piece.len().min(PART_BYTES - part.len())]);
+        if part.len() == PART_BYTES {
+            break;
+        }
+    }
+    part.freeze()
+}
+
+impl Blobs for HttpBlobs {
+    fn get(&self, digest: Digest) -> Result<Arc<[u8]>, BlobError> {
+        self.cached(digest)?.into_memory()
+    }
+
     fn put(&self, bytes: Vec<u8>) -> Result<Digest, BlobError> {
+        self.put_pieces(&[&bytes])
+    }
+
+    fn put_pieces(&self, pieces: &[&[u8]]) -> Result<Digest, BlobError> {
         if self.gang {
             failpoints::hit("checkpoint::before_upload");
         }
-        let expected = Digest::of(&bytes);
-        // Cheap to clone: each try sends the same memory.
-        let bytes = Bytes::from(bytes);
-        let stored = retry::until_ended(&self.held, &format!("uploading blob {expected}"), |grant| {
-            self.client.wait(self.client.put_blob(grant, bytes.clone()))
+        let mut hasher = Hasher::default();
+        pieces.iter().for_each(|piece| hasher.update(piece));
+        let digest = hasher.finish();
+        let bytes = pieces.iter().map(|piece| piece.len() as u64).sum();
+        retry::until_ended(&self.held, &format!("uploading blob {digest}"), |grant| {
+            self.send(grant, digest, bytes, pieces)
         })
         .map_err(|gave_up| error(gave_up, None))?;
-        if stored != expected {
-            return Err(BlobError::Corrupt { expected, found: stored });
-        }
         if self.gang {
             failpoints::hit("checkpoint::after_upload");
         }
-        Ok(expected)
+        Ok(digest)
+    }
+
+    fn open(&self, digest: Digest) -> Result<Box<dyn Blob>, BlobError> {
+        Ok(Box::new(self.cached(digest)?))
     }
 }
 
@@ -75,8 +154,24 @@ fn error(gave_up: GaveUp, wanted: Option<Digest>) -> BlobError {
     match (gave_up, wanted) {
         (GaveUp::Ended(reason), _) => BlobError::Refused(reason),
         (GaveUp::Answer(CallError::NotFound(_)), Some(digest)) => BlobError::NotFound(digest),
+        (GaveUp::Answer(CallError::Damaged(message)), _) => BlobError::Damaged(message),
         (GaveUp::Answer(CallError::Storage(message)), _) => BlobError::Storage(message),
         (GaveUp::Answer(CallError::Stale(message)), _) => BlobError::Refused(message),
         (GaveUp::Answer(error), _) => BlobError::Unavailable(error.to_string()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_of_pieces_are_the_parts_of_the_whole() {
+        let whole: Vec<u8> = (0..PART_BYTES + 1000).map(|i| (i % 251) as u8).collect();
+        let pieces = [&whole[..10], &[], &whole[10..PART_BYTES - 5], &whole[PART_BYTES - 5..]];
+        for offset in [0, 5, 10, 11, PART_BYTES - 6, PART_BYTES, whole.len() - 1, whole.len()] {
+            let end = (offset + PART_BYTES).min(whole.len());
+            assert_eq!(cut(&pieces, offset as u64), &whole[offset..end], "{offset}");
+        }
     }
 }

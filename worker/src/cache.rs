@@ -1,16 +1,21 @@
 //! Blobs that were read before: small ones in memory, all of them in a folder if there is one.
 //!
-//! Files are named by their digest and verified on every read, so a folder may be shared by workers, cut short by a crash
-//! or emptied at any time. The least recently read go first once it is over its bound.
+//! Files are named by their digest and verified whenever they are opened, so a folder may be shared by workers, cut short by a
+//! crash or emptied at any time. The least recently read go first once it is over its bound. A large blob lies in a file even
+//! where there is no folder: in a nameless one among the system's temporary files, which is gone once nobody reads it.
 
 use std::collections::{HashMap, VecDeque};
-use std::fs::{self, File};
-use std::io::Write as _;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Read as _, Write as _};
+use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::SystemTime;
 
+use checkpoint::{Blob, BlobError};
 use protocol::Digest;
+use protocol::digest::Hasher;
 
 use crate::event_count::lock;
 
@@ -58,38 +63,67 @@ impl Cache {
         Ok(Self { bounds, memory: Mutex::default(), folder, disk: Mutex::new(bytes) })
     }
 
-    pub(crate) fn get(&self, digest: Digest) -> Option<Arc<[u8]>> {
+    /// A blob that was read before, verified again.
+    pub(crate) fn get(&self, digest: Digest) -> Option<Cached> {
         if let Some(blob) = lock(&self.memory).blobs.get(&digest) {
-            return Some(blob.clone());
+            return Some(Cached::Memory(blob.clone()));
         }
         let path = self.path(digest)?;
-        let bytes = fs::read(&path).ok()?;
-        if Digest::of(&bytes) != digest {
+        let mut file = File::open(&path).ok()?;
+        if file.metadata().is_ok_and(|data| !data.is_file()) || digest_of(&mut file).ok() != Some(digest) {
             tracing::warn!("a cached blob does not hash to its name and is fetched again: {}", path.display());
             remove(&path);
             return None;
         }
-        // Only the order of eviction hangs on it.
-        let _ = File::open(&path).and_then(|file| file.set_modified(SystemTime::now()));
-        let blob: Arc<[u8]> = bytes.into();
-        self.remember(digest, &blob);
-        Some(blob)
+        // Only the order of eviction rests on it.
+        let _ = file.set_modified(SystemTime::now());
+        let blob = Cached::File(CachedFile::new(digest, file).ok()?);
+        self.keep_small(digest, blob).ok()
     }
 
-    /// Keeps a verified blob. A cache that cannot be written is a slow one, not an error.
-    pub(crate) fn insert(&self, digest: Digest, blob: &Arc<[u8]>) {
+    /// A place for a blob that is being fetched, of `length` bytes if that is known.
+    pub(crate) fn arriving(&self, digest: Digest, length: Option<u64>) -> io::Result<Arriving> {
+        let small = length.is_some_and(|length| length <= self.bounds.small as u64);
+        let place = if small {
+            Place::Memory(Vec::new())
+        } else {
+            match self.path(digest) {
+                Some(path) => Place::named(path)?,
+                None => Place::nameless()?,
+            }
+        };
+        Ok(Arriving { digest, place, hasher: Hasher::default(), written: 0 })
+    }
+
+    /// Keeps a verified blob in memory. A cache that cannot be written is a slow one, not an error.
+    fn insert(&self, digest: Digest, blob: &Arc<[u8]>) {
         self.remember(digest, blob);
         let Some(path) = self.path(digest) else { return };
-        match self.write(&path, blob) {
-            Ok(()) => {
-                let mut bytes = lock(&self.disk);
-                *bytes += blob.len() as u64;
-                if *bytes > self.bounds.disk {
-                    *bytes = self.evict();
-                }
-            }
+        match Place::named(path.clone()).and_then(|mut place| {
+            place.write(blob)?;
+            place.publish()
+        }) {
+            Ok(_) => self.grew(blob.len() as u64),
             Err(error) => tracing::warn!("a blob is not cached: {}: {error}", path.display()),
         }
+    }
+
+    fn grew(&self, by: u64) {
+        let mut bytes = lock(&self.disk);
+        *bytes += by;
+        if *bytes > self.bounds.disk {
+            *bytes = self.evict();
+        }
+    }
+
+    /// Takes a blob that is small enough into memory.
+    fn keep_small(&self, digest: Digest, blob: Cached) -> Result<Cached, BlobError> {
+        if blob.bytes() > self.bounds.small as u64 {
+            return Ok(blob);
+        }
+        let blob = blob.into_memory()?;
+        self.remember(digest, &blob);
+        Ok(Cached::Memory(blob))
     }
 
     fn remember(&self, digest: Digest, blob: &Arc<[u8]>) {
@@ -115,19 +149,6 @@ impl Cache {
         self.folder.as_ref().map(|folder| folder.join(&hex[..2]).join(&hex[2..]))
     }
 
-    fn write(&self, path: &Path, blob: &[u8]) -> std::io::Result<()> {
-        let parent = path.parent().unwrap_or(path);
-        fs::create_dir_all(parent)?;
-        // No fsync: what a crash cuts short is found out by its digest.
-        let staged = path.with_extension(format!("{}.part", std::process::id()));
-        let written =
-            File::create(&staged).and_then(|mut file| file.write_all(blob)).and_then(|()| fs::rename(&staged, path));
-        if written.is_err() {
-            remove(&staged);
-        }
-        written
-    }
-
     /// Deletes the least recently read files until a tenth of the bound is free; returns what is left.
     fn evict(&self) -> u64 {
         let Some(folder) = &self.folder else { return 0 };
@@ -142,6 +163,184 @@ impl Cache {
             bytes -= size;
         }
         bytes
+    }
+}
+
+/// A verified blob.
+#[derive(Debug)]
+pub(crate) enum Cached {
+    Memory(Arc<[u8]>),
+    File(CachedFile),
+}
+
+/// A verified blob in an open file. Nobody writes to it: files are replaced and removed, never changed.
+#[derive(Debug)]
+pub(crate) struct CachedFile {
+    digest: Digest,
+    file: File,
+    bytes: u64,
+}
+
+impl CachedFile {
+    fn new(digest: Digest, file: File) -> io::Result<Self> {
+        let bytes = file.metadata()?.len();
+        Ok(Self { digest, file, bytes })
+    }
+}
+
+impl Cached {
+    /// All of it.
+    pub(crate) fn into_memory(self) -> Result<Arc<[u8]>, BlobError> {
+        match self {
+            Self::Memory(bytes) => Ok(bytes),
+            Self::File(file) => {
+                let length = usize::try_from(file.bytes).unwrap_or(usize::MAX);
+                let mut bytes: Arc<[u8]> = std::iter::repeat_n(0, length).collect();
+                let out = Arc::get_mut(&mut bytes).expect("nobody else has it yet");
+                Self::File(file).read_at(0, out)?;
+                Ok(bytes)
+            }
+        }
+    }
+}
+
+impl Blob for Cached {
+    fn bytes(&self) -> u64 {
+        match self {
+            Self::Memory(bytes) => bytes.len() as u64,
+            Self::File(file) => file.bytes,
+        }
+    }
+
+    fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), BlobError> {
+        match self {
+            Self::Memory(bytes) => bytes.read_at(offset, out),
+            Self::File(file) => file
+                .file
+                .read_exact_at(out, offset)
+                .map_err(|e| BlobError::Unavailable(format!("reading the cached blob {}: {e}", file.digest))),
+        }
+    }
+}
+
+/// A blob on its way into the cache, hashed as it comes.
+#[derive(Debug)]
+pub(crate) struct Arriving {
+    digest: Digest,
+    place: Place,
+    hasher: Hasher,
+    written: u64,
+}
+
+impl Arriving {
+    pub(crate) fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
+        self.place.write(bytes)?;
+        self.hasher.update(bytes);
+        self.written += bytes.len() as u64;
+        Ok(())
+    }
+
+    /// Bytes that have arrived.
+    pub(crate) fn written(&self) -> u64 {
+        self.written
+    }
+
+    /// The blob, or what it hashes to if that is not its name.
+    pub(crate) fn finish(self, cache: &Cache) -> Result<Result<Cached, Digest>, BlobError> {
+        let found = self.hasher.finish();
+        if found != self.digest {
+            return Ok(Err(found));
+        }
+        let local = |e: io::Error| BlobError::Storage(format!("blob {} cannot be kept here: {e}", self.digest));
+        match self.place {
+            Place::Memory(bytes) => {
+                let blob: Arc<[u8]> = bytes.into();
+                cache.insert(self.digest, &blob);
+                Ok(Ok(Cached::Memory(blob)))
+            }
+            place => {
+                let is_named = matches!(place, Place::Named { .. });
+                let file = place.publish().map_err(local)?;
+                if is_named {
+                    cache.grew(self.written);
+                }
+                let blob = Cached::File(CachedFile::new(self.digest, file).map_err(local)?);
+                cache.keep_small(self.digest, blob).map(Ok)
+            }
+        }
+    }
+}
+
+/// Where a blob arrives.
+#[derive(Debug)]
+enum Place {
+    Memory(Vec<u8>),
+    Named { file: File, staged: Staged, path: PathBuf },
+    Nameless(File),
+}
+
+/// A file that goes unless it was given its name.
+#[derive(Debug)]
+struct Staged(PathBuf);
+
+impl Drop for Staged {
+    fn drop(&mut self) {
+        remove(&self.0);
+    }
+}
+
+impl Place {
+    fn named(path: PathBuf) -> io::Result<Self> {
+        fs::create_dir_all(path.parent().unwrap_or(&path))?;
+        let staged = Staged(path.with_extension(unique()));
+        let file = OpenOptions::new().read(true).write(true).create_new(true).open(&staged.0)?;
+        Ok(Self::Named { file, staged, path })
+    }
+
+    fn nameless() -> io::Result<Self> {
+        let path = std::env::temp_dir().join(format!("stride-{}", unique()));
+        let file = OpenOptions::new().read(true).write(true).create_new(true).open(&path)?;
+        fs::remove_file(&path)?;
+        Ok(Self::Nameless(file))
+    }
+
+    fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
+        match self {
+            Self::Memory(memory) => {
+                memory.extend_from_slice(bytes);
+                Ok(())
+            }
+            Self::Named { file, .. } | Self::Nameless(file) => file.write_all(bytes),
+        }
+    }
+
+    /// The whole blob's file, under its name if it has one. No fsync: what a crash cuts short is found out by its digest.
+    fn publish(self) -> io::Result<File> {
+        match self {
+            Self::Memory(_) => Err(io::Error::other("a blob in memory has no file")),
+            Self::Nameless(file) => Ok(file),
+            Self::Named { file, staged, path } => {
+                fs::rename(&staged.0, path)?;
+                Ok(file)
+            }
+        }
+    }
+}
+
+/// A part of a file name that nobody else uses.
+fn unique() -> String {
+    static NEXT: AtomicU64 = AtomicU64::new(0);
+    format!("{}.{}.part", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed))
+}
+
+fn digest_of(file: &mut File) -> io::Result<Digest> {
+    let mut hasher = Hasher::default();
+    let mut buffer = vec![0; 1 << 20];
+    loop {
+        match file.read(&mut buffer)? {
+            0 => return Ok(hasher.finish()),
+            read => hasher.update(&buffer[..read]),
+        }
     }
 }
 
@@ -181,9 +380,10 @@ mod tests {
         let bounds = Bounds { small: 0, ..Bounds::default() };
         let cache = Cache::new(Some(folder.path().to_owned()), bounds).expect("writable");
         cache.insert(digest, &bytes);
-        assert_eq!(cache.get(digest).as_deref(), Some(&*bytes));
+        let found = cache.get(digest).expect("kept").into_memory().expect("read");
+        assert_eq!(found, bytes);
         fs::write(cache.path(digest).expect("a folder"), b"something else").expect("writable");
-        assert_eq!(cache.get(digest), None);
+        assert!(cache.get(digest).is_none());
         assert!(!cache.path(digest).expect("a folder").exists());
     }
 
@@ -200,5 +400,32 @@ mod tests {
         let on_disk: u64 = files(folder.path()).iter().map(|(_, bytes, _)| bytes).sum();
         assert!(on_disk <= 1000, "{on_disk}");
         assert_eq!(on_disk, *lock(&cache.disk));
+    }
+
+    #[test]
+    fn a_large_blob_arrives_in_a_file_with_and_without_a_folder() {
+        let folder = tempfile::tempdir().expect("a folder");
+        for place in [Some(folder.path().to_owned()), None] {
+            let bounds = Bounds { small: 10, ..Bounds::default() };
+            let cache = Cache::new(place.clone(), bounds).expect("writable");
+            let (digest, bytes) = blob(1, 1000);
+            let mut arriving = cache.arriving(digest, Some(1000)).expect("writable");
+            arriving.write(&bytes[..600]).expect("written");
+            assert_eq!(arriving.written(), 600);
+            arriving.write(&bytes[600..]).expect("written");
+            let blob = arriving.finish(&cache).expect("kept").expect("whole");
+            assert!(matches!(blob, Cached::File(_)));
+            let mut read = [0; 10];
+            blob.read_at(990, &mut read).expect("read");
+            assert_eq!(read, [1; 10]);
+            assert!(blob.read_at(991, &mut read).is_err());
+            assert!(lock(&cache.memory).blobs.is_empty());
+            assert_eq!(cache.get(digest).is_some(), place.is_some());
+
+            let mut damaged = cache.arriving(digest, Some(1000)).expect("writable");
+            damaged.write(&bytes[1..]).expect("written");
+            assert!(damaged.finish(&cache).expect("no error of the disk").is_err());
+        }
+        assert_eq!(files(folder.path()).len(), 1, "no part is left");
     }
 }

@@ -31,6 +31,9 @@ pub(crate) enum CallError {
     /// No such thing.
     #[error("{0}")]
     NotFound(String),
+    /// The store has the blob, and its bytes are wrong.
+    #[error("{0}")]
+    Damaged(String),
     /// Wrong, and will stay so.
     #[error("{0}")]
     Refused(String),
@@ -77,26 +80,72 @@ impl Client {
         self.post(path, what, SHORT).await.map(drop)
     }
 
-    pub(crate) async fn put_blob(&self, grant: &Grant, bytes: Bytes) -> Result<Digest, CallError> {
-        #[derive(serde::Deserialize)]
-        struct Stored {
-            digest: Digest,
-        }
-        let grant = serde_json::to_string(grant).map_err(|e| CallError::Refused(e.to_string()))?;
-        let request = self.request(reqwest::Method::PUT, "/v1/blobs", LONG);
-        let request = request.header("x-stride-grant", grant).header("content-type", "application/octet-stream");
-        let stored: Stored = answer(check(request.body(bytes).send().await).await?).await?;
-        Ok(stored.digest)
+    /// How much of a blob the coordinator has.
+    pub(crate) async fn staged(&self, grant: &Grant, digest: Digest) -> Result<Stored, CallError> {
+        let request = self.request(reqwest::Method::GET, &format!("/v1/blobs/{digest}/staged"), LONG);
+        answer(check(in_the_name_of(request, grant)?.send().await).await?).await
     }
 
-    pub(crate) async fn get_blob(&self, digest: Digest) -> Result<Bytes, CallError> {
-        let request = self.request(reqwest::Method::GET, &format!("/v1/blobs/{digest}"), LONG);
-        check(request.send().await).await?.bytes().await.map_err(|e| CallError::Away(explain(&e)))
+    /// Sends what begins at `offset` of a blob of `bytes` bytes.
+    pub(crate) async fn put_part(
+        &self,
+        grant: &Grant,
+        digest: Digest,
+        bytes: u64,
+        offset: u64,
+        part: Bytes,
+    ) -> Result<Stored, CallError> {
+        let request = self.request(reqwest::Method::PUT, &format!("/v1/blobs/{digest}"), LONG);
+        let request = in_the_name_of(request, grant)?.header("content-type", "application/octet-stream");
+        let request = request.header("x-stride-bytes", bytes).header("x-stride-offset", offset);
+        answer(check(request.body(part).send().await).await?).await
+    }
+
+    /// What begins at `offset` of a blob.
+    pub(crate) async fn get_blob(&self, digest: Digest, offset: u64) -> Result<Download, CallError> {
+        let mut request = self.request(reqwest::Method::GET, &format!("/v1/blobs/{digest}"), LONG);
+        if offset > 0 {
+            request = request.header("range", format!("bytes={offset}-"));
+        }
+        let response = check(request.send().await).await?;
+        match (offset, response.status()) {
+            (0, _) | (_, StatusCode::PARTIAL_CONTENT) => Ok(Download(response)),
+            (_, status) => Err(CallError::Refused(format!("a part of blob {digest} was answered with {status}"))),
+        }
     }
 
     async fn post<T: Serialize + Sync>(&self, path: &str, what: &T, timeout: Duration) -> Result<Response, CallError> {
         check(self.request(reqwest::Method::POST, path, timeout).json(what).send().await).await
     }
+}
+
+/// What the coordinator says of a blob that is sent to it.
+#[derive(Debug, Clone, Copy, serde::Serialize, serde::Deserialize)]
+pub(crate) struct Stored {
+    pub(crate) stored: bool,
+    /// Bytes that have arrived, if not all have.
+    pub(crate) staged: u64,
+}
+
+/// A blob on its way here.
+#[derive(Debug)]
+pub(crate) struct Download(Response);
+
+impl Download {
+    /// How many bytes are to come, if the coordinator says so.
+    pub(crate) fn length(&self) -> Option<u64> {
+        self.0.content_length()
+    }
+
+    /// The next bytes; `None` after the last.
+    pub(crate) async fn next(&mut self) -> Result<Option<Bytes>, CallError> {
+        self.0.chunk().await.map_err(|e| CallError::Away(explain(&e)))
+    }
+}
+
+fn in_the_name_of(request: RequestBuilder, grant: &Grant) -> Result<RequestBuilder, CallError> {
+    let grant = serde_json::to_string(grant).map_err(|e| CallError::Refused(e.to_string()))?;
+    Ok(request.header("x-stride-grant", grant))
 }
 
 async fn answer<T: DeserializeOwned>(response: Response) -> Result<T, CallError> {
@@ -126,6 +175,9 @@ async fn check(sent: Result<Response, reqwest::Error>) -> Result<Response, CallE
         (_, "stale-fence") => CallError::Stale(message),
         (_, "storage") | (StatusCode::INSUFFICIENT_STORAGE, _) => CallError::Storage(message),
         (_, "not-found") | (StatusCode::NOT_FOUND, _) => CallError::NotFound(message),
+        (_, "damaged") => CallError::Damaged(message),
+        // What has arrived is asked for again.
+        (StatusCode::RANGE_NOT_SATISFIABLE, "offset") => CallError::Away(message),
         (StatusCode::REQUEST_TIMEOUT | StatusCode::TOO_MANY_REQUESTS, _) => CallError::Away(message),
         (StatusCode::INTERNAL_SERVER_ERROR, _) => CallError::Fault(message),
         (status, _) if status.is_server_error() => CallError::Away(message),

@@ -324,7 +324,9 @@ fn blob_error(error: BlobError) -> ContextError {
         BlobError::Refused(reason) => ContextError::GrantEnded(reason),
         BlobError::Storage(message) => ContextError::Storage(message),
         BlobError::Unavailable(message) => ContextError::Unavailable(message),
-        error @ (BlobError::NotFound(_) | BlobError::Corrupt { .. }) => ContextError::Corrupt(error.to_string()),
+        error @ (BlobError::NotFound(_) | BlobError::Corrupt { .. } | BlobError::Damaged(_)) => {
+            ContextError::Corrupt(error.to_string())
+        }
     }
 }
 

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::body::Bytes;
-use axum::extract::{Json, Path, State};
+use axum::extract::{DefaultBodyLimit, Json, Path, State};
 use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post, put};
@@ -53,6 +53,7 @@ struct ActorHandle {
     polls: u64,
     last_poll: Option<Poll>,
     blobs: HashMap<Digest, Vec<u8>>,
+    staged: HashMap<Digest, Vec<u8>>,
     metrics: Metrics,
     logs: BTreeMap<u64, String>,
     checkpoints: Vec<CommitCheckpoint>,
@@ -72,6 +73,12 @@ struct Fake {
     lossy: AtomicBool,
     /// The next so many downloads arrive with a flipped bit.
     damage: AtomicU64,
+    /// The next so many transfers of blobs break off in their middle.
+    cut: AtomicU64,
+    /// All blobs are damaged in the store.
+    rotten: AtomicBool,
+    /// Bytes of blobs that were transferred, or calls for damaged ones.
+    received: AtomicU64,
 }
 
 fn refuse(status: StatusCode, code: &str) -> Response {
@@ -179,30 +186,84 @@ async fn outcome(State(fake): State<Arc<Fake>>, Json(report): Json<ReportOutcome
     })
 }
 
-async fn put_blob(State(fake): State<Arc<Fake>>, headers: axum::http::HeaderMap, body: Bytes) -> Response {
+/// Takes the next part of a blob. Of a part that is to be cut it keeps half.
+async fn put_blob(
+    State(fake): State<Arc<Fake>>,
+    Path(digest): Path<Digest>,
+    headers: axum::http::HeaderMap,
+    body: Bytes,
+) -> Response {
     let grant: Grant = serde_json::from_slice(headers["x-stride-grant"].as_bytes()).expect("a grant");
     assert_eq!(headers["authorization"], format!("Bearer {TOKEN}"));
-    let digest = Digest::of(&body);
-    let response = fake.write(&grant, |coordinator| drop(coordinator.blobs.insert(digest, body.to_vec())));
-    if response.status().is_success() {
-        Json(serde_json::json!({ "digest": digest })).into_response()
-    } else {
-        response
+    let number =
+        |name: &str| headers[name].to_str().ok().and_then(|text| text.parse::<usize>().ok()).expect("a number");
+    let (offset, bytes) = (number("x-stride-offset"), number("x-stride-bytes"));
+    fake.received.fetch_add(body.len() as u64, Ordering::SeqCst);
+    let cut = fake.cut.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok();
+    let mut answer = serde_json::Value::Null;
+    let response = fake.write(&grant, |coordinator| {
+        let staged = coordinator.staged.entry(digest).or_default();
+        if offset == 0 {
+            staged.clear();
+        }
+        assert_eq!(staged.len(), offset, "it goes on where it was cut");
+        staged.extend_from_slice(if cut { &body[..body.len() / 2] } else { &body });
+        let (staged, stored) = (staged.len(), staged.len() == bytes);
+        if stored {
+            let blob = coordinator.staged.remove(&digest).expect("it has arrived");
+            assert_eq!(Digest::of(&blob), digest);
+            coordinator.blobs.insert(digest, blob);
+        }
+        answer = serde_json::json!({ "digest": digest, "stored": stored, "staged": staged });
+    });
+    match (response.status().is_success(), cut) {
+        (true, true) => refuse(StatusCode::REQUEST_TIMEOUT, "cut"),
+        (true, false) => Json(answer).into_response(),
+        (false, _) => response,
     }
 }
 
-async fn get_blob(State(fake): State<Arc<Fake>>, Path(digest): Path<String>) -> Response {
+async fn staged(State(fake): State<Arc<Fake>>, Path(digest): Path<Digest>) -> Response {
+    let coordinator = lock(&fake.coordinator);
+    let stored = coordinator.blobs.contains_key(&digest);
+    let staged = coordinator.staged.get(&digest).map_or(0, Vec::len);
+    Json(serde_json::json!({ "digest": digest, "stored": stored, "staged": staged })).into_response()
+}
+
+/// Sends a blob, or what follows byte N of it. An answer that is to be cut breaks off in its middle.
+async fn get_blob(
+    State(fake): State<Arc<Fake>>,
+    Path(digest): Path<Digest>,
+    headers: axum::http::HeaderMap,
+) -> Response {
     if fake.away.load(Ordering::SeqCst) {
         return refuse(StatusCode::SERVICE_UNAVAILABLE, "internal");
     }
-    let digest: Digest = digest.parse().expect("a digest");
+    if fake.rotten.load(Ordering::SeqCst) {
+        fake.received.fetch_add(1, Ordering::SeqCst);
+        return refuse(StatusCode::CONFLICT, "damaged");
+    }
     let Some(mut bytes) = lock(&fake.coordinator).blobs.get(&digest).cloned() else {
         return refuse(StatusCode::NOT_FOUND, "not-found");
     };
     if fake.damage.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok() {
         bytes[0] ^= 1;
     }
-    bytes.into_response()
+    let range = headers.get("range").and_then(|range| range.to_str().ok()?.strip_prefix("bytes=")?.strip_suffix('-'));
+    let from: Option<usize> = range.map(|from| from.parse().expect("a number"));
+    let rest = bytes.split_off(from.unwrap_or_default());
+    let status = if from.is_some() { StatusCode::PARTIAL_CONTENT } else { StatusCode::OK };
+    let length = rest.len();
+    fake.received.fetch_add(length as u64, Ordering::SeqCst);
+    let cut = fake.cut.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok();
+    let body = if cut {
+        let half = Bytes::from(rest).slice(..length / 2);
+        let broken = std::io::Error::other("cut");
+        axum::body::Body::from_stream(futures::stream::iter([Ok(half), Err(broken)]))
+    } else {
+        rest.into()
+    };
+    (status, [("content-length", length.to_string())], body).into_response()
 }
 
 /// A stage of a test.
@@ -246,8 +307,9 @@ impl Worker {
             .route("/v1/logs", post(logs))
             .route("/v1/checkpoints", post(checkpoint))
             .route("/v1/outcomes", post(outcome))
-            .route("/v1/blobs", put(put_blob))
-            .route("/v1/blobs/{digest}", get(get_blob))
+            .route("/v1/blobs/{digest}", put(put_blob).get(get_blob))
+            .route("/v1/blobs/{digest}/staged", get(staged))
+            .layer(DefaultBodyLimit::disable())
             .with_state(fake.clone());
         let listener = server.block_on(tokio::net::TcpListener::bind("127.0.0.1:0")).expect("loopback");
         let url = format!("http://{}", listener.local_addr().expect("bound"));
@@ -528,4 +590,66 @@ fn a_blob_that_stays_damaged_is_an_error() {
     worker.grant(1);
     worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
     assert!(matches!(worker.leave().outcomes[0].outcome, TaskOutcome::Finished { .. }));
+}
+
+#[test]
+fn cut_transfers_go_on_where_they_were_cut() {
+    const BYTES: usize = 30 << 20;
+    let whole: Vec<u8> = (0..BYTES).map(|i| (i % 251) as u8).collect();
+    let sent = whole.clone();
+    let worker = Worker::start(Box::new(move |context| {
+        let blobs = context.blobs();
+        let digest = blobs.put_pieces(&[&sent[..1000], &sent[1000..]]).expect("stored");
+        let read = blobs.open(digest).expect("fetched");
+        assert_eq!(read.bytes(), BYTES as u64);
+        let mut end = vec![0; 1000];
+        read.read_at((BYTES - 1000) as u64, &mut end).expect("read");
+        assert_eq!(end, sent[BYTES - 1000..]);
+        finished(context)
+    }));
+    worker.fake.cut.store(2, Ordering::SeqCst);
+    worker.grant(1);
+    worker.wait("an upload", |coordinator| coordinator.blobs.contains_key(&Digest::of(&whole)));
+    let uploaded = worker.fake.received.load(Ordering::SeqCst);
+    // Two parts of 8 MiB of which half arrived; all again would be twice as much.
+    assert!(uploaded < (BYTES + (10 << 20)) as u64, "{uploaded} bytes were sent");
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    let outcomes = worker.leave().outcomes.clone();
+    assert!(matches!(outcomes[0].outcome, TaskOutcome::Finished { .. }), "{outcomes:?}");
+}
+
+#[test]
+fn a_cut_download_goes_on() {
+    const BYTES: usize = 20 << 20;
+    let whole: Vec<u8> = (0..BYTES).map(|i| (i % 241) as u8).collect();
+    let digest = Digest::of(&whole);
+    let sent = whole.clone();
+    let worker = Worker::start(Box::new(move |context| {
+        assert_eq!(*context.blobs().get(digest).expect("fetched"), *sent);
+        finished(context)
+    }));
+    lock(&worker.fake.coordinator).blobs.insert(digest, whole);
+    worker.fake.cut.store(1, Ordering::SeqCst);
+    worker.grant(1);
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    let received = worker.fake.received.load(Ordering::SeqCst);
+    // What was in flight when it broke off may be lost, but not all that came before.
+    assert!(received < (2 * BYTES) as u64, "{received} bytes were sent");
+    assert!(matches!(worker.leave().outcomes[0].outcome, TaskOutcome::Finished { .. }));
+}
+
+/// A blob that is damaged in the store is no trouble of the network: said once, with its name, and not asked for again.
+#[test]
+fn a_blob_that_is_damaged_in_the_store_fails_the_attempt_at_once() {
+    let digest = Digest::of(b"rotten");
+    let worker = Worker::start(Box::new(move |context| {
+        context.manifest(digest)?;
+        finished(context)
+    }));
+    worker.fake.rotten.store(true, Ordering::SeqCst);
+    worker.grant(1);
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    assert_eq!(worker.fake.received.load(Ordering::SeqCst), 1, "asked once");
+    let outcomes = worker.leave().outcomes.clone();
+    let TaskOutcome::Failed { class: FailureClass::Storage, .. } = &outcomes[0].outcome else { panic!("{outcomes:?}") };
 }

@@ -24,6 +24,9 @@ pub enum BlobError {
         /// What the bytes hash to.
         found: Digest,
     },
+    /// The store found the bytes damaged and does not hand them out; the message names the blob.
+    #[error("{0}")]
+    Damaged(String),
     /// The grant has ended.
     #[error("write refused: {0}")]
     Refused(String),
@@ -36,9 +39,54 @@ pub enum BlobError {
 }
 
 /// Content-addressed bytes. Reads are verified.
+///
+/// What may be large goes through [`put_pieces`](Self::put_pieces) and [`open`](Self::open), which hold no second copy of it.
 pub trait Blobs: Send + Sync + fmt::Debug {
-    /// The bytes named `digest`.
+    /// The bytes named `digest`, in memory.
     fn get(&self, digest: Digest) -> Result<Arc<[u8]>, BlobError>;
+
     /// Stores bytes and returns their name. Storing the same bytes twice stores them once.
     fn put(&self, bytes: Vec<u8>) -> Result<Digest, BlobError>;
+
+    /// Stores the bytes that `pieces` are one after the other.
+    fn put_pieces(&self, pieces: &[&[u8]]) -> Result<Digest, BlobError> {
+        self.put(pieces.concat())
+    }
+
+    /// The blob named `digest`, verified, to be read where it is needed.
+    fn open(&self, digest: Digest) -> Result<Box<dyn Blob>, BlobError> {
+        Ok(Box::new(self.get(digest)?))
+    }
+}
+
+/// A verified blob.
+pub trait Blob: Send + fmt::Debug {
+    /// Its length.
+    fn bytes(&self) -> u64;
+
+    /// Fills `out` with what begins at `offset`; a blob that ends before that is an error.
+    fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), BlobError>;
+}
+
+impl Blob for Arc<[u8]> {
+    fn bytes(&self) -> u64 {
+        self.len() as u64
+    }
+
+    fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), BlobError> {
+        let start = usize::try_from(offset).ok();
+        let range = start.and_then(|start| Some(start..start.checked_add(out.len())?));
+        match range.and_then(|range| self.get(range)) {
+            Some(bytes) => {
+                out.copy_from_slice(bytes);
+                Ok(())
+            }
+            None => Err(past_the_end(offset, out.len(), self.len() as u64)),
+        }
+    }
+}
+
+/// The error of a read that a blob is too short for.
+pub fn past_the_end(offset: u64, wanted: usize, bytes: u64) -> BlobError {
+    BlobError::Unavailable(format!("a blob of {bytes} bytes has no {wanted} bytes at {offset}"))
 }

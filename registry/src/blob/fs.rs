@@ -1,155 +1,279 @@
-//! Blobs in a folder: `sha256/ab/cdef...` holds the bytes whose digest begins with `ab`.
+//! Blobs in a folder: `blobs/sha256/ab/cdef...` holds the bytes whose digest begins with `ab`.
 //!
-//! A blob is written to `staging/`, synced, renamed to its name, and its folder synced: under a name there is never a part
-//! of a blob, and once `write` returns the blob outlives a loss of power. What a killed process left in `staging/` is
-//! removed by the next one that opens the store; it holds the store's lock, so nobody is writing there.
+//! A blob arrives in `staging/`, is synced, renamed to its name, and its folder synced: under a name there is never a part
+//! of a blob, and once it is committed the blob outlives a loss of power. A name that is taken is not given again; what
+//! lies there is put aside first, in `quarantine/`, if it is damaged. What a killed process left in `staging/` is removed by
+//! the next one that opens the store; it holds the store's lock, so nobody is writing there.
+//!
+//! Files that are not ours are left alone and never opened: a symbolic link is not followed, a pipe does not block.
 
-use std::fs::{self, File, FileTimes, OpenOptions};
-use std::io::{self, ErrorKind, Write as _};
+use std::fs::{self, OpenOptions};
+use std::io::{self, ErrorKind, Read, Seek, SeekFrom};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use checkpoint::BlobError;
 use fail::fail_point;
 use protocol::Digest;
 
-use super::{Backend, Entry};
-
-/// Free space that a blob must leave, so that the database can still be written to.
-const RESERVE_BYTES: u64 = 16 << 20;
+use super::disk::{Disk, Os, regular};
+use super::staging::{Part, RESERVE_BYTES, Staging};
+use super::{Backend, Entry, Staged, Stat};
+use crate::clock;
 
 /// Blobs in a folder.
 #[derive(Debug)]
-pub struct Folder {
+pub struct Folder(Arc<Inner>);
+
+#[derive(Debug)]
+struct Inner {
+    dir: PathBuf,
     blobs: PathBuf,
-    staging: PathBuf,
-    next: AtomicU64,
+    staging: Staging,
+    disk: Arc<dyn Disk>,
+    /// Held while a name is looked at and taken.
+    naming: Mutex<()>,
 }
 
 impl Folder {
     /// Opens `dir/blobs` and `dir/staging`, making them where they are missing, and clears the latter. Only for the holder
     /// of the store's lock.
     pub fn open(dir: &Path) -> io::Result<Self> {
-        let folder = Self { blobs: dir.join("blobs/sha256"), staging: dir.join("staging"), next: AtomicU64::new(0) };
-        fs::create_dir_all(&folder.blobs)?;
-        fs::create_dir_all(&folder.staging)?;
-        for entry in fs::read_dir(&folder.staging)? {
-            fs::remove_file(entry?.path())?;
-        }
-        sync_dir(dir)?;
-        sync_dir(&dir.join("blobs"))?;
-        Ok(folder)
+        Self::open_on(dir, Arc::new(Os))
+    }
+
+    /// Opens a folder of another file system than the operating system's.
+    pub fn open_on(dir: &Path, disk: Arc<dyn Disk>) -> io::Result<Self> {
+        let blobs = dir.join("blobs/sha256");
+        fs::create_dir_all(&blobs)?;
+        let staging = Staging::open(dir.join("staging"), Arc::clone(&disk))?;
+        disk.sync_dir(dir)?;
+        disk.sync_dir(&dir.join("blobs"))?;
+        Ok(Self(Arc::new(Inner { dir: dir.to_owned(), blobs, staging, disk, naming: Mutex::default() })))
     }
 
     /// For reading only: makes and clears nothing.
     pub fn to_read(dir: &Path) -> Self {
-        Self { blobs: dir.join("blobs/sha256"), staging: dir.join("staging"), next: AtomicU64::new(0) }
+        let disk: Arc<dyn Disk> = Arc::new(Os);
+        let staging = Staging::to_read(dir.join("staging"), Arc::clone(&disk));
+        let blobs = dir.join("blobs/sha256");
+        Self(Arc::new(Inner { dir: dir.to_owned(), blobs, staging, disk, naming: Mutex::default() }))
     }
+}
 
+impl Inner {
     fn path(&self, digest: Digest) -> PathBuf {
         let hex = digest.hex();
         self.blobs.join(&hex[..2]).join(&hex[2..])
     }
 
-    fn metadata(&self, digest: Digest) -> Result<Option<fs::Metadata>, BlobError> {
-        let path = self.path(digest);
-        match fs::metadata(&path) {
-            Ok(metadata) => Ok(Some(metadata)),
-            Err(e) if e.kind() == ErrorKind::NotFound => Ok(None),
-            Err(e) => Err(error("read", &path, &e)),
+    /// The blob's file, if it is there and a file.
+    fn metadata(&self, path: &Path) -> Result<Option<fs::Metadata>, BlobError> {
+        let shard = path.parent().unwrap_or(&self.blobs);
+        let found = fs::symlink_metadata(shard).and_then(|shard| {
+            if shard.is_dir() { fs::symlink_metadata(path) } else { Err(ErrorKind::NotADirectory.into()) }
+        });
+        match found {
+            Ok(metadata) => Ok(metadata.is_file().then_some(metadata)),
+            Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => Ok(None),
+            Err(e) => Err(error("read", path, &e)),
         }
     }
 
-    fn stage(&self, path: &Path, bytes: &[u8]) -> io::Result<()> {
-        let mut file = OpenOptions::new().write(true).create_new(true).open(path)?;
-        fail_point!("blob::before_write");
-        file.write_all(bytes)?;
-        fail_point!("blob::after_write");
-        fail_point!("blob::before_fsync");
-        file.sync_all()?;
-        fail_point!("blob::after_fsync");
-        Ok(())
+    fn put_aside(&self, path: &Path) -> Result<(), BlobError> {
+        let folder = self.dir.join("quarantine");
+        let shard = path.parent().filter(|parent| *parent != self.blobs).and_then(Path::file_name);
+        let name = [shard, path.file_name()];
+        let name: String = name.into_iter().flatten().map(|part| part.to_string_lossy()).collect();
+        let aside = folder.join(format!("{name}.{}", clock::now_ms()));
+        let moved = || -> io::Result<()> {
+            self.disk.create_dir(&folder)?;
+            self.disk.sync_dir(&self.dir)?;
+            match self.disk.rename(path, &aside) {
+                Err(e) if e.kind() == ErrorKind::NotFound => return Ok(()),
+                done => done?,
+            }
+            self.disk.sync_dir(&folder)?;
+            tracing::warn!(
+                "`{}` is not the blob that its name says; it was put aside as `{}`",
+                path.display(),
+                aside.display()
+            );
+            Ok(())
+        };
+        moved().map_err(|e| error("put aside", path, &e))
     }
 }
 
 impl Backend for Folder {
-    fn read(&self, digest: Digest) -> Result<Vec<u8>, BlobError> {
-        let path = self.path(digest);
-        fs::read(&path).map_err(|e| match e.kind() {
-            ErrorKind::NotFound => BlobError::NotFound(digest),
-            _ => error("read", &path, &e),
-        })
+    fn stage(&self, bytes: u64) -> Result<Box<dyn Staged>, BlobError> {
+        let part = self.0.staging.create(bytes)?;
+        Ok(Box::new(StagedFile { part, folder: Arc::clone(&self.0) }))
     }
 
-    fn write(&self, digest: Digest, bytes: &[u8]) -> Result<(), BlobError> {
-        let free = free_bytes(&self.staging).map_err(|e| error("ask for free space on", &self.staging, &e))?;
-        if free < bytes.len() as u64 + RESERVE_BYTES {
-            return Err(BlobError::Storage(full(&self.staging, bytes.len() as u64, free)));
+    fn read(&self, digest: Digest, from: u64) -> Result<Box<dyn Read + Send>, BlobError> {
+        let path = self.0.path(digest);
+        if self.0.metadata(&path)?.is_none() {
+            return Err(BlobError::NotFound(digest));
         }
-        let staged = self.staging.join(self.next.fetch_add(1, Ordering::Relaxed).to_string());
-        let path = self.path(digest);
-        self.stage(&staged, bytes).map_err(|e| {
-            // The error at hand says more than one about the clean-up would; the next open clears what is left.
-            let _ = fs::remove_file(&staged);
-            error("write", &staged, &e)
-        })?;
-        let shard = path.parent().unwrap_or(&self.blobs);
-        if !shard.is_dir() {
-            // Another thread may make it at the same time.
-            fs::create_dir_all(shard).map_err(|e| error("make", shard, &e))?;
-        }
-        // Always, not only by whoever made it: that one may not have come to it yet.
-        sync_dir(&self.blobs).map_err(|e| error("sync", &self.blobs, &e))?;
-        fail_point!("blob::before_rename");
-        fs::rename(&staged, &path).map_err(|e| error("write", &path, &e))?;
-        fail_point!("blob::after_rename");
-        sync_dir(shard).map_err(|e| error("sync", shard, &e))
-    }
-
-    fn size(&self, digest: Digest) -> Result<Option<u64>, BlobError> {
-        Ok(self.metadata(digest)?.map(|metadata| metadata.len()))
-    }
-
-    fn put_ms(&self, digest: Digest) -> Result<Option<i64>, BlobError> {
-        Ok(self.metadata(digest)?.map(|metadata| modified_ms(&metadata)))
-    }
-
-    fn touch(&self, digest: Digest) -> Result<(), BlobError> {
-        let path = self.path(digest);
-        let touch = || -> io::Result<()> {
-            let file = OpenOptions::new().append(true).open(&path)?;
-            file.set_times(FileTimes::new().set_modified(SystemTime::now()))?;
-            // Whoever wrote it may have been killed between the rename and the sync.
-            file.sync_all()?;
-            sync_dir(path.parent().unwrap_or(&self.blobs))
+        let opened = || -> io::Result<fs::File> {
+            let mut file = regular(OpenOptions::new().read(true), &path)?;
+            file.seek(SeekFrom::Start(from))?;
+            Ok(file)
         };
-        touch().map_err(|e| error("write", &path, &e))
+        match opened() {
+            Ok(file) => Ok(Box::new(file)),
+            Err(e) if e.kind() == ErrorKind::NotFound => Err(BlobError::NotFound(digest)),
+            Err(e) => Err(error("read", &path, &e)),
+        }
+    }
+
+    fn stat(&self, digest: Digest) -> Result<Option<Stat>, BlobError> {
+        Ok(self.0.metadata(&self.0.path(digest))?.as_ref().map(stat))
+    }
+
+    fn touch(&self, digest: Digest) -> Result<Stat, BlobError> {
+        let path = self.0.path(digest);
+        let touch = || -> io::Result<()> {
+            let mut file = self.0.disk.open(&path)?;
+            file.set_modified(SystemTime::now())?;
+            // Whoever wrote it may have been killed between the rename and the sync.
+            file.sync()?;
+            self.0.disk.sync_dir(path.parent().unwrap_or(&self.0.blobs))
+        };
+        touch().map_err(|e| error("write", &path, &e))?;
+        self.stat(digest)?.ok_or(BlobError::NotFound(digest))
     }
 
     fn remove(&self, digest: Digest) -> Result<(), BlobError> {
-        let path = self.path(digest);
-        match fs::remove_file(&path) {
+        let path = self.0.path(digest);
+        match self.0.disk.remove(&path) {
             Err(e) if e.kind() != ErrorKind::NotFound => Err(error("remove", &path, &e)),
             _ => Ok(()),
         }
     }
 
+    fn put_aside(&self, digest: Digest) -> Result<(), BlobError> {
+        let _naming = self.0.naming.lock().unwrap_or_else(PoisonError::into_inner);
+        self.0.put_aside(&self.0.path(digest))
+    }
+
     fn list(&self) -> Result<Vec<Entry>, BlobError> {
-        let failed = |e: io::Error| error("list", &self.blobs, &e);
+        let failed = |e: io::Error| error("list", &self.0.blobs, &e);
         let mut entries = Vec::new();
-        for shard in fs::read_dir(&self.blobs).map_err(failed)? {
-            let shard = shard.map_err(failed)?;
-            for blob in fs::read_dir(shard.path()).map_err(failed)? {
-                let blob = blob.map_err(failed)?;
-                let name = [shard.file_name(), blob.file_name()].map(|n| n.to_string_lossy().into_owned()).concat();
-                let Ok(digest) = format!("sha256:{name}").parse() else { continue };
-                let metadata = blob.metadata().map_err(failed)?;
+        for_all(&self.0.blobs, |entry, digest| {
+            if let Some(digest) = digest {
+                // Removed since the listing.
+                let Ok(metadata) = entry.metadata() else { return };
                 entries.push(Entry { digest, bytes: metadata.len(), put_ms: modified_ms(&metadata) });
             }
-        }
+        })
+        .map_err(failed)?;
         Ok(entries)
     }
+
+    fn strays(&self) -> Result<Vec<String>, BlobError> {
+        let mut strays = self.0.staging.strays().map_err(|e| error("list", &self.0.staging.dir, &e))?;
+        let listed = for_all(&self.0.blobs, |entry, digest| {
+            if digest.is_none() {
+                strays.push(entry.path());
+            }
+        });
+        listed.map_err(|e| error("list", &self.0.blobs, &e))?;
+        Ok(strays.iter().map(|path| path.display().to_string()).collect())
+    }
+
+    fn aside(&self) -> Result<Vec<String>, BlobError> {
+        let folder = self.0.dir.join("quarantine");
+        match fs::read_dir(&folder) {
+            Ok(entries) => Ok(entries.flatten().map(|entry| entry.path().display().to_string()).collect()),
+            Err(e) if e.kind() == ErrorKind::NotFound => Ok(Vec::new()),
+            Err(e) => Err(error("list", &folder, &e)),
+        }
+    }
+}
+
+/// Calls `see` with all entries of the folder of blobs, and with the digest of those that are blobs.
+fn for_all(blobs: &Path, mut see: impl FnMut(&fs::DirEntry, Option<Digest>)) -> io::Result<()> {
+    let is_hex = |name: &str, len| name.len() == len && name.bytes().all(|b| b.is_ascii_hexdigit());
+    for shard in fs::read_dir(blobs)? {
+        let shard = shard?;
+        let start = shard.file_name();
+        let start = start.to_str().filter(|name| is_hex(name, 2));
+        let (Some(start), true) = (start, shard.file_type()?.is_dir()) else {
+            see(&shard, None);
+            continue;
+        };
+        for blob in fs::read_dir(shard.path())? {
+            let blob = blob?;
+            let is_file = blob.file_type()?.is_file();
+            let digest = blob.file_name().to_str().and_then(|end| format!("sha256:{start}{end}").parse().ok());
+            see(&blob, digest.filter(|_| is_file));
+        }
+    }
+    Ok(())
+}
+
+/// A blob that arrives.
+#[derive(Debug)]
+struct StagedFile {
+    part: Part,
+    folder: Arc<Inner>,
+}
+
+impl Staged for StagedFile {
+    fn write(&mut self, bytes: &[u8]) -> Result<(), BlobError> {
+        self.part.write(bytes)
+    }
+
+    fn commit(mut self: Box<Self>, digest: Digest) -> Result<bool, BlobError> {
+        fail_point!("blob::after_write");
+        fail_point!("blob::before_fsync");
+        self.part.file.sync().map_err(|e| error("write", &self.part.path, &e))?;
+        fail_point!("blob::after_fsync");
+        let folder = Arc::clone(&self.folder);
+        let path = folder.path(digest);
+        let shard = path.parent().unwrap_or(&folder.blobs);
+        let mut made = folder.disk.create_dir(shard);
+        if made.as_ref().is_err_and(|e| e.kind() == ErrorKind::AlreadyExists) {
+            // Something that is no folder has its name.
+            folder.put_aside(shard)?;
+            made = folder.disk.create_dir(shard);
+        }
+        // Always synced, not only by whoever made the shard: that one may not have come to it yet.
+        let made = made.and_then(|()| folder.disk.sync_dir(&folder.blobs));
+        made.map_err(|e| error("make", shard, &e))?;
+        {
+            let _naming = folder.naming.lock().unwrap_or_else(PoisonError::into_inner);
+            match fs::symlink_metadata(&path) {
+                Ok(metadata) if metadata.is_file() => return Ok(false),
+                Ok(_) => folder.put_aside(&path)?,
+                Err(e) if e.kind() == ErrorKind::NotFound => {}
+                Err(e) => return Err(error("read", &path, &e)),
+            }
+            fail_point!("blob::before_rename");
+            self.part.rename(&path).map_err(|e| error("write", &path, &e))?;
+            fail_point!("blob::after_rename");
+        }
+        folder.disk.sync_dir(shard).map_err(|e| error("sync", shard, &e))?;
+        Ok(true)
+    }
+}
+
+/// The inode and the time of its last change are in the stamp, so that a changed file is noticed whose time was set back.
+fn stat(metadata: &fs::Metadata) -> Stat {
+    let stamp = format!(
+        "{}-{}.{:09}-{}.{:09}-{}",
+        metadata.len(),
+        metadata.mtime(),
+        metadata.mtime_nsec(),
+        metadata.ctime(),
+        metadata.ctime_nsec(),
+        metadata.ino()
+    );
+    Stat { bytes: metadata.len(), put_ms: modified_ms(metadata), stamp }
 }
 
 fn modified_ms(metadata: &fs::Metadata) -> i64 {
@@ -159,7 +283,7 @@ fn modified_ms(metadata: &fs::Metadata) -> i64 {
 
 /// Makes the names in a folder outlive a loss of power.
 pub(crate) fn sync_dir(dir: &Path) -> io::Result<()> {
-    File::open(dir)?.sync_all()
+    fs::File::open(dir)?.sync_all()
 }
 
 /// Bytes that this user may still write where `path` lies.
@@ -169,7 +293,7 @@ pub(crate) fn free_bytes(path: &Path) -> io::Result<u64> {
     Ok(u64::from(stat.blocks_available()).saturating_mul(u64::from(stat.fragment_size())))
 }
 
-fn full(path: &Path, needed: u64, free: u64) -> String {
+pub(super) fn full(path: &Path, needed: u64, free: u64) -> String {
     format!(
         "no space for {needed} bytes where `{}` lies: {free} bytes are free and {RESERVE_BYTES} are kept for the database; \
          `registry gc` removes what nothing needs, on a full disk too; then run the same command again",
@@ -187,7 +311,7 @@ pub(crate) fn is_read_only(e: &io::Error) -> bool {
     matches!(e.kind(), ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem)
 }
 
-fn error(did: &str, path: &Path, e: &io::Error) -> BlobError {
+pub(super) fn error(did: &str, path: &Path, e: &io::Error) -> BlobError {
     let path = path.display();
     if is_full(e) {
         BlobError::Storage(format!(

@@ -1,60 +1,128 @@
 //! Blobs in memory: for tests, and the yardstick for every other backend.
 
 use std::collections::HashMap;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::io::{Cursor, Read};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use checkpoint::BlobError;
 use protocol::Digest;
 
-use super::{Backend, Entry};
+use super::{Backend, Entry, Staged, Stat};
 use crate::clock;
 
 /// Blobs in memory.
 #[derive(Debug, Default)]
-pub struct Memory(Mutex<HashMap<Digest, (Vec<u8>, i64)>>);
+pub struct Memory(Arc<Mutex<Held>>);
+
+#[derive(Debug, Default)]
+struct Held {
+    blobs: HashMap<Digest, Blob>,
+    aside: Vec<String>,
+    /// Makes every write's stamp another.
+    writes: u64,
+}
+
+#[derive(Debug)]
+struct Blob {
+    bytes: Arc<[u8]>,
+    put_ms: i64,
+    write: u64,
+}
+
+impl Blob {
+    fn stat(&self) -> Stat {
+        Stat { bytes: self.bytes.len() as u64, put_ms: self.put_ms, stamp: self.write.to_string() }
+    }
+}
 
 impl Memory {
-    fn lock(&self) -> MutexGuard<'_, HashMap<Digest, (Vec<u8>, i64)>> {
+    fn lock(&self) -> MutexGuard<'_, Held> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Changes bytes behind the store's back, as a failing disk does.
+    pub fn damage(&self, digest: Digest, bytes: &[u8]) {
+        let mut held = self.lock();
+        held.writes += 1;
+        let blob = Blob { bytes: bytes.into(), put_ms: clock::now_ms(), write: held.writes };
+        held.blobs.insert(digest, blob);
     }
 }
 
 impl Backend for Memory {
-    fn read(&self, digest: Digest) -> Result<Vec<u8>, BlobError> {
-        self.lock().get(&digest).map(|(bytes, _)| bytes.clone()).ok_or(BlobError::NotFound(digest))
+    fn stage(&self, _bytes: u64) -> Result<Box<dyn Staged>, BlobError> {
+        Ok(Box::new(StagedBytes { bytes: Vec::new(), memory: Arc::clone(&self.0) }))
     }
 
-    fn write(&self, digest: Digest, bytes: &[u8]) -> Result<(), BlobError> {
-        self.lock().insert(digest, (bytes.to_vec(), clock::now_ms()));
-        Ok(())
+    fn read(&self, digest: Digest, from: u64) -> Result<Box<dyn Read + Send>, BlobError> {
+        let bytes = self.lock().blobs.get(&digest).map(|blob| Arc::clone(&blob.bytes));
+        let mut cursor = Cursor::new(bytes.ok_or(BlobError::NotFound(digest))?);
+        cursor.set_position(from);
+        Ok(Box::new(cursor))
     }
 
-    fn size(&self, digest: Digest) -> Result<Option<u64>, BlobError> {
-        Ok(self.lock().get(&digest).map(|(bytes, _)| bytes.len() as u64))
+    fn stat(&self, digest: Digest) -> Result<Option<Stat>, BlobError> {
+        Ok(self.lock().blobs.get(&digest).map(Blob::stat))
     }
 
-    fn put_ms(&self, digest: Digest) -> Result<Option<i64>, BlobError> {
-        Ok(self.lock().get(&digest).map(|(_, put_ms)| *put_ms))
-    }
-
-    fn touch(&self, digest: Digest) -> Result<(), BlobError> {
-        let mut blobs = self.lock();
-        let entry = blobs.get_mut(&digest).ok_or(BlobError::NotFound(digest))?;
-        entry.1 = clock::now_ms();
-        Ok(())
+    fn touch(&self, digest: Digest) -> Result<Stat, BlobError> {
+        let mut held = self.lock();
+        let blob = held.blobs.get_mut(&digest).ok_or(BlobError::NotFound(digest))?;
+        blob.put_ms = clock::now_ms();
+        Ok(blob.stat())
     }
 
     fn remove(&self, digest: Digest) -> Result<(), BlobError> {
-        self.lock().remove(&digest);
+        self.lock().blobs.remove(&digest);
+        Ok(())
+    }
+
+    fn put_aside(&self, digest: Digest) -> Result<(), BlobError> {
+        let mut held = self.lock();
+        if held.blobs.remove(&digest).is_some() {
+            held.aside.push(digest.to_string());
+        }
         Ok(())
     }
 
     fn list(&self) -> Result<Vec<Entry>, BlobError> {
-        let entry = |(digest, (bytes, put_ms)): (&Digest, &(Vec<u8>, i64))| Entry {
+        let entry = |(digest, blob): (&Digest, &Blob)| Entry {
             digest: *digest,
-            bytes: bytes.len() as u64,
-            put_ms: *put_ms,
+            bytes: blob.bytes.len() as u64,
+            put_ms: blob.put_ms,
         };
-        Ok(self.lock().iter().map(entry).collect())
+        Ok(self.lock().blobs.iter().map(entry).collect())
+    }
+
+    fn strays(&self) -> Result<Vec<String>, BlobError> {
+        Ok(Vec::new())
+    }
+
+    fn aside(&self) -> Result<Vec<String>, BlobError> {
+        Ok(self.lock().aside.clone())
+    }
+}
+
+#[derive(Debug)]
+struct StagedBytes {
+    bytes: Vec<u8>,
+    memory: Arc<Mutex<Held>>,
+}
+
+impl Staged for StagedBytes {
+    fn write(&mut self, bytes: &[u8]) -> Result<(), BlobError> {
+        self.bytes.extend_from_slice(bytes);
+        Ok(())
+    }
+
+    fn commit(self: Box<Self>, digest: Digest) -> Result<bool, BlobError> {
+        let mut held = self.memory.lock().unwrap_or_else(PoisonError::into_inner);
+        if held.blobs.contains_key(&digest) {
+            return Ok(false);
+        }
+        held.writes += 1;
+        let blob = Blob { bytes: self.bytes.into(), put_ms: clock::now_ms(), write: held.writes };
+        held.blobs.insert(digest, blob);
+        Ok(true)
     }
 }

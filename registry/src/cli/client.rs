@@ -241,11 +241,10 @@ async fn export(place: &Place, model: &str, dir: &Path) -> Result<Answer, Missed
 
 impl Source for Place {
     async fn fetch(&self, digest: Digest, into: &mut impl FnMut(&[u8]) -> std::io::Result<()>) -> Result<(), ApiError> {
-        let damaged = |e: &dyn std::fmt::Display| error("damaged", e, Some("`registry fsck` checks the store"));
         let unwritten = |e: std::io::Error| error("storage", e, None);
         match self {
-            Self::Here(store) => into(&store.blobs().get(digest).map_err(|e| damaged(&e))?).map_err(unwritten),
-            Self::Reading(store) => into(&store.blobs().get(digest).map_err(|e| damaged(&e))?).map_err(unwritten),
+            Self::Here(store) => pass(store.blobs().read(digest), into),
+            Self::Reading(store) => pass(store.blobs().read(digest), into),
             Self::At(server) => {
                 let lost = |missed| {
                     let (Missed::NotThere(why) | Missed::Broken(why)) = missed;
@@ -264,6 +263,19 @@ impl Source for Place {
             }
         }
     }
+}
+
+/// Gives the parts of a blob of this machine to `into`.
+fn pass(
+    reader: Result<crate::blob::Reader, checkpoint::BlobError>,
+    into: &mut impl FnMut(&[u8]) -> std::io::Result<()>,
+) -> Result<(), ApiError> {
+    let damaged = |e: checkpoint::BlobError| error("damaged", e, Some("`registry fsck` checks the store"));
+    let mut reader = reader.map_err(damaged)?;
+    while let Some(part) = reader.next_part().map_err(damaged)? {
+        into(&part).map_err(|e| error("storage", e, None))?;
+    }
+    Ok(())
 }
 
 /// Who moves an alias of a store that nobody serves; a server writes down whose token it was.

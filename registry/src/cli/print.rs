@@ -157,6 +157,9 @@ pub fn render(data: &Data) -> String {
             for problem in &report.problems {
                 text += &format!("  {problem}\n");
             }
+            for note in &report.notes {
+                text += &format!("  note: {note}\n");
+            }
             text
         }
         Data::Gc { dry_run, plan } => {

@@ -1,6 +1,8 @@
 //! What the tests of this crate share.
 #![allow(dead_code, unreachable_pub, reason = "not every test file uses all of it")]
 
+pub mod power;
+
 use std::collections::BTreeMap;
 
 use protocol::message::Grant;

@@ -86,7 +86,7 @@ impl Connection {
 
     async fn put(&mut self, grant: &Grant, bytes: &[u8]) -> Result<Digest> {
         let header = format!("x-stride-grant: {}\r\n", serde_json::to_string(grant)?);
-        let answer = self.send("PUT /v1/blobs", &header, bytes).await?;
+        let answer = self.send(&format!("PUT /v1/blobs/{}", Digest::of(bytes)), &header, bytes).await?;
         Ok(serde_json::from_slice::<coordinator::shell::BlobStored>(&answer)?.digest)
     }
 }

@@ -681,7 +681,10 @@ pub(crate) fn result(
 fn check_pipeline(pipeline: &Pipeline, until: Option<&StageName>) -> Result<(), Rejected> {
     if pipeline.stages.len() > limits::STAGES {
         let stages = pipeline.stages.len();
-        return Err(Rejected::Invalid(format!("the pipeline has {stages} stages; expected at most {}", limits::STAGES)));
+        return Err(Rejected::Invalid(format!(
+            "the pipeline has {stages} stages; expected at most {}",
+            limits::STAGES
+        )));
     }
     let mut seen = BTreeSet::new();
     for stage in &pipeline.stages {

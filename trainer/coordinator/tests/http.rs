@@ -67,8 +67,9 @@ impl Client {
     }
 
     async fn put_blob(&self, grant: &Grant, bytes: &[u8]) -> TestResult<Digest> {
-        let request = Request::builder().method("PUT").uri("/v1/blobs");
+        let request = Request::builder().method("PUT").uri(format!("/v1/blobs/{}", Digest::of(bytes)));
         let request = request.header("x-stride-grant", serde_json::to_string(grant)?);
+        let request = request.header("x-stride-bytes", bytes.len());
         let (status, answer) = self.send(request.body(Body::from(bytes.to_vec()))?).await?;
         assert!(status.is_success(), "{status} {}", String::from_utf8_lossy(&answer));
         let stored: coordinator::shell::BlobStored = serde_json::from_slice(&answer)?;
@@ -209,7 +210,7 @@ async fn a_run_goes_through_over_http_and_survives_a_restart() -> TestResult {
     let other = Grant { attempt: protocol::Attempt(9), ..vae.grant.clone() };
     let metrics = MetricBatch { grant: other.clone(), rows: vec![] };
     let logs = LogBatch { grant: other.clone(), first: 0, lines: vec![] };
-    let request = Request::builder().method("PUT").uri("/v1/blobs");
+    let request = Request::builder().method("PUT").uri(format!("/v1/blobs/{}", Digest::of(b"late")));
     let request = request.header("x-stride-grant", serde_json::to_string(&other)?).body(Body::from("late"))?;
     let refused = [
         client.try_call("POST", "/v1/metrics", metrics).await?.0,
@@ -260,7 +261,7 @@ async fn p2_a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestR
     let report = ReportOutcome { grant: lost.clone(), outcome: TaskOutcome::Yielded { at: 0 } };
     let (status, error) = client.refused("/v1/outcomes", report).await?;
     assert_eq!((status, error.code.as_str()), (409, "stale-fence"));
-    let request = Request::builder().method("PUT").uri("/v1/blobs");
+    let request = Request::builder().method("PUT").uri(format!("/v1/blobs/{}", Digest::of(b"late")));
     let request = request.header("x-stride-grant", serde_json::to_string(&lost)?).body(Body::from("late"))?;
     assert_eq!(client.send(request).await?.0, StatusCode::CONFLICT);
 
@@ -358,5 +359,138 @@ async fn p1_a_torn_log_is_a_whole_beginning_of_itself() -> TestResult {
     }
     assert!(lengths.contains(&0) && lengths.contains(&whole.len()), "{lengths:?} of {}", whole.len());
     assert!(lengths.iter().any(|l| (1..whole.len()).contains(l)), "some entries were cut off: {lengths:?}");
+    Ok(())
+}
+
+/// A blob that is made as it is sent.
+const LARGE_PARTS: u64 = 256;
+const LARGE_BYTES: u64 = LARGE_PARTS << 20;
+
+fn part(i: u64) -> Vec<u8> {
+    let mut part = vec![7; 1 << 20];
+    part[..8].copy_from_slice(&i.to_le_bytes());
+    part
+}
+
+/// The most memory that this process has had, in bytes.
+fn peak() -> TestResult<u64> {
+    let status = std::fs::read_to_string("/proc/self/status")?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).ok_or("no VmHWM")?;
+    Ok(line.trim().trim_end_matches(" kB").parse::<u64>()? << 10)
+}
+
+impl Client {
+    /// Sends the head of a request whose body is to follow.
+    async fn begin(&self, head: &str, headers: &[(&str, String)], length: u64) -> TestResult<TcpStream> {
+        let mut text =
+            format!("{head} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\ncontent-length: {length}\r\n");
+        if let Some(token) = &self.token {
+            text += &format!("authorization: Bearer {token}\r\n");
+        }
+        for (name, value) in headers {
+            text += &format!("{name}: {value}\r\n");
+        }
+        let mut stream = TcpStream::connect(self.address).await?;
+        stream.write_all(format!("{text}\r\n").as_bytes()).await?;
+        Ok(stream)
+    }
+
+    async fn staged(&self, grant: &Grant, digest: Digest) -> TestResult<coordinator::shell::BlobStored> {
+        let request = Request::builder().method("GET").uri(format!("/v1/blobs/{digest}/staged"));
+        let request = request.header("x-stride-grant", serde_json::to_string(grant)?).body(Body::empty())?;
+        let (status, answer) = self.send(request).await?;
+        assert!(status.is_success(), "{status} {}", String::from_utf8_lossy(&answer));
+        Ok(serde_json::from_slice(&answer)?)
+    }
+
+    /// Fetches a blob: the status, how long it should be, how much came, and what that hashes to.
+    async fn fetch(&self, digest: Digest) -> TestResult<(u16, u64, u64, Digest)> {
+        let mut stream = self.begin(&format!("GET /v1/blobs/{digest}"), &[], 0).await?;
+        let (mut head, mut buffer) = (Vec::new(), vec![0; 1 << 16]);
+        while !head.ends_with(b"\r\n\r\n") {
+            head.push(stream.read_u8().await?);
+        }
+        let head = String::from_utf8(head)?.to_ascii_lowercase();
+        let length = head.lines().find_map(|line| line.strip_prefix("content-length: ")).ok_or("no length")?.parse()?;
+        let (mut hasher, mut came) = (protocol::digest::Hasher::default(), 0);
+        // A connection that is reset ends the body as well.
+        while let Ok(read @ 1..) = stream.read(&mut buffer).await {
+            hasher.update(&buffer[..read]);
+            came += read as u64;
+        }
+        Ok((head[9..12].parse()?, length, came, hasher.finish()))
+    }
+}
+
+/// Whole blobs in memory would need several times what is allowed here.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_large_blob_passes_in_little_memory_and_a_cut_upload_goes_on() -> TestResult {
+    let dir = tempfile::tempdir()?;
+    let store = Store::open(dir.path(), Holder::this_process("a test")).await?;
+    let handle = Coordinator::start(store.clone(), Config { park: false, ..Config::embedded() }).await?;
+    let client = Client { address: handle.address(), token: Some(handle.token().secret().to_owned()) };
+    handle.submit(submission(None)?).await?;
+    let joined = join(&client, "w").await?;
+    let grant = assignment(&client, "w", &joined, "dataset").await?.grant;
+    let mut hasher = protocol::digest::Hasher::default();
+    (0..LARGE_PARTS).for_each(|i| hasher.update(&part(i)));
+    let digest = hasher.finish();
+    let before = peak()?;
+
+    // Without a grant nothing of the body is read: what is on the way fills the sockets' buffers and no more.
+    let stale = Grant { fence: protocol::Fence(0), ..grant.clone() };
+    let header = |grant: &Grant| -> TestResult<_> { Ok(("x-stride-grant", serde_json::to_string(grant)?)) };
+    let put = format!("PUT /v1/blobs/{digest}");
+    for headers in [vec![], vec![header(&stale)?]] {
+        let mut stream = client.begin(&put, &headers, 10 << 30).await?;
+        let mut sent = 0;
+        while sent < LARGE_PARTS && stream.write_all(&part(sent)).await.is_ok() {
+            sent += 1;
+        }
+        assert!(sent < LARGE_PARTS / 4, "{sent} MiB were taken without a grant");
+    }
+
+    // Cut in the middle.
+    let headers = vec![header(&grant)?];
+    let mut stream = client.begin(&put, &headers, LARGE_BYTES).await?;
+    for i in 0..LARGE_PARTS / 2 {
+        stream.write_all(&part(i)).await?;
+    }
+    drop(stream);
+    let staged = loop {
+        let there = client.staged(&grant, digest).await?;
+        assert!(!there.stored);
+        if there.staged > 0 {
+            break there.staged;
+        }
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    };
+    assert!(staged > LARGE_BYTES / 4 && staged <= LARGE_BYTES / 2, "{staged} bytes were kept");
+
+    let mut headers = headers;
+    headers.extend([("x-stride-bytes", LARGE_BYTES.to_string()), ("x-stride-offset", staged.to_string())]);
+    let mut stream = client.begin(&put, &headers, LARGE_BYTES - staged).await?;
+    stream.write_all(&part(staged >> 20)[usize::try_from(staged % (1 << 20))?..]).await?;
+    for i in (staged >> 20) + 1..LARGE_PARTS {
+        stream.write_all(&part(i)).await?;
+    }
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).await?;
+    assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("\"stored\":true"), "{answer}");
+    assert!(client.staged(&grant, digest).await?.stored, "it need not be sent again");
+
+    assert_eq!(client.fetch(digest).await?, (200, LARGE_BYTES, LARGE_BYTES, digest));
+    let grown = peak()?.saturating_sub(before);
+    assert!(grown < 100 << 20, "{} MiB of memory for a blob of {LARGE_PARTS} MiB", grown >> 20);
+
+    // A damaged blob is never sent whole, and is refused once that is known.
+    let path = dir.path().join("blobs/sha256").join(&digest.hex()[..2]).join(&digest.hex()[2..]);
+    let file = std::fs::OpenOptions::new().write(true).open(path)?;
+    std::os::unix::fs::FileExt::write_all_at(&file, b"x", LARGE_BYTES / 2)?;
+    drop(file);
+    let (_, length, came, found) = client.fetch(digest).await?;
+    assert!(length == LARGE_BYTES && came < LARGE_BYTES && found != digest, "{came} bytes were sent");
+    assert_eq!(client.fetch(digest).await?.0, 409);
+    handle.shutdown().await;
     Ok(())
 }

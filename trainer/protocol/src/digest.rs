@@ -37,6 +37,22 @@ impl Digest {
     }
 }
 
+/// A digest in the making, for bytes that come in parts.
+#[derive(Debug, Clone, Default)]
+pub struct Hasher(Sha256);
+
+impl Hasher {
+    /// Takes the next bytes.
+    pub fn update(&mut self, bytes: &[u8]) {
+        self.0.update(bytes);
+    }
+
+    /// The digest of all bytes taken.
+    pub fn finish(self) -> Digest {
+        Digest(self.0.finalize().into())
+    }
+}
+
 impl fmt::Display for Digest {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "sha256:{}", self.hex())
@@ -94,5 +110,13 @@ mod tests {
         assert_eq!(digest.to_string().parse::<Digest>(), Ok(digest));
         assert!("sha256:12".parse::<Digest>().is_err());
         assert!(digest.hex().parse::<Digest>().is_err());
+    }
+
+    #[test]
+    fn parts_hash_like_the_whole() {
+        let mut hasher = Hasher::default();
+        hasher.update(b"str");
+        hasher.update(b"ide");
+        assert_eq!(hasher.finish(), Digest::of(b"stride"));
     }
 }

@@ -8,7 +8,7 @@ use std::cell::RefCell;
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
-use checkpoint::{BlobError, Blobs};
+use checkpoint::{Blob, BlobError, Blobs};
 use motion::dataset::{Caption, Dataset, PackError, Split};
 use protocol::artifact::FileEntry;
 use protocol::stage::{DataFormat, LatentShape, Network};
@@ -152,7 +152,7 @@ pub fn to_meta<T: Serialize>(meta: &T) -> serde_json::Value {
 pub fn blob_error(error: BlobError) -> StageError {
     let text = error.to_string();
     StageError::Context(match error {
-        BlobError::NotFound(_) | BlobError::Corrupt { .. } => ContextError::Corrupt(text),
+        BlobError::NotFound(_) | BlobError::Corrupt { .. } | BlobError::Damaged(_) => ContextError::Corrupt(text),
         BlobError::Refused(_) => ContextError::GrantEnded(text),
         BlobError::Storage(_) => ContextError::Storage(text),
         BlobError::Unavailable(_) => ContextError::Unavailable(text),
@@ -176,13 +176,21 @@ pub fn input(cx: &dyn AttemptContext, field: &str, kind: ArtifactKind) -> Result
     Ok((digest, manifest))
 }
 
-/// One file of an artifact.
-pub fn file(blobs: &dyn Blobs, manifest: &Manifest, name: &str) -> Result<Arc<[u8]>, StageError> {
-    let entry = manifest.files.get(name).ok_or_else(|| {
+fn entry<'a>(manifest: &'a Manifest, name: &str) -> Result<&'a FileEntry, StageError> {
+    manifest.files.get(name).ok_or_else(|| {
         let have: Vec<_> = manifest.files.keys().map(String::as_str).collect();
         StageError::Input(format!("an artifact of kind {:?} has no file `{name}`; it has {have:?}", manifest.kind))
-    })?;
-    blobs.get(entry.digest).map_err(blob_error)
+    })
+}
+
+/// One file of an artifact.
+pub fn file(blobs: &dyn Blobs, manifest: &Manifest, name: &str) -> Result<Arc<[u8]>, StageError> {
+    blobs.get(entry(manifest, name)?.digest).map_err(blob_error)
+}
+
+/// One file of an artifact, to be read where it is needed: for what is too large to lie in memory twice.
+pub fn open(blobs: &dyn Blobs, manifest: &Manifest, name: &str) -> Result<Box<dyn Blob>, StageError> {
+    blobs.open(entry(manifest, name)?.digest).map_err(blob_error)
 }
 
 /// All files of an artifact.
@@ -209,8 +217,13 @@ impl Draft {
 
     /// Uploads one file.
     pub fn add(&mut self, name: &str, bytes: Vec<u8>) -> Result<(), StageError> {
-        let length = bytes.len() as u64;
-        let digest = self.blobs.put(bytes).map_err(blob_error)?;
+        self.add_pieces(name, &[&bytes])
+    }
+
+    /// Uploads one file that consists of `pieces`.
+    pub fn add_pieces(&mut self, name: &str, pieces: &[&[u8]]) -> Result<(), StageError> {
+        let length = pieces.iter().map(|piece| piece.len() as u64).sum();
+        let digest = self.blobs.put_pieces(pieces).map_err(blob_error)?;
         self.manifest.files.insert(name.to_owned(), FileEntry { digest, bytes: length });
         Ok(())
     }

@@ -66,7 +66,8 @@ fn table() -> Vec<Entry> {
         entry("POST", "/v1/logs",                  &[Worker],       limits::BATCH_BYTES,      SHORT, uploads::logs),
         entry("POST", "/v1/checkpoints",           &[Worker],       CALL,                     SHORT, uploads::checkpoint),
         entry("POST", "/v1/outcomes",              &[Worker],       CALL,                     SHORT, uploads::outcome),
-        entry("PUT",  "/v1/blobs",                 &[Worker],       limits::BLOB_BYTES,       LONG,  uploads::put_blob),
+        entry("PUT",  "/v1/blobs/{digest}",        &[Worker],       limits::BLOB_BYTES,       LONG,  uploads::put_blob),
+        entry("GET",  "/v1/blobs/{digest}/staged", &[Worker],       CALL,                     LONG,  uploads::staged),
         entry("GET",  "/v1/blobs/{digest}",        &[Read, Worker], CALL,                     LONG,  uploads::get_blob),
         entry("POST", "/v1/runs",                  &[Submit],       limits::SUBMISSION_BYTES, SHORT, queries::submit),
         entry("GET",  "/v1/runs",                  &[Read],         CALL,                     SHORT, queries::runs),
@@ -195,8 +196,8 @@ impl From<BlobError> for Failure {
             BlobError::Storage(_) => Self::new(StatusCode::INSUFFICIENT_STORAGE, "storage", message)
                 .hint("free some space or make the store writable, then `trainer resume`"),
             // Not 5xx: the bytes on our disk are wrong, and asking again would not change them.
-            BlobError::Corrupt { .. } => Self::new(StatusCode::CONFLICT, "conflict", message)
-                .hint("the blob is damaged on disk; remove it and run the stage that made it again"),
+            BlobError::Corrupt { .. } | BlobError::Damaged(_) => Self::new(StatusCode::CONFLICT, "damaged", message)
+                .hint("run the pipeline again: the stage that made it is computed anew, which mends it"),
             BlobError::Refused(_) => Self::new(StatusCode::CONFLICT, "stale-fence", message),
             BlobError::Unavailable(_) => Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", message),
         }

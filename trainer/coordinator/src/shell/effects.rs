@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use checkpoint::bundle::bundle;
-use protocol::{Digest, RunId, StageName};
+use protocol::{Digest, RunId, StageName, TaskId};
 use registry::{BlobStore, QueryError};
 use tokio::sync::watch;
 
@@ -80,16 +80,18 @@ async fn looked_up(actor_handle: &ActorHandle, key: Digest) -> Result<Event, Que
     Ok(Event::LookedUp { key, known: None, source: None, archived })
 }
 
-/// A value counts as known only while all of it is there: an artifact that was removed is made again.
+/// A value counts as known only while all of it is there and whole: an artifact that was removed or damaged is made again,
+/// which mends it.
 async fn known(actor_handle: &ActorHandle, key: Digest) -> Result<Option<(Known, (RunId, StageName))>, QueryError> {
     let Some(row) = actor_handle.store.stage_result(key).await? else { return Ok(None) };
     let (blobs, outputs) = (actor_handle.store.blobs().clone(), row.outputs.clone());
-    let whole = blocking(move || outputs.values().all(|output| blobs.complete_manifest(*output).is_ok())).await;
-    if !whole {
-        tracing::warn!(%key, "a stage's value is known but not all of it is in the store; it is made again");
+    let flaw = blocking(move || outputs.values().find_map(|output| blobs.flaw(*output).transpose()).transpose());
+    let flaw = flaw.await.map_err(|e| QueryError::Blob(e.to_string()))?;
+    if let Some(flaw) = &flaw {
+        tracing::warn!(%key, "a stage's value is known but not whole in the store; it is made again: {flaw}");
     }
     let known = Known { outputs: row.outputs, metrics: row.metrics };
-    Ok(whole.then_some((known, (row.run, row.stage))))
+    Ok(flaw.is_none().then_some((known, (row.run, row.stage))))
 }
 
 async fn register(actor_handle: Arc<ActorHandle>, key: Digest, candidates: Vec<Candidate>) {
@@ -154,6 +156,9 @@ pub(crate) async fn tick(actor_handle: Arc<ActorHandle>, every_ms: u64, mut stop
         if collected.elapsed() > COLLECT_EVERY {
             collected = tokio::time::Instant::now();
             let actor_handle = Arc::clone(&actor_handle);
+            let state = actor_handle.state();
+            let is_held = |task: &TaskId| state.task(task).is_ok_and(|(_, task)| !task.holders().is_empty());
+            actor_handle.store.blobs().let_go(is_held);
             tokio::spawn(async move {
                 if let Err(error) = actor_handle.store.gc(registry::retention::GRACE_MS).await {
                     tracing::warn!(%error, "unneeded blobs stay");

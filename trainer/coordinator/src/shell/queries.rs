@@ -21,11 +21,15 @@ use super::body::Message;
 use crate::event::{Control, Rejected};
 use crate::view::WorkerView;
 
-/// The answer to `PUT /v1/blobs`.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+/// The answer to `PUT /v1/blobs/{digest}` and `GET /v1/blobs/{digest}/staged`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BlobStored {
     /// The blob's name.
     pub digest: Digest,
+    /// Whether all of it has arrived and is stored.
+    pub stored: bool,
+    /// Bytes that have arrived, if it is not.
+    pub staged: u64,
 }
 
 /// The answer to `POST /v1/runs`.

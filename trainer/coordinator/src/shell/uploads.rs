@@ -2,14 +2,18 @@
 //! writers before their bytes are read, and again inside the transaction, which is what counts.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use axum::Json;
-use axum::body::Bytes;
+use axum::body::Body;
 use axum::extract::{Path, State};
-use axum::http::{HeaderMap, header};
-use axum::response::IntoResponse;
-use protocol::Digest;
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::response::Response;
+use checkpoint::BlobError;
+use futures::{StreamExt as _, stream};
 use protocol::message::{CommitCheckpoint, Grant, LogBatch, MetricBatch, ReportOutcome};
+use protocol::{Digest, limits};
+use registry::blob::{Arriving, PART_BYTES, ResumeError};
 use registry::{Write, WriteError};
 
 use super::actor::ActorHandle;
@@ -21,6 +25,14 @@ use crate::event::Event;
 
 /// The header that carries a blob's grant, as JSON.
 const GRANT_HEADER: &str = "x-stride-grant";
+/// The header with a blob's length.
+const BYTES_HEADER: &str = "x-stride-bytes";
+/// The header that says where in its blob a body begins; 0 without it.
+const OFFSET_HEADER: &str = "x-stride-offset";
+/// The largest blob.
+const MAX_BLOB_BYTES: u64 = limits::BLOB_BYTES as u64;
+/// How long a body may rest before the upload counts as cut.
+const BODY_IDLE: Duration = Duration::from_secs(30);
 
 async fn write(actor_handle: &ActorHandle, write: Write) -> Result<Json<()>, Failure> {
     let written = actor_handle.store.write(vec![write]).await;
@@ -61,30 +73,195 @@ pub(crate) async fn outcome(
     Ok(Json(()))
 }
 
-pub(crate) async fn put_blob(
-    State(actor_handle): State<Arc<ActorHandle>>,
-    headers: HeaderMap,
-    body: Bytes,
-) -> Result<Json<BlobStored>, Failure> {
+/// Whose upload a request is about. Asked of the state before a byte of the body is read.
+fn granted(actor_handle: &ActorHandle, headers: &HeaderMap) -> Result<Grant, Failure> {
     let grant =
         headers.get(GRANT_HEADER).ok_or_else(|| Failure::invalid(format!("header `{GRANT_HEADER}` is missing")))?;
     let grant: Grant = serde_json::from_slice(grant.as_bytes())
         .map_err(|e| Failure::invalid(format!("header `{GRANT_HEADER}` is no grant: {e}")))?;
     actor_handle.state().check_write(&grant)?;
-    let blobs = actor_handle.store.blobs().clone();
-    let put = blocking(move || blobs.put(&body)).await;
-    if let Err(checkpoint::BlobError::Storage(message)) = &put {
-        actor_handle.wrote::<()>(&Err(WriteError::Storage(message.clone())));
-    }
-    Ok(Json(BlobStored { digest: put? }))
+    Ok(grant)
 }
 
+/// A header that is a number.
+fn number(headers: &HeaderMap, name: &str) -> Result<Option<u64>, Failure> {
+    let Some(value) = headers.get(name) else { return Ok(None) };
+    let number = value.to_str().ok().and_then(|text| text.parse().ok());
+    number.map(Some).ok_or_else(|| Failure::invalid(format!("header `{name}` is not a number of bytes")))
+}
+
+fn named(digest: &str) -> Result<Digest, Failure> {
+    digest.parse().map_err(|e| Failure::invalid(format!("{e}")))
+}
+
+/// How much of a blob is there, in the name of a grant: a cut upload goes on from `staged`, and one of bytes that are stored
+/// already need not begin.
+pub(crate) async fn staged(
+    State(actor_handle): State<Arc<ActorHandle>>,
+    Path(digest): Path<String>,
+    headers: HeaderMap,
+) -> Result<Json<BlobStored>, Failure> {
+    let grant = granted(&actor_handle, &headers)?;
+    let digest = named(&digest)?;
+    let blobs = actor_handle.store.blobs().clone();
+    blocking(move || {
+        blobs.hold(&grant.task, digest);
+        let stored = blobs.reuse(digest)?;
+        Ok(Json(BlobStored { digest, stored, staged: blobs.staged(&grant, digest) }))
+    })
+    .await
+}
+
+/// Takes a blob, or the next part of one, as it comes.
+pub(crate) async fn put_blob(
+    State(actor_handle): State<Arc<ActorHandle>>,
+    Path(digest): Path<String>,
+    headers: HeaderMap,
+    body: Body,
+) -> Result<Json<BlobStored>, Failure> {
+    let grant = granted(&actor_handle, &headers)?;
+    let digest = named(&digest)?;
+    let missing = || Failure::invalid(format!("header `{BYTES_HEADER}` is missing: the blob's length"));
+    let bytes = match number(&headers, BYTES_HEADER)? {
+        Some(bytes) => bytes,
+        // The body is the whole blob.
+        None => number(&headers, header::CONTENT_LENGTH.as_str())?.ok_or_else(missing)?,
+    };
+    let offset = number(&headers, OFFSET_HEADER)?.unwrap_or_default();
+    if bytes > MAX_BLOB_BYTES {
+        return Err(Failure::invalid(format!(
+            "a blob of {bytes} bytes is too large: at most {MAX_BLOB_BYTES} are taken"
+        )));
+    }
+    let blobs = actor_handle.store.blobs().clone();
+    let stored = async {
+        let arriving = blocking(move || blobs.take_up(&grant, digest, offset, bytes)).await?;
+        receive(arriving, body, digest).await
+    };
+    stored.await.map_err(|error| {
+        if let Unstored::Resume(ResumeError::Blob(BlobError::Storage(message))) = &error {
+            actor_handle.wrote::<()>(&Err(WriteError::Storage(message.clone())));
+        }
+        error.into()
+    })
+}
+
+async fn receive(mut arriving: Arriving, body: Body, digest: Digest) -> Result<Json<BlobStored>, Unstored> {
+    let mut body = body.into_data_stream();
+    let mut ended = false;
+    while !ended {
+        // A slow sender holds no thread, and no more memory than this.
+        let (mut parts, mut length) = (Vec::new(), 0);
+        while length < PART_BYTES {
+            match tokio::time::timeout(BODY_IDLE, body.next()).await {
+                Ok(Some(Ok(part))) => {
+                    length += part.len();
+                    parts.push(part);
+                }
+                Ok(Some(Err(error))) => return Err(Unstored::Cut(error.to_string())),
+                Ok(None) => {
+                    ended = true;
+                    break;
+                }
+                Err(_) => return Err(Unstored::Cut(format!("nothing came for {} s", BODY_IDLE.as_secs()))),
+            }
+        }
+        // Comes back dropped if this request is: what has arrived is kept.
+        arriving = blocking(move || -> Result<Arriving, BlobError> {
+            for part in parts {
+                arriving.write(&part)?;
+            }
+            Ok(arriving)
+        })
+        .await
+        .map_err(ResumeError::Blob)?;
+    }
+    let staged = arriving.written();
+    let stored = blocking(move || arriving.finish()).await.map_err(ResumeError::Blob)?;
+    Ok(Json(BlobStored { digest, stored, staged }))
+}
+
+/// Why a blob was not taken.
+enum Unstored {
+    /// The body ended early.
+    Cut(String),
+    /// The store refuses it.
+    Resume(ResumeError),
+}
+
+impl From<ResumeError> for Unstored {
+    fn from(error: ResumeError) -> Self {
+        Self::Resume(error)
+    }
+}
+
+impl From<Unstored> for Failure {
+    fn from(error: Unstored) -> Self {
+        let message = match &error {
+            Unstored::Cut(message) => format!("the blob was cut short: {message}"),
+            Unstored::Resume(error) => error.to_string(),
+        };
+        match error {
+            Unstored::Cut(_) => Self::new(StatusCode::REQUEST_TIMEOUT, "cut", message),
+            Unstored::Resume(ResumeError::Offset { .. }) => {
+                Self::new(StatusCode::RANGE_NOT_SATISFIABLE, "offset", message)
+            }
+            Unstored::Resume(ResumeError::Busy | ResumeError::TooMany(_)) => {
+                Self::new(StatusCode::TOO_MANY_REQUESTS, "busy", message)
+            }
+            // These bytes came damaged, which says nothing about what is stored.
+            Unstored::Resume(ResumeError::Blob(BlobError::Corrupt { .. } | BlobError::Refused(_))) => {
+                Self::invalid(message)
+            }
+            Unstored::Resume(ResumeError::Blob(error)) => error.into(),
+        }
+    }
+}
+
+/// A blob, or what follows `range: bytes=N-` of one. The last bytes of a damaged blob are never sent: the answer breaks off.
 pub(crate) async fn get_blob(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(digest): Path<String>,
-) -> Result<impl IntoResponse, Failure> {
-    let digest: Digest = digest.parse().map_err(|e| Failure::invalid(format!("{e}")))?;
+    headers: HeaderMap,
+) -> Result<Response, Failure> {
+    let digest = named(&digest)?;
+    let from = from(&headers)?;
     let blobs = actor_handle.store.blobs().clone();
-    let bytes = blocking(move || blobs.get(digest)).await?;
-    Ok(([(header::CONTENT_TYPE, "application/octet-stream")], bytes))
+    let opened = blocking(move || -> Result<_, BlobError> {
+        let mut reader = match from {
+            None => blobs.read(digest)?,
+            Some(from) => blobs.read_from(digest, from)?,
+        };
+        // A small blob is whole by now, or refused.
+        let first = reader.next_part()?;
+        Ok((first, reader))
+    });
+    let (first, reader) = opened.await?;
+    let bytes = reader.bytes();
+    let length = bytes - from.unwrap_or_default();
+    let rest = stream::try_unfold(reader, |mut reader| async {
+        let (part, reader) = blocking(move || (reader.next_part(), reader)).await;
+        Ok::<_, BlobError>(part?.map(|part| (part, reader)))
+    });
+    let body = Body::from_stream(stream::iter(first.map(Ok)).chain(rest));
+    let mut response = Response::new(body);
+    let headers = response.headers_mut();
+    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/octet-stream"));
+    headers.insert(header::CONTENT_LENGTH, HeaderValue::from(length));
+    if let Some(from) = from {
+        let range = format!("bytes {from}-{}/{bytes}", bytes.saturating_sub(1));
+        if let Ok(range) = HeaderValue::try_from(range) {
+            headers.insert(header::CONTENT_RANGE, range);
+        }
+        *response.status_mut() = StatusCode::PARTIAL_CONTENT;
+    }
+    Ok(response)
+}
+
+/// Where a download goes on.
+fn from(headers: &HeaderMap) -> Result<Option<u64>, Failure> {
+    let Some(range) = headers.get(header::RANGE) else { return Ok(None) };
+    let text = range.to_str().ok().and_then(|text| text.strip_prefix("bytes=")?.strip_suffix('-'));
+    let from = text.and_then(|text| text.parse().ok());
+    from.map(Some).ok_or_else(|| Failure::invalid("header `range`: expected `bytes=N-`".to_owned()))
 }

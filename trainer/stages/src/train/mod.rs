@@ -22,7 +22,7 @@ use protocol::ArtifactKind;
 use serde_json::json;
 
 pub use order::{Order, Pick};
-pub use state::{Group, GroupPlan, TrainState};
+pub use state::{Group, GroupPlan, RestoreError, TrainState};
 pub use tree::tree_sum;
 
 /// The input that a rung of a sweep goes on from: the checkpoint that the rung before left.
@@ -164,8 +164,11 @@ pub fn train(
 
 /// Takes over the state of a checkpoint.
 fn restore(state: &mut TrainState, manifest: &protocol::Manifest, cx: &dyn GangContext) -> Result<(), StageError> {
-    let bytes = crate::artifacts::file(&*cx.blobs(), manifest, STATE_FILE)?;
-    state.restore(&bytes).map_err(|e| StageError::Context(ContextError::Corrupt(format!("{STATE_FILE}: {e}"))))
+    let saved = crate::artifacts::open(&*cx.blobs(), manifest, STATE_FILE)?;
+    state.restore(&*saved).map_err(|error| match error {
+        RestoreError::Blob(error) => crate::artifacts::blob_error(error),
+        RestoreError::Wrong(_) => StageError::Context(ContextError::Corrupt(format!("{STATE_FILE}: {error}"))),
+    })
 }
 
 /// Meets the others, and takes over a peer's state where one is ahead or this member has none (`applied` is `None`); true if so.
@@ -246,7 +249,7 @@ fn save(
         "build": env!("CARGO_PKG_VERSION"),
     });
     let mut draft = Draft::new(cx, ArtifactKind::Checkpoint, meta);
-    draft.add(STATE_FILE, state.to_bytes())?;
+    state.saved(|pieces| draft.add_pieces(STATE_FILE, pieces))?;
     let digest = draft.finish(cx)?;
     let manifest = cx.manifest(digest)?;
     cx.commit_checkpoint(state.step, &manifest, &recent.means())?;

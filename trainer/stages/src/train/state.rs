@@ -1,12 +1,28 @@
 //! What training changes, and its bytes.
 
+use std::collections::BTreeMap;
 use std::ops::Range;
 
 use bytemuck::{cast_slice, cast_slice_mut};
+use checkpoint::{Blob, BlobError};
 use models::flat::Entry;
 use models::optim::{AdamW, LrSchedule, ema};
+use safetensors::Dtype;
+use safetensors::tensor::{Metadata, TensorInfo};
 
-use crate::artifacts::Tensors;
+/// The largest header of a saved state that is read; ours have some hundred bytes.
+const HEADER_BYTES: u64 = 1 << 20;
+
+/// Why a saved state was not taken over.
+#[derive(Debug, thiserror::Error)]
+pub enum RestoreError {
+    /// It is not a state of this plan.
+    #[error("{0}")]
+    Wrong(String),
+    /// It could not be read.
+    #[error(transparent)]
+    Blob(#[from] BlobError),
+}
 
 /// One set of parameters with an optimizer of its own.
 #[derive(Debug, Clone)]
@@ -97,59 +113,107 @@ impl TrainState {
         Self { step: 0, groups: plans.iter().map(group).collect() }
     }
 
-    /// Safetensors: `step`, and per group `NAME.params`, `NAME.m`, `NAME.v`, `NAME.average`.
-    ///
-    /// # Panics
-    /// Never: flat f32 buffers always serialise.
-    pub fn to_bytes(&self) -> Vec<u8> {
-        let step = i64::try_from(self.step).expect("a step fits");
-        let mut tensors = Tensors::default().with_integers("step", [1], vec![step]);
-        for group in &self.groups {
-            let len = group.params.len();
-            let buffers = [
-                ("params", Some(&group.params)),
-                ("m", Some(&group.m)),
-                ("v", Some(&group.v)),
-                ("average", group.average.as_ref()),
-            ];
-            for (what, values) in buffers {
-                if let Some(values) = values {
-                    tensors = tensors.with(&format!("{}.{what}", group.name), [len], values.clone());
-                }
-            }
+    /// The buffers of all groups by their names in a saved state.
+    fn buffers(&self) -> BTreeMap<String, &Vec<f32>> {
+        fn of(group: &Group) -> Vec<(String, &Vec<f32>)> {
+            let all = [("params", Some(&group.params)), ("m", Some(&group.m)), ("v", Some(&group.v))];
+            let all = all.into_iter().chain([("average", group.average.as_ref())]);
+            all.filter_map(|(what, values)| Some((format!("{}.{what}", group.name), values?))).collect()
         }
-        tensors.to_bytes().expect("flat buffers serialise")
+        self.groups.iter().flat_map(of).collect()
     }
 
-    /// Takes over the bytes of another state of the same plan.
+    fn buffers_mut(&mut self) -> impl Iterator<Item = (String, &mut Vec<f32>)> {
+        self.groups.iter_mut().flat_map(|group| {
+            let Group { name, params, m, v, average, .. } = group;
+            let all = [("params", Some(params)), ("m", Some(m)), ("v", Some(v)), ("average", average.as_mut())];
+            all.into_iter().filter_map(move |(what, values)| Some((format!("{name}.{what}"), values?)))
+        })
+    }
+
+    /// Begins the bytes of a saved state: safetensors with `step`, and per group `NAME.params`, `NAME.m`, `NAME.v`,
+    /// `NAME.average`, in the order and with the alignment of the `safetensors` crate. What follows it is [`Self::saved`]'s.
+    fn header(&self) -> Vec<u8> {
+        let mut end = 0;
+        let mut info = |dtype, shape: usize, bytes: usize| {
+            let begin = end;
+            end += bytes;
+            TensorInfo { dtype, shape: vec![shape], data_offsets: (begin, end) }
+        };
+        let mut tensors = vec![("step".to_owned(), info(Dtype::I64, 1, 8))];
+        let buffers = self.buffers();
+        tensors.extend(
+            buffers
+                .iter()
+                .map(|(name, values)| (name.clone(), info(Dtype::F32, values.len(), size_of_val(values.as_slice())))),
+        );
+        let metadata = Metadata::new(None, tensors).expect("flat buffers one after the other");
+        let mut json = serde_json::to_vec(&metadata).expect("names and numbers");
+        json.resize(json.len().next_multiple_of(8), b' ');
+        [&(json.len() as u64).to_le_bytes()[..], &json].concat()
+    }
+
+    /// Calls `save` with the bytes of a saved state in pieces, nearly all of which lie where they are: no second copy of a large
+    /// state is made.
+    pub fn saved<T>(&self, save: impl FnOnce(&[&[u8]]) -> T) -> T {
+        let (header, step) = (self.header(), self.step.to_le_bytes());
+        let buffers = self.buffers();
+        let mut pieces: Vec<&[u8]> = vec![&header, &step];
+        pieces.extend(buffers.values().map(|values| cast_slice::<f32, u8>(values)));
+        save(&pieces)
+    }
+
+    /// Takes over a saved state of the same plan, buffer by buffer.
     ///
     /// # Errors
-    /// If a buffer is missing or has another length; nothing is changed then.
-    pub fn restore(&mut self, bytes: &[u8]) -> Result<(), String> {
-        let text = |e: crate::context::StageError| e.to_string();
-        let mut tensors = Tensors::from_bytes(bytes, "the state").map_err(text)?;
-        let step = tensors.take_integers("step", 1, "the state").map_err(text)?.values;
-        let step = step.first().and_then(|s| u64::try_from(*s).ok()).ok_or("no step")?;
-        let mut groups = self.groups.clone();
-        for group in &mut groups {
-            let (name, len) = (group.name, group.params.len());
-            let mut take = |what: &str| {
-                let values = tensors.take(&format!("{name}.{what}"), 1, "the state").map_err(text)?.values;
-                if values.len() == len {
-                    Ok(values)
-                } else {
-                    Err(format!("`{name}.{what}` has {} values, expected {len}", values.len()))
-                }
-            };
-            group.params = take("params")?;
-            group.m = take("m")?;
-            group.v = take("v")?;
-            if group.average.is_some() {
-                group.average = Some(take("average")?);
+    /// If a buffer is missing or has another length; nothing is changed then. If the bytes cannot be read; then the state is
+    /// of no use any more.
+    pub fn restore(&mut self, saved: &dyn Blob) -> Result<(), RestoreError> {
+        let wrong = |text: String| RestoreError::Wrong(text);
+        let mut length = [0; 8];
+        if saved.bytes() < 8 {
+            return Err(wrong(format!("{} bytes are no tensors", saved.bytes())));
+        }
+        saved.read_at(0, &mut length)?;
+        let length = u64::from_le_bytes(length);
+        if length > HEADER_BYTES || length > saved.bytes() - 8 {
+            return Err(wrong(format!("a header of {length} bytes in {} bytes", saved.bytes())));
+        }
+        let mut json = vec![0; usize::try_from(length).unwrap_or_default()];
+        saved.read_at(8, &mut json)?;
+        let metadata: Metadata = serde_json::from_slice(&json).map_err(|e| wrong(e.to_string()))?;
+        let end = metadata.data_len();
+        if end as u64 != saved.bytes() - 8 - length {
+            return Err(wrong(format!("tensors of {end} bytes in {} bytes", saved.bytes() - 8 - length)));
+        }
+        let place = |name: &str, dtype: Dtype, values: usize| {
+            let info = metadata.info(name).ok_or_else(|| {
+                let mut there: Vec<String> = metadata.tensors().into_keys().collect();
+                there.sort();
+                wrong(format!("no tensor `{name}`; there are {there:?}"))
+            })?;
+            if info.dtype != dtype || info.shape != [values] {
+                return Err(wrong(format!(
+                    "`{name}` is {:?} {:?}, expected {dtype:?} [{values}]",
+                    info.dtype, info.shape
+                )));
             }
+            Ok(8 + length + info.data_offsets.0 as u64)
+        };
+
+        let mut step = [0; 8];
+        saved.read_at(place("step", Dtype::I64, 1)?, &mut step)?;
+        let step = u64::try_from(i64::from_le_bytes(step)).map_err(|_| wrong("a step below 0".to_owned()))?;
+        let buffers = self.buffers();
+        let places: BTreeMap<&String, u64> = buffers
+            .iter()
+            .map(|(name, values)| Ok((name, place(name, Dtype::F32, values.len())?)))
+            .collect::<Result<_, RestoreError>>()?;
+        let places: BTreeMap<String, u64> = places.into_iter().map(|(name, at)| (name.clone(), at)).collect();
+        for (name, values) in self.buffers_mut() {
+            saved.read_at(places[&name], cast_slice_mut(values))?;
         }
         self.step = step;
-        self.groups = groups;
         Ok(())
     }
 
@@ -205,9 +269,12 @@ impl TrainState {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use protocol::stage::Decay;
 
     use super::*;
+    use crate::artifacts::Tensors;
 
     #[test]
     fn a_member_takes_over_a_peers_state_bit_for_bit_or_not_at_all() {
@@ -240,8 +307,25 @@ mod tests {
             assert_eq!(joiner, donor, "in pieces of {cut} bytes");
         }
         // What is saved says the same.
-        let mut saved = before;
-        saved.restore(&donor.to_bytes()).unwrap();
+        let bytes: Arc<[u8]> = donor.saved(|pieces| pieces.concat()).into();
+        let mut saved = before.clone();
+        saved.restore(&bytes).unwrap();
         assert_eq!(saved, donor);
+
+        // It is what the crate would have written, and less than all of it is refused.
+        let mut tensors = Tensors::default().with_integers("step", [1], vec![3]);
+        for (name, values) in donor.buffers() {
+            tensors = tensors.with(&name, [values.len()], values.clone());
+        }
+        assert_eq!(*bytes, tensors.to_bytes().unwrap());
+        for end in [0, 7, 8, 100, bytes.len() - 4] {
+            let mut cut = before.clone();
+            let error = cut.restore(&Arc::<[u8]>::from(&bytes[..end])).unwrap_err();
+            assert!(matches!(error, RestoreError::Wrong(_)), "{end}: {error}");
+            assert_eq!(cut, before);
+        }
+        let mut other = TrainState::new(&plans[..1]);
+        other.groups[0].params.push(0.0);
+        assert!(matches!(other.restore(&bytes), Err(RestoreError::Wrong(_))));
     }
 }

@@ -1,0 +1,95 @@
+//! A blob read part by part, verified by the time its last part is handed out.
+
+use std::fmt;
+use std::io::Read;
+
+use checkpoint::BlobError;
+use protocol::Digest;
+use protocol::digest::Hasher;
+
+use super::known::Finding;
+use super::{BlobStore, Stat};
+
+/// How much is read at once.
+pub const PART_BYTES: usize = 1 << 20;
+
+/// A blob that is being read. Every part is held back until the next one was read, and the last one until all bytes were
+/// hashed: a damaged blob is never handed out whole.
+pub struct Reader {
+    store: BlobStore,
+    digest: Digest,
+    stat: Stat,
+    source: Box<dyn Read + Send>,
+    state: State,
+    held_back: Option<Vec<u8>>,
+}
+
+enum State {
+    /// Bytes are hashed as they pass.
+    Hashing(Hasher),
+    /// The blob was found whole before.
+    Verified,
+    Ended,
+}
+
+impl fmt::Debug for Reader {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Reader").field("digest", &self.digest).finish_non_exhaustive()
+    }
+}
+
+impl Reader {
+    pub(super) fn new(store: BlobStore, digest: Digest, stat: Stat) -> Result<Self, BlobError> {
+        let source = store.backend().read(digest, 0)?;
+        Ok(Self { store, digest, stat, source, state: State::Hashing(Hasher::default()), held_back: None })
+    }
+
+    /// Of a blob that was found whole, from byte `from` on.
+    pub(super) fn verified(store: BlobStore, digest: Digest, stat: Stat, from: u64) -> Result<Self, BlobError> {
+        let source = store.backend().read(digest, from)?;
+        Ok(Self { store, digest, stat, source, state: State::Verified, held_back: None })
+    }
+
+    /// The blob's length.
+    pub fn bytes(&self) -> u64 {
+        self.stat.bytes
+    }
+
+    /// The next bytes; `None` after the last ones. [`BlobError::Corrupt`] takes the place of the last part of a damaged blob.
+    pub fn next_part(&mut self) -> Result<Option<Vec<u8>>, BlobError> {
+        loop {
+            let hasher = match &mut self.state {
+                State::Hashing(hasher) => hasher,
+                State::Verified => {
+                    let part = read_part(&mut *self.source, self.digest)?;
+                    return Ok((!part.is_empty()).then_some(part));
+                }
+                State::Ended => return Ok(self.held_back.take()),
+            };
+            let part = read_part(&mut *self.source, self.digest)?;
+            hasher.update(&part);
+            if part.is_empty() {
+                let found = std::mem::take(hasher).finish();
+                self.state = State::Ended;
+                if found != self.digest {
+                    self.held_back = None;
+                    self.store.found(self.digest, &self.stat, Finding::Damaged(found));
+                    return Err(BlobError::Corrupt { expected: self.digest, found });
+                }
+                self.store.found(self.digest, &self.stat, Finding::Whole);
+            } else if let Some(before) = self.held_back.replace(part) {
+                return Ok(Some(before));
+            }
+        }
+    }
+}
+
+/// Up to [`PART_BYTES`]; fewer only at the end.
+fn read_part(source: &mut (dyn Read + Send), digest: Digest) -> Result<Vec<u8>, BlobError> {
+    let mut part = Vec::with_capacity(PART_BYTES);
+    source
+        .take(PART_BYTES as u64)
+        .read_to_end(&mut part)
+        .map_err(|e| BlobError::Unavailable(format!("failed to read blob {digest}: {e}")))?;
+    Ok(part)
+}
