@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use cluster_tests::cluster::{Cluster, stage_of};
-use cluster_tests::network::Network;
+use cluster_tests::network::{Network, SlowLine};
 use cluster_tests::{Bench, Running, digests, wait_for};
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
@@ -222,7 +222,10 @@ fn p2_a_worker_that_slept_past_its_lease_writes_nothing() {
     // What the worker holds, as it would be told itself.
     let workers = cluster.get("/v1/workers").expect("the coordinator is there");
     let orders = cluster
-        .post("/v1/workers/a/poll", &json!({"incarnation": workers[0]["incarnation"], "doing": [], "version": 0}))
+        .post(
+            "/v1/workers/a/poll",
+            &json!({"incarnation": workers[0]["incarnation"], "doing": [], "ready": [], "version": 0}),
+        )
         .expect("answered");
     let grant = orders.body["assignments"][0]["grant"].clone();
     assert_eq!(grant["worker"], "a", "{:?}", orders.body);
@@ -468,4 +471,112 @@ fn p15_a_loss_that_is_no_number_is_final() {
     let begun = std::fs::read_to_string(bench.store().join("workers/w1.log")).expect("a log");
     let begins = begun.lines().filter(|line| line.contains(" begin ") && line.contains("/vae attempt=")).count();
     assert_eq!(begins, 1, "tried once:\n{begun}");
+}
+
+/// What makes a worker die the `nth` time it gets to a fail point.
+fn dies_at(point: &str, nth: u32) -> [String; 2] {
+    ["env".to_owned(), format!("STRIDE_WORKER_FAILPOINT={point}@{nth}")]
+}
+
+/// Sampled: a stage of two workers that saves nothing before its end. Rank 0 dies when it commits the last step, and, in another run,
+/// before it reports the end. The other worker still has the state.
+#[test]
+fn p4_rank_0_dies_in_its_last_save_and_no_step_is_computed_again() {
+    let sets = [
+        "--set",
+        "stages.vae.steps=150",
+        "--set",
+        "stages.vae.windows.until=1",
+        "--set",
+        "stages.vae.checkpoint.every=0",
+        "--until",
+        "vae",
+    ];
+    let expected = undisturbed(&sets);
+    for point in ["checkpoint::before_commit", "outcome::before_report"] {
+        let mut cluster = Cluster::start(TRAINER);
+        // It makes the dataset first, and reports that.
+        let nth = if point.starts_with("outcome") { 2 } else { 1 };
+        cluster.join_by("w1", &dies_at(point, nth), &[]);
+        let run = cluster.submit(&config(), &sets);
+        cluster.wait_step(&run, "vae", 1);
+        cluster.join("w2");
+        wait_for("the second worker to take over the state", || {
+            cluster.said("w2").contains("adopts=true").then_some(())
+        });
+        let view = cluster.wait_end(&run);
+        wait_for("the first worker to have died", || (!cluster.alive("w1")).then_some(()));
+        let stage = stage_of(&view, "vae");
+        assert_eq!(
+            (&stage["attempt"], &stage["state"]),
+            (&json!(1), &json!("ran")),
+            "{point}: {stage:#}\n{}",
+            cluster.everything()
+        );
+        equals(&cluster, &run, &view, &expected);
+        cluster.fsck();
+    }
+}
+
+/// Sampled: a worker that trains alone, and cannot save because the coordinator is dead.
+#[test]
+fn a_worker_leaves_in_time_though_the_coordinator_is_gone() {
+    let mut cluster = Cluster::start(TRAINER);
+    cluster.join_by("w1", &[], &["--leave-within", "3"]);
+    let run = cluster.submit(&config(), &VAE);
+    cluster.wait_step(&run, "vae", 60);
+    let saved = cluster.stage(&run, "vae");
+    cluster.kill_server();
+    cluster.signal("w1", Signal::SIGTERM);
+    let asked = Instant::now();
+    assert_eq!(cluster.ended("w1"), Some(1), "not in good order");
+    let took = asked.elapsed();
+    eprintln!("a worker without a coordinator left after {took:.1?}");
+    assert!(took < Duration::from_secs(10), "it took {took:?}");
+    // What was acknowledged is there.
+    cluster.serve();
+    cluster.join("w2");
+    let view = cluster.wait_end(&run);
+    assert_eq!(stage_of(&view, "vae")["state"], "resumed", "{saved:#}");
+    equals_reference(&cluster, &run, &view);
+}
+
+/// Sampled: a worker whose downloads come at 40 kB a second joins while another trains alone. It becomes a member once it has what it
+/// needs, and until then nobody waits for it.
+#[test]
+fn p4_a_slow_joiner_holds_nobody_up() {
+    let sets = [
+        "--set",
+        "stages.vae.steps=3000",
+        "--set",
+        "stages.vae.windows.until=1",
+        "--set",
+        "stages.vae.checkpoint.every=500",
+        "--until",
+        "vae",
+    ];
+    let mut cluster = Cluster::start(TRAINER);
+    cluster.join("w1");
+    let run = cluster.submit(&config(), &sets);
+    cluster.wait_step(&run, "vae", 20);
+    let line = SlowLine::to(cluster.address(), 40_000);
+    cluster.join_at(&line.url(), "w2", &[], &[]);
+    wait_for("the second worker to be there", || {
+        let workers = cluster.get("/v1/workers")?;
+        workers.as_array()?.iter().any(|worker| worker["worker"] == "w2").then_some(())
+    });
+    let done = |cluster: &Cluster| cluster.stage(&run, "vae")["progress"]["done"].as_u64().expect("steps");
+    let before = done(&cluster);
+    cluster.wait_step(&run, "vae", before + 150);
+    let stage = cluster.stage(&run, "vae");
+    assert_eq!(stage["workers"], json!(["w1"]), "it fetches, and is no member yet");
+    assert!(!cluster.said("w2").contains(" begin "), "{}", cluster.said("w2"));
+    line.open();
+    wait_for("it to take over the state", || {
+        assert!(cluster.stage(&run, "vae")["state"] == "running", "the stage was over too early to tell");
+        cluster.said("w2").contains("adopts=true").then_some(())
+    });
+    let view = cluster.wait_end(&run);
+    assert_eq!(stage_of(&view, "vae")["attempt"], 1);
+    cluster.fsck();
 }

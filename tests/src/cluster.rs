@@ -58,6 +58,11 @@ impl Cluster {
     }
 
     /// Where the coordinator listens.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// The same as a URL.
     pub fn url(&self) -> String {
         format!("http://{}", self.address)
     }
@@ -121,8 +126,12 @@ impl Cluster {
 
     /// Starts a worker with more arguments, and something before its command.
     pub fn join_by(&mut self, name: &str, wrap: &[String], more: &[&str]) {
-        let url = self.url();
-        let mut arguments = vec!["worker", "join", &url, "--name", name];
+        self.join_at(&self.url(), name, wrap, more);
+    }
+
+    /// The same by another way to the coordinator.
+    pub fn join_at(&mut self, url: &str, name: &str, wrap: &[String], more: &[&str]) {
+        let mut arguments = vec!["worker", "join", url, "--name", name];
         arguments.extend_from_slice(more);
         let worker = self.spawn(name, wrap, &arguments);
         if let Some(mut old) = self.workers.insert(name.to_owned(), worker) {

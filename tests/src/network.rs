@@ -1,7 +1,12 @@
-//! Hosts of their own for workers: a network namespace each, all on one bridge with the coordinator.
+//! Hosts of their own for workers: a network namespace each, all on one bridge with the coordinator. And slow lines without any of that.
 
-use std::net::SocketAddr;
+use std::io::{Read, Write};
+use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::process::Command;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::thread;
+use std::time::Duration;
 
 /// A bridge and a namespace per worker; gone when dropped.
 #[derive(Debug)]
@@ -11,11 +16,15 @@ pub struct Network {
 }
 
 fn ip(arguments: &str) -> Result<(), String> {
-    let done = Command::new("ip").args(arguments.split(' ')).output().map_err(|e| format!("ip: {e}"))?;
+    tool("ip", arguments)
+}
+
+fn tool(name: &str, arguments: &str) -> Result<(), String> {
+    let done = Command::new(name).args(arguments.split(' ')).output().map_err(|e| format!("{name}: {e}"))?;
     if done.status.success() {
         return Ok(());
     }
-    Err(format!("ip {arguments}: {}", String::from_utf8_lossy(&done.stderr).trim()))
+    Err(format!("{name} {arguments}: {}", String::from_utf8_lossy(&done.stderr).trim()))
 }
 
 impl Network {
@@ -69,6 +78,12 @@ impl Network {
         ip(&format!("link set sv{}-{i} nomaster", self.id)).unwrap_or_else(|e| panic!("{e}"));
     }
 
+    /// What comes to host `i` comes at so many kilobits a second from now on. False, loudly, where `tc` cannot do that.
+    pub fn slow_down(&self, i: usize, kilobits: u32) -> bool {
+        let shape = format!("qdisc add dev sv{}-{i} root tbf rate {kilobits}kbit burst 32kb latency 400ms", self.id);
+        tool("tc", &shape).map_err(|error| eprintln!("SKIPPED: a slow link: {error}")).is_ok()
+    }
+
     /// The host is back, and so are its connections.
     pub fn mend(&self, i: usize) {
         ip(&format!("link set sv{0}-{i} master stride{0}", self.id)).unwrap_or_else(|e| panic!("{e}"));
@@ -84,4 +99,67 @@ impl Drop for Network {
         }
         let _ = ip(&format!("link del stride{}", self.id));
     }
+}
+
+/// A way to a server on which each connection's answers come slowly.
+#[derive(Debug)]
+pub struct SlowLine {
+    address: SocketAddr,
+    bytes_per_second: Arc<AtomicU64>,
+}
+
+impl SlowLine {
+    /// Longest rest between two pieces.
+    const BEAT: Duration = Duration::from_millis(50);
+
+    /// Listens on this machine and passes everything on to `server`. It lasts as long as the process.
+    pub fn to(server: SocketAddr, bytes_per_second: u64) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
+        let address = listener.local_addr().expect("bound");
+        let rate = Arc::new(AtomicU64::new(bytes_per_second));
+        let shared = rate.clone();
+        thread::spawn(move || {
+            for client in listener.incoming().flatten() {
+                // Whoever calls while the server is away finds the connection closed.
+                let Ok(server) = TcpStream::connect(server) else { continue };
+                let (there, back) = (pair(&client, &server), pair(&server, &client));
+                let rate = shared.clone();
+                thread::spawn(move || pass(there, &AtomicU64::new(u64::MAX)));
+                thread::spawn(move || pass(back, &rate));
+            }
+        });
+        Self { address, bytes_per_second: rate }
+    }
+
+    /// Where to call instead of the server.
+    pub fn url(&self) -> String {
+        format!("http://{}", self.address)
+    }
+
+    /// As fast as it goes, from now on.
+    pub fn open(&self) {
+        self.bytes_per_second.store(u64::MAX, Ordering::SeqCst);
+    }
+}
+
+fn pair(from: &TcpStream, to: &TcpStream) -> (TcpStream, TcpStream) {
+    (from.try_clone().expect("a socket twice"), to.try_clone().expect("a socket twice"))
+}
+
+fn pass((mut from, mut to): (TcpStream, TcpStream), bytes_per_second: &AtomicU64) {
+    let mut buffer = vec![0; 64 << 10];
+    loop {
+        let rate = bytes_per_second.load(Ordering::SeqCst);
+        let share = usize::try_from(rate / 20).unwrap_or(usize::MAX).clamp(1, buffer.len());
+        let Ok(n @ 1..) = from.read(&mut buffer[..share]) else { break };
+        if to.write_all(&buffer[..n]).is_err() {
+            break;
+        }
+        if rate != u64::MAX {
+            thread::sleep(SlowLine::BEAT);
+        }
+    }
+    // One direction's end is the other side's news.
+    let _ = to.shutdown(Shutdown::Write);
+    let _ = from.shutdown(Shutdown::Read);
 }

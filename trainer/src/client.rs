@@ -156,7 +156,7 @@ impl Client {
         class: FailureClass,
         message: &str,
     ) -> Result<()> {
-        let poll = Poll { incarnation, doing: Vec::new(), version: 0 };
+        let poll = Poll { incarnation, doing: Vec::new(), ready: Vec::new(), version: 0 };
         let desired: DesiredAssignments = self.post(&format!("/v1/workers/{worker}/poll"), &poll).await?;
         for assignment in desired.assignments {
             let outcome = TaskOutcome::Failed { class, message: message.to_owned() };

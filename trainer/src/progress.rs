@@ -206,6 +206,7 @@ mod tests {
             wall_s: 12.0,
             attempt: protocol::Attempt(1),
             workers: vec!["w1".into(), "w2".into()],
+            instruction_set: None,
             message: None,
             of: None,
         }

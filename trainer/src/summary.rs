@@ -192,6 +192,7 @@ mod tests {
             wall_s: 2.0,
             attempt: protocol::Attempt(1),
             workers: vec![],
+            instruction_set: None,
             message: None,
             of: None,
         };

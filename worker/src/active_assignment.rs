@@ -16,7 +16,7 @@ use tokio::sync::Notify;
 
 use crate::event_count::{EventCount, lock};
 use crate::gang::endpoint::Endpoint;
-use crate::gang::mesh::{Halt, Mesh, MeshConfig};
+use crate::gang::mesh::{Busy, Halt, Mesh, MeshConfig};
 
 /// After a refused write, how long to wait for orders that explain it.
 const STALE_PATIENCE: Duration = Duration::from_secs(30);
@@ -42,6 +42,7 @@ pub(crate) struct ActiveAssignment {
     wake: Arc<Notify>,
     endpoint: Arc<Endpoint>,
     flags: Arc<Flags>,
+    busy: Busy,
 }
 
 /// What holds for all that a worker holds.
@@ -80,7 +81,8 @@ impl ActiveAssignment {
             offered: None,
             newest: None,
         };
-        let held = Self { state: Mutex::new(state), event_count: Arc::default(), wake, endpoint, flags };
+        let (state, busy) = (Mutex::new(state), Busy::default());
+        let held = Self { state, event_count: Arc::default(), wake, endpoint, flags, busy };
         held.connect(&mut lock(&held.state));
         Arc::new(held)
     }
@@ -92,6 +94,11 @@ impl ActiveAssignment {
 
     pub(crate) fn assignment(&self) -> Assignment {
         lock(&self.state).assignment.clone()
+    }
+
+    /// What the peers are told that this member is busy with.
+    pub(crate) fn busy(&self) -> &Busy {
+        &self.busy
     }
 
     pub(crate) fn event_count(&self) -> &Arc<EventCount> {
@@ -137,7 +144,8 @@ impl ActiveAssignment {
             return;
         };
         let (task, members, secret) = (grant.task.clone(), members.clone(), secret.clone());
-        let config = MeshConfig { task, generation: *generation, rank, members, secret };
+        let busy = self.busy.clone();
+        let config = MeshConfig { task, generation: *generation, rank, members, secret, busy };
         if let Some(unused) = state.offered.take() {
             unused.close(Some(*generation));
         }

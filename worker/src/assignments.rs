@@ -16,6 +16,7 @@ use crate::active_assignment::{ActiveAssignment, Flags, Reading};
 use crate::client::{CallError, Client};
 use crate::event_count::{EventCount, lock};
 use crate::gang::endpoint::Endpoint;
+use crate::prepare::Preparation;
 
 /// Longest pause between two polls of a coordinator that is away.
 const LONGEST: Duration = Duration::from_secs(1);
@@ -34,14 +35,17 @@ pub(crate) struct Shared {
     flags: Arc<Flags>,
     over: AtomicBool,
     endpoint: Arc<Endpoint>,
+    pub(crate) preparation: Preparation,
 }
 
 impl Shared {
     pub(crate) fn new(endpoint: Arc<Endpoint>) -> Arc<Self> {
+        let wake: Arc<Notify> = Arc::default();
         Arc::new(Self {
             held: Mutex::default(),
             work: EventCount::default(),
-            wake: Arc::default(),
+            preparation: Preparation::new(wake.clone()),
+            wake,
             flags: Arc::default(),
             over: AtomicBool::new(false),
             endpoint,
@@ -59,6 +63,7 @@ impl Shared {
     /// Takes nothing new; what runs saves and yields.
     pub(crate) fn leave(&self) {
         self.flags.leaving.store(true, Ordering::SeqCst);
+        self.preparation.end();
         for held in lock(&self.held).iter() {
             held.event_count().notify();
         }
@@ -80,6 +85,7 @@ impl Shared {
         for held in lock(&self.held).drain(..) {
             held.end(reason);
         }
+        self.preparation.end();
         self.work.notify();
     }
 
@@ -116,6 +122,7 @@ impl Shared {
             }
         }
         drop(held);
+        self.preparation.want(&desired.prepare);
         self.work.notify();
     }
 
@@ -125,7 +132,7 @@ impl Shared {
 
     fn poll(&self, incarnation: Incarnation, version: u64) -> Poll {
         let doing = lock(&self.held).iter().map(|held| held.doing()).collect();
-        Poll { incarnation, doing, version }
+        Poll { incarnation, doing, ready: self.preparation.ready(), version }
     }
 }
 
@@ -164,6 +171,12 @@ async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Option<Jo
     }
 }
 
+/// How long an answer to a poll is waited for: as long as the coordinator may wait, and a third of a lease. If the connection hangs, there
+/// is time for another one within the lease.
+fn patience(joined: &Joined) -> Duration {
+    Duration::from_millis(joined.poll_ms + joined.lease_ms / 3)
+}
+
 /// Joins and polls until the worker may go.
 pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> End {
     let mut joined = match join(client, offer, shared).await {
@@ -186,7 +199,7 @@ pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> En
                 sleep(SHORTEST).await;
                 continue;
             }
-            answer = client.poll(&path, &poll, Duration::from_millis(joined.poll_ms)) => answer,
+            answer = client.poll(&path, &poll, patience(&joined)) => answer,
         };
         let answered = !matches!(answer, Err(CallError::Away(_) | CallError::Fault(_)));
         shared.flags.away.store(!answered, Ordering::SeqCst);

@@ -48,6 +48,8 @@ struct Memory {
 pub(crate) struct Cache {
     bounds: Bounds,
     memory: Mutex<Memory>,
+    /// Blobs in nameless files that were fetched before somebody needed them.
+    ahead: Mutex<HashMap<Digest, Cached>>,
     folder: Option<PathBuf>,
     /// Bytes in the folder, as far as this process knows.
     disk: Mutex<u64>,
@@ -60,13 +62,16 @@ impl Cache {
             fs::create_dir_all(folder)?;
             bytes = files(folder).iter().map(|(_, bytes, _)| bytes).sum();
         }
-        Ok(Self { bounds, memory: Mutex::default(), folder, disk: Mutex::new(bytes) })
+        Ok(Self { bounds, memory: Mutex::default(), ahead: Mutex::default(), folder, disk: Mutex::new(bytes) })
     }
 
     /// A blob that was read before, verified again.
     pub(crate) fn get(&self, digest: Digest) -> Option<Cached> {
         if let Some(blob) = lock(&self.memory).blobs.get(&digest) {
             return Some(Cached::Memory(blob.clone()));
+        }
+        if let Some(blob) = lock(&self.ahead).get(&digest) {
+            return Some(blob.clone());
         }
         let path = self.path(digest)?;
         let mut file = File::open(&path).ok()?;
@@ -79,6 +84,18 @@ impl Cache {
         let _ = file.set_modified(SystemTime::now());
         let blob = Cached::File(CachedFile::new(digest, file).ok()?);
         self.keep_small(digest, blob).ok()
+    }
+
+    /// Keeps a blob that lies in a nameless file until [`forget_ahead`](Self::forget_ahead): somebody will read it soon.
+    pub(crate) fn keep_ahead(&self, digest: Digest, blob: &Cached) {
+        if self.folder.is_none() && matches!(blob, Cached::File(_)) {
+            lock(&self.ahead).insert(digest, blob.clone());
+        }
+    }
+
+    /// Lets go of what was kept ahead and is not among `wanted`.
+    pub(crate) fn forget_ahead(&self, wanted: &[Digest]) {
+        lock(&self.ahead).retain(|digest, _| wanted.contains(digest));
     }
 
     /// A place for a blob that is being fetched, of `length` bytes if that is known.
@@ -167,24 +184,24 @@ impl Cache {
 }
 
 /// A verified blob.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) enum Cached {
     Memory(Arc<[u8]>),
     File(CachedFile),
 }
 
 /// A verified blob in an open file. Nobody writes to it: files are replaced and removed, never changed.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct CachedFile {
     digest: Digest,
-    file: File,
+    file: Arc<File>,
     bytes: u64,
 }
 
 impl CachedFile {
     fn new(digest: Digest, file: File) -> io::Result<Self> {
         let bytes = file.metadata()?.len();
-        Ok(Self { digest, file, bytes })
+        Ok(Self { digest, file: Arc::new(file), bytes })
     }
 }
 

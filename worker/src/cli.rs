@@ -1,6 +1,7 @@
 //! The arguments of `worker join`, shared by the two binaries that have it.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use access::ConnectionOptions;
 use protocol::WorkerId;
@@ -34,6 +35,9 @@ pub struct JoinArgs {
     /// Be killed when the parent process dies, and leave Ctrl-C to it
     #[arg(long)]
     pub die_with_parent: bool,
+    /// After SIGTERM, end at the latest after so many seconds, saved or not
+    #[arg(long, value_name = "SECONDS", default_value_t = 30)]
+    pub leave_within: u64,
 }
 
 impl TryFrom<JoinArgs> for Options {
@@ -50,6 +54,7 @@ impl TryFrom<JoinArgs> for Options {
             cache: args.cache,
             peer_address: args.peer_address,
             die_with_parent: args.die_with_parent,
+            leave_within: Duration::from_secs(args.leave_within),
         })
     }
 }

@@ -70,9 +70,13 @@ impl Client {
         answer(self.post("/v1/workers", join, SHORT).await?).await
     }
 
-    /// Waits as long as the coordinator does, and somewhat longer.
-    pub(crate) async fn poll(&self, path: &str, poll: &Poll, waits: Duration) -> Result<DesiredAssignments, CallError> {
-        answer(self.post(path, poll, waits + Duration::from_secs(10)).await?).await
+    pub(crate) async fn poll(
+        &self,
+        path: &str,
+        poll: &Poll,
+        patience: Duration,
+    ) -> Result<DesiredAssignments, CallError> {
+        answer(self.post(path, poll, patience).await?).await
     }
 
     /// A call whose answer says no more than that it was done.

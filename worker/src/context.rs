@@ -17,7 +17,7 @@ use crate::cache::Cache;
 use crate::client::{CallError, Client};
 use crate::failpoints;
 use crate::gang::exchange::{self, Contribution, Met};
-use crate::gang::mesh::{Halt, Mesh};
+use crate::gang::mesh::{Halt, Mesh, Phase};
 use crate::gang::tree;
 use crate::retry::{self, GaveUp};
 use crate::telemetry_buffer::{Sender, TelemetryBuffer};
@@ -95,6 +95,13 @@ impl HttpContext {
         }
     }
 
+    /// A member that asks for blobs between two steps is about to save.
+    fn saves(&self) {
+        if self.held.busy().phase() == Phase::Working {
+            self.held.busy().set(Phase::Saving);
+        }
+    }
+
     fn check(&self) -> Result<(), ContextError> {
         self.held.ended().map_or(Ok(()), |reason| Err(ContextError::GrantEnded(reason)))
     }
@@ -116,6 +123,7 @@ impl AttemptContext for HttpContext {
     }
 
     fn blobs(&self) -> Arc<dyn Blobs> {
+        self.saves();
         self.blobs.clone()
     }
 
@@ -167,6 +175,7 @@ impl GangContext for HttpContext {
     }
 
     fn rendezvous(&mut self, applied: Option<u64>, state: &[&[u8]]) -> Result<Rendezvous, ContextError> {
+        self.held.busy().set(Phase::Working);
         loop {
             self.check()?;
             if let Some(newer) = self.held.take_mesh() {
@@ -225,6 +234,7 @@ impl GangContext for HttpContext {
 
     fn exchange(&mut self, step: u64, slices: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError> {
         self.check()?;
+        self.held.busy().set(Phase::Working);
         let Some(mesh) = self.mesh.clone() else { return Ok(Exchange::Regroup) };
         let generation = mesh.config.generation;
         if self.held.halt(generation).is_some() {
@@ -265,6 +275,25 @@ impl GangContext for HttpContext {
 
     fn leads(&self) -> bool {
         self.mesh.as_ref().map_or_else(|| self.held.leads(), |mesh| mesh.config.rank == 0)
+    }
+
+    fn hold(&mut self) -> Result<(), ContextError> {
+        let Some(mesh) = self.mesh.clone() else {
+            return Err(ContextError::Unavailable("a stage that is not a gang's holds no state for others".to_owned()));
+        };
+        // What this member logged is stored before rank 0 ends the attempt for all.
+        self.flush()?;
+        let held = self.held.clone();
+        let generation = mesh.config.generation;
+        let barrier = format!("barrier `closing` of generation {generation}");
+        match mesh.watch(0, &barrier, &|| held.halt(generation)) {
+            Halt::Ended(reason) => {
+                self.part();
+                Err(ContextError::GrantEnded(reason))
+            }
+            Halt::Disagree(message) => Err(ContextError::Unavailable(message)),
+            Halt::Regroup | Halt::Peer => self.await_regroup(&mesh),
+        }
     }
 
     fn can_save(&self) -> bool {

@@ -42,6 +42,8 @@ pub struct Options {
     pub peer_address: Option<String>,
     /// Be killed when the parent dies, and leave Ctrl-C to it.
     pub die_with_parent: bool,
+    /// How long saving and saying goodbye may take once the process was asked to end; then it ends at once.
+    pub leave_within: Duration,
 }
 
 /// Why a worker ended other than in good order.
@@ -62,7 +64,7 @@ pub enum JoinError {
         source: std::io::Error,
     },
     /// A thread of ours panicked.
-    #[error("the stage thread has panicked")]
+    #[error("a thread of the worker has panicked")]
     Fault,
 }
 
@@ -89,14 +91,18 @@ pub fn init_logging() {
 /// Works for a coordinator until that says to leave or the process is asked to end.
 ///
 /// To be called from `main` before other threads are started, after [`tune_allocator`](process::tune_allocator).
-/// SIGTERM, and SIGINT unless a parent takes care of it, winds down: what runs saves a checkpoint and is released.
+/// SIGTERM, and SIGINT unless a parent takes care of it, winds down: what runs saves a checkpoint and is released. If that is not over
+/// after [`Options::leave_within`], be it that no coordinator is there to take the checkpoint, the process ends as it is with exit code 1:
+/// what was acknowledged is stored, and the task goes on from there.
 pub fn join(options: Options) -> Result<(), JoinError> {
     if options.die_with_parent {
         process::belong_to_parent();
     }
     failpoints::arm_from_env();
     stage_thread::log_panics();
-    let device = kinds::device(options.backend, options.device).map_err(JoinError::Usage)?;
+    // The one place that counts devices: number 3 here is number 3 of `trainer devices`.
+    let device = models::device::open(options.backend, options.device);
+    let device = device.map_err(|error| JoinError::Usage(error.to_string()))?;
     work(options, device, Arc::new(kinds::Stages), Timing::default())
 }
 
@@ -115,9 +121,16 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
     let endpoint = Endpoint::open(bind, timing).map_err(system("the listener for peers"))?;
     let cache = Cache::new(options.cache.clone(), Bounds::default()).map_err(system("the blob cache"))?;
     let shared = Shared::new(endpoint.clone());
-    runtime.block_on(async { watch_signals(shared.clone(), options.die_with_parent) }).map_err(system("signals"))?;
+    let watch = async { watch_signals(shared.clone(), options.die_with_parent, options.leave_within) };
+    runtime.block_on(watch).map_err(system("signals"))?;
 
-    let bench = Bench { kinds, client: client.clone(), cache: Arc::new(cache), device };
+    let cache = Arc::new(cache);
+    let preparer = {
+        let (shared, client, cache) = (shared.clone(), client.clone(), cache.clone());
+        let run = move || shared.preparation.run(&client, &cache);
+        thread::Builder::new().name("prepare".to_owned()).spawn(run).map_err(system("the thread that fetches ahead"))?
+    };
+    let bench = Bench { kinds, client: client.clone(), cache, device };
     let stage = {
         let shared = shared.clone();
         let run = move || {
@@ -136,11 +149,13 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
         worker: name,
         pid: std::process::id(),
         backend: options.backend,
+        instruction_set: models::instruction_set().to_owned(),
         peer_address: advertised.unwrap_or_else(|| endpoint.address().to_string()),
     };
     let end = runtime.block_on(assignments::follow(&client, &offer, &shared));
     shared.end("this worker leaves");
     stage.join().map_err(|_| JoinError::Fault)?;
+    preparer.join().map_err(|_| JoinError::Fault)?;
     match end {
         End::Left => {
             // Spares the coordinator the wait for our lease to run out; if it does not hear it, that is what happens.
@@ -182,7 +197,7 @@ fn peer_address(options: &Options) -> Result<(SocketAddr, Option<String>), JoinE
     }
 }
 
-fn watch_signals(shared: Arc<Shared>, owned: bool) -> std::io::Result<()> {
+fn watch_signals(shared: Arc<Shared>, owned: bool, leave_within: Duration) -> std::io::Result<()> {
     let mut terminate = signal(SignalKind::terminate())?;
     let mut interrupt = signal(SignalKind::interrupt())?;
     tokio::spawn(async move {
@@ -203,6 +218,15 @@ fn watch_signals(shared: Arc<Shared>, owned: bool) -> std::io::Result<()> {
             if !shared.is_leaving() {
                 tracing::info!("winding down: what runs is saved and released");
                 shared.leave();
+                // A thread, so that nothing that waits on the runtime or for the coordinator puts it off.
+                thread::spawn(move || {
+                    thread::sleep(leave_within);
+                    tracing::error!(
+                        "not done {} s after it was asked to leave; ending now: what was acknowledged is stored",
+                        leave_within.as_secs_f64()
+                    );
+                    std::process::exit(1);
+                });
             }
         }
     });

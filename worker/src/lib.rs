@@ -1,8 +1,9 @@
 //! The data plane: a process that takes assignments from a coordinator, runs their stages and uploads what they make.
 //!
-//! Its threads: one computes (`stage_thread`), one drives all HTTP, on which the poll (`orders`) lives, one a running
-//! attempt sends metrics and logs (`telemetry`), and a few short-stacked ones serve the connections of a gang (`gang::mesh`). What
-//! binds them is `held::ActiveAssignment`: an assignment, its newest grant, and whether it has ended.
+//! Its threads: one computes (`stage_thread`), one drives all HTTP, on which the poll (`assignments`) lives, one fetches ahead what
+//! the next task needs (`prepare`), one a running attempt sends metrics and logs (`telemetry_buffer`), and a few short-stacked ones
+//! serve the connections of a gang (`gang::mesh`). What binds them is `active_assignment::ActiveAssignment`: an assignment, its
+//! newest grant, and whether it has ended.
 //!
 //! Not its job: what a stage computes (`stages`), and every decision about who does what (the coordinator's).
 
@@ -18,6 +19,7 @@ pub mod failpoints;
 mod gang;
 mod join;
 mod kinds;
+mod prepare;
 pub mod process;
 mod retry;
 mod stage_thread;

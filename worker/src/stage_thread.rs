@@ -14,7 +14,7 @@ use stages::context::{AttemptContext, ContextError, GangContext, Outcome, Part, 
 use crate::active_assignment::ActiveAssignment;
 use crate::assignments::Shared;
 use crate::cache::Cache;
-use crate::client::Client;
+use crate::client::{CallError, Client};
 use crate::context::HttpContext;
 use crate::failpoints;
 use crate::retry::{self, GaveUp};
@@ -66,16 +66,32 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
     let Some(outcome) = outcome(result, held, &context) else { return };
 
     failpoints::hit("outcome::before_report");
-    let reported = retry::until_ended(held, "reporting the outcome", |grant| {
-        let report = ReportOutcome { grant: grant.clone(), outcome: outcome.clone() };
-        bench.client.wait(bench.client.tell("/v1/outcomes", &report))
-    });
+    let reported = report(held, bench, &outcome);
     failpoints::hit("outcome::after_report");
     match reported {
         Ok(()) => tracing::info!(task = %grant.task, attempt = %grant.attempt, "end: {}", summary(&outcome)),
         Err(GaveUp::Ended(reason)) => tracing::info!(task = %grant.task, "the outcome came too late: {reason}"),
-        Err(GaveUp::Answer(error)) => tracing::error!(task = %grant.task, "the outcome was refused: {error}"),
+        Err(GaveUp::Answer(error)) => {
+            tracing::error!(task = %grant.task, "the outcome was refused: {error}");
+            // Said by nobody, the end would be waited for as long as this worker lives.
+            let class = if matches!(error, CallError::Storage(_)) {
+                FailureClass::Storage
+            } else {
+                FailureClass::Infrastructure
+            };
+            let message = format!("what it made was refused: {error}");
+            if let Err(GaveUp::Answer(error)) = report(held, bench, &TaskOutcome::Failed { class, message }) {
+                tracing::error!(task = %grant.task, "so was the failure: {error}");
+            }
+        }
     }
+}
+
+fn report(held: &ActiveAssignment, bench: &Bench, outcome: &TaskOutcome) -> Result<(), GaveUp> {
+    retry::until_ended(held, "reporting the outcome", |grant| {
+        let report = ReportOutcome { grant: grant.clone(), outcome: outcome.clone() };
+        bench.client.wait(bench.client.tell("/v1/outcomes", &report))
+    })
 }
 
 /// What to report; nothing if the grant has ended, or if it is for rank 0 to say.

@@ -16,7 +16,7 @@ use burn::tensor::Device;
 use checkpoint::BlobError;
 use protocol::message::{
     ApiError, Assignment, CommitCheckpoint, DesiredAssignments, FailureClass, Grant, Join, Joined, LogBatch, Member,
-    MetricBatch, PROTOCOL_VERSION, Poll, ReportOutcome, Role, StageTask, TaskOutcome,
+    MetricBatch, PROTOCOL_VERSION, Poll, Prepare, ReportOutcome, Role, StageTask, TaskOutcome,
 };
 use protocol::stage::{Backend, CheckpointPolicy, DataSynthetic, StageSettings};
 use protocol::{
@@ -33,6 +33,9 @@ use crate::gang::endpoint::Endpoint;
 use crate::gang::mesh::Timing;
 use crate::stage_thread::{self, Bench, Kinds};
 
+/// Long enough that no poll of a busy machine is given up in vain.
+const LEASE_MS: u64 = 6000;
+
 type Metrics = BTreeMap<(u64, String), f64>;
 
 const TOKEN: &str = "a-token-of-tests-only";
@@ -46,11 +49,12 @@ pub(crate) fn server_at(url: &str) -> access::Server {
 #[derive(Debug, Default)]
 struct ActorHandle {
     assignments: Vec<Assignment>,
+    prepare: Vec<Prepare>,
     version: u64,
     leave: bool,
     joins: u64,
     forget: bool,
-    polls: u64,
+    polls: Vec<Instant>,
     last_poll: Option<Poll>,
     blobs: HashMap<Digest, Vec<u8>>,
     staged: HashMap<Digest, Vec<u8>>,
@@ -61,6 +65,10 @@ struct ActorHandle {
     /// The fence that the store has; writes with another are refused.
     fence: u64,
     calls: u64,
+    /// Blobs that were asked for.
+    fetched: Vec<Digest>,
+    /// Ends with an artifact are refused.
+    refuses: bool,
 }
 
 /// The coordinator.
@@ -71,6 +79,10 @@ struct Fake {
     away: AtomicBool,
     /// Every third write is done, and then its answer is lost.
     lossy: AtomicBool,
+    /// The next so many polls are never answered.
+    hang: AtomicU64,
+    /// Downloads never end.
+    stuck: AtomicBool,
     /// The next so many downloads arrive with a flipped bit.
     damage: AtomicU64,
     /// The next so many transfers of blobs break off in their middle.
@@ -114,7 +126,7 @@ async fn join(State(fake): State<Arc<Fake>>, Json(join): Json<Join>) -> Response
     assert_eq!(join.protocol, PROTOCOL_VERSION);
     let mut coordinator = lock(&fake.coordinator);
     coordinator.joins += 1;
-    Json(Joined { incarnation: Incarnation(coordinator.joins), lease_ms: 1000, poll_ms: 100 }).into_response()
+    Json(Joined { incarnation: Incarnation(coordinator.joins), lease_ms: LEASE_MS, poll_ms: 100 }).into_response()
 }
 
 async fn poll(State(fake): State<Arc<Fake>>, Path(worker): Path<String>, Json(poll): Json<Poll>) -> Response {
@@ -128,8 +140,11 @@ async fn poll(State(fake): State<Arc<Fake>>, Path(worker): Path<String>, Json(po
         if std::mem::take(&mut coordinator.forget) {
             return refuse(StatusCode::NOT_FOUND, "not-found");
         }
-        coordinator.polls += 1;
+        coordinator.polls.push(Instant::now());
         coordinator.last_poll = Some(poll);
+    }
+    if fake.hang.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok() {
+        std::future::pending::<()>().await;
     }
     for _ in 0..20 {
         if lock(&fake.coordinator).version != version {
@@ -141,6 +156,7 @@ async fn poll(State(fake): State<Arc<Fake>>, Path(worker): Path<String>, Json(po
     Json(DesiredAssignments {
         version: coordinator.version,
         assignments: coordinator.assignments.clone(),
+        prepare: coordinator.prepare.clone(),
         leave: coordinator.leave,
     })
     .into_response()
@@ -177,6 +193,9 @@ async fn checkpoint(State(fake): State<Arc<Fake>>, Json(commit): Json<CommitChec
 }
 
 async fn outcome(State(fake): State<Arc<Fake>>, Json(report): Json<ReportOutcome>) -> Response {
+    if lock(&fake.coordinator).refuses && matches!(report.outcome, TaskOutcome::Finished { .. }) {
+        return refuse(StatusCode::NOT_FOUND, "not-found");
+    }
     fake.write(&report.grant.clone(), |coordinator| {
         if !coordinator.outcomes.contains(&report) {
             coordinator.assignments.retain(|a| a.grant.task != report.grant.task);
@@ -243,6 +262,10 @@ async fn get_blob(
         fake.received.fetch_add(1, Ordering::SeqCst);
         return refuse(StatusCode::CONFLICT, "damaged");
     }
+    lock(&fake.coordinator).fetched.push(digest);
+    if fake.stuck.load(Ordering::SeqCst) {
+        std::future::pending::<()>().await;
+    }
     let Some(mut bytes) = lock(&fake.coordinator).blobs.get(&digest).cloned() else {
         return refuse(StatusCode::NOT_FOUND, "not-found");
     };
@@ -292,6 +315,7 @@ struct Worker {
     member: Member,
     stage: JoinHandle<()>,
     poll: JoinHandle<End>,
+    preparer: JoinHandle<()>,
     _server: Runtime,
 }
 
@@ -321,14 +345,24 @@ impl Worker {
         let member = Member { worker: "w0".into(), incarnation: Incarnation(1), peer_address: peer_address.clone() };
         let shared = Shared::new(endpoint);
         let cache = Arc::new(Cache::new(None, Bounds::default()).expect("memory"));
+        let preparer = {
+            let (shared, client, cache) = (shared.clone(), client.clone(), cache.clone());
+            thread::spawn(move || shared.preparation.run(&client, &cache))
+        };
         let bench =
             Bench { kinds: Arc::new(Scripted(script)), client: client.clone(), cache, device: Device::default() };
         let stage = {
             let shared = shared.clone();
             thread::spawn(move || stage_thread::run(&shared, &bench))
         };
-        let offer =
-            Join { protocol: PROTOCOL_VERSION, worker: "w0".into(), pid: 1, backend: Backend::Flex, peer_address };
+        let offer = Join {
+            protocol: PROTOCOL_VERSION,
+            worker: "w0".into(),
+            pid: 1,
+            backend: Backend::Flex,
+            instruction_set: "avx2".into(),
+            peer_address,
+        };
         let poll = {
             let (shared, handle) = (shared.clone(), server.handle().clone());
             thread::spawn(move || {
@@ -337,7 +371,7 @@ impl Worker {
                 end
             })
         };
-        Self { fake, shared, member, stage, poll, _server: server }
+        Self { fake, shared, member, stage, poll, preparer, _server: server }
     }
 
     /// Grants the task anew under the next fence.
@@ -362,6 +396,7 @@ impl Worker {
         self.fake.desired(|coordinator| coordinator.leave = true);
         assert_eq!(self.poll.join().expect("no panic"), End::Left);
         self.stage.join().expect("no panic");
+        self.preparer.join().expect("no panic");
         std::mem::take(&mut *lock(&self.fake.coordinator))
     }
 }
@@ -652,4 +687,121 @@ fn a_blob_that_is_damaged_in_the_store_fails_the_attempt_at_once() {
     assert_eq!(worker.fake.received.load(Ordering::SeqCst), 1, "asked once");
     let outcomes = worker.leave().outcomes.clone();
     let TaskOutcome::Failed { class: FailureClass::Storage, .. } = &outcomes[0].outcome else { panic!("{outcomes:?}") };
+}
+
+#[test]
+fn a_poll_whose_connection_hangs_is_followed_by_another_within_the_lease() {
+    let worker = Worker::start(Box::new(finished));
+    worker.wait("some polls", |coordinator| coordinator.polls.len() > 2);
+    worker.fake.hang.store(1, Ordering::SeqCst);
+    worker.wait("the hanging one", |_| worker.fake.hang.load(Ordering::SeqCst) == 0);
+    let before = lock(&worker.fake.coordinator).polls.len();
+    worker.wait("the next ones", |coordinator| coordinator.polls.len() > before + 2);
+    let coordinator = worker.leave();
+    let longest = coordinator.polls.windows(2).map(|pair| pair[1] - pair[0]).max().expect("polls");
+    assert!(longest < Duration::from_millis(LEASE_MS), "not heard of for {longest:?}");
+    assert!(longest > Duration::from_millis(LEASE_MS / 3), "one poll did hang: {longest:?}");
+}
+
+/// An artifact of one file in the fake's store: its manifest's digest, and the file's.
+fn artifact(fake: &Fake, bytes: &[u8]) -> (Digest, Digest) {
+    let file = Digest::of(bytes);
+    let mut manifest = Manifest::new(ArtifactKind::Dataset, serde_json::json!({}));
+    let entry = protocol::artifact::FileEntry { digest: file, bytes: bytes.len() as u64 };
+    manifest.files.insert("file".to_owned(), entry);
+    let blobs = &mut lock(&fake.coordinator).blobs;
+    blobs.insert(file, bytes.to_vec());
+    blobs.insert(manifest.digest(), manifest.to_bytes());
+    (manifest.digest(), file)
+}
+
+fn prepare(task: &str, input: Digest, resume: Option<Digest>) -> Prepare {
+    Prepare { task: task.into(), inputs: BTreeMap::from([("dataset".to_owned(), input)]), resume }
+}
+
+fn says_ready(coordinator: &ActorHandle, tasks: &[&str]) -> bool {
+    coordinator.last_poll.as_ref().is_some_and(|poll| poll.ready.iter().map(TaskId::as_str).eq(tasks.iter().copied()))
+}
+
+#[test]
+fn what_a_task_needs_is_fetched_before_it_is_given() {
+    let input = Arc::new(Mutex::new(None));
+    let read = input.clone();
+    let worker = Worker::start(Box::new(move |context| {
+        let digest = lock(&read).expect("set before the grant");
+        let manifest = context.manifest(digest)?;
+        context.blobs().get(manifest.files["file"].digest).expect("there");
+        finished(context)
+    }));
+    let (data, file) = artifact(&worker.fake, b"data");
+    let (saved, state) = artifact(&worker.fake, b"state");
+    *lock(&input) = Some(data);
+    // Part of it is not there yet, and part arrives damaged.
+    let held_back = lock(&worker.fake.coordinator).blobs.remove(&state).expect("stored");
+    worker.fake.damage.store(1, Ordering::SeqCst);
+    worker.fake.desired(|coordinator| coordinator.prepare = vec![prepare("run/stage", data, Some(saved))]);
+    worker.wait("the file that is missing", |coordinator| coordinator.fetched.contains(&state));
+    assert!(says_ready(&lock(&worker.fake.coordinator), &[]), "not before all is there");
+    lock(&worker.fake.coordinator).blobs.insert(state, held_back);
+    worker.wait("it to be ready", |coordinator| says_ready(coordinator, &["run/stage"]));
+    let fetched = lock(&worker.fake.coordinator).fetched.len();
+    assert!(lock(&worker.fake.coordinator).fetched.contains(&file));
+    worker.grant(1);
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    worker.fake.desired(|coordinator| coordinator.prepare.clear());
+    worker.wait("it to be forgotten", |coordinator| says_ready(coordinator, &[]));
+    let coordinator = worker.leave();
+    assert_eq!(coordinator.fetched.len(), fetched, "the stage fetches nothing");
+    assert!(matches!(coordinator.outcomes[0].outcome, TaskOutcome::Finished { .. }), "{:?}", coordinator.outcomes);
+}
+
+#[test]
+fn fetching_ahead_stops_when_the_task_is_another_s_and_when_the_worker_leaves() {
+    let worker = Worker::start(Box::new(finished));
+    let (first, _) = artifact(&worker.fake, b"first");
+    let (second, _) = artifact(&worker.fake, b"second");
+    worker.fake.stuck.store(true, Ordering::SeqCst);
+    worker.fake.desired(|coordinator| coordinator.prepare = vec![prepare("run/a", first, None)]);
+    worker.wait("a download that hangs", |coordinator| coordinator.fetched == [first]);
+    worker.fake.stuck.store(false, Ordering::SeqCst);
+    worker.fake.desired(|coordinator| coordinator.prepare = vec![prepare("run/b", second, None)]);
+    worker.wait("the other one", |coordinator| says_ready(coordinator, &["run/b"]));
+    worker.fake.stuck.store(true, Ordering::SeqCst);
+    worker.fake.desired(|coordinator| coordinator.prepare = vec![prepare("run/a", first, None)]);
+    worker.wait("the first one again", |coordinator| coordinator.fetched.iter().filter(|d| **d == first).count() == 2);
+    let begun = Instant::now();
+    worker.leave();
+    assert!(begun.elapsed() < Duration::from_secs(5), "it waited for the download");
+}
+
+#[test]
+fn an_outcome_that_is_refused_is_a_failure_and_not_silence() {
+    let worker = Worker::start(Box::new(finished));
+    lock(&worker.fake.coordinator).refuses = true;
+    worker.grant(1);
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    let coordinator = worker.leave();
+    let TaskOutcome::Failed { class, message } = &coordinator.outcomes[0].outcome else {
+        panic!("{:?}", coordinator.outcomes)
+    };
+    assert_eq!(*class, FailureClass::Infrastructure);
+    assert!(message.contains("not-found"), "{message}");
+}
+
+#[test]
+fn a_member_that_runs_out_of_memory_says_so_itself() {
+    let worker = Worker::start(Box::new(|_| panic!("CUDA_ERROR: out of memory")));
+    let first = Member { worker: "other".into(), incarnation: Incarnation(1), peer_address: "127.0.0.1:9".into() };
+    let members = vec![first, worker.member.clone()];
+    worker.fake.desired(|coordinator| {
+        coordinator.fence = 1;
+        let mut desired = assignment(&members[1], 1, 1);
+        desired.role =
+            Role::Member { generation: Generation(1), members: members.clone(), secret: "secret".to_owned() };
+        coordinator.assignments = vec![desired];
+    });
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    let outcomes = worker.leave().outcomes;
+    let TaskOutcome::Failed { class, .. } = &outcomes[0].outcome else { panic!("{outcomes:?}") };
+    assert_eq!((*class, outcomes[0].grant.worker.as_str()), (FailureClass::OutOfMemory, "w0"));
 }

@@ -108,6 +108,7 @@ impl Worker {
             worker: name.as_str().into(),
             pid: 1,
             backend: Backend::Flex,
+            instruction_set: "avx2".into(),
             peer_address: "127.0.0.1:1".into(),
         };
         let joined: Joined = connection.post("/v1/workers", &join).await?;
@@ -116,7 +117,7 @@ impl Worker {
 
     /// A heartbeat that is answered at once.
     async fn poll(&mut self) -> Result<Option<Assignment>> {
-        let poll = Poll { incarnation: self.incarnation, doing: vec![], version: 0 };
+        let poll = Poll { incarnation: self.incarnation, doing: vec![], ready: vec![], version: 0 };
         let desired: DesiredAssignments =
             self.connection.post(&format!("/v1/workers/{}/poll", self.name), &poll).await?;
         Ok(desired.assignments.into_iter().next())

@@ -13,7 +13,7 @@ use std::sync::Arc;
 
 use protocol::message::{Join, RunState};
 use protocol::pipeline::Pipeline;
-use protocol::{Digest, Fence, RunId, StageName, TaskId, WorkerId, limits};
+use protocol::{Digest, Fence, Incarnation, RunId, StageName, TaskId, WorkerId, limits};
 use registry::Write;
 
 use crate::event::{Control, Effect, Event, Known, Millis, Moment, Rejected};
@@ -133,6 +133,7 @@ impl<'a> Deciding<'a> {
             | Fact::ExecutionSource { key, .. }
             | Fact::ExecutionTime { key, .. }
             | Fact::ExecutionResumed { key }
+            | Fact::ExecutionInstructions { key, .. }
             | Fact::Tasks { key, .. }
             | Fact::Task { key, .. } => drop(self.touched.insert(*key)),
             Fact::Draining { .. } => {
@@ -222,6 +223,7 @@ impl Deciding<'_> {
             }
             Event::Join { join } => self.join(join)?,
             Event::WorkerBack { worker } => return self.sign(&worker, Sign::Back),
+            Event::WorkerReady { worker, incarnation, tasks } => return self.ready(worker, incarnation, tasks),
             Event::LeaseExpired { worker, incarnation } => {
                 if self.state.process(&worker, incarnation).is_err() || !self.sign(&worker, Sign::LeaseExpired)? {
                     return Ok(false);
@@ -455,6 +457,9 @@ impl Deciding<'_> {
         let (run, stage) = (archived.run.clone(), archived.stage.clone());
         self.record(Fact::ExecutionSource { key, run: run.clone(), stage });
         self.record(Fact::Tasks { key, tasks: archived.tasks.iter().map(again).collect() });
+        if let Some(instruction_set) = archived.instruction_set.clone() {
+            self.record(Fact::ExecutionInstructions { key, instruction_set });
+        }
         self.record(Fact::ExecutionTime { key, wall_ms: archived.wall_ms, busy_since: None });
         if archived.resumed || archived.has_something() {
             self.resumed(key);
@@ -500,6 +505,18 @@ impl Deciding<'_> {
             self.fences.push(fence);
         }
         Ok(over)
+    }
+
+    /// Takes note of what a worker has fetched ahead; `false` if all of that is known or over.
+    fn ready(&mut self, worker: WorkerId, incarnation: Incarnation, tasks: Vec<TaskId>) -> Result<bool, Rejected> {
+        let known = self.state.process(&worker, incarnation)?;
+        let ready: BTreeSet<TaskId> = tasks.into_iter().filter(|task| self.state.tasks.contains_key(task)).collect();
+        if ready.is_subset(&known.ready) {
+            return Ok(false);
+        }
+        let process = Worker { ready, ..known.clone() };
+        self.record(Fact::Worker { worker, process });
+        Ok(true)
     }
 
     /// Takes note of a sign of a known worker; `false` if it says nothing new.

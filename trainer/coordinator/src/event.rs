@@ -94,6 +94,15 @@ pub enum Event {
         /// Who.
         worker: WorkerId,
     },
+    /// A worker has what it needs for tasks that it may be given.
+    WorkerReady {
+        /// Who.
+        worker: WorkerId,
+        /// Which process.
+        incarnation: Incarnation,
+        /// Which tasks, all of them.
+        tasks: Vec<TaskId>,
+    },
     /// A worker was not heard of for the length of its lease.
     LeaseExpired {
         /// Who.

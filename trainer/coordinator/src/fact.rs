@@ -119,6 +119,13 @@ pub enum Fact {
         /// Its key.
         key: Digest,
     },
+    /// The instruction set of all that work on it.
+    ExecutionInstructions {
+        /// Its key.
+        key: Digest,
+        /// What their kernels dispatch to.
+        instruction_set: String,
+    },
     /// It has tasks: new ones, or those that an earlier try left.
     Tasks {
         /// Its key.

@@ -4,7 +4,7 @@
 //! | | holds |
 //! |---|---|
 //! | C1 | A worker holds at most one task. |
-//! | C2 | Whoever holds a task is the newest process of its name, is here, and computes on the work's backend. |
+//! | C2 | Whoever holds a task is the newest process of its name, is here, and computes on the work's backend, with the others' instruction set. |
 //! | C3 | Only tasks of open works are held; a held task has an attempt and a fence. |
 //! | C4 | A gang has at least `min` and at most `max` members, each once; other tasks have one holder. |
 //! | C5 | Fences, attempts and incarnations never go down; whoever gains or loses a task sees the fence go up. |
@@ -53,7 +53,7 @@ pub fn check(state: &State) -> Vec<String> {
             let small =
                 task.part != Part::Gang && execution.state == ExecutionState::Open && wanted.contains(&execution.key);
             if small && !state.draining && task.is_free(state.now) && execution.is_ready(task) {
-                let idle: Vec<_> = schedule::idle(state, execution.backend).collect();
+                let idle: Vec<_> = schedule::idle(state, execution).collect();
                 if !idle.is_empty() {
                     broken.push(format!("C11: `{}` is ready and {idle:?} idle", task.id));
                 }
@@ -156,9 +156,7 @@ fn check_task(state: &State, execution: &StageExecution, task: &Task, broken: &m
     let holders = task.holders();
     for member in holders {
         let good = state.workers.get(&member.worker).is_some_and(|worker| {
-            worker.incarnation == member.incarnation
-                && worker.presence == Presence::Here
-                && worker.backend == execution.backend
+            worker.incarnation == member.incarnation && worker.presence == Presence::Here && execution.takes(worker)
         });
         if !good {
             broken.push(format!("C2: `{}` is held by {member:?}", task.id));

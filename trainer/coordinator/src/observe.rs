@@ -9,7 +9,7 @@ use protocol::message::Poll;
 use crate::event::{Event, Millis, Observation, Rejected};
 use crate::state::State;
 use crate::state::task::Lease;
-use crate::state::worker::Presence;
+use crate::state::worker::{Presence, Worker};
 
 /// Takes note of `observation`, which was made at `at`, and says which events follow from it.
 pub fn observe(state: &mut State, at: Millis, observation: Observation) -> Result<Vec<Event>, Rejected> {
@@ -22,7 +22,13 @@ pub fn observe(state: &mut State, at: Millis, observation: Observation) -> Resul
 /// Whether `poll` says no more than that its worker lives and how far it is: nothing follows from it.
 pub fn is_quiet(state: &State, worker: &WorkerId, poll: &Poll) -> Result<bool, Rejected> {
     let known = state.process(worker, poll.incarnation)?;
-    Ok(known.presence == Presence::Here && poll.doing.iter().all(|doing| doing.lost.is_empty()))
+    let lost_nobody = poll.doing.iter().all(|doing| doing.lost.is_empty());
+    Ok(known.presence == Presence::Here && lost_nobody && !is_ready_for_more(state, known, poll))
+}
+
+/// Whether the worker has what it needs for a task of which that was not known.
+fn is_ready_for_more(state: &State, known: &Worker, poll: &Poll) -> bool {
+    poll.ready.iter().any(|task| !known.ready.contains(task) && state.tasks.contains_key(task))
 }
 
 fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result<Vec<Event>, Rejected> {
@@ -43,6 +49,10 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
                 poll.incarnation
             )));
         }
+    }
+    if is_ready_for_more(state, known, &poll) {
+        let (worker, incarnation) = (worker.clone(), poll.incarnation);
+        events.push(Event::WorkerReady { worker, incarnation, tasks: poll.ready });
     }
     let heard = Arc::make_mut(&mut state.heard.workers).entry(worker).or_default();
     *heard = now.max(*heard);

@@ -138,6 +138,7 @@ impl Deciding<'_> {
                     wall_ms: 0,
                     busy_since: None,
                     resumed: false,
+                    instruction_set: None,
                     users: BTreeMap::new(),
                 };
                 self.record(Fact::Execution { execution: Box::new(execution) });

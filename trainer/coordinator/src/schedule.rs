@@ -3,21 +3,29 @@
 //! Executions are served in the order of [`State::wanted`](crate::state::State::wanted). Gangs that have become
 //! too large give up members. Then plain tasks, shards and merges
 //! that are ready, one worker each: they are short, and much waits for them. Then gangs that are under way take in whoever
-//! is left, up to their `max`; then gangs that wait start with everybody who is left. A gang does not start while a map
+//! is left, up to their `max`; then gangs that wait start with everybody who is left. A gang takes only workers that have said that they
+//! have its inputs: [`State::open_gangs`] says to those who are left for what they should fetch them, and nobody waits for who is slow
+//! at that. Whoever works on an execution has the instruction set of the others. A gang does not start while a map
 //! stage that its workers could merge is almost done (its last shards are out), or the merge would wait for the whole
 //! training; one that takes a single worker leaves the others to it.
+
+use std::sync::Arc;
 
 use protocol::Digest;
 use protocol::message::Member;
 use protocol::stage::Backend;
 
 use crate::decide::Deciding;
+use crate::fact::Fact;
 use crate::policy::GrantOrder;
 use crate::state::State;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::gang::{self, Change};
 use crate::state::task::{Lease, Part, Task};
 use crate::state::worker::Presence;
+
+/// So many gangs idle workers may be asked to prepare for. With more than that, which is sweeps, the others' turn comes later.
+const OPEN_GANGS: usize = 64;
 
 /// Gives idle workers what is ready.
 pub(crate) fn schedule(cx: &mut Deciding<'_>) {
@@ -34,6 +42,7 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
         }
     }
     // Mostly everybody is at work, and nothing else is looked at.
+    cx.state.open_gangs = Arc::default();
     if !cx.state.unused.iter().any(|name| cx.state.workers.get(name).is_some_and(|w| w.presence == Presence::Here)) {
         return;
     }
@@ -43,7 +52,7 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
         small_tasks(cx, *key);
     }
     // With a thousand workers at work one does not look for an idle one again for each gang.
-    let some_idle = |key: &Digest| idle(cx.state, cx.state.executions[key].backend).next().is_some();
+    let some_idle = |key: &Digest| idle(cx.state, &cx.state.executions[key]).next().is_some();
     let left: Vec<Digest> = wanted.into_iter().filter(some_idle).collect();
     for key in &left {
         change_gangs(cx, *key, fit);
@@ -51,28 +60,55 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
     for key in &left {
         start_gangs(cx, *key);
     }
+    let open = left.iter().filter_map(|key| open_gang(cx.state, *key));
+    cx.state.open_gangs = Arc::new(open.take(OPEN_GANGS).collect());
 }
 
-/// Workers of a backend that can be given work and have none, in the order in which they are served.
-pub(crate) fn idle(state: &State, backend: Backend) -> impl Iterator<Item = Member> + '_ {
+/// A gang task that could take in a worker, and waits for one that is ready.
+fn open_gang(state: &State, key: Digest) -> Option<(Digest, usize)> {
+    let execution = &state.executions[&key];
+    let has_room = |task: &Task| match &task.lease {
+        Lease::Waiting { .. } => true,
+        Lease::Held { holders, drain_by: None, .. } => gang::has_room(holders.len(), execution.range()),
+        Lease::Held { drain_by: Some(_), .. } | Lease::Done { .. } => false,
+    };
+    let place = execution.tasks.iter().position(|task| task.part == Part::Gang && has_room(task))?;
+    Some((key, place))
+}
+
+/// Workers that can be given work of an execution and have none, in the order in which they are served.
+pub(crate) fn idle<'a>(state: &'a State, execution: &'a StageExecution) -> impl Iterator<Item = Member> + 'a {
     let mut names = state.unused.iter();
     let in_order = std::iter::from_fn(move || match state.policy.grants {
         GrantOrder::ByName => names.next(),
         GrantOrder::ByNameBackwards => names.next_back(),
     });
     let known = in_order.filter_map(|name| Some((name, state.workers.get(name)?)));
-    let fit = known.filter(move |(_, worker)| worker.presence == Presence::Here && worker.backend == backend);
+    let fit = known.filter(move |(_, worker)| worker.presence == Presence::Here && execution.takes(worker));
     fit.map(|(name, worker)| worker.member(name))
 }
 
-/// Those of them that have memory enough for a task, as far as is known.
-fn fit(state: &State, backend: Backend, task: &Task) -> Vec<Member> {
-    idle(state, backend).filter(|member| !task.too_small.contains(&member.worker)).collect()
+/// Those of them that have the inputs of a task, and as far as is known the memory for it. All of one instruction set: where nothing
+/// is done yet that binds them to one, that of the most.
+fn fit(state: &State, execution: &StageExecution, task: &Task) -> Vec<Member> {
+    let fits = |member: &Member| {
+        state.workers[&member.worker].ready.contains(&task.id) && !task.too_small.contains(&member.worker)
+    };
+    let mut by_set: Vec<(&str, Vec<Member>)> = Vec::new();
+    for member in idle(state, execution).filter(fits) {
+        let set = state.workers[&member.worker].instruction_set.as_str();
+        match by_set.iter_mut().find(|(known, _)| *known == set) {
+            Some((_, members)) => members.push(member),
+            None => by_set.push((set, vec![member])),
+        }
+    }
+    // Of equals the first, which has the worker that is served first.
+    by_set.into_iter().rev().max_by_key(|(_, members)| members.len()).map(|(_, members)| members).unwrap_or_default()
 }
 
 fn small_tasks(cx: &mut Deciding<'_>, key: Digest) {
     let now = cx.now();
-    if is_gang(&cx.state.executions[&key]) || idle(cx.state, cx.state.executions[&key].backend).next().is_none() {
+    if is_gang(&cx.state.executions[&key]) || idle(cx.state, &cx.state.executions[&key]).next().is_none() {
         return;
     }
     let waiting: Vec<usize> = cx.state.executions[&key].tasks.waiting().collect();
@@ -82,7 +118,7 @@ fn small_tasks(cx: &mut Deciding<'_>, key: Digest) {
         if !task.is_free(now) || !execution.is_ready(task) {
             continue;
         }
-        let Some(worker) = idle(cx.state, execution.backend).next() else { return };
+        let Some(worker) = idle(cx.state, execution).next() else { return };
         grant(cx, key, i, vec![worker]);
     }
 }
@@ -91,7 +127,7 @@ fn is_gang(execution: &StageExecution) -> bool {
     execution.tasks.first().is_some_and(|task| task.part == Part::Gang)
 }
 
-fn change_gangs(cx: &mut Deciding<'_>, key: Digest, joiners: impl Fn(&State, Backend, &Task) -> Vec<Member>) {
+fn change_gangs(cx: &mut Deciding<'_>, key: Digest, joiners: impl Fn(&State, &StageExecution, &Task) -> Vec<Member>) {
     if !is_gang(&cx.state.executions[&key]) {
         return;
     }
@@ -99,7 +135,7 @@ fn change_gangs(cx: &mut Deciding<'_>, key: Digest, joiners: impl Fn(&State, Bac
         let execution = &cx.state.executions[&key];
         let task = &execution.tasks[i];
         if matches!(task.lease, Lease::Held { drain_by: None, .. }) {
-            match gang::with(task.holders(), &joiners(cx.state, execution.backend, task), execution.range()) {
+            match gang::with(task.holders(), &joiners(cx.state, execution, task), execution.range()) {
                 Change::Keep | Change::Disband => {}
                 Change::Regroup(members) => cx.regroup(key, i, members),
             }
@@ -117,7 +153,7 @@ fn start_gangs(cx: &mut Deciding<'_>, key: Digest) {
         let task = &execution.tasks[i];
         if task.is_free(now)
             && (execution.range().max == 1 || !merge_is_near(cx.state, execution.backend))
-            && let Some(members) = gang::start(&fit(cx.state, execution.backend, task), execution.range())
+            && let Some(members) = gang::start(&fit(cx.state, execution, task), execution.range())
         {
             grant(cx, key, i, members);
         }
@@ -137,6 +173,11 @@ fn grant(cx: &mut Deciding<'_>, key: Digest, i: usize, holders: Vec<Member>) {
     let secret = cx.secret(&cx.state.executions[&key].tasks[i]);
     if cx.state.executions[&key].tasks[i].newest().is_some() {
         cx.resumed(key);
+    }
+    let set = &cx.state.workers[&holders[0].worker].instruction_set;
+    if cx.state.executions[&key].instruction_set.as_ref() != Some(set) {
+        let instruction_set = set.clone();
+        cx.record(Fact::ExecutionInstructions { key, instruction_set });
     }
     let fence = cx.change(key, i, |task| task.grant(holders, secret));
     cx.fences.push(fence);

@@ -1,7 +1,7 @@
 //! What workers and clients are told. Read-only.
 
 use protocol::message::{
-    Assignment, DesiredAssignments, Progress, Role, RunState, RunView, StageState, StageTask, StageView,
+    Assignment, DesiredAssignments, Prepare, Progress, Role, RunState, RunView, StageState, StageTask, StageView,
 };
 use protocol::stage::Backend;
 use protocol::{Generation, Incarnation, TaskId, WorkerId, canonical};
@@ -25,6 +25,8 @@ pub struct WorkerView {
     pub pid: u32,
     /// Where it computes.
     pub backend: Backend,
+    /// What its kernels dispatch to, such as `avx512`.
+    pub instruction_set: String,
     /// `idle`, `working`, `unreachable`, `silent` or `gone`.
     pub state: String,
     /// What it works on.
@@ -48,6 +50,7 @@ impl State {
                 incarnation: worker.incarnation,
                 pid: worker.pid,
                 backend: worker.backend,
+                instruction_set: worker.instruction_set.clone(),
                 state: state.to_owned(),
                 task,
             }
@@ -57,17 +60,36 @@ impl State {
 
     /// All that a worker process should be doing.
     pub fn desired(&self, worker: &WorkerId, incarnation: Incarnation) -> Result<DesiredAssignments, Rejected> {
-        self.process(worker, incarnation)?;
+        let known = self.process(worker, incarnation)?;
         let held = self.held_by(worker).and_then(|(execution, task)| assignment(execution, task, worker, incarnation));
         let assignments: Vec<Assignment> = held.into_iter().collect();
+        let held_nothing = assignments.is_empty();
         let leave = self.draining && assignments.is_empty();
         // A new checkpoint is not news for whoever made it, so it does not end a wait.
         let news: Vec<Assignment> =
             assignments.iter().map(|assignment| Assignment { resume: None, ..assignment.clone() }).collect();
-        let digest = canonical::digest(&(&news, leave));
+        let prepare = if held_nothing && !self.draining { self.to_prepare(known) } else { Vec::new() };
+        let digest = canonical::digest(&(&news, &prepare, leave));
         // 53 bits, so that no JSON reader rounds it.
         let version = digest.as_bytes()[..8].iter().fold(0, |number, byte| number << 8 | u64::from(*byte)) >> 11;
-        Ok(DesiredAssignments { version, assignments, leave })
+        Ok(DesiredAssignments { version, assignments, prepare, leave })
+    }
+
+    /// What a worker that has nothing to do should fetch.
+    fn to_prepare(&self, worker: &Worker) -> Vec<Prepare> {
+        /// A worker takes one of them in the end.
+        const AT_ONCE: usize = 8;
+        if worker.presence != Presence::Here {
+            return Vec::new();
+        }
+        let open = self.open_gangs.iter().filter_map(|(key, i)| {
+            let execution = self.executions.get(key).filter(|execution| execution.takes(worker))?;
+            let task = execution.tasks.get(*i)?;
+            // Whoever joins others is handed their state.
+            let resume = if task.is_held() { None } else { task.newest().map(|saved| saved.manifest) };
+            Some(Prepare { task: task.id.clone(), inputs: execution.inputs.clone(), resume })
+        });
+        open.take(AT_ONCE).collect()
     }
 
     /// A run as clients see it at `now`.
@@ -91,6 +113,7 @@ impl State {
             wall_s: execution.map_or(0.0, |execution| execution.wall_s(now)),
             attempt: execution.map(StageExecution::attempt).unwrap_or_default(),
             workers: Vec::new(),
+            instruction_set: execution.and_then(|execution| execution.instruction_set.clone()),
             message: None,
             of: stage.derived.as_ref().map(|derived| derived.of.clone()),
         };
@@ -150,7 +173,9 @@ impl State {
                     format!("tries again soon (attempt {} failed)", execution.attempt())
                 } else {
                     let min = execution.placement.workers.min.max(1);
-                    format!("waits for {min} idle `{}` worker(s)", execution.backend.name())
+                    let set =
+                        execution.bound_to().map(|set| format!(" with {set}, as those before")).unwrap_or_default();
+                    format!("waits for {min} idle `{}` worker(s){set}", execution.backend.name())
                 };
                 (StageState::Ready, Some(waits_for))
             }

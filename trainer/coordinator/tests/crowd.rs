@@ -63,6 +63,7 @@ fn join(handle: &Handle) -> (Known, Joined) {
         worker: "w".into(),
         pid: 7,
         backend: Backend::Flex,
+        instruction_set: "avx2".into(),
         peer_address: "127.0.0.1:1".into(),
     };
     let joined = known.post("/v1/workers", &join);
@@ -94,7 +95,7 @@ fn echo() -> TcpStream {
 /// Heartbeats until `until`, each answered at once because it says another version than the newest.
 fn beat(handle: &Handle, until: Instant) -> Times {
     let (mut known, joined) = join(handle);
-    let poll = Poll { incarnation: joined.incarnation, doing: vec![], version: u64::MAX };
+    let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: u64::MAX };
     let mut times = Times { kept: vec![], new: vec![], echo: vec![] };
     let mut echo = echo();
     while Instant::now() < until {
@@ -219,7 +220,7 @@ async fn silent_connections_end_and_known_ones_are_not_evicted() {
     let limits = Connections { most: 20, strangers: 4, idle: Duration::from_secs(4) };
     let handle = start(dir.path(), limits).await;
     let (mut known, joined) = join(&handle);
-    let poll = Poll { incarnation: joined.incarnation, doing: vec![], version: u64::MAX };
+    let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: u64::MAX };
 
     // The fifth stranger takes the place of the first.
     let mut strangers: Vec<TcpStream> = (0..5).map(|_| TcpStream::connect(handle.address()).unwrap()).collect();

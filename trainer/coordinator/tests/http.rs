@@ -132,6 +132,7 @@ async fn join(client: &Client, name: &str) -> TestResult<Joined> {
         worker: name.into(),
         pid: 7,
         backend: Backend::Flex,
+        instruction_set: "avx2".into(),
         peer_address: "127.0.0.1:1".into(),
     };
     client.call("POST", "/v1/workers", join).await
@@ -144,11 +145,12 @@ async fn assignment(
     joined: &Joined,
     stage: &str,
 ) -> TestResult<protocol::message::Assignment> {
-    let mut version = 0;
+    let (mut version, mut ready) = (0, Vec::new());
     loop {
-        let poll = Poll { incarnation: joined.incarnation, doing: vec![], version };
+        let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready, version };
         let desired: DesiredAssignments = client.call("POST", &format!("/v1/workers/{name}/poll"), poll).await?;
         version = desired.version;
+        ready = desired.prepare.into_iter().map(|prepare| prepare.task).collect();
         if let Some(assignment) = desired.assignments.into_iter().find(|a| a.stage.name.as_str() == stage) {
             return Ok(assignment);
         }
@@ -271,6 +273,7 @@ async fn p2_a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestR
         worker: "c".into(),
         pid: 8,
         backend: Backend::Flex,
+        instruction_set: "avx2".into(),
         peer_address: "127.0.0.1:1".into(),
     };
     let (status, error) = client.refused("/v1/workers", other).await?;
@@ -279,7 +282,7 @@ async fn p2_a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestR
 
     // A process that joins under the name replaces the old one, whose polls are refused.
     join(&client, "b").await?;
-    let poll = Poll { incarnation: second.incarnation, doing: vec![], version: 0 };
+    let poll = Poll { incarnation: second.incarnation, doing: vec![], ready: vec![], version: 0 };
     assert_eq!(client.refused("/v1/workers/b/poll", poll.clone()).await?.0, 409);
     assert_eq!(client.refused("/v1/workers/c/poll", poll).await?.0, 404);
     handle.shutdown().await;
@@ -303,7 +306,7 @@ async fn polls_alone_keep_a_lease_and_show_progress() -> TestResult {
             let progress = Progress { done, total: 100, ..Progress::default() };
             let doing = Doing { grant: held.clone(), progress, lost: vec![] };
             let doing = if name == "a" { vec![doing] } else { vec![] };
-            let poll = Poll { incarnation: joined.incarnation, doing, version: version[i] };
+            let poll = Poll { incarnation: joined.incarnation, doing, ready: vec![], version: version[i] };
             let desired: DesiredAssignments = client.call("POST", &format!("/v1/workers/{name}/poll"), poll).await?;
             version[i] = desired.version;
             let grants: Vec<&Grant> = desired.assignments.iter().map(|assignment| &assignment.grant).collect();

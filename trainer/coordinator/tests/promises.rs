@@ -5,7 +5,7 @@
 #[allow(dead_code, reason = "not every test file uses all of it")]
 mod common;
 
-use coordinator::state::task::Lease;
+use coordinator::state::task::{Lease, Part};
 use coordinator::{Control, Event, Millis, Observation, Policy, Rejected, observe};
 use protocol::message::{
     CommitCheckpoint, Doing, FailureClass, Grant, Poll, Progress, ReportOutcome, RunState, StageState, TaskOutcome,
@@ -100,7 +100,7 @@ fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
     let lost = vec!["b".into(), "c".into()];
     let progress = Progress { done: 999, total: 1000, ..Progress::default() };
     let doing = vec![Doing { grant: old.clone(), progress, lost: lost.clone() }];
-    let poll = Poll { incarnation: a, doing, version: 0 };
+    let poll = Poll { incarnation: a, doing, ready: Vec::new(), version: 0 };
     let heard =
         observe(&mut actor_handle.state, Millis(actor_handle.now), Observation::Poll { worker: "a".into(), poll });
     let heard = heard.expect("it is known");
@@ -339,4 +339,93 @@ fn p14_a_drain_ends_though_a_worker_ignores_it() {
     actor_handle.restart(false);
     actor_handle.poll("a", a);
     assert!(actor_handle.assignment("a").is_some(), "a new start gives it out again");
+}
+
+fn members(actor_handle: &ActorHandle) -> Vec<String> {
+    let tasks = actor_handle.state.executions.values().flat_map(|execution| execution.tasks.iter());
+    let gang = tasks.filter(|task| task.part == Part::Gang).flat_map(|task| task.holders());
+    gang.map(|member| member.worker.to_string()).collect()
+}
+
+/// Sampled: of three workers one has the inputs when the stage begins, one gets them later, one never does.
+#[test]
+fn p4_a_gang_waits_for_nobody_who_fetches_its_inputs() {
+    let mut actor_handle = ActorHandle::new(Policy::default());
+    actor_handle.quick = false;
+    actor_handle.submit("vae", WorkerRange { min: 1, max: 3 });
+    actor_handle.join("a");
+    let dataset = actor_handle.assignment("a").expect("the only worker gets it");
+    actor_handle.report(&dataset, TaskOutcome::Finished { output: Digest::of(b"clips"), metrics: Default::default() });
+    for name in ["b", "c"] {
+        actor_handle.join(name);
+    }
+    assert_eq!(members(&actor_handle), [""; 0], "nobody has its inputs");
+    for name in ["a", "b", "c"] {
+        let asked = actor_handle.asked(name);
+        assert_eq!(asked.len(), 1, "{name}: {asked:?}");
+        assert!(asked[0].inputs.values().eq([&Digest::of(b"clips")]) && asked[0].resume.is_none(), "{asked:?}");
+    }
+    actor_handle.prepare("b");
+    assert_eq!(members(&actor_handle), ["b"], "it starts with who is ready");
+    assert_eq!(actor_handle.asked("b"), []);
+    let held = actor_handle.assignment("b").expect("it trains");
+    actor_handle.poll("c", actor_handle.state.workers[&WorkerId::from("c")].incarnation);
+    actor_handle.tick();
+    assert_eq!(actor_handle.assignment("b").as_ref(), Some(&held), "and nobody disturbs it");
+    let commit = CommitCheckpoint {
+        grant: held.grant.clone(),
+        step: 4,
+        manifest: Digest::of(b"state"),
+        metrics: Default::default(),
+    };
+    actor_handle.happen(Event::Checkpoint { commit }).expect("saved");
+    assert_eq!(actor_handle.asked("a")[0].resume, None, "a joiner is handed the state");
+    actor_handle.prepare("a");
+    assert_eq!(members(&actor_handle), ["b", "a"]);
+    assert_eq!(actor_handle.assignment("b").expect("it trains").grant.attempt, held.grant.attempt);
+    // With nobody left to hand it over, whoever begins needs the checkpoint too.
+    for name in ["a", "b"] {
+        actor_handle.happen(Event::WorkerGone { worker: name.into() }).expect("gone");
+    }
+    assert_eq!(actor_handle.asked("c")[0].resume, Some(Digest::of(b"state")));
+}
+
+/// Sampled: two workers of one instruction set and one of another, before and after something is saved.
+#[test]
+fn p1_all_that_work_on_a_stage_share_an_instruction_set() {
+    let mut actor_handle = ActorHandle::new(Policy::default());
+    let run = actor_handle.submit("vae", WorkerRange { min: 1, max: 3 });
+    let vae = |actor_handle: &ActorHandle| {
+        actor_handle.view(&run).stages.into_iter().find(|stage| stage.name.as_str() == "vae").expect("a stage")
+    };
+    actor_handle.join_with("a", "avx2");
+    let dataset = actor_handle.assignment("a").expect("the only worker gets it");
+    actor_handle.report(&dataset, TaskOutcome::Finished { output: Digest::of(b"clips"), metrics: Default::default() });
+    actor_handle.join_with("b", "avx512");
+    actor_handle.join_with("c", "avx2");
+    assert_eq!(members(&actor_handle), ["a", "c"]);
+    assert_eq!(actor_handle.asked("b"), [], "it could not be taken in");
+    assert_eq!(vae(&actor_handle).instruction_set.as_deref(), Some("avx2"));
+    let over = |actor_handle: &mut ActorHandle, names: &[&str]| {
+        for name in names {
+            actor_handle.happen(Event::WorkerGone { worker: (*name).into() }).expect("gone");
+        }
+        for _ in 0..5 {
+            actor_handle.now += 1_000;
+            actor_handle.tick();
+        }
+    };
+    over(&mut actor_handle, &["a", "c"]);
+    assert_eq!(members(&actor_handle), ["b"], "nothing was saved that would bind it");
+    assert_eq!(vae(&actor_handle).instruction_set.as_deref(), Some("avx512"));
+    let grant = actor_handle.assignment("b").expect("it trains").grant;
+    let commit = CommitCheckpoint { grant, step: 4, manifest: Digest::of(b"state"), metrics: Default::default() };
+    actor_handle.happen(Event::Checkpoint { commit }).expect("saved");
+    over(&mut actor_handle, &["b"]);
+    actor_handle.join_with("a", "avx2");
+    assert_eq!(members(&actor_handle), [""; 0], "its bits would be others");
+    let message = vae(&actor_handle).message.unwrap_or_default();
+    assert!(message.contains("avx512"), "{message}");
+    actor_handle.join_with("b", "avx512");
+    assert_eq!(members(&actor_handle), ["b"]);
 }

@@ -11,16 +11,29 @@ pub mod names;
 pub mod networks;
 pub mod optim;
 
-/// The instruction set that the kernels of this process use, which can change bits.
+/// The instruction set that the kernels of this process dispatch to: ours, Burn's and those of `gemm` look for the same features. Another
+/// one rounds differently, so workers of one stage must agree on it.
 pub fn instruction_set() -> &'static str {
     #[cfg(target_arch = "x86_64")]
     {
-        if is_x86_feature_detected!("avx512f") {
-            return "x86-64 avx512";
+        if kernels::simd::has_wide() {
+            return "avx512";
         }
-        if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
-            return "x86-64 avx2";
+        if std::arch::is_x86_feature_detected!("avx512f") {
+            // Without the extensions that ours need: `gemm` goes wide and our kernels do not.
+            return "avx512f";
         }
+        if kernels::simd::has_middle() {
+            return "avx2";
+        }
+        "sse2"
     }
-    std::env::consts::ARCH
+    #[cfg(target_arch = "aarch64")]
+    {
+        "neon"
+    }
+    #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+    {
+        std::env::consts::ARCH
+    }
 }

@@ -16,7 +16,7 @@ use crate::sweep::{SearchKind, Values};
 use crate::{Attempt, Digest, Fence, Generation, Incarnation, RunId, Seed, StageName, TaskId, WorkerId};
 
 /// The version of these messages; a worker of another version is turned away.
-pub const PROTOCOL_VERSION: u32 = 2;
+pub const PROTOCOL_VERSION: u32 = 3;
 
 /// `POST /v1/workers`: a process offers itself.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -29,6 +29,9 @@ pub struct Join {
     pub pid: u32,
     /// Where it computes.
     pub backend: Backend,
+    /// What its processor's kernels dispatch to, such as `avx512` or `neon`. Sums round differently under another one, so all that
+    /// work on one stage share it.
+    pub instruction_set: String,
     /// Where peers reach its collective listener, `host:port`.
     pub peer_address: String,
 }
@@ -51,6 +54,8 @@ pub struct Poll {
     pub incarnation: Incarnation,
     /// What the worker does now, one for each assignment it holds.
     pub doing: Vec<Doing>,
+    /// Of the tasks that it was asked to prepare ([`DesiredAssignments::prepare`]), those whose inputs it has.
+    pub ready: Vec<TaskId>,
     /// Digest-like number of the assignments the worker knows ([`DesiredAssignments::version`]); the coordinator answers at once
     /// when it has others, else within `poll_ms`.
     pub version: u64,
@@ -87,8 +92,22 @@ pub struct DesiredAssignments {
     pub version: u64,
     /// All that the worker should be doing; what is missing here it must stop and forget.
     pub assignments: Vec<Assignment>,
+    /// Tasks that an idle worker may be given: it fetches what they need and says so, and only then takes part. What is missing here it
+    /// stops fetching.
+    pub prepare: Vec<Prepare>,
     /// The worker should exit when it holds nothing.
     pub leave: bool,
+}
+
+/// What a worker fetches before it is given a task.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Prepare {
+    /// The task.
+    pub task: TaskId,
+    /// Artifacts by the field that names them, as in [`StageTask::inputs`].
+    pub inputs: BTreeMap<String, Digest>,
+    /// The checkpoint that it goes on from, unless a member would hand over its state.
+    pub resume: Option<Digest>,
 }
 
 /// The right to write about a task.
@@ -349,6 +368,9 @@ pub struct StageView {
     pub attempt: Attempt,
     /// Who works on it now.
     pub workers: Vec<WorkerId>,
+    /// What the kernels of those dispatch to that computed it, or compute it now; not part of any key.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub instruction_set: Option<String>,
     /// Why it failed or what it waits for.
     pub message: Option<String>,
     /// The swept stage that it is a part of, if a sweep made it.

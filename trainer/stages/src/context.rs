@@ -149,6 +149,13 @@ pub trait GangContext: AttemptContext {
     /// Whether this member is rank 0, which alone saves, records and reports.
     fn leads(&self) -> bool;
 
+    /// Waits with the caller's state in memory while rank 0 saves and reports the last step. Returns once the members have changed:
+    /// then [`rendezvous`](Self::rendezvous), and if this member leads now, the last save is its own.
+    ///
+    /// # Errors
+    /// [`ContextError::GrantEnded`] once what rank 0 reported is acknowledged: nothing is left to do.
+    fn hold(&mut self) -> Result<(), ContextError>;
+
     /// Whether a checkpoint could be stored now. A member that keeps its state in memory loses nothing by saving later, so
     /// training does not wait at a due checkpoint for a coordinator that is away.
     fn can_save(&self) -> bool {

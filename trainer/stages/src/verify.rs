@@ -137,6 +137,10 @@ impl GangContext for Solo {
         Ok(Exchange::Sum { sum: tree_sum(&parts), drain: step + 1 >= self.until })
     }
 
+    fn hold(&mut self) -> Result<(), ContextError> {
+        Err(ContextError::Unavailable("one member alone has nobody to wait for".to_owned()))
+    }
+
     fn leads(&self) -> bool {
         true
     }

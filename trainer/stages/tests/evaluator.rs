@@ -58,7 +58,7 @@ fn an_evaluator_is_the_same_bytes_with_any_members_and_after_any_stop() {
 
     let mut three = bench(3);
     assert_eq!(dataset(&mut three, 30), data);
-    three.script = Script { lost: vec![(0, 3)], joins: vec![(5, 5)], drain: None };
+    three.script = Script { lost: vec![(0, 3)], joins: vec![(5, 5)], ..Script::default() };
     let ran = three.run("evaluator", &small(), &[("dataset", data)]).expect("the stage runs");
     assert_eq!(ran.output(), expected.output(), "three members, of which the leader is lost and a fourth joins");
 

@@ -40,7 +40,7 @@ fn p6_every_digest_is_the_same_with_any_number_of_members_and_shards() {
     assert_eq!(alone, pair, "1 member and 1 shard against 2 and 3");
     let mut three = bench(3);
     // One is lost in each training stage, the leader, and another joins.
-    three.script = Script { lost: vec![(0, 3)], joins: vec![(5, 1)], drain: None };
+    three.script = Script { lost: vec![(0, 3)], joins: vec![(5, 1)], ..Script::default() };
     assert_eq!(alone, run(&mut three, 4), "1 member against 3 of which the leader is lost and a fourth joins");
 }
 

@@ -1,16 +1,19 @@
 //! Where peers dial this process: one listener for all gangs that it was ever in.
+//!
+//! Anybody may connect; until a handshake is over a connection is a stranger's. There is room for [`Endpoint::STRANGERS`] of them, a
+//! newcomer takes the place of the oldest, and none stays longer than a handshake may take. So strangers, however many and however
+//! slow, keep no peer out for longer than it takes to dial again.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
 use std::io;
-use std::net::{SocketAddr, TcpListener, TcpStream};
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::{Arc, Mutex, Weak};
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use protocol::{Generation, TaskId};
 
-use super::handshake::{self, HandshakeError};
+use super::handshake::{self, HandshakeError, Hurried};
 use super::mesh::{Mesh, Timing, spawn};
 use crate::event_count::lock;
 
@@ -20,18 +23,48 @@ pub(crate) struct Endpoint {
     address: SocketAddr,
     pub(super) timing: Timing,
     meshes: Mutex<HashMap<(TaskId, Generation), Weak<Mesh>>>,
-    handshakes: AtomicUsize,
+    strangers: Mutex<Strangers>,
+}
+
+/// Connections that have not proved themselves, oldest first.
+#[derive(Debug, Default)]
+struct Strangers {
+    next: u64,
+    connections: VecDeque<(u64, TcpStream)>,
+}
+
+impl Strangers {
+    /// Takes in a connection and gives its number; the oldest is ended if there is no room.
+    fn admit(&mut self, stream: &TcpStream) -> io::Result<u64> {
+        if self.connections.len() >= Endpoint::STRANGERS
+            && let Some((_, oldest)) = self.connections.pop_front()
+        {
+            // Its thread finds the connection ended.
+            let _ = oldest.shutdown(Shutdown::Both);
+        }
+        let number = self.next;
+        self.next += 1;
+        self.connections.push_back((number, stream.try_clone()?));
+        Ok(number)
+    }
+
+    /// Forgets a connection; false if it was ended to make room.
+    fn dismiss(&mut self, number: u64) -> bool {
+        let before = self.connections.len();
+        self.connections.retain(|(other, _)| *other != number);
+        self.connections.len() < before
+    }
 }
 
 impl Endpoint {
-    /// Handshakes under way at once; more are turned away and dial again.
-    const MAX_HANDSHAKES: usize = 64;
+    /// Handshakes under way at once.
+    pub(super) const STRANGERS: usize = 64;
 
     /// Listens and serves in the background, as long as the process lives.
     pub(crate) fn open(address: SocketAddr, timing: Timing) -> io::Result<Arc<Self>> {
         let listener = TcpListener::bind(address)?;
         let address = listener.local_addr()?;
-        let endpoint = Arc::new(Self { address, timing, meshes: Mutex::default(), handshakes: AtomicUsize::new(0) });
+        let endpoint = Arc::new(Self { address, timing, meshes: Mutex::default(), strangers: Mutex::default() });
         let weak = Arc::downgrade(&endpoint);
         spawn("gang-accept", move || accept(&weak, &listener));
         Ok(endpoint)
@@ -48,8 +81,9 @@ impl Endpoint {
         meshes.insert((mesh.config.task.clone(), mesh.config.generation), Arc::downgrade(mesh));
     }
 
-    fn welcome(&self, mut stream: TcpStream) -> Result<(), HandshakeError> {
-        let dial = handshake::wanted(&mut stream)?;
+    fn welcome(&self, number: u64, stream: TcpStream, since: Instant) -> Result<(), HandshakeError> {
+        let hurried = &mut Hurried::new(&stream, since)?;
+        let dial = handshake::wanted(hurried)?;
         let unknown = || HandshakeError::Unknown { task: dial.task.clone(), generation: dial.generation };
         let key = (dial.task.clone(), dial.generation);
         let mesh =
@@ -57,8 +91,12 @@ impl Endpoint {
         if dial.to != mesh.config.rank || dial.from <= dial.to || dial.from >= mesh.size() {
             return Err(HandshakeError::Ranks { from: dial.from, to: dial.to });
         }
-        handshake::accept(&mut stream, &dial, &mesh.config.secret)?;
-        mesh.attach(dial.from, stream);
+        let session = handshake::accept(hurried, &dial, &mesh.config.secret)?;
+        // From here on it is a peer's, and stays when there are too many strangers.
+        if !lock(&self.strangers).dismiss(number) {
+            return Err(HandshakeError::Crowded);
+        }
+        mesh.attach(dial.from, stream, session);
         Ok(())
     }
 }
@@ -67,26 +105,27 @@ fn accept(endpoint: &Weak<Endpoint>, listener: &TcpListener) {
     loop {
         let stream = listener.accept();
         let Some(endpoint) = endpoint.upgrade() else { return };
-        let stream = match stream {
-            Ok((stream, _)) => stream,
+        let admitted = stream.and_then(|(stream, _)| Ok((lock(&endpoint.strangers).admit(&stream)?, stream)));
+        let (number, stream) = match admitted {
+            Ok(admitted) => admitted,
             Err(error) => {
                 tracing::warn!("accepting a peer failed: {error}");
                 thread::sleep(Duration::from_millis(100));
                 continue;
             }
         };
-        if endpoint.handshakes.fetch_add(1, Ordering::SeqCst) >= Endpoint::MAX_HANDSHAKES {
-            endpoint.handshakes.fetch_sub(1, Ordering::SeqCst);
-            continue;
-        }
+        let since = Instant::now();
         spawn("gang-welcome", move || {
-            match endpoint.welcome(stream) {
+            let welcomed = endpoint.welcome(number, stream, since);
+            lock(&endpoint.strangers).dismiss(number);
+            match welcomed {
                 Ok(()) => {}
-                // The peer heard of the generation before we did, and will dial again.
-                Err(error @ HandshakeError::Unknown { .. }) => tracing::debug!("{error}"),
-                Err(error) => tracing::warn!("turned a peer away: {error}"),
+                Err(error @ (HandshakeError::Secret(_) | HandshakeError::Ranks { .. })) => {
+                    tracing::warn!("turned a peer away: {error}");
+                }
+                // A peer that heard of the generation before we did will dial again; what strangers do is not news.
+                Err(error) => tracing::debug!("turned a connection away: {error}"),
             }
-            endpoint.handshakes.fetch_sub(1, Ordering::SeqCst);
         });
     }
 }

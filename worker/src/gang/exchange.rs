@@ -69,7 +69,14 @@ pub(crate) fn rendezvous(
         tracing::info!(step = newest, bytes, receivers = behind.len(), "sending the state to members behind");
         for peer in behind {
             mesh.send(peer, &barrier, Head::new(Kind::StateLength, bytes as u64, 0, 0), &[], interrupt)?;
+            let begun = Instant::now();
             for piece in state.iter().flat_map(|piece| piece.chunks(MAX_PAYLOAD)) {
+                if begun.elapsed() > mesh.timing.start {
+                    // All others wait for this one.
+                    let limit = mesh.timing.start.as_secs_f32();
+                    mesh.lose(peer, format!("{barrier}: it has not taken the state of {bytes} bytes after {limit} s"));
+                    return Err(Halt::Peer);
+                }
                 mesh.send(peer, &barrier, Head::new(Kind::State, newest, 0, 0), piece, interrupt)?;
             }
         }

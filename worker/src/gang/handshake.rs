@@ -5,8 +5,9 @@
 //! one dialled checks that and welcomes it. Both nonces are fresh, so no recorded proof is of use; the two words differ,
 //! so that a proof cannot be sent back to who made it. The secret itself never travels.
 
+use std::io::{self, Read, Write};
 use std::net::TcpStream;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use hmac::{Hmac, Mac};
 use protocol::{Generation, TaskId};
@@ -14,10 +15,10 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use sha2::Sha256;
 
-use super::frame::{self, FrameError, Head, Kind, MAX_HANDSHAKE};
+use super::frame::{self, FrameError, Head, Kind, Seal};
 
-/// How long a side may take over one frame of the handshake.
-const PATIENCE: Duration = Duration::from_secs(5);
+/// How long a handshake may take, all frames together.
+pub(super) const PATIENCE: Duration = Duration::from_secs(5);
 
 /// Why a connection did not come about.
 #[derive(Debug, thiserror::Error)]
@@ -36,6 +37,8 @@ pub(crate) enum HandshakeError {
     Unknown { task: TaskId, generation: Generation },
     #[error("rank {from} may not dial rank {to} of this gang")]
     Ranks { from: usize, to: usize },
+    #[error("the connection was ended to make room for others")]
+    Crowded,
     #[error("no randomness: {0}")]
     Random(getrandom::Error),
 }
@@ -95,56 +98,104 @@ fn check(secret: &str, word: &str, dial: &Dial, nonce: &[u8; 16], proof: &[u8; 3
     mac(secret, word, dial, nonce).verify_slice(proof).map_err(|_| HandshakeError::Secret(dial.generation))
 }
 
-fn send<T: Serialize>(stream: &mut TcpStream, kind: Kind, value: &T) -> Result<(), HandshakeError> {
+/// What vouches for the frames after a handshake.
+#[derive(Debug)]
+pub(crate) struct Session {
+    /// For what this side sends.
+    pub(crate) sends: Seal,
+    /// For what it receives.
+    pub(crate) receives: Seal,
+}
+
+fn session(secret: &str, dial: &Dial, nonce: &[u8; 16], dialed: bool) -> Session {
+    let dialer = Seal::new(proof(secret, "frames of the dialer", dial, nonce));
+    let dialled = Seal::new(proof(secret, "frames of the one dialled", dial, nonce));
+    let (sends, receives) = if dialed { (dialer, dialled) } else { (dialled, dialer) };
+    Session { sends, receives }
+}
+
+/// A connection on which everything has to be over at one moment.
+#[derive(Debug)]
+pub(super) struct Hurried<'a> {
+    stream: &'a TcpStream,
+    until: Instant,
+}
+
+impl<'a> Hurried<'a> {
+    /// Until [`PATIENCE`] after `since`.
+    pub(super) fn new(stream: &'a TcpStream, since: Instant) -> io::Result<Self> {
+        stream.set_nodelay(true)?;
+        Ok(Self { stream, until: since + PATIENCE })
+    }
+
+    fn left(&self) -> io::Result<Duration> {
+        let left = self.until.saturating_duration_since(Instant::now());
+        if left.is_zero() { Err(io::ErrorKind::TimedOut.into()) } else { Ok(left) }
+    }
+}
+
+impl Read for Hurried<'_> {
+    fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
+        self.stream.set_read_timeout(Some(self.left()?))?;
+        self.stream.read(into)
+    }
+}
+
+impl Write for Hurried<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.stream.set_write_timeout(Some(self.left()?))?;
+        self.stream.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.stream.flush()
+    }
+}
+
+fn send<T: Serialize>(stream: &mut Hurried<'_>, kind: Kind, value: &T) -> Result<(), HandshakeError> {
     Ok(frame::write(stream, Head::new(kind, 0, 0, 0), &serde_json::to_vec(value)?)?)
 }
 
-fn receive<T: DeserializeOwned>(stream: &mut TcpStream, expected: Kind) -> Result<T, HandshakeError> {
-    let frame = frame::read(stream, MAX_HANDSHAKE)?;
+fn receive<T: DeserializeOwned>(stream: &mut Hurried<'_>, expected: Kind) -> Result<T, HandshakeError> {
+    let frame = frame::read(stream)?;
     if frame.kind != expected {
         return Err(HandshakeError::Unexpected { expected, found: frame.kind });
     }
     Ok(serde_json::from_slice(frame.bytes())?)
 }
 
-fn prepare(stream: &TcpStream) -> Result<(), HandshakeError> {
-    stream.set_nodelay(true)?;
-    stream.set_read_timeout(Some(PATIENCE))?;
-    stream.set_write_timeout(Some(PATIENCE))?;
-    Ok(())
-}
-
 /// The dialer's side.
 pub(crate) fn dial(
-    stream: &mut TcpStream,
+    stream: &TcpStream,
     task: &TaskId,
     generation: Generation,
     from: usize,
     to: usize,
     secret: &str,
-) -> Result<(), HandshakeError> {
-    prepare(stream)?;
+) -> Result<Session, HandshakeError> {
+    let stream = &mut Hurried::new(stream, Instant::now())?;
     let dial = Dial { task: task.clone(), generation, from, to, nonce: nonce()? };
     send(stream, Kind::Dial, &dial)?;
     let challenge: Challenge = receive(stream, Kind::Challenge)?;
     check(secret, "accept", &dial, &challenge.nonce, &challenge.proof)?;
     send(stream, Kind::Proof, &Proof { proof: proof(secret, "dial", &dial, &challenge.nonce) })?;
-    receive::<()>(stream, Kind::Welcome)
+    receive::<()>(stream, Kind::Welcome)?;
+    Ok(session(secret, &dial, &challenge.nonce, true))
 }
 
 /// The first frame of the side that was dialled: what the dialer wants.
-pub(crate) fn wanted(stream: &mut TcpStream) -> Result<Dial, HandshakeError> {
-    prepare(stream)?;
+pub(super) fn wanted(stream: &mut Hurried<'_>) -> Result<Dial, HandshakeError> {
     receive(stream, Kind::Dial)
 }
 
 /// The rest of that side. After it the dialer is known to be of the generation.
-pub(crate) fn accept(stream: &mut TcpStream, dial: &Dial, secret: &str) -> Result<(), HandshakeError> {
+pub(super) fn accept(stream: &mut Hurried<'_>, dial: &Dial, secret: &str) -> Result<Session, HandshakeError> {
     let nonce = nonce()?;
     send(stream, Kind::Challenge, &Challenge { nonce, proof: proof(secret, "accept", dial, &nonce) })?;
     let answer: Proof = receive(stream, Kind::Proof)?;
     check(secret, "dial", dial, &nonce, &answer.proof)?;
-    send(stream, Kind::Welcome, &())
+    send(stream, Kind::Welcome, &())?;
+    Ok(session(secret, dial, &nonce, false))
 }
 
 #[cfg(test)]
@@ -154,26 +205,42 @@ mod tests {
 
     use super::*;
 
-    fn meet(dialer: &str, dialled: &str) -> (Result<(), HandshakeError>, Result<(), HandshakeError>) {
+    type Met = Result<Session, HandshakeError>;
+
+    fn meet(dialer: &str, dialled: &str) -> (Met, Met) {
         let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
         let address = listener.local_addr().expect("bound");
         let secret = dialled.to_owned();
-        let server = thread::spawn(move || {
-            let (mut stream, _) = listener.accept()?;
-            let dial = wanted(&mut stream)?;
-            accept(&mut stream, &dial, &secret)
-        });
-        let mut stream = TcpStream::connect(address).expect("listening");
-        let here = dial(&mut stream, &TaskId::from("run/stage"), Generation(3), 1, 0, dialer);
+        let server = thread::spawn(move || answer(&listener, &secret));
+        let stream = TcpStream::connect(address).expect("listening");
+        let here = dial(&stream, &TaskId::from("run/stage"), Generation(3), 1, 0, dialer);
         drop(stream);
         (here, server.join().expect("no panic"))
     }
 
+    fn answer(listener: &TcpListener, secret: &str) -> Met {
+        let (stream, _) = listener.accept()?;
+        let stream = &mut Hurried::new(&stream, Instant::now())?;
+        let dial = wanted(stream)?;
+        accept(stream, &dial, secret)
+    }
+
+    /// Whether what one side sends is what the other receives.
+    fn agree(sends: &mut Seal, receives: &mut Seal) -> bool {
+        let mut bytes = Vec::new();
+        frame::write_sealed(&mut bytes, Head::new(Kind::State, 1, 2, 3), b"payload", sends).expect("memory");
+        frame::read_sealed(&mut bytes.as_slice(), frame::MAX_PAYLOAD, receives).is_ok()
+    }
+
     #[test]
-    fn one_secret_meets() {
+    fn one_secret_meets_and_each_direction_of_each_connection_has_a_key_of_its_own() {
         let (dialer, dialled) = meet("same", "same");
-        dialer.expect("welcome");
-        dialled.expect("proved");
+        let (mut dialer, mut dialled) = (dialer.expect("welcome"), dialled.expect("proved"));
+        assert!(agree(&mut dialer.sends.clone(), &mut dialled.receives));
+        assert!(agree(&mut dialled.sends.clone(), &mut dialer.receives.clone()));
+        assert!(!agree(&mut dialer.sends.clone(), &mut dialer.receives), "a frame is not sent back to who made it");
+        let (_, again) = meet("same", "same");
+        assert!(!agree(&mut dialer.sends, &mut again.expect("proved").receives), "nor over another connection");
     }
 
     #[test]
@@ -186,18 +253,30 @@ mod tests {
     #[test]
     fn a_dialer_that_does_not_check_is_refused_too() {
         let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
-        let mut stream = TcpStream::connect(listener.local_addr().expect("bound")).expect("listening");
-        let server = thread::spawn(move || {
-            let (mut stream, _) = listener.accept()?;
-            let dial = wanted(&mut stream)?;
-            accept(&mut stream, &dial, "yours")
-        });
+        let stream = TcpStream::connect(listener.local_addr().expect("bound")).expect("listening");
+        let server = thread::spawn(move || answer(&listener, "yours"));
+        let stream = &mut Hurried::new(&stream, Instant::now()).expect("connected");
         let dial = Dial { task: TaskId::from("t"), generation: Generation(1), from: 1, to: 0, nonce: [0; 16] };
-        send(&mut stream, Kind::Dial, &dial).expect("sent");
-        let challenge: Challenge = receive(&mut stream, Kind::Challenge).expect("challenged");
+        send(stream, Kind::Dial, &dial).expect("sent");
+        let challenge: Challenge = receive(stream, Kind::Challenge).expect("challenged");
         // The best a stranger can do: send the other's proof back.
-        send(&mut stream, Kind::Proof, &Proof { proof: challenge.proof }).expect("sent");
+        send(stream, Kind::Proof, &Proof { proof: challenge.proof }).expect("sent");
         let refused = server.join().expect("no panic");
         assert!(matches!(refused, Err(HandshakeError::Secret(_))), "{refused:?}");
+    }
+
+    #[test]
+    fn a_handshake_is_over_in_time_however_its_bytes_come() {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
+        let mut stream = TcpStream::connect(listener.local_addr().expect("bound")).expect("listening");
+        let begun = Instant::now();
+        let server = thread::spawn(move || answer(&listener, "s"));
+        while !server.is_finished() {
+            // A byte at a time: each one alone is in time.
+            let _ = stream.write_all(b"S");
+            thread::sleep(PATIENCE / 20);
+            assert!(begun.elapsed() < PATIENCE * 2, "it goes on for as long as bytes come");
+        }
+        assert!(server.join().expect("no panic").is_err());
     }
 }

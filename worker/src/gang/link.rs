@@ -7,7 +7,7 @@ use std::net::TcpStream;
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-use super::frame::{self, Head};
+use super::frame::{self, Head, Seal};
 use crate::event_count::lock;
 
 /// The write timeout of a link's socket.
@@ -18,7 +18,14 @@ pub(super) const BLINK: Duration = Duration::from_millis(200);
 pub(super) struct Link {
     /// To end the connection while somebody writes.
     pub(super) socket: TcpStream,
-    pub(super) writer: Mutex<TcpStream>,
+    pub(super) writer: Mutex<Writer>,
+}
+
+/// The socket, and what vouches for the frames that go into it.
+#[derive(Debug)]
+pub(super) struct Writer {
+    pub(super) stream: TcpStream,
+    pub(super) seal: Seal,
 }
 
 impl Link {
@@ -30,41 +37,42 @@ impl Link {
         patience: Duration,
         abort: &dyn Fn() -> bool,
     ) -> io::Result<()> {
-        let mut stream = lock(&self.writer);
-        send(&mut stream, head, payload, patience, abort)
+        lock(&self.writer).send(head, payload, patience, abort)
     }
 }
 
-/// Writes a whole frame, or an error.
-pub(super) fn send(
-    out: &mut TcpStream,
-    head: Head,
-    payload: &[u8],
-    patience: Duration,
-    abort: &dyn Fn() -> bool,
-) -> io::Result<()> {
-    let header = frame::header(head, payload);
-    for mut rest in [header.as_slice(), payload] {
-        let mut moved = Instant::now();
-        while !rest.is_empty() {
-            match out.write(rest) {
-                Ok(0) => return Err(io::ErrorKind::WriteZero.into()),
-                Ok(n) => {
-                    rest = &rest[n..];
-                    moved = Instant::now();
-                }
-                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                Err(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {
-                    if abort() {
-                        return Err(io::ErrorKind::Interrupted.into());
+impl Writer {
+    /// Writes a whole frame, or an error. After an error the peer takes no more frames: part of one may be on its way.
+    pub(super) fn send(
+        &mut self,
+        head: Head,
+        payload: &[u8],
+        patience: Duration,
+        abort: &dyn Fn() -> bool,
+    ) -> io::Result<()> {
+        let header = frame::header(head, payload, &mut self.seal);
+        for mut rest in [header.as_slice(), payload] {
+            let mut moved = Instant::now();
+            while !rest.is_empty() {
+                match self.stream.write(rest) {
+                    Ok(0) => return Err(io::ErrorKind::WriteZero.into()),
+                    Ok(n) => {
+                        rest = &rest[n..];
+                        moved = Instant::now();
                     }
-                    if moved.elapsed() > patience {
-                        return Err(io::ErrorKind::TimedOut.into());
+                    Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                    Err(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {
+                        if abort() {
+                            return Err(io::ErrorKind::Interrupted.into());
+                        }
+                        if moved.elapsed() > patience {
+                            return Err(io::ErrorKind::TimedOut.into());
+                        }
                     }
+                    Err(error) => return Err(error),
                 }
-                Err(error) => return Err(error),
             }
         }
+        Ok(())
     }
-    Ok(())
 }

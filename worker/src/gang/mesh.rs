@@ -10,7 +10,7 @@
 use std::collections::{BTreeSet, VecDeque};
 use std::io;
 use std::net::{Shutdown, TcpStream, ToSocketAddrs};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, Weak};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -20,9 +20,9 @@ use protocol::{Generation, TaskId, WorkerId};
 use tokio::sync::Notify;
 
 use super::endpoint::Endpoint;
-use super::frame::{self, Frame, FrameError, Head, Kind, MAX_PAYLOAD};
-use super::handshake::{self, HandshakeError};
-use super::link::{BLINK, Link, send};
+use super::frame::{self, Frame, FrameError, Head, Kind, MAX_PAYLOAD, Seal};
+use super::handshake::{self, HandshakeError, Session};
+use super::link::{BLINK, Link, Writer};
 use crate::event_count::{EventCount, lock};
 
 /// How patient members are with each other.
@@ -34,6 +34,9 @@ pub(crate) struct Timing {
     pub(crate) keep_alive: Duration,
     /// A peer that shows signs of life but does not take its turn for so long is lost.
     pub(crate) stall: Duration,
+    /// The same for a peer that has only begun: so long it may take to read its inputs, which it fetched before it became a member,
+    /// to initialise itself, and to take over a state.
+    pub(crate) start: Duration,
     /// A peer at whose address nothing listens for so long is lost.
     pub(crate) refused: Duration,
 }
@@ -44,8 +47,44 @@ impl Default for Timing {
             patience: Duration::from_secs(20),
             keep_alive: Duration::from_secs(3),
             stall: Duration::from_secs(30 * 60),
+            start: Duration::from_secs(5 * 60),
             refused: Duration::from_secs(3),
         }
+    }
+}
+
+/// What a member is busy with. It says so with its signs of life, for the others to know how long to wait for it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Phase {
+    /// Reads its inputs; was at no rendezvous of this attempt yet.
+    Starting,
+    /// Computes, or waits for others.
+    Working,
+    /// Saves or reports: as long as the coordinator takes.
+    Saving,
+}
+
+impl Phase {
+    fn read(number: u32) -> Self {
+        match number {
+            0 => Self::Starting,
+            2 => Self::Saving,
+            _ => Self::Working,
+        }
+    }
+}
+
+/// The phase of a member, which the stage sets and all meshes of the attempt tell.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Busy(Arc<AtomicU8>);
+
+impl Busy {
+    pub(crate) fn set(&self, phase: Phase) {
+        self.0.store(phase as u8, Ordering::SeqCst);
+    }
+
+    pub(crate) fn phase(&self) -> Phase {
+        Phase::read(self.0.load(Ordering::SeqCst).into())
     }
 }
 
@@ -80,6 +119,7 @@ struct Peer {
     inbox: VecDeque<Frame>,
     heard: Instant,
     standing: Standing,
+    phase: Phase,
 }
 
 /// All that a mesh needs to know.
@@ -90,13 +130,15 @@ pub(crate) struct MeshConfig {
     pub(crate) rank: usize,
     pub(crate) members: Vec<Member>,
     pub(crate) secret: String,
+    /// What this member tells the others about itself.
+    pub(crate) busy: Busy,
 }
 
 /// The connections of one generation.
 #[derive(Debug)]
 pub(crate) struct Mesh {
     pub(crate) config: MeshConfig,
-    timing: Timing,
+    pub(super) timing: Timing,
     peers: Mutex<Vec<Peer>>,
     event_count: Arc<EventCount>,
     /// Wakes the poll, which reports what is lost.
@@ -117,6 +159,7 @@ impl Mesh {
             inbox: VecDeque::new(),
             heard: Instant::now(),
             standing: Standing::Unmet(None),
+            phase: Phase::Working,
         };
         let peers = Mutex::new(config.members.iter().map(peer).collect());
         let timing = endpoint.timing;
@@ -186,11 +229,11 @@ impl Mesh {
         }
         let links: Vec<_> = lock(&self.peers).iter_mut().filter_map(|peer| peer.link.take()).collect();
         for link in links {
-            if let Ok(mut stream) = link.writer.try_lock() {
+            if let Ok(mut writer) = link.writer.try_lock() {
                 let head = Head::new(Kind::Bye, next.map_or(0, |g| g.0), 0, 0);
                 // A farewell is a courtesy: a peer that does not get it finds the connection closed.
-                let _ = send(&mut stream, head, &[], Duration::ZERO, &|| true);
-                let _ = stream.shutdown(Shutdown::Write);
+                let _ = writer.send(head, &[], Duration::ZERO, &|| true);
+                let _ = writer.stream.shutdown(Shutdown::Write);
             }
         }
     }
@@ -217,7 +260,7 @@ impl Mesh {
     }
 
     /// Gives a peer up and has the next poll say so.
-    fn lose(&self, rank: usize, reason: String) {
+    pub(super) fn lose(&self, rank: usize, reason: String) {
         if self.is_closed() {
             return;
         }
@@ -242,8 +285,8 @@ impl Mesh {
         let mut pause = Duration::from_millis(10);
         while !self.is_closed() {
             match self.connect(rank) {
-                Ok(stream) => {
-                    self.attach(rank, stream);
+                Ok((stream, session)) => {
+                    self.attach(rank, stream, session);
                     return;
                 }
                 Err(error) => {
@@ -266,15 +309,15 @@ impl Mesh {
         }
     }
 
-    fn connect(&self, rank: usize) -> Result<TcpStream, HandshakeError> {
+    fn connect(&self, rank: usize) -> Result<(TcpStream, Session), HandshakeError> {
         let address = &self.config.members[rank].peer_address;
         let mut last = io::Error::new(io::ErrorKind::AddrNotAvailable, format!("`{address}` names no address"));
         for socket in address.to_socket_addrs()? {
             match TcpStream::connect_timeout(&socket, Duration::from_secs(5)) {
-                Ok(mut stream) => {
+                Ok(stream) => {
                     let MeshConfig { task, generation, rank: from, secret, .. } = &self.config;
-                    handshake::dial(&mut stream, task, *generation, *from, rank, secret)?;
-                    return Ok(stream);
+                    let session = handshake::dial(&stream, task, *generation, *from, rank, secret)?;
+                    return Ok((stream, session));
                 }
                 Err(error) => last = error,
             }
@@ -283,12 +326,13 @@ impl Mesh {
     }
 
     /// Takes a connection whose other side has proved to be `rank`.
-    pub(super) fn attach(self: &Arc<Self>, rank: usize, stream: TcpStream) {
+    pub(super) fn attach(self: &Arc<Self>, rank: usize, stream: TcpStream, session: Session) {
+        let Session { sends, receives } = session;
         let both = stream.try_clone().and_then(|reader| {
             // Signs of life come far more often than this; it only keeps a reader from outliving everything.
             reader.set_read_timeout(Some(self.timing.patience * 3))?;
             stream.set_write_timeout(Some(BLINK))?;
-            Ok((reader, Link { socket: stream.try_clone()?, writer: Mutex::new(stream) }))
+            Ok((reader, Link { socket: stream.try_clone()?, writer: Mutex::new(Writer { stream, seal: sends }) }))
         });
         let (reader, link) = match both {
             Ok(both) => both,
@@ -306,7 +350,7 @@ impl Mesh {
         }
         self.event_count.notify();
         let mesh = Arc::downgrade(self);
-        spawn("gang-read", move || read(&mesh, rank, reader));
+        spawn("gang-read", move || read(&mesh, rank, reader, receives));
     }
 
     /// What a frame means for the connection; those of the exchange are queued.
@@ -318,7 +362,10 @@ impl Mesh {
             let peer = &mut lock(&self.peers)[rank];
             peer.heard = Instant::now();
             match frame.kind {
-                Kind::KeepAlive => return,
+                Kind::KeepAlive => {
+                    peer.phase = Phase::read(frame.a);
+                    return;
+                }
                 Kind::Bye => peer.standing = if frame.step == 0 { Standing::Left } else { Standing::Moved },
                 _ => peer.inbox.push_back(frame),
             }
@@ -350,15 +397,34 @@ impl Mesh {
         self.wait(rank, barrier, interrupt, |peer| peer.inbox.pop_front())
     }
 
+    /// Waits for as long as `rank` lives, and after it has left in good order for what the coordinator says about that.
+    pub(crate) fn watch(&self, rank: usize, barrier: &str, interrupt: &dyn Fn() -> Option<Halt>) -> Halt {
+        let Err(halt) = self.look_at(rank, barrier, interrupt, Patience::WhileItLives, |_| None::<Frame>) else {
+            unreachable!("nothing is taken")
+        };
+        halt
+    }
+
     fn wait<T>(
         &self,
         rank: usize,
         barrier: &str,
         interrupt: &dyn Fn() -> Option<Halt>,
+        take: impl FnMut(&mut Peer) -> Option<T>,
+    ) -> Result<T, Halt> {
+        self.look_at(rank, barrier, interrupt, Patience::ForItsTurn, take)
+    }
+
+    fn look_at<T>(
+        &self,
+        rank: usize,
+        barrier: &str,
+        interrupt: &dyn Fn() -> Option<Halt>,
+        patience: Patience,
         mut take: impl FnMut(&mut Peer) -> Option<T>,
     ) -> Result<T, Halt> {
         const GLANCE: Duration = Duration::from_millis(250);
-        let begun = Instant::now();
+        let mut begun = Instant::now();
         // If we were stopped ourselves, the peers were not silent: we were deaf.
         let mut awake = begun;
         let mut looked = begun;
@@ -374,9 +440,16 @@ impl Mesh {
                 if let Some(taken) = take(peer) {
                     return Ok(taken);
                 }
-                let silent = now.duration_since(peer.heard.max(awake));
+                if patience == Patience::WhileItLives || peer.phase == Phase::Saving {
+                    begun = now;
+                }
+                let (silent, waited) = (now.duration_since(peer.heard.max(awake)), now.duration_since(begun));
+                let too_late = |limit: Duration, how: &str| {
+                    (waited > limit).then(|| format!("{barrier}: {how} after {} s", limit.as_secs_f32()))
+                };
                 match &peer.standing {
                     Standing::Lost(_) | Standing::Moved => return Err(interrupt().unwrap_or(Halt::Peer)),
+                    Standing::Left if patience == Patience::WhileItLives => None,
                     Standing::Left => Some(format!("{barrier}: it has left")),
                     Standing::Unmet(why) if silent > self.timing.patience => {
                         let why = why.as_deref().unwrap_or("it did not call");
@@ -385,10 +458,11 @@ impl Mesh {
                     Standing::Up if silent > self.timing.patience => {
                         Some(format!("{barrier}: no sign of life for {} s", self.timing.patience.as_secs_f32()))
                     }
-                    Standing::Up if now.duration_since(begun) > self.timing.stall => {
-                        Some(format!("{barrier}: alive, but not there after {} s", self.timing.stall.as_secs_f32()))
+                    Standing::Up if peer.phase == Phase::Starting => {
+                        too_late(self.timing.start, "alive, but has not started")
                     }
-                    Standing::Unmet(_) | Standing::Up => None,
+                    Standing::Up => too_late(self.timing.stall, "alive, but not there"),
+                    Standing::Unmet(_) => None,
                 }
             };
             if let Some(halt) = interrupt() {
@@ -404,6 +478,15 @@ impl Mesh {
     }
 }
 
+/// How long a peer is waited for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Patience {
+    /// Until it should have had its turn ([`Timing::stall`], [`Timing::start`]).
+    ForItsTurn,
+    /// For as long as it shows signs of life.
+    WhileItLives,
+}
+
 impl Drop for Mesh {
     fn drop(&mut self) {
         self.close(None);
@@ -411,10 +494,10 @@ impl Drop for Mesh {
 }
 
 /// Threads that outlive their mesh's owner hold it weakly.
-fn read(mesh: &Weak<Mesh>, rank: usize, mut stream: TcpStream) {
+fn read(mesh: &Weak<Mesh>, rank: usize, mut stream: TcpStream, mut seal: Seal) {
     let mut buffered = io::BufReader::with_capacity(64 << 10, &mut stream);
     loop {
-        let frame = frame::read(&mut buffered, MAX_PAYLOAD);
+        let frame = frame::read_sealed(&mut buffered, MAX_PAYLOAD, &mut seal);
         let Some(mesh) = mesh.upgrade() else {
             // Our side is closed. Until the peer's is, what it sends must be taken, or the kernel resets the connection
             // and the peer may lose what we sent last.
@@ -448,10 +531,10 @@ fn keep_alive(mesh: &Weak<Mesh>, timing: Timing) {
         let links: Vec<_> = lock(&mesh.peers).iter().map(|peer| peer.link.clone()).collect();
         for link in links.into_iter().flatten() {
             // A link that is being written to shows that we are alive.
-            if let Ok(mut stream) = link.writer.try_lock() {
+            if let Ok(mut writer) = link.writer.try_lock() {
                 // An error shows up where somebody waits for the peer.
-                let _ =
-                    send(&mut stream, Head::new(Kind::KeepAlive, 0, 0, 0), &[], timing.patience, &|| mesh.is_closed());
+                let head = Head::new(Kind::KeepAlive, 0, mesh.config.busy.phase() as u32, 0);
+                let _ = writer.send(head, &[], timing.patience, &|| mesh.is_closed());
             }
         }
     }

@@ -19,7 +19,7 @@ use tokio::runtime::Runtime;
 use super::endpoint::Endpoint;
 use super::exchange;
 use super::frame::{self, Head, Kind};
-use super::mesh::{Halt, Mesh, MeshConfig, Timing};
+use super::mesh::{Busy, Halt, Mesh, MeshConfig, Phase, Timing};
 use super::tree;
 use crate::active_assignment::ActiveAssignment;
 use crate::cache::{Bounds, Cache};
@@ -32,6 +32,7 @@ const QUICK: Timing = Timing {
     patience: Duration::from_secs(2),
     keep_alive: Duration::from_millis(200),
     stall: Duration::from_secs(60),
+    start: Duration::from_secs(60),
     refused: Duration::from_millis(500),
 };
 
@@ -409,7 +410,14 @@ fn one_wish_to_wind_down_is_heard_by_all_after_the_same_step() {
 
 fn mesh(gang: &Gang, seats: &[usize], own: usize, secret: &str) -> (Arc<Mesh>, Arc<EventCount>) {
     let members = seats.iter().map(|&i| gang.seats[i].member.clone()).collect();
-    let config = MeshConfig { task: task(), generation: Generation(7), rank: own, members, secret: secret.to_owned() };
+    let config = MeshConfig {
+        task: task(),
+        generation: Generation(7),
+        rank: own,
+        members,
+        secret: secret.to_owned(),
+        busy: Busy::default(),
+    };
     let event_count: Arc<EventCount> = Arc::default();
     (Mesh::open(config, &gang.seats[seats[own]].endpoint, event_count.clone(), Arc::default()), event_count)
 }
@@ -524,6 +532,76 @@ fn p18_each_barrier_has_a_name_and_a_time_and_lists_who_is_missing() {
             mesh.close(None);
         }
     }
+}
+
+/// A member that has not started is waited for as long as that may take and no longer; one that saves, for as long as it takes.
+#[test]
+fn a_member_that_does_not_start_is_lost_and_one_that_saves_is_not() {
+    let gang = Gang::new(3, Timing { start: Duration::from_millis(1500), ..QUICK });
+    let meshes = [0, 1, 2].map(|own| mesh(&gang, &[0, 1, 2], own, "s").0);
+    meshes[1].config.busy.set(Phase::Saving);
+    meshes[2].config.busy.set(Phase::Starting);
+    let begun = Instant::now();
+    // Both show signs of life all the time.
+    let late = meshes[0].next(2, "barrier `rendezvous` of generation 7", &|| None);
+    assert!(matches!(late, Err(Halt::Peer)), "{late:?}");
+    assert!(begun.elapsed() < QUICK.patience * 2, "found after {:.1?}", begun.elapsed());
+    let missing = meshes[0].missing();
+    assert_eq!(missing.len(), 1, "{missing:?}");
+    assert!(
+        missing[0].starts_with("w2 (rank 2): barrier `rendezvous`") && missing[0].contains("has not started"),
+        "{missing:?}"
+    );
+    let saver = thread::spawn({
+        let saver = meshes[1].clone();
+        move || {
+            thread::sleep(Duration::from_secs(3));
+            saver.send(0, "saved", Head::new(Kind::Applied, 5, 1, 0), &[], &|| None)
+        }
+    });
+    assert_eq!(meshes[0].next(1, "barrier `rendezvous` of generation 7", &|| None).expect("waited for").step, 5);
+    assert_eq!(saver.join().expect("no panic"), Ok(()));
+    for mesh in meshes {
+        mesh.close(None);
+    }
+}
+
+/// Rank 0 has the last step to save; the others hold their state for as long as it lives, and learn of its death at once.
+#[test]
+fn members_hold_their_state_until_rank_0_has_saved() {
+    let gang = Gang::new(3, QUICK);
+    gang.regroup(&[0, 1, 2], false);
+    let mut contexts: Vec<HttpContext> = (0..3).map(|i| gang.context(i)).collect();
+    thread::scope(|scope| {
+        for context in &mut contexts {
+            scope.spawn(|| context.rendezvous(Some(8), &[]).map(drop).expect("met"));
+        }
+    });
+    let [_lead, second, third] = &mut contexts[..] else { unreachable!("there are three") };
+    thread::scope(|scope| {
+        let holds = [scope.spawn(|| second.hold()), scope.spawn(|| third.hold())];
+        thread::sleep(Duration::from_millis(300));
+        assert!(holds.iter().all(|hold| !hold.is_finished()), "rank 0 has not reported");
+        gang.held(0).expect("a member").sever();
+        wait_until("both miss rank 0", || {
+            [1, 2].iter().all(|&i| gang.held(i).expect("a member").doing().lost == [WorkerId::from("w0")])
+        });
+        gang.regroup(&[1, 2], false);
+        for hold in holds {
+            assert!(matches!(hold.join().expect("no panic"), Ok(())));
+        }
+    });
+    thread::scope(|scope| {
+        for context in [&mut *second, &mut *third] {
+            scope.spawn(|| assert!(matches!(context.rendezvous(Some(8), &[]), Ok(Rendezvous::Keep))));
+        }
+    });
+    assert!(second.leads() && !third.leads(), "the next rank saves");
+    thread::scope(|scope| {
+        let hold = scope.spawn(|| third.hold());
+        gang.held(2).expect("a member").end("the coordinator has taken it back");
+        assert!(matches!(hold.join().expect("no panic"), Err(ContextError::GrantEnded(_))), "once it is reported");
+    });
 }
 
 #[test]

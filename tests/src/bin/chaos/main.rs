@@ -39,6 +39,12 @@ const SETS: [&str; 14] = [
 const WORKERS: [&str; 3] = ["w1", "w2", "w3"];
 /// Mean time between two disturbances.
 const MEAN: f64 = 5.0;
+/// A run that gets no further for so long, while the coordinator and a worker are there to work on it, has hung.
+const STUCK: Duration = Duration::from_secs(60);
+/// Every so many seeds one host is on a slow line.
+const SLOW_EVERY: u64 = 4;
+/// What comes to that host, in kilobits a second.
+const SLOW: u32 = 4_000;
 /// A run that takes longer has hung.
 const LIMIT: Duration = Duration::from_secs(3600);
 
@@ -111,10 +117,17 @@ impl Chaos {
             Some(network) => Cluster::listen(trainer, network.coordinator()),
             None => Cluster::start(trainer),
         };
+        let mut random = Random(seed);
+        if let Some(network) = network.as_ref().filter(|_| seed.is_multiple_of(SLOW_EVERY)) {
+            let host = (random.next() % WORKERS.len() as u64) as usize;
+            if network.slow_down(host, SLOW) {
+                println!("  {} is on a line of {SLOW} kbit/s", WORKERS[host]);
+            }
+        }
         let mut chaos = Self {
             cluster,
             network,
-            random: Random(seed),
+            random,
             begun: Instant::now(),
             remedies: Vec::new(),
             down: [false; WORKERS.len()],
@@ -218,6 +231,7 @@ impl Chaos {
         let run = self.cluster.submit(&config(), sets);
         let mut next = Instant::now() + self.random.wait();
         let mut view = None;
+        let (mut last, mut moved) = (Vec::new(), Instant::now());
         loop {
             let newest = if self.server_down { None } else { self.cluster.get(&format!("/v1/runs/{run}")) };
             if let Some(newest) = newest {
@@ -240,12 +254,25 @@ impl Chaos {
                     return Err(format!("worker {name} ended by itself:\n{}", self.cluster.everything()));
                 }
             }
+            let now = view.as_ref().map(progress).unwrap_or_default();
+            if now != last || self.server_down || self.down.iter().all(|down| *down) {
+                (last, moved) = (now, Instant::now());
+            }
+            if moved.elapsed() > STUCK {
+                return Err(format!("no progress for {STUCK:?}: {view:#?}\n{}", self.cluster.everything()));
+            }
             if self.begun.elapsed() > LIMIT {
                 return Err(format!("not over after {LIMIT:?}: {view:#?}\n{}", self.cluster.everything()));
             }
             std::thread::sleep(Duration::from_millis(50));
         }
     }
+}
+
+/// How far each stage is.
+fn progress(view: &Value) -> Vec<(Value, Value)> {
+    let stages = view["stages"].as_array().into_iter().flatten();
+    stages.map(|stage| (stage["state"].clone(), stage["progress"]["done"].clone())).collect()
 }
 
 fn one(trainer: &str, sets: &[&str], seed: u64, expected: &Value) -> Result<(), String> {

@@ -63,6 +63,7 @@ impl State {
             | Fact::ExecutionSource { .. }
             | Fact::ExecutionTime { .. }
             | Fact::ExecutionResumed { .. }
+            | Fact::ExecutionInstructions { .. }
             | Fact::Tasks { .. }
             | Fact::Task { .. }
             | Fact::ExecutionForgotten { .. } => self.apply_to_execution(fact)?,
@@ -104,6 +105,9 @@ impl State {
             Fact::ExecutionTime { key, wall_ms, busy_since } => {
                 let execution = self.execution_mut(*key)?;
                 (execution.wall_ms, execution.busy_since) = (*wall_ms, *busy_since);
+            }
+            Fact::ExecutionInstructions { key, instruction_set } => {
+                self.execution_mut(*key)?.instruction_set = Some(instruction_set.clone());
             }
             Fact::ExecutionResumed { key } => self.execution_mut(*key)?.resumed = true,
             Fact::Tasks { key, tasks } => {

@@ -20,6 +20,7 @@ use serde::{Deserialize, Serialize};
 
 use super::task::{Part, Task};
 use super::tasks::Tasks;
+use super::worker::Worker;
 use crate::event::{Known, Millis};
 use crate::register::Registration;
 
@@ -83,6 +84,9 @@ pub struct StageExecution {
     pub busy_since: Option<Millis>,
     /// It went on from something that an earlier try had saved.
     pub resumed: bool,
+    /// The instruction set of who worked on it last.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub instruction_set: Option<String>,
     /// The runs in memory that have stages with this key, and how many: those that came to it while it was in memory itself.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub users: BTreeMap<u64, usize>,
@@ -113,6 +117,16 @@ impl StageExecution {
         let slices = training.batch.slices.max(1);
         let max = if max == 0 { slices } else { max.max(min).min(slices) };
         WorkerRange { min: min.min(slices), max }
+    }
+
+    /// The instruction set that all who work on it must have: that of those who work on it now, or of what an earlier try left.
+    pub fn bound_to(&self) -> Option<&str> {
+        self.instruction_set.as_deref().filter(|_| self.is_busy() || self.has_something())
+    }
+
+    /// Whether a worker may work on it.
+    pub fn takes(&self, worker: &Worker) -> bool {
+        worker.backend == self.backend && self.bound_to().is_none_or(|set| worker.instruction_set == set)
     }
 
     /// The shards' artifacts in order, once all are there.

@@ -50,6 +50,11 @@ pub fn start(idle: &[Member], range: WorkerRange) -> Option<Vec<Member>> {
     (idle.len() >= range.min.max(1)).then(|| idle[..room(0, range).min(idle.len())].to_vec())
 }
 
+/// Whether a gang of so many takes in one more.
+pub fn has_room(members: usize, range: WorkerRange) -> bool {
+    room(members, range) > 0
+}
+
 fn room(members: usize, range: WorkerRange) -> usize {
     if range.max == 0 { usize::MAX } else { range.max.max(range.min).saturating_sub(members) }
 }

@@ -71,6 +71,8 @@ pub struct State {
     pub heard: Heard,
     /// How many facts decisions have recorded since this process started.
     pub recorded: u64,
+    /// Gangs that could take in workers which have nothing to do: what those should prepare for. Made anew by each decision.
+    pub open_gangs: Arc<Vec<(Digest, usize)>>,
     /// How many runs, executions and workers decisions have looked at: what they cost, for tests that count it.
     pub visits: u64,
 }

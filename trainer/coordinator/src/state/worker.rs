@@ -11,9 +11,11 @@
 //! the process can say that it is gone, and only a new process (a join, with the next incarnation) returns from that.
 //! Whatever a worker held it loses on leaving `Here`; that is the business of `decide`.
 
+use std::collections::BTreeSet;
+
 use protocol::message::{Join, Member};
 use protocol::stage::Backend;
-use protocol::{Digest, Incarnation};
+use protocol::{Digest, Incarnation, TaskId};
 
 use serde::{Deserialize, Serialize};
 
@@ -86,12 +88,18 @@ pub struct Worker {
     pub pid: u32,
     /// Where it computes.
     pub backend: Backend,
+    /// What its kernels dispatch to.
+    #[serde(default)]
+    pub instruction_set: String,
     /// Where peers reach it.
     pub peer_address: String,
     /// Whether it can be given work.
     pub presence: Presence,
     /// How often peers could not reach this process; each time it stays out for longer.
     pub suspicions: u32,
+    /// Gang tasks whose inputs it has said that it has. Some may be over.
+    #[serde(default, skip_serializing_if = "BTreeSet::is_empty")]
+    pub ready: BTreeSet<TaskId>,
     /// What it holds: the key of an execution, and a task's place there. Follows from the tasks.
     #[serde(skip)]
     pub holds: Option<(Digest, usize)>,
@@ -104,9 +112,11 @@ impl Worker {
             incarnation,
             pid: join.pid,
             backend: join.backend,
+            instruction_set: join.instruction_set.clone(),
             peer_address: join.peer_address.clone(),
             presence: Presence::Here,
             suspicions: 0,
+            ready: BTreeSet::new(),
             holds: None,
         }
     }

@@ -5,11 +5,12 @@ pub(crate) mod pipelines;
 #[path = "../simulation/store.rs"]
 pub(crate) mod store;
 
+use coordinator::state::worker::Worker;
 use coordinator::{
     Control, Effect, Event, Millis, Moment, Observation, Policy, Rejected, State, decide, invariants, journal, observe,
 };
 use protocol::message::{
-    Assignment, FailureClass, Join, PROTOCOL_VERSION, Poll, ReportOutcome, RunState, RunView, TaskOutcome,
+    Assignment, FailureClass, Join, PROTOCOL_VERSION, Poll, Prepare, ReportOutcome, RunState, RunView, TaskOutcome,
 };
 use protocol::stage::{Backend, WorkerRange};
 use protocol::{Digest, Incarnation, RunId, WorkerId};
@@ -20,6 +21,8 @@ pub(crate) struct ActorHandle {
     pub(crate) store: store::FakeStore,
     pub(crate) now: u64,
     pub(crate) entropy: Digest,
+    /// Workers have what they are asked to fetch as soon as they are asked.
+    pub(crate) quick: bool,
 }
 
 impl ActorHandle {
@@ -29,6 +32,7 @@ impl ActorHandle {
             store: store::FakeStore::default(),
             now: 1_000_000,
             entropy: Digest::of(b"entropy"),
+            quick: true,
         }
     }
 
@@ -46,7 +50,29 @@ impl ActorHandle {
                 _ => {}
             }
         }
+        let names: Vec<WorkerId> = self.state.workers.keys().filter(|_| self.quick).cloned().collect();
+        for name in names {
+            self.prepare(name.as_str());
+        }
         Ok(effects)
+    }
+
+    /// A worker says that it has all that it is asked to fetch.
+    pub(crate) fn prepare(&mut self, name: &str) {
+        let worker = WorkerId::from(name);
+        let Worker { incarnation, ready, .. } = self.state.workers[&worker].clone();
+        let asked = self.asked(name);
+        if asked.iter().any(|prepare| !ready.contains(&prepare.task)) {
+            let tasks = asked.into_iter().map(|prepare| prepare.task).collect();
+            self.happen(Event::WorkerReady { worker, incarnation, tasks }).expect("taken");
+        }
+    }
+
+    /// What a worker is asked to fetch.
+    pub(crate) fn asked(&self, name: &str) -> Vec<Prepare> {
+        let worker = WorkerId::from(name);
+        let incarnation = self.state.workers[&worker].incarnation;
+        self.state.desired(&worker, incarnation).expect("known").prepare
     }
 
     pub(crate) fn hear(&mut self, observation: Observation) {
@@ -78,11 +104,16 @@ impl ActorHandle {
     }
 
     pub(crate) fn join(&mut self, name: &str) -> Incarnation {
+        self.join_with(name, "avx2")
+    }
+
+    pub(crate) fn join_with(&mut self, name: &str, instruction_set: &str) -> Incarnation {
         let join = Join {
             protocol: PROTOCOL_VERSION,
             worker: name.into(),
             pid: 1,
             backend: Backend::Flex,
+            instruction_set: instruction_set.into(),
             peer_address: format!("{name}:1"),
         };
         let effects = self.happen(Event::Join { join }).expect("joined");
@@ -94,7 +125,7 @@ impl ActorHandle {
     }
 
     pub(crate) fn poll(&mut self, name: &str, incarnation: Incarnation) {
-        let poll = Poll { incarnation, doing: Vec::new(), version: 0 };
+        let poll = Poll { incarnation, doing: Vec::new(), ready: Vec::new(), version: 0 };
         self.hear(Observation::Poll { worker: name.into(), poll });
     }
 

@@ -26,10 +26,18 @@ pub(crate) fn events(state: &State, ended: &[Run]) -> Vec<Event> {
     for worker in state.workers.keys().chain([&nobody]) {
         let incarnation = state.workers.get(worker).map_or(Incarnation(9), |worker| worker.incarnation);
         let (worker_name, peer_address) = (worker.clone(), "x:1".into());
-        let join =
-            Join { protocol: PROTOCOL_VERSION, worker: worker_name, pid: 1, backend: Backend::Flex, peer_address };
+        let join = Join {
+            protocol: PROTOCOL_VERSION,
+            worker: worker_name,
+            pid: 1,
+            backend: Backend::Flex,
+            instruction_set: "avx2".into(),
+            peer_address,
+        };
         events.push(Event::Join { join });
         events.push(Event::WorkerBack { worker: worker.clone() });
+        let tasks = state.tasks.keys().take(3).cloned().chain(["none".into()]).collect();
+        events.push(Event::WorkerReady { worker: worker.clone(), incarnation, tasks });
         events.push(Event::LeaseExpired { worker: worker.clone(), incarnation });
         events.push(Event::LeaseExpired { worker: worker.clone(), incarnation: Incarnation(0) });
         events.push(Event::WorkerGone { worker: worker.clone() });

@@ -1,7 +1,7 @@
 //! A worker that does not compute: it joins, polls, steps, saves and reports, over a network that delays, loses and
 //! doubles what it says.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use coordinator::Millis;
 use protocol::message::{
@@ -63,6 +63,12 @@ pub(crate) struct FakeWorker {
     saving: Saving,
     next_call: Millis,
     silent_peers_since: Option<Millis>,
+    /// How long this process takes to fetch a task's inputs. Milliseconds.
+    fetches_ms: u64,
+    /// When those will be there that it was asked for.
+    fetching: BTreeMap<TaskId, Millis>,
+    /// Tasks of which it has said that their inputs are there.
+    said_ready: BTreeSet<TaskId>,
 }
 
 impl FakeWorker {
@@ -79,12 +85,26 @@ impl FakeWorker {
             saving: Saving::No,
             next_call: Millis(0),
             silent_peers_since: None,
+            fetches_ms: 0,
+            fetching: BTreeMap::new(),
+            said_ready: BTreeSet::new(),
         }
+    }
+
+    /// Its host's kernels: two kinds of hosts.
+    fn instruction_set(&self) -> String {
+        let is_odd = self.name.as_str().ends_with(['1', '3']);
+        if is_odd { "avx512".to_owned() } else { "avx2".to_owned() }
     }
 
     /// A new process.
     pub(crate) fn launch(&mut self) {
-        *self = Self { process: self.process + 1, alive: true, ..Self::new(self.name.as_str()) };
+        // Half of them are on a slow line.
+        let fetches_ms = match lot(&format!("{} {}", self.name, self.process)) {
+            quick @ 0..128 => u64::from(quick),
+            slow => u64::from(slow) * 100,
+        };
+        *self = Self { process: self.process + 1, alive: true, fetches_ms, ..Self::new(self.name.as_str()) };
     }
 
     pub(crate) fn runs(&self, now: Millis) -> bool {
@@ -115,6 +135,9 @@ impl FakeWorker {
             Answer::DesiredAssignments(desired) => {
                 let held = self.grant().cloned();
                 self.desired = Some(desired);
+                if let Some(Assignment { grant, role: Role::Member { .. }, .. }) = self.assignment() {
+                    assert!(self.said_ready.contains(&grant.task), "`{}` got {grant:?} without its inputs", self.name);
+                }
                 if self.grant() != held.as_ref() {
                     self.saving = Saving::No;
                     self.silent_peers_since = None;
@@ -154,6 +177,7 @@ impl FakeWorker {
                 worker: self.name.clone(),
                 pid: self.process,
                 backend: Backend::Flex,
+                instruction_set: self.instruction_set(),
                 peer_address: format!("{}:{}", self.name, self.process),
             })];
         };
@@ -167,8 +191,17 @@ impl FakeWorker {
                 _ => Vec::new(),
             },
         });
+        let asked = self.desired.iter().flat_map(|desired| &desired.prepare).map(|prepare| prepare.task.clone());
+        let asked: BTreeSet<TaskId> = asked.collect();
+        self.fetching.retain(|task, _| asked.contains(task));
+        for task in asked {
+            self.fetching.entry(task).or_insert(now.after(self.fetches_ms));
+        }
+        let ready = self.fetching.iter().filter(|(_, at)| **at <= now).map(|(task, _)| task.clone());
+        let ready: Vec<TaskId> = ready.collect();
+        self.said_ready.extend(ready.iter().cloned());
         let version = self.desired.as_ref().map_or(0, |desired| desired.version);
-        let mut calls = vec![Call::Poll(Poll { incarnation, doing: doing.into_iter().collect(), version })];
+        let mut calls = vec![Call::Poll(Poll { incarnation, doing: doing.into_iter().collect(), ready, version })];
         match &self.saving {
             Saving::Commit(commit) => calls.push(Call::Commit(commit.clone())),
             Saving::Report(report) => calls.push(Call::Report(report.clone())),

@@ -10,7 +10,7 @@ use coordinator::{Control, Effect, Event, Millis, Moment, Observation, Policy, R
 use coordinator::{decide, invariants, journal, observe, refused_for_good};
 use protocol::message::{RunState, TaskOutcome};
 use protocol::stage::WorkerRange;
-use protocol::{Digest, RunId};
+use protocol::{Digest, RunId, WorkerId};
 
 use crate::pipelines;
 use crate::random::Random;
@@ -34,6 +34,8 @@ pub(crate) struct World {
     pub(crate) calls: Vec<(Millis, usize, u32, Call)>,
     pub(crate) answers: Vec<(Millis, usize, u32, Answer)>,
     pub(crate) workers: Vec<FakeWorker>,
+    /// Pairs of workers that cannot reach each other, and until when; the coordinator reaches both.
+    pub(crate) cuts: Vec<(WorkerId, WorkerId, Millis)>,
     pub(crate) submissions: Vec<(Millis, Event)>,
     pub(crate) checkpoint_steps: BTreeMap<Digest, u64>,
     pub(crate) events: u64,
@@ -105,6 +107,7 @@ impl World {
             calls: Vec::new(),
             answers: Vec::new(),
             workers,
+            cuts: Vec::new(),
             submissions,
             checkpoint_steps: BTreeMap::new(),
             events: 0,

@@ -16,7 +16,7 @@ mod gru;
 mod linear;
 mod norm;
 mod raw;
-mod simd;
+pub(crate) mod simd;
 
 pub use attention::{KeyMask, cross_attention, self_attention};
 pub use dropout::{Dropout, dropout};

@@ -1,7 +1,7 @@
 //! Loops compiled for several instruction sets; the best one that the processor has is taken at run time.
 //!
 //! The bodies are plain loops that the compiler vectorises. On one machine the choice never changes, so bits do not either;
-//! another instruction set may contract multiply-adds differently, which is why manifests record it.
+//! another instruction set may contract multiply-adds differently, which is why a gang is made of one (`crate::instruction_set`).
 
 /// Defines `fn name(args)` that runs `body` compiled for AVX-512, AVX2 or the baseline.
 macro_rules! multiversion {
@@ -40,7 +40,7 @@ pub(super) use multiversion;
 
 /// Whether the AVX-512 version may run.
 #[cfg(target_arch = "x86_64")]
-pub(super) fn has_wide() -> bool {
+pub(crate) fn has_wide() -> bool {
     is_x86_feature_detected!("avx512f")
         && is_x86_feature_detected!("avx512vl")
         && is_x86_feature_detected!("avx512bw")
@@ -50,7 +50,7 @@ pub(super) fn has_wide() -> bool {
 
 /// Whether the AVX2 version may run.
 #[cfg(target_arch = "x86_64")]
-pub(super) fn has_middle() -> bool {
+pub(crate) fn has_middle() -> bool {
     is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma")
 }
 

@@ -21,6 +21,8 @@ use crate::train::tree_sum;
 pub struct Script {
     /// Member and step: it is lost when it would contribute to that step.
     pub lost: Vec<(usize, u64)>,
+    /// Member and step: it is lost when it commits the checkpoint of that step.
+    pub lost_saving: Vec<(usize, u64)>,
     /// Member and step: it starts once that step is summed. Its number is above those of the first members.
     pub joins: Vec<(usize, u64)>,
     /// All members are told to stop after applying this step.
@@ -66,6 +68,7 @@ struct Member {
     generation: u64,
     members: Vec<usize>,
     lost_at: Option<u64>,
+    lost_saving: Option<u64>,
     drain: Option<u64>,
 }
 
@@ -102,6 +105,7 @@ pub(super) fn run(
         generation: 0,
         members: (0..count).collect(),
         lost_at: script.lost.iter().find(|(who, _)| *who == me).map(|(_, step)| *step),
+        lost_saving: script.lost_saving.iter().find(|(who, _)| *who == me).map(|(_, step)| *step),
         drain: script.drain,
     };
     let starters = (0..count).map(|me| (member(me), None));
@@ -139,7 +143,10 @@ pub(super) fn run(
     });
 
     *saved = std::mem::take(&mut lock(&gang.state).checkpoints);
-    let may_end = |me: usize| script.lost.iter().chain(&script.joins).any(|(who, _)| *who == me);
+    let ends_early =
+        |me: usize| script.lost.iter().chain(&script.lost_saving).chain(&script.joins).any(|(who, _)| *who == me);
+    // Members that hold their state hear that it is over once the leader has reported.
+    let reported = results.iter().any(|(_, result, _)| matches!(result, Some(Ok(_))));
     let mut ran: Option<Ran> = None;
     for (me, result, told) in results {
         match result {
@@ -152,7 +159,7 @@ pub(super) fn run(
                     ran = Some(Ran { outcome, told });
                 }
             }
-            Some(Err(StageError::Context(ContextError::GrantEnded(_)))) if may_end(me) => {}
+            Some(Err(StageError::Context(ContextError::GrantEnded(_)))) if reported || ends_early(me) => {}
             Some(Err(error)) => return Err(error),
             None => {}
         }
@@ -170,6 +177,7 @@ fn join(member: &mut Member, step: u64) -> bool {
         return false;
     }
     state.regroup(|members| members.push(member.me));
+    member.members.clone_from(&state.members);
     drop(state);
     member.gang.changed.notify_all();
     true
@@ -300,6 +308,15 @@ impl GangContext for Member {
         self.rank() == 0
     }
 
+    fn hold(&mut self) -> Result<(), ContextError> {
+        let gang = Arc::clone(&self.gang);
+        let mut state = lock(&gang.state);
+        while !state.over && state.generation == self.generation {
+            state = gang.changed.wait(state).unwrap_or_else(std::sync::PoisonError::into_inner);
+        }
+        if state.over { Err(ContextError::GrantEnded("rank 0 has reported the end".into())) } else { Ok(()) }
+    }
+
     fn commit_checkpoint(
         &mut self,
         step: u64,
@@ -307,6 +324,12 @@ impl GangContext for Member {
         _metrics: &BTreeMap<String, f64>,
     ) -> Result<(), ContextError> {
         assert!(self.leads(), "only the leader saves");
+        if self.lost_saving == Some(step) {
+            let me = self.me;
+            lock(&self.gang.state).regroup(|members| members.retain(|m| *m != me));
+            self.gang.changed.notify_all();
+            return Err(ContextError::GrantEnded(format!("member {me} was lost while it saved step {step}")));
+        }
         self.put_manifest(manifest)?;
         lock(&self.gang.state).checkpoints.push((step, manifest.clone()));
         Ok(())
@@ -398,7 +421,7 @@ mod tests {
             assert_eq!(ran(count, &Script::default(), &mut vec![]).output(), alone.output());
         }
         for _ in 0..20 {
-            let script = Script { lost: vec![(0, 3), (2, 5)], joins: vec![(7, 1), (8, 6)], drain: None };
+            let script = Script { lost: vec![(0, 3), (2, 5)], joins: vec![(7, 1), (8, 6)], ..Script::default() };
             assert_eq!(ran(3, &script, &mut vec![]).output(), alone.output());
         }
     }

@@ -73,7 +73,8 @@ pub enum Trained {
 
 /// Trains to the last step (of the schedule, or of a rung that stops before), or until told to stop.
 ///
-/// Every member of the gang runs this same loop. What may end the attempt happens between steps, where the state is whole.
+/// Every member of the gang runs this same loop. What may end the attempt happens between steps, where the state is whole. Rank 0 alone
+/// returns: the others hold their state until what it saved and reported is acknowledged, so that one of them can do the same if it is lost.
 ///
 /// # Errors
 /// [`StageError::Diverged`] before the weights change if the loss or the gradient norm is not finite; whatever the context says no
@@ -90,25 +91,34 @@ pub fn train(
     // Names of other stages say nothing about a state, which the key of the next rung rests on.
     let config = cx.task().settings.digest();
     let mut state = TrainState::new(&objective.groups());
-    let mut applied = None;
-    let mut saved_at = None;
-    if let Some(manifest) = cx.latest_checkpoint()? {
-        restore(&mut state, &manifest, cx)?;
-        applied = Some(state.step);
-        saved_at = applied;
-        cx.log(&format!("goes on from the checkpoint after step {}", state.step));
-    } else if cx.task().inputs.contains_key(STATE_INPUT) {
-        let (_, manifest) = crate::artifacts::input(cx, STATE_INPUT, ArtifactKind::Checkpoint)?;
-        restore(&mut state, &manifest, cx)?;
-        applied = Some(state.step);
-        cx.log(&format!("goes on from the rung that ended after step {}", state.step));
-    }
+    let mut saved_at = begin(&mut state, cx)?;
     let mut save_is_due = false;
+    let mut stop = false;
     let mut recent = Recent::default();
-    meet(&mut state, applied, cx)?;
     objective.load(&state);
     let mut done: BTreeMap<usize, Vec<f32>> = BTreeMap::new();
-    while state.step < steps {
+    loop {
+        if stop || state.step >= steps {
+            if cx.leads() {
+                if saved_at != Some(state.step) {
+                    // Publishing may fail or be cut off; the last step should not have to be found again.
+                    save(&state, config, &recent, cx)?;
+                }
+                return Ok(if state.step < steps {
+                    Trained::Yielded { at: state.step }
+                } else {
+                    Trained::Finished { state, metrics: recent.means() }
+                });
+            }
+            // Until rank 0 has stored the last step, it lives in the members' memory alone.
+            cx.hold()?;
+            stop = false;
+            let applied = Some(state.step);
+            if meet(&mut state, applied, cx)? {
+                objective.load(&state);
+            }
+            continue;
+        }
         // A regroup may hand us other slices of the same step; what was computed is not computed again.
         let share = cx.share(slices);
         for slice in share.clone() {
@@ -147,19 +157,39 @@ pub fn train(
         cx.progress(state.step, steps, "steps", &values[..1]);
         let every = cx.task().checkpoint.every.0;
         save_is_due |= every > 0 && state.step.is_multiple_of(every);
-        if cx.leads() && state.step < steps && (drain || (save_is_due && cx.can_save())) {
+        stop = drain;
+        if cx.leads() && state.step < steps && save_is_due && !stop && cx.can_save() {
             save(&state, config, &recent, cx)?;
             (saved_at, save_is_due) = (Some(state.step), false);
         }
-        if drain && state.step < steps {
-            return Ok(Trained::Yielded { at: state.step });
+    }
+}
+
+/// Brings `state` to where the gang is, or to where the task was left: rank 0 alone reads the checkpoint, or the state that the rung
+/// before left, and the others take it from there. Gives the step that is committed already, if this member read it.
+fn begin(state: &mut TrainState, cx: &mut dyn GangContext) -> Result<Option<u64>, StageError> {
+    let (mut applied, mut saved_at) = (None, None);
+    loop {
+        let checkpoint = cx.latest_checkpoint()?;
+        let continues = checkpoint.is_some() || cx.task().inputs.contains_key(STATE_INPUT);
+        if applied.is_none() && cx.leads() {
+            if let Some(manifest) = checkpoint {
+                restore(state, &manifest, cx)?;
+                (applied, saved_at) = (Some(state.step), Some(state.step));
+                cx.log(&format!("goes on from the checkpoint after step {}", state.step));
+            } else if continues {
+                let (_, manifest) = crate::artifacts::input(cx, STATE_INPUT, ArtifactKind::Checkpoint)?;
+                restore(state, &manifest, cx)?;
+                applied = Some(state.step);
+                cx.log(&format!("goes on from the rung that ended after step {}", state.step));
+            }
+        }
+        let adopted = meet(state, applied, cx)?;
+        // Nobody has a state if rank 0 was lost before it met the others. Then the next one reads it.
+        if applied.is_some() || adopted || !continues {
+            return Ok(saved_at);
         }
     }
-    if cx.leads() && saved_at != Some(state.step) {
-        // Publishing may fail or be cut off; the last step should not have to be found again.
-        save(&state, config, &recent, cx)?;
-    }
-    Ok(Trained::Finished { state, metrics: recent.means() })
 }
 
 /// Takes over the state of a checkpoint.
@@ -245,7 +275,6 @@ fn save(
         "settings": config,
         "seed": cx.task().seed,
         "groups": state.groups.iter().map(|g| json!({"name": g.name, "parameters": g.params.len()})).collect::<Vec<_>>(),
-        "instruction_set": models::instruction_set(),
         "build": env!("CARGO_PKG_VERSION"),
     });
     let mut draft = Draft::new(cx, ArtifactKind::Checkpoint, meta);

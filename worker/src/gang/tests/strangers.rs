@@ -1,10 +1,11 @@
 //! Peers that do not belong, or do not behave.
 
 use std::io::Write as _;
-use std::net::TcpStream;
+use std::net::{SocketAddr, TcpStream};
 
 use super::*;
-use crate::gang::handshake;
+use crate::gang::frame::Seal;
+use crate::gang::handshake::{self, Session};
 
 #[test]
 fn a_peer_with_another_secret_never_gets_in() {
@@ -18,36 +19,104 @@ fn a_peer_with_another_secret_never_gets_in() {
     second.close(None);
 }
 
-/// Connects as rank 1 with the right secret, then sends `bytes`.
-fn misbehave(bytes: &[u8]) -> Arc<Mesh> {
+/// Connects as rank 1 with the right secret, then sends what `bytes` makes of the session.
+fn misbehave(bytes: impl FnOnce(&mut Seal) -> Vec<u8>) -> Arc<Mesh> {
     let gang = Gang::new(2, QUICK);
     let (mesh, _) = mesh(&gang, &[0, 1], 0, "s");
     let mut stream = TcpStream::connect(gang.seats[0].endpoint.address()).expect("listening");
-    handshake::dial(&mut stream, &task(), Generation(7), 1, 0, "s").expect("welcome");
-    stream.write_all(bytes).expect("sent");
+    let Session { mut sends, .. } = handshake::dial(&stream, &task(), Generation(7), 1, 0, "s").expect("welcome");
+    stream.write_all(&bytes(&mut sends)).expect("sent");
     wait_until("the peer is given up", || !mesh.lost().is_empty());
     mesh
 }
 
-#[test]
-fn a_corrupt_frame_ends_the_connection() {
+fn frame_under(seal: &mut Seal) -> Vec<u8> {
     let mut bytes = Vec::new();
-    frame::write(&mut bytes, Head::new(Kind::Applied, 3, 1, 0), b"payload").expect("memory");
-    *bytes.last_mut().expect("not empty") ^= 1;
-    misbehave(&bytes).close(None);
+    frame::write_sealed(&mut bytes, Head::new(Kind::Applied, 3, 1, 0), b"payload", seal).expect("memory");
+    bytes
+}
+
+#[test]
+fn a_changed_frame_ends_the_connection() {
+    let mesh = misbehave(|seal| {
+        let mut bytes = frame_under(seal);
+        *bytes.last_mut().expect("not empty") ^= 1;
+        bytes
+    });
+    assert!(mesh.missing()[0].contains("tag"), "{:?}", mesh.missing());
+    mesh.close(None);
+}
+
+/// What somebody on the way could do without the key: send a frame of its own, or a recorded one again.
+#[test]
+fn a_frame_that_the_peer_did_not_send_there_ends_the_connection() {
+    let forged = misbehave(|_| frame_under(&mut Seal::new([0; 32])));
+    assert!(forged.missing()[0].contains("frame 0"), "{:?}", forged.missing());
+    let repeated = misbehave(|seal| frame_under(seal).repeat(2));
+    assert!(repeated.missing()[0].contains("frame 1"), "{:?}", repeated.missing());
+    for mesh in [forged, repeated] {
+        mesh.close(None);
+    }
 }
 
 #[test]
 fn an_oversized_frame_ends_the_connection_without_being_read() {
-    let mut bytes = frame::header(Head::new(Kind::State, 0, 0, 0), &[]).to_vec();
-    bytes[24..28].copy_from_slice(&(frame::MAX_PAYLOAD as u32 + 1).to_le_bytes());
-    misbehave(&bytes).close(None);
+    misbehave(|seal| {
+        let mut bytes = frame::header(Head::new(Kind::State, 0, 0, 0), &[], seal).to_vec();
+        bytes[24..28].copy_from_slice(&(frame::MAX_PAYLOAD as u32 + 1).to_le_bytes());
+        bytes
+    })
+    .close(None);
+}
+
+/// Sampled: as many as there is room for and half as many again, who send a byte now and then, and come again when they are
+/// turned away.
+#[test]
+fn slow_strangers_keep_no_peer_out() {
+    let gang = Gang::new(2, QUICK);
+    let address = gang.seats[0].endpoint.address();
+    let over = AtomicBool::new(false);
+    let crowd = std::sync::Barrier::new(Endpoint::STRANGERS * 3 / 2 + 1);
+    let stranger = |address: SocketAddr, over: &AtomicBool| {
+        let mut stream = TcpStream::connect(address).expect("listening");
+        crowd.wait();
+        while !over.load(Ordering::SeqCst) {
+            if stream.write_all(b"S").is_err() {
+                stream = TcpStream::connect(address).expect("listening");
+            }
+            thread::sleep(Duration::from_millis(100));
+        }
+    };
+    thread::scope(|scope| {
+        for _ in 0..Endpoint::STRANGERS * 3 / 2 {
+            scope.spawn(|| stranger(address, &over));
+        }
+        crowd.wait();
+        let begun = Instant::now();
+        let meshes = [0, 1].map(|own| mesh(&gang, &[0, 1], own, "s").0);
+        let [first, second] = &meshes;
+        let met: Vec<_> = thread::scope(|scope| {
+            let meet = |mesh: &Arc<Mesh>| {
+                let mesh = mesh.clone();
+                scope.spawn(move || exchange::rendezvous(&mesh, None, &[], &|| None).map(drop))
+            };
+            [meet(first), meet(second)].map(|met| met.join().expect("no panic")).to_vec()
+        });
+        let took = begun.elapsed();
+        over.store(true, Ordering::SeqCst);
+        assert_eq!(met, [Ok(()), Ok(())]);
+        eprintln!("met among {} strangers after {took:.1?}", Endpoint::STRANGERS * 3 / 2);
+        assert!(took < Duration::from_secs(2), "strangers held it up for {took:.1?}");
+        for mesh in meshes {
+            mesh.close(None);
+        }
+    });
 }
 
 /// Dials the first of two members of generation 7.
 fn dial(gang: &Gang, of: &TaskId, generation: u64, from: usize, to: usize) -> Result<(), handshake::HandshakeError> {
-    let mut stream = TcpStream::connect(gang.seats[0].endpoint.address()).expect("listening");
-    handshake::dial(&mut stream, of, Generation(generation), from, to, "s")
+    let stream = TcpStream::connect(gang.seats[0].endpoint.address()).expect("listening");
+    handshake::dial(&stream, of, Generation(generation), from, to, "s").map(drop)
 }
 
 /// With the right secret, so that nothing but the check in question stands between it and the gang.

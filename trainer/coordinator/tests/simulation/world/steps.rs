@@ -102,6 +102,13 @@ impl World {
                     let _ = self.happen(Event::WorkerGone { worker });
                 }
             }
+            40..48 => {
+                let other = self.random.below(self.workers.len() as u64) as usize;
+                if other != i {
+                    let until = self.now.after(self.random.below(20_000));
+                    self.cuts.push((self.workers[i].name.clone(), self.workers[other].name.clone(), until));
+                }
+            }
             12..20 => self.workers[i].hung_until = self.now.after(self.random.below(40_000)),
             20..24 if self.up => self.crash(),
             24..40 if self.up && !self.store.runs.is_empty() => {
@@ -234,10 +241,18 @@ impl World {
 
     fn workers_step(&mut self) {
         let now = self.now;
-        let dead: Vec<WorkerId> = self.workers.iter().filter(|w| !w.runs(now)).map(|w| w.name.clone()).collect();
+        self.cuts.retain(|(_, _, until)| *until > now);
+        let cuts = self.cuts.clone();
+        let is_cut = |a: &WorkerId, b: &WorkerId| cuts.iter().any(|(x, y, _)| (x, y) == (a, b) || (x, y) == (b, a));
         for i in 0..self.workers.len() {
-            let process = self.workers[i].process;
-            for call in self.workers[i].speak(now, &dead) {
+            let (process, own) = (self.workers[i].process, self.workers[i].name.clone());
+            let unreachable: Vec<WorkerId> = self
+                .workers
+                .iter()
+                .filter(|other| !other.runs(now) || is_cut(&own, &other.name))
+                .map(|other| other.name.clone())
+                .collect();
+            for call in self.workers[i].speak(now, &unreachable) {
                 let copies = if self.chaos() && self.random.chance(8) { 2 } else { 1 };
                 for _ in 0..copies {
                     if !(self.chaos() && self.random.chance(8)) {
@@ -251,7 +266,9 @@ impl World {
             let members = task.map(|task| task.holders().to_vec()).unwrap_or_default();
             let peers: Vec<&FakeWorker> =
                 self.workers.iter().filter(|w| members.iter().any(|member| member.worker == w.name)).collect();
+            let apart = |peer: &&FakeWorker| peers.iter().any(|other| is_cut(&peer.name, &other.name));
             let together = !peers.is_empty()
+                && !peers.iter().any(apart)
                 && peers.iter().all(|peer| peer.runs(now) && peer.grant().is_some_and(|g| g.fence == grant.fence));
             let furthest = together.then(|| peers.iter().filter_map(|peer| peer.live(&grant)).max());
             let saved = task.and_then(|task| task.newest()).map_or(0, |saved| saved.step);

@@ -1,0 +1,181 @@
+//! Fetches ahead what tasks need that this worker may be given, so that a gang that takes it in does not wait for its downloads.
+//!
+//! The coordinator says for which tasks ([`Prepare`]); a thread of its own fetches and verifies their inputs into the cache, and the
+//! next poll says which of them are there. A task that is not named any more is forgotten at once, in the middle of a download too.
+
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use checkpoint::BlobError;
+use protocol::message::Prepare;
+use protocol::{Digest, Manifest, TaskId};
+use tokio::sync::{Notify, watch};
+
+use crate::cache::{Arriving, Cache, Cached};
+use crate::client::{CallError, Client};
+use crate::event_count::lock;
+
+/// Between two tries to fetch something.
+const PAUSE: Duration = Duration::from_secs(1);
+
+/// What is to be fetched ahead, and what is there. The poll sets one and reads the other.
+#[derive(Debug)]
+pub(crate) struct Preparation {
+    /// `None` once the worker leaves.
+    wanted: watch::Sender<Option<Vec<Prepare>>>,
+    /// What is there, with the digests of all of it.
+    ready: Mutex<Vec<(Prepare, Vec<Digest>)>>,
+    /// Wakes the poll, which says what is ready.
+    wake: Arc<Notify>,
+}
+
+/// Why a task is not prepared.
+#[derive(Debug, thiserror::Error)]
+enum Stopped {
+    #[error("something else is wanted now")]
+    News,
+    #[error(transparent)]
+    Call(#[from] CallError),
+    #[error("it cannot be kept here: {0}")]
+    Local(#[from] std::io::Error),
+    #[error(transparent)]
+    Blob(#[from] BlobError),
+    #[error("blob {0} arrived damaged")]
+    Damaged(Digest),
+    #[error("{0} is not a manifest: {1}")]
+    Manifest(Digest, serde_json::Error),
+}
+
+type News = watch::Receiver<Option<Vec<Prepare>>>;
+
+impl Preparation {
+    pub(crate) fn new(wake: Arc<Notify>) -> Self {
+        Self { wanted: watch::Sender::new(Some(Vec::new())), ready: Mutex::default(), wake }
+    }
+
+    /// Sets what is to be there; what is not among it is forgotten.
+    pub(crate) fn want(&self, tasks: &[Prepare]) {
+        lock(&self.ready).retain(|(ready, _)| tasks.contains(ready));
+        self.wanted.send_if_modified(|wanted| match wanted {
+            Some(wanted) if *wanted != tasks => {
+                *wanted = tasks.to_vec();
+                true
+            }
+            Some(_) | None => false,
+        });
+    }
+
+    /// Nothing will be wanted any more.
+    pub(crate) fn end(&self) {
+        lock(&self.ready).clear();
+        self.wanted.send_replace(None);
+    }
+
+    /// Tasks whose inputs are there.
+    pub(crate) fn ready(&self) -> Vec<TaskId> {
+        lock(&self.ready).iter().map(|(ready, _)| ready.task.clone()).collect()
+    }
+
+    /// Fetches what is wanted, until [`end`](Self::end). The body of a thread.
+    pub(crate) fn run(&self, client: &Client, cache: &Cache) {
+        let mut news = self.wanted.subscribe();
+        loop {
+            let Some(wanted) = news.borrow_and_update().clone() else { return };
+            let missing = wanted.into_iter().find(|task| !lock(&self.ready).iter().any(|(ready, _)| ready == task));
+            let Some(task) = missing else {
+                // The sender is ours, so it is there.
+                let _ = client.wait(news.changed());
+                continue;
+            };
+            // Trials of a sweep read the same things.
+            let has_all = |ready: &Prepare| (&ready.inputs, ready.resume) == (&task.inputs, task.resume);
+            let known = lock(&self.ready).iter().find(|(ready, _)| has_all(ready)).map(|(_, all)| all.clone());
+            match known.map_or_else(|| prepare(&task, client, cache, &mut news), Ok) {
+                Ok(all) => {
+                    tracing::info!(task = %task.task, "its inputs are here");
+                    // Not if it is not wanted any more: then its blobs are just cached.
+                    if news.borrow().as_ref().is_some_and(|wanted| wanted.contains(&task)) {
+                        let mut ready = lock(&self.ready);
+                        ready.push((task, all));
+                        // What was kept for a task before these has been read.
+                        let wanted: Vec<Digest> = ready.iter().flat_map(|(_, all)| all).copied().collect();
+                        cache.forget_ahead(&wanted);
+                        drop(ready);
+                        self.wake.notify_one();
+                    }
+                }
+                Err(Stopped::News) => {}
+                Err(error) => {
+                    tracing::debug!(task = %task.task, "its inputs cannot be fetched ahead yet: {error}");
+                    let _ = client.wait(async { tokio::time::timeout(PAUSE, news.changed()).await });
+                }
+            }
+        }
+    }
+}
+
+/// Fetches the manifests that `task` names, and the files they list; gives all their digests.
+fn prepare(task: &Prepare, client: &Client, cache: &Cache, news: &mut News) -> Result<Vec<Digest>, Stopped> {
+    let mut all = Vec::new();
+    for digest in task.inputs.values().copied().chain(task.resume) {
+        let bytes = fetch(digest, client, cache, news)?.into_memory()?;
+        let manifest: Manifest = serde_json::from_slice(&bytes).map_err(|e| Stopped::Manifest(digest, e))?;
+        all.push(digest);
+        for file in manifest.files.values() {
+            let blob = fetch(file.digest, client, cache, news)?;
+            cache.keep_ahead(file.digest, &blob);
+            all.push(file.digest);
+        }
+    }
+    Ok(all)
+}
+
+/// A blob from the cache, or fetched into it. A transfer that is cut goes on as long as each try brings something.
+fn fetch(digest: Digest, client: &Client, cache: &Cache, news: &mut News) -> Result<Cached, Stopped> {
+    if let Some(blob) = cache.get(digest) {
+        return Ok(blob);
+    }
+    let mut arriving: Option<Arriving> = None;
+    loop {
+        let before = arriving.as_ref().map(Arriving::written);
+        match go_on(digest, &mut arriving, client, cache, news) {
+            Err(Stopped::Call(CallError::Away(_))) if arriving.as_ref().map(Arriving::written) > before => {}
+            done => break done?,
+        }
+    }
+    let Some(arrived) = arriving else { return Err(Stopped::Damaged(digest)) };
+    arrived.finish(cache)?.map_err(|_| Stopped::Damaged(digest))
+}
+
+fn go_on(
+    digest: Digest,
+    arriving: &mut Option<Arriving>,
+    client: &Client,
+    cache: &Cache,
+    news: &mut News,
+) -> Result<(), Stopped> {
+    let offset = arriving.as_ref().map_or(0, Arriving::written);
+    let mut download = unless_news(client, news, client.get_blob(digest, offset))?;
+    let arriving = match arriving {
+        Some(arriving) => arriving,
+        None => arriving.insert(cache.arriving(digest, download.length())?),
+    };
+    while let Some(bytes) = unless_news(client, news, download.next())? {
+        arriving.write(&bytes)?;
+    }
+    Ok(())
+}
+
+/// Waits for a call. News ends it: dropping a download ends that.
+fn unless_news<T>(
+    client: &Client,
+    news: &mut News,
+    call: impl Future<Output = Result<T, CallError>>,
+) -> Result<T, Stopped> {
+    client.wait(async {
+        tokio::select! {
+            _ = news.changed() => Err(Stopped::News),
+            done = call => Ok(done?),
+        }
+    })
+}
