@@ -541,7 +541,7 @@ fn a_worker_leaves_in_time_though_the_coordinator_is_gone() {
     equals_reference(&cluster, &run, &view);
 }
 
-/// Sampled: a worker whose downloads come at 40 kB a second joins while another trains alone. It becomes a member once it has what it
+/// Sampled: a worker whose downloads come at 8 kB a second joins while another trains alone. It becomes a member once it has what it
 /// needs, and until then nobody waits for it.
 #[test]
 fn p4_a_slow_joiner_holds_nobody_up() {
@@ -559,7 +559,7 @@ fn p4_a_slow_joiner_holds_nobody_up() {
     cluster.join("w1");
     let run = cluster.submit(&config(), &sets);
     cluster.wait_step(&run, "vae", 20);
-    let line = SlowLine::to(cluster.address(), 40_000);
+    let line = SlowLine::to(cluster.address(), 8_000);
     cluster.join_at(&line.url(), "w2", &[], &[]);
     wait_for("the second worker to be there", || {
         let workers = cluster.get("/v1/workers")?;
@@ -567,7 +567,7 @@ fn p4_a_slow_joiner_holds_nobody_up() {
     });
     let done = |cluster: &Cluster| cluster.stage(&run, "vae")["progress"]["done"].as_u64().expect("steps");
     let before = done(&cluster);
-    cluster.wait_step(&run, "vae", before + 150);
+    cluster.wait_step(&run, "vae", before + 50);
     let stage = cluster.stage(&run, "vae");
     assert_eq!(stage["workers"], json!(["w1"]), "it fetches, and is no member yet");
     assert!(!cluster.said("w2").contains(" begin "), "{}", cluster.said("w2"));
