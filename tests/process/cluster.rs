@@ -525,7 +525,6 @@ fn a_worker_leaves_in_time_though_the_coordinator_is_gone() {
     cluster.join_by("w1", &[], &["--leave-within", "3"]);
     let run = cluster.submit(&config(), &VAE);
     cluster.wait_step(&run, "vae", 60);
-    let saved = cluster.stage(&run, "vae");
     cluster.kill_server();
     cluster.signal("w1", Signal::SIGTERM);
     let asked = Instant::now();
@@ -537,7 +536,7 @@ fn a_worker_leaves_in_time_though_the_coordinator_is_gone() {
     cluster.serve();
     cluster.join("w2");
     let view = cluster.wait_end(&run);
-    assert_eq!(stage_of(&view, "vae")["state"], "resumed", "{saved:#}");
+    assert!(cluster.said("w2").contains("goes on from the checkpoint after step"), "{}", cluster.said("w2"));
     equals_reference(&cluster, &run, &view);
 }
 
