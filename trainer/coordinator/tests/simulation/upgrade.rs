@@ -44,7 +44,7 @@ fn make_the_store() {
     let submit = Event::Submit { pipeline, source: String::new(), idempotency_key: Some("once".into()), until: None };
     world.submissions = vec![(world.now, submit)];
     let trials_done =
-        |world: &World| world.state.runs.values().flat_map(|run| &run.sweeps).any(|s| s.search.score(2).is_some());
+        |world: &World| world.state.runs.values().flat_map(|run| &run.sweeps).any(|s| s.search.score(14).is_some());
     for _ in 0..4_000 {
         world.step();
         if trials_done(&world) && holds_with_a_checkpoint(&world.state) {
