@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use cluster_tests::cluster::{Cluster, stage_of};
+use cluster_tests::cluster::{Cluster, TOKEN, stage_of};
 use cluster_tests::network::{Network, SlowLine};
 use cluster_tests::{Bench, Running, digests, wait_for};
 use nix::sys::signal::Signal;
@@ -137,6 +137,11 @@ fn network_cut(how_long: Duration, sets: &[&str], expected: &(Value, Curves), ou
     });
     cluster.wait_step(&run, "vae", 20);
     let pids = names.map(|name| cluster.pid(name));
+    let process_of_w3 = |cluster: &Cluster| {
+        let workers = cluster.get("/v1/workers")?;
+        workers.as_array()?.iter().find(|worker| worker["worker"] == "w3").cloned()
+    };
+    let before = process_of_w3(&cluster).expect("it has joined")["incarnation"].clone();
     let done = |stage: &Value| stage["progress"]["done"].as_u64().unwrap_or_default();
 
     network.cut(2);
@@ -154,9 +159,8 @@ fn network_cut(how_long: Duration, sets: &[&str], expected: &(Value, Curves), ou
     network.mend(2);
     let mended = Instant::now();
     wait_for("the worker to be heard again", || {
-        let workers = cluster.get("/v1/workers")?;
-        let worker = workers.as_array()?.iter().find(|worker| worker["worker"] == "w3")?.clone();
-        assert_eq!(worker["incarnation"], 1, "the same process: {worker}");
+        let worker = process_of_w3(&cluster)?;
+        assert_eq!(worker["incarnation"], before, "the same process: {worker}");
         matches!(worker["state"].as_str(), Some("idle" | "working")).then_some(())
     });
     let heard = mended.elapsed();
@@ -394,7 +398,7 @@ fn p14_pause_resume_cancel_and_sigterm_end_with_saved_work() {
 /// pause. A client that was not answered asks again with the same key.
 #[test]
 fn p1_what_a_submission_was_answered_survives_and_counts_once() {
-    let bench = Bench::new(TRAINER);
+    let bench = Bench::new(TRAINER).with_token(TOKEN);
     let mut known: BTreeMap<String, String> = BTreeMap::new();
     let mut next = 0;
     for (point, at) in ["db::before_commit", "db::after_commit"].into_iter().flat_map(|p| (3..9).map(move |at| (p, at)))
@@ -462,7 +466,7 @@ fn p15_a_loss_that_is_no_number_is_final() {
     let bench = Bench::new(TRAINER);
     let config = config().display().to_string();
     let said = bench
-        .run(&["run", &config, "--until", "vae", "--set", "stages.vae.lr=1e30", "--workers", "1", "-o", "json"])
+        .run(&["run", &config, "--until", "vae", "--set", "stages.vae.lr=1000", "--workers", "1", "-o", "json"])
         .expect_code(1);
     let report: Value = serde_json::from_str(said.stdout.lines().next().map_or("", |_| said.stdout.as_str()))
         .unwrap_or_else(|e| panic!("{e}: {}", said.stdout));

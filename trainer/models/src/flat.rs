@@ -33,7 +33,8 @@ pub fn layout<M: Module>(module: &M) -> Vec<Entry> {
     struct Layout(Vec<String>, Vec<Entry>);
     impl ModuleVisitor for Layout {
         fn enter_module(&mut self, name: &str, _: &str) {
-            let entry = name.rsplit_once('_').filter(|(sequence, _)| SEQUENCES.contains(sequence));
+            let entry =
+                name.rsplit_once('_').filter(|(sequence, n)| SEQUENCES.contains(sequence) && n.parse::<u32>().is_ok());
             self.0.push(entry.map_or_else(|| name.to_owned(), |(sequence, n)| format!("{sequence}.{n}")));
         }
         fn exit_module(&mut self, _: &str, _: &str) {
