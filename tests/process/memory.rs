@@ -42,8 +42,8 @@ fn p15_a_worker_whose_allocation_is_refused_is_final() {
         return;
     }
     let bench = Bench::new(TRAINER);
-    // Far more than anything here needs, and less than the 17 GB of the first weights.
-    let said = run(&bench, 65_536, &["prlimit", "--as=8589934592"]);
+    // More than anything else here needs, and less than the 7 GB of all weights, the first of which has 1.8.
+    let said = run(&bench, 12_288, &["prlimit", "--as=4294967296"]);
     check(&bench, said, "was refused");
 }
 
@@ -83,7 +83,7 @@ fn p15_a_worker_that_the_kernel_kills_for_want_of_memory_is_final() {
     let Some(group) = Group::new(600 << 20) else { return };
     let bench = Bench::new(TRAINER);
     let enter = format!("echo $$ > {}/cgroup.procs && exec \"$@\"", group.0.display());
-    // Weights of one gigabyte each.
-    let said = run(&bench, 16_384, &["sh", "-c", &enter, "sh"]);
+    // The first weights have .8 GB.
+    let said = run(&bench, 8_192, &["sh", "-c", &enter, "sh"]);
     check(&bench, said, "the kernel killed it");
 }

@@ -102,7 +102,7 @@ fn a_metric_that_nobody_reports_ends_the_run_and_says_what_there_is() {
 #[test]
 fn a_trial_that_diverges_is_stopped_and_the_sweep_goes_on() {
     let bench = Bench::new(TRAINER);
-    let sweep = "stages.pcm.sweep={search: grid, metric: latent_fid, space: {lr: {choice: [5e-4, 1e30]}}, \
+    let sweep = "stages.pcm.sweep={search: grid, metric: latent_fid, space: {lr: {choice: [5e-4, 1000]}}, \
         evaluate: {kind: evaluate.latent_fid, sampler: {steps: 1, guidance: 2}, repeats: 1, components: 8, shards: 1}}";
     let report = bench.pipeline(CONFIG, &["--workers", "2", "--set", sweep, "--until", "pcm"]);
     let sweep = &report["sweeps"][0];
