@@ -1,6 +1,6 @@
 //! The only one who decides: (state, moment, event) to facts and effects.
 //!
-//! Nothing here reads a clock, a socket or a generator. What is decided is a list of facts; [`Deciding::record`] is the one way to
+//! Nothing here reads a clock, a socket or a generator. What is decided is a list of facts; `Deciding::record` is the one way to
 //! change the state, and keeps each fact. They are stored in the same transaction as the rows that they imply, before any other effect;
 //! recovery applies them and decides nothing again. After the event itself, every run that it touched is reconciled (stages whose work is
 //! over, stages whose inputs are there), work that nobody wants is asked to wind down, idle workers are given what is ready, and what has
