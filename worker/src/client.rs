@@ -25,7 +25,10 @@ pub(crate) enum CallError {
     /// The grant is not the task's newest.
     #[error("{0}")]
     Stale(String),
-    /// The store is full or not writable.
+    /// The coordinator's store is full or not writable: the same call may succeed once there is room.
+    #[error("{0}")]
+    Full(String),
+    /// What is fetched cannot be kept on this machine.
     #[error("{0}")]
     Storage(String),
     /// No such thing.
@@ -177,7 +180,7 @@ async fn check(sent: Result<Response, reqwest::Error>) -> Result<Response, CallE
     };
     Err(match (status, error.code.as_str()) {
         (_, "stale-fence") => CallError::Stale(message),
-        (_, "storage") | (StatusCode::INSUFFICIENT_STORAGE, _) => CallError::Storage(message),
+        (_, "storage") | (StatusCode::INSUFFICIENT_STORAGE, _) => CallError::Full(message),
         (_, "not-found") | (StatusCode::NOT_FOUND, _) => CallError::NotFound(message),
         (_, "damaged") => CallError::Damaged(message),
         // What has arrived is asked for again.

@@ -1,4 +1,4 @@
-//! Trying again, for as long as the grant holds: a coordinator that restarts is waited for, however long it takes.
+//! Trying again, for as long as the grant holds: a coordinator that restarts, or whose disk is full, is waited for, however long it takes.
 
 use std::time::{Duration, Instant};
 
@@ -51,7 +51,7 @@ pub(crate) fn until_ended<T>(
             Err(CallError::Fault(message)) if faults == FAULTS => {
                 return Err(GaveUp::Answer(CallError::Fault(message)));
             }
-            Err(error @ (CallError::Away(_) | CallError::Fault(_))) => {
+            Err(error @ (CallError::Away(_) | CallError::Full(_) | CallError::Fault(_))) => {
                 faults += u32::from(matches!(error, CallError::Fault(_)));
                 if warned == begun || warned.elapsed() > Duration::from_secs(10) {
                     tracing::warn!("{what}: {error}; trying again");

@@ -77,6 +77,10 @@ struct Fake {
     coordinator: Mutex<ActorHandle>,
     /// Answers 503 to everything.
     away: AtomicBool,
+    /// Its disk is full: nothing can be stored.
+    full: AtomicBool,
+    /// How often it said so.
+    turned_down: AtomicU64,
     /// Every third write is done, and then its answer is lost.
     lossy: AtomicBool,
     /// The next so many polls are never answered.
@@ -98,6 +102,15 @@ fn refuse(status: StatusCode, code: &str) -> Response {
 }
 
 impl Fake {
+    /// The answer of a full disk, if it is full.
+    fn no_room(&self) -> Option<Response> {
+        let full = self.full.load(Ordering::SeqCst);
+        full.then(|| {
+            self.turned_down.fetch_add(1, Ordering::SeqCst);
+            refuse(StatusCode::INSUFFICIENT_STORAGE, "storage")
+        })
+    }
+
     fn desired(&self, change: impl FnOnce(&mut ActorHandle)) {
         let mut coordinator = lock(&self.coordinator);
         change(&mut coordinator);
@@ -108,6 +121,9 @@ impl Fake {
     fn write(&self, grant: &Grant, work: impl FnOnce(&mut ActorHandle)) -> Response {
         if self.away.load(Ordering::SeqCst) {
             return refuse(StatusCode::SERVICE_UNAVAILABLE, "internal");
+        }
+        if let Some(response) = self.no_room() {
+            return response;
         }
         let mut coordinator = lock(&self.coordinator);
         if grant.fence.0 != coordinator.fence {
@@ -124,6 +140,9 @@ impl Fake {
 
 async fn join(State(fake): State<Arc<Fake>>, Json(join): Json<Join>) -> Response {
     assert_eq!(join.protocol, PROTOCOL_VERSION);
+    if let Some(response) = fake.no_room() {
+        return response;
+    }
     let mut coordinator = lock(&fake.coordinator);
     coordinator.joins += 1;
     Json(Joined { incarnation: Incarnation(coordinator.joins), lease_ms: LEASE_MS, poll_ms: 100 }).into_response()
@@ -496,6 +515,28 @@ fn a_coordinator_that_goes_away_and_forgets_is_waited_for() {
     worker.wait("a second join", |coordinator| coordinator.joins == 2);
     let coordinator = worker.leave();
     assert_eq!(coordinator.metrics.len(), 200);
+    assert!(matches!(coordinator.outcomes[..], [ReportOutcome { outcome: TaskOutcome::Finished { .. }, .. }]));
+}
+
+#[test]
+fn a_coordinator_whose_disk_is_full_is_waited_for() {
+    let worker = Worker::start(Box::new(|context| train(context, 200, Duration::from_millis(5))));
+    worker.grant(1);
+    worker.wait("some steps", |coordinator| coordinator.metrics.len() > 10);
+    worker.fake.full.store(true, Ordering::SeqCst);
+    worker.wait("refusals", |_| worker.fake.turned_down.load(Ordering::SeqCst) >= 3);
+    worker.fake.full.store(false, Ordering::SeqCst);
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    let before = worker.fake.turned_down.load(Ordering::SeqCst);
+    worker.fake.full.store(true, Ordering::SeqCst);
+    lock(&worker.fake.coordinator).forget = true;
+    worker.wait("joins that are refused", |coordinator| {
+        !coordinator.forget && worker.fake.turned_down.load(Ordering::SeqCst) >= before + 3
+    });
+    worker.fake.full.store(false, Ordering::SeqCst);
+    worker.wait("a second join", |coordinator| coordinator.joins == 2);
+    let coordinator = worker.leave();
+    assert_eq!(coordinator.metrics.len(), 200, "no row was lost");
     assert!(matches!(coordinator.outcomes[..], [ReportOutcome { outcome: TaskOutcome::Finished { .. }, .. }]));
 }
 
