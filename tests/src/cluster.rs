@@ -37,16 +37,27 @@ pub struct Cluster {
 impl Cluster {
     /// A coordinator on a free port of this machine, with an empty store.
     pub fn start(trainer: &str) -> Self {
+        Self::listen(trainer, Self::free_address())
+    }
+
+    /// A port of this machine that nobody uses.
+    pub fn free_address() -> SocketAddr {
         let free = TcpListener::bind("127.0.0.1:0").expect("a free port");
-        let address = free.local_addr().expect("bound");
-        drop(free);
-        Self::listen(trainer, address)
+        free.local_addr().expect("bound")
     }
 
     /// The same at a chosen address.
     pub fn listen(trainer: &str, address: SocketAddr) -> Self {
+        Self::listen_on(trainer, address, None)
+    }
+
+    /// The same with its store in a chosen folder.
+    pub fn listen_on(trainer: &str, address: SocketAddr, store: Option<&Path>) -> Self {
         let bench = Bench::new(trainer).with_token(TOKEN);
         fs::create_dir_all(bench.path().join("logs")).expect("a folder for logs");
+        if let Some(store) = store {
+            std::os::unix::fs::symlink(store, bench.store()).expect("a link to the store");
+        }
         let mut cluster = Self { bench, address, server: None, workers: BTreeMap::new() };
         cluster.serve();
         cluster
@@ -112,6 +123,11 @@ impl Cluster {
             server.kill();
             server.wait();
         }
+    }
+
+    /// Whether the coordinator's process runs.
+    pub fn serving(&mut self) -> bool {
+        self.server.as_mut().is_some_and(Running::alive)
     }
 
     /// The coordinator's process id, while it is there.

@@ -4,6 +4,7 @@
 //! with a bound after which the test fails and prints what the trainer said.
 
 pub mod cluster;
+pub mod disk;
 pub mod documented;
 pub mod network;
 

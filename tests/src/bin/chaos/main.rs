@@ -5,6 +5,8 @@
 //! the store must be whole. See `tests/chaos.sh`.
 #![expect(clippy::print_stdout, reason = "a harness prints what it did and measured")]
 
+mod damage;
+mod hardship;
 mod measure;
 
 use std::collections::BTreeMap;
@@ -12,11 +14,13 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime};
 
 use cluster_tests::cluster::Cluster;
+use cluster_tests::disk::Disk;
 use cluster_tests::network::Network;
 use cluster_tests::{Bench, digests, signal, wait_for};
 use nix::sys::signal::Signal;
 use serde_json::Value;
 
+use crate::hardship::{Hardship, Random, Seed};
 use crate::measure::Kill;
 
 /// The quickstart with fewer clips and steps, so that many seeds are affordable.
@@ -41,9 +45,7 @@ const WORKERS: [&str; 3] = ["w1", "w2", "w3"];
 const MEAN: f64 = 5.0;
 /// A run that gets no further for so long, while the coordinator and a worker are there to work on it, has hung.
 const STUCK: Duration = Duration::from_secs(60);
-/// Every so many seeds one host is on a slow line.
-const SLOW_EVERY: u64 = 4;
-/// What comes to that host, in kilobits a second.
+/// What comes to a host on a slow line, in kilobits a second.
 const SLOW: u32 = 4_000;
 /// A run that takes longer has hung.
 const LIMIT: Duration = Duration::from_secs(3600);
@@ -58,30 +60,13 @@ fn config() -> PathBuf {
     Bench::repository().join("configs/quickstart.yaml")
 }
 
-/// SplitMix64: what happens, and when, is a function of the seed.
-struct Random(u64);
+fn between(random: &mut Random, low: f64, high: f64) -> Duration {
+    Duration::from_secs_f64(low + random.unit() * (high - low))
+}
 
-impl Random {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    /// In `0..1`.
-    fn unit(&mut self) -> f64 {
-        (self.next() >> 11) as f64 / (1u64 << 53) as f64
-    }
-
-    fn between(&mut self, low: f64, high: f64) -> Duration {
-        Duration::from_secs_f64(low + self.unit() * (high - low))
-    }
-
-    fn wait(&mut self) -> Duration {
-        Duration::from_secs_f64(-MEAN * (1.0 - self.unit()).ln())
-    }
+/// The time to the next disturbance.
+fn wait(random: &mut Random) -> Duration {
+    Duration::from_secs_f64(-MEAN * (1.0 - random.unit()).ln())
 }
 
 /// What ends a disturbance.
@@ -95,10 +80,17 @@ enum Remedy {
     Mend(usize),
     Serve,
     WakeServer,
+    /// A full disk gets its room back.
+    Empty,
+    /// A paused disk goes on.
+    Resume,
 }
 
 struct Chaos {
     cluster: Cluster,
+    /// The store's own; after the cluster, so that nobody holds it when it goes.
+    disk: Option<Disk>,
+    hardship: Hardship,
     network: Option<Network>,
     random: Random,
     begun: Instant,
@@ -106,32 +98,35 @@ struct Chaos {
     /// Workers that are dead, stopped or cut off.
     down: [bool; WORKERS.len()],
     server_down: bool,
+    disk_down: bool,
     kills: Vec<Kill>,
     counts: BTreeMap<&'static str, u32>,
 }
 
 impl Chaos {
-    fn start(trainer: &str, seed: u64) -> Self {
+    fn start(trainer: &str, Seed { hardship, number }: Seed) -> Self {
         let network = Network::new(WORKERS.len());
-        let cluster = match &network {
-            Some(network) => Cluster::listen(trainer, network.coordinator()),
-            None => Cluster::start(trainer),
-        };
-        let mut random = Random(seed);
-        if let Some(network) = network.as_ref().filter(|_| seed.is_multiple_of(SLOW_EVERY)) {
-            let host = (random.next() % WORKERS.len() as u64) as usize;
+        let disk = hardship.needs_disk().then(Disk::new).flatten();
+        let address = network.as_ref().map_or_else(Cluster::free_address, Network::coordinator);
+        let cluster = Cluster::listen_on(trainer, address, disk.as_ref().map(Disk::path).as_deref());
+        let mut random = Random(number);
+        if let Some(network) = network.as_ref().filter(|_| hardship == Hardship::Slow) {
+            let host = random.index(WORKERS.len());
             if network.slow_down(host, SLOW) {
                 println!("  {} is on a line of {SLOW} kbit/s", WORKERS[host]);
             }
         }
         let mut chaos = Self {
             cluster,
+            disk,
+            hardship,
             network,
             random,
             begun: Instant::now(),
             remedies: Vec::new(),
             down: [false; WORKERS.len()],
             server_down: false,
+            disk_down: false,
             kills: Vec::new(),
             counts: BTreeMap::new(),
         };
@@ -155,18 +150,24 @@ impl Chaos {
 
     /// One disturbance. What is down already is left alone.
     fn disturb(&mut self, view: Option<&Value>) {
-        let (dice, i) = (self.random.next() % 100, (self.random.next() % WORKERS.len() as u64) as usize);
+        let (dice, i) = (self.random.index(100), self.random.index(WORKERS.len()));
         let now = Instant::now();
         let (what, remedy, how_long) = match dice {
-            0..40 => ("kill", Remedy::Join(i), self.random.between(0.0, 4.0)),
-            40..55 => ("stop", Remedy::Wake(i), self.random.between(0.5, 25.0)),
-            55..75 => ("kill", Remedy::Serve, self.random.between(0.0, 6.0)),
-            75..85 => ("stop", Remedy::WakeServer, self.random.between(0.5, 6.0)),
-            _ => ("cut off", Remedy::Mend(i), self.random.between(1.0, 30.0)),
+            0..25 if self.hardship == Hardship::Full => ("fill", Remedy::Empty, between(&mut self.random, 1.0, 15.0)),
+            0..25 if self.hardship == Hardship::Paused => {
+                ("pause", Remedy::Resume, between(&mut self.random, 0.5, 15.0))
+            }
+            0..40 => ("kill", Remedy::Join(i), between(&mut self.random, 0.0, 4.0)),
+            40..55 => ("stop", Remedy::Wake(i), between(&mut self.random, 0.5, 25.0)),
+            55..75 => ("kill", Remedy::Serve, between(&mut self.random, 0.0, 6.0)),
+            75..85 => ("stop", Remedy::WakeServer, between(&mut self.random, 0.5, 6.0)),
+            _ => ("cut off", Remedy::Mend(i), between(&mut self.random, 1.0, 30.0)),
         };
         match remedy {
             Remedy::Join(i) | Remedy::Wake(i) | Remedy::Mend(i) if self.down[i] => return,
-            Remedy::Serve | Remedy::WakeServer if self.server_down => return,
+            // A process that waits for a paused disk takes no signal.
+            Remedy::Serve | Remedy::WakeServer if self.server_down || self.disk_down => return,
+            Remedy::Empty | Remedy::Resume if self.disk_down || self.server_down || self.disk.is_none() => return,
             Remedy::Mend(_) if self.network.is_none() => return,
             _ => {}
         }
@@ -186,6 +187,8 @@ impl Chaos {
             Remedy::Mend(i) => self.network.as_ref().expect("looked at above").cut(i),
             Remedy::Serve => self.cluster.kill_server(),
             Remedy::WakeServer => signal(self.cluster.server().expect("it is up"), Signal::SIGSTOP),
+            Remedy::Empty => self.disk.as_ref().expect("looked at above").fill(),
+            Remedy::Resume => self.disk.as_mut().expect("looked at above").pause(),
         }
         let who = match remedy {
             Remedy::Join(i) | Remedy::Wake(i) | Remedy::Mend(i) => {
@@ -195,6 +198,10 @@ impl Chaos {
             Remedy::Serve | Remedy::WakeServer => {
                 self.server_down = true;
                 "the coordinator"
+            }
+            Remedy::Empty | Remedy::Resume => {
+                self.disk_down = true;
+                "the disk"
             }
         };
         if let Some(last) = self.kills.last_mut()
@@ -218,22 +225,41 @@ impl Chaos {
                 Remedy::Mend(i) => self.network.as_ref().expect("it was cut").mend(i),
                 Remedy::Serve => self.cluster.serve(),
                 Remedy::WakeServer => signal(self.cluster.server().expect("it is there"), Signal::SIGCONT),
+                Remedy::Empty => self.disk.as_ref().expect("it was filled").empty(),
+                Remedy::Resume => self.disk.as_mut().expect("it was paused").resume(),
             }
             match remedy {
                 Remedy::Join(i) | Remedy::Wake(i) | Remedy::Mend(i) => self.down[i] = false,
                 Remedy::Serve | Remedy::WakeServer => self.server_down = false,
+                Remedy::Empty | Remedy::Resume => self.disk_down = false,
             }
         }
+    }
+
+    /// A coordinator may end when its disk is full, and somebody starts it again; nothing else excuses its end.
+    fn look_after_the_server(&mut self) -> Result<(), String> {
+        if self.server_down || self.cluster.serving() {
+            return Ok(());
+        }
+        if self.hardship != Hardship::Full {
+            return Err(format!("the coordinator ended by itself:\n{}", self.cluster.everything()));
+        }
+        if !self.disk_down {
+            *self.counts.entry("start after a full disk").or_default() += 1;
+            self.cluster.serve();
+        }
+        Ok(())
     }
 
     /// Disturbs until the run is over.
     fn run(&mut self, sets: &[&str]) -> Result<Value, String> {
         let run = self.cluster.submit(&config(), sets);
-        let mut next = Instant::now() + self.random.wait();
+        let mut next = Instant::now() + wait(&mut self.random);
         let mut view = None;
         let (mut last, mut moved) = (Vec::new(), Instant::now());
         loop {
-            let newest = if self.server_down { None } else { self.cluster.get(&format!("/v1/runs/{run}")) };
+            let newest =
+                if self.server_down || self.disk_down { None } else { self.cluster.get(&format!("/v1/runs/{run}")) };
             if let Some(newest) = newest {
                 match newest["state"].as_str() {
                     Some("finished") => {
@@ -245,9 +271,10 @@ impl Chaos {
                 }
             }
             self.mend(false);
+            self.look_after_the_server()?;
             if Instant::now() >= next {
                 self.disturb(view.as_ref());
-                next = Instant::now() + self.random.wait();
+                next = Instant::now() + wait(&mut self.random);
             }
             for (i, name) in WORKERS.iter().enumerate() {
                 if !self.down[i] && !self.cluster.alive(name) {
@@ -255,7 +282,7 @@ impl Chaos {
                 }
             }
             let now = view.as_ref().map(progress).unwrap_or_default();
-            if now != last || self.server_down || self.down.iter().all(|down| *down) {
+            if now != last || self.server_down || self.disk_down || self.down.iter().all(|down| *down) {
                 (last, moved) = (now, Instant::now());
             }
             if moved.elapsed() > STUCK {
@@ -275,7 +302,7 @@ fn progress(view: &Value) -> Vec<(Value, Value)> {
     stages.map(|stage| (stage["state"].clone(), stage["progress"]["done"].clone())).collect()
 }
 
-fn one(trainer: &str, sets: &[&str], seed: u64, expected: &Value) -> Result<(), String> {
+fn one(trainer: &str, sets: &[&str], seed: Seed, expected: &Value) -> Result<(), String> {
     println!("seed {seed}");
     let mut chaos = Chaos::start(trainer, seed);
     let view = chaos.run(sets)?;
@@ -284,6 +311,10 @@ fn one(trainer: &str, sets: &[&str], seed: u64, expected: &Value) -> Result<(), 
     let different: Vec<&String> = expected.keys().filter(|stage| found.get(*stage) != expected.get(*stage)).collect();
     if !different.is_empty() {
         return Err(format!("seed {seed}: other digests of {different:?}:\n{found:#?}\nexpected {expected:#?}"));
+    }
+    if seed.hardship == Hardship::Damaged {
+        let Chaos { cluster, random, .. } = &mut chaos;
+        damage::between_runs(cluster, random, &view, |cluster| cluster.submit(&config(), sets), &WORKERS)?;
     }
     let logs = WORKERS.map(|name| (name, chaos.cluster.said(name)));
     let fsck = {
@@ -348,10 +379,16 @@ fn main() -> std::process::ExitCode {
     let mut arguments = std::env::args().skip(1).peekable();
     let trainer = arguments.next();
     let full = arguments.next_if(|argument| argument == "--full").is_some();
-    let seeds: Result<Vec<u64>, _> = arguments.map(|seed| seed.parse()).collect();
-    let (Some(trainer), Ok(seeds)) = (trainer, seeds) else {
-        eprintln!("usage: chaos TRAINER [--full] SEED...; `tests/chaos.sh [--full] SEED...` builds the trainer first");
-        return 2.into();
+    let seeds: Result<Vec<Seed>, _> = arguments.map(|seed| seed.parse()).collect();
+    let (trainer, seeds) = match (trainer, seeds) {
+        (Some(trainer), Ok(seeds)) => (trainer, seeds),
+        (_, seeds) => {
+            eprintln!("usage: chaos TRAINER [--full] [HARDSHIP:]SEED...; `tests/chaos.sh` builds the trainer first");
+            if let Err(problem) = seeds {
+                eprintln!("{problem}");
+            }
+            return 2.into();
+        }
     };
     let sets = sets(full);
     let trainer = std::fs::canonicalize(&trainer).map_or(trainer, |path| path.display().to_string());
@@ -361,13 +398,13 @@ fn main() -> std::process::ExitCode {
     for seed in &seeds {
         if let Err(message) = one(&trainer, &sets, *seed, &expected) {
             eprintln!("{message}");
-            failed.push(*seed);
+            failed.push(seed.to_string());
         }
     }
     println!("{} of {} seeds passed", seeds.len() - failed.len(), seeds.len());
     if failed.is_empty() {
         return 0.into();
     }
-    eprintln!("failed: {failed:?}");
+    eprintln!("failed: {}", failed.join(" "));
     1.into()
 }
