@@ -80,6 +80,20 @@ impl SharedLock {
     }
 }
 
+/// Who holds the store whose lock is at `path`, if somebody does.
+pub(crate) fn holder(path: &Path) -> io::Result<Option<Holder>> {
+    let file = match File::open(path) {
+        Ok(file) => file,
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
+        Err(e) => return Err(e),
+    };
+    match file.try_lock_shared() {
+        Ok(()) => Ok(None),
+        Err(TryLockError::WouldBlock) => read(file).map(Some),
+        Err(TryLockError::Error(e)) => Err(e),
+    }
+}
+
 /// Kept by whoever collects, alone, and by those who copy what a collection could take from under them.
 #[derive(Debug)]
 pub(crate) struct CollectionLock(#[expect(dead_code, reason = "the lock lasts as long as the file is open")] File);

@@ -30,7 +30,7 @@ use crate::db::writer::{Done, Order, Session, Writer};
 use crate::db::{self, Opened};
 use crate::forget::Forgotten;
 use crate::identity::{self, Found, Mismatch, StoreId, Verdict, Witness};
-use crate::lock::{Holder, SharedLock, StoreLock, Taken, network_filesystem};
+use crate::lock::{self, Holder, SharedLock, StoreLock, Taken, network_filesystem};
 use crate::reserve::{self, OPEN_NEEDS_BYTES};
 use crate::retention::{Named, Vouched};
 use crate::{Write, WriteError, clock};
@@ -223,6 +223,12 @@ impl ReadStore {
         let readers = db::open_readers(&dir, closed.is_some());
         let opened_ms = clock::now_ms();
         Ok(Self(Arc::new(Reading { dir, id, opened_ms, blobs, readers, _closed: closed })))
+    }
+
+    /// Who holds the store in `dir` now, if somebody does. There need be no store.
+    pub fn holder_of(dir: &Path) -> Result<Option<Holder>, OpenError> {
+        let path = dir.join("lock");
+        lock::holder(&path).map_err(|e| OpenError::io(&path, &e))
     }
 
     /// Ends its connections to the database, which would otherwise end some time after the last clone is gone.

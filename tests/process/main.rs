@@ -10,6 +10,7 @@ mod determinism;
 mod documented;
 mod failpoints;
 mod memory;
+mod reading;
 mod registry;
 mod storage;
 mod sweeps;

@@ -1,5 +1,5 @@
 //! The HTTP client of a coordinator: the one given by `--server`, the one that holds the store, or one started for the
-//! length of a command.
+//! length of a command that changes something. What only reads asks a [`Reader`](crate::reader::Reader).
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ use protocol::message::{
 };
 use protocol::{Digest, Incarnation, RunId, WorkerId};
 use registry::cli::{Answer, Command};
-use registry::{Holder, LogRow, OpenError, Store};
+use registry::{Holder, LogRow, ReadStore, Store};
 use reqwest::Method;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -36,33 +36,34 @@ pub(crate) struct Client {
 }
 
 impl Client {
-    /// Finds the coordinator of `target`.
-    pub(crate) async fn connect(target: &Target) -> Result<Self> {
+    /// The coordinator of `target` if one is running: the one that is named, or the one that holds the store.
+    pub(crate) async fn running(target: &Target) -> Result<Option<Self>> {
         if let Some(server) = target.server.connect()? {
-            return Ok(Self { server, own: None });
+            return Ok(Some(Self { server, own: None }));
         }
-        match Store::open_existing(&target.store, Holder::this_process("trainer")).await {
-            Ok(store) => {
-                let handle = Coordinator::start(store, Config::embedded()).await?;
-                let client = Self::of(&handle)?;
-                Ok(Self { own: Some(handle), ..client })
+        match ReadStore::holder_of(&target.store)? {
+            Some(Holder { address: Some(address), .. }) => {
+                Ok(Some(Self { server: target.server.holder(&target.store, &address)?, own: None }))
             }
-            Err(OpenError::Busy { holder: Holder { address: Some(address), .. }, .. }) => {
-                Ok(Self { server: target.server.holder(&target.store, &address)?, own: None })
-            }
-            Err(error) => Err(error.into()),
+            _ => Ok(None),
         }
+    }
+
+    /// The coordinator of `target`; if none is running, one is started and goes with this.
+    pub(crate) async fn connect(target: &Target) -> Result<Self> {
+        if let Some(client) = Self::running(target).await? {
+            return Ok(client);
+        }
+        let store = Store::open_existing(&target.store, Holder::this_process("trainer")).await?;
+        let handle = Coordinator::start(store, Config::embedded()).await?;
+        let client = Self::of(&handle)?;
+        Ok(Self { own: Some(handle), ..client })
     }
 
     /// A client of a coordinator in this process.
     pub(crate) fn of(handle: &Handle) -> Result<Self> {
         let server = Server::new(&handle.local_url(), Some(handle.token().clone()), None)?;
         Ok(Self { server, own: None })
-    }
-
-    /// Whether the coordinator lives only as long as this command.
-    pub(crate) fn is_own(&self) -> bool {
-        self.own.is_some()
     }
 
     /// Ends a coordinator of our own, and lets go of its store.
@@ -121,12 +122,8 @@ impl Client {
         Ok(self.post::<coordinator::shell::Submitted>("/v1/runs", submit).await?.run)
     }
 
-    pub(crate) async fn runs(&self) -> Result<Vec<RunView>> {
-        self.newest_runs(1_000_000).await
-    }
-
     /// Runs that go on, and of those that ended the newest `ended`.
-    async fn newest_runs(&self, ended: u32) -> Result<Vec<RunView>> {
+    pub(crate) async fn newest_runs(&self, ended: u32) -> Result<Vec<RunView>> {
         self.get(&format!("/v1/runs?limit={ended}")).await
     }
 
@@ -139,9 +136,10 @@ impl Client {
         self.post(&format!("/v1/runs/{run}/{action}"), &()).await
     }
 
-    pub(crate) async fn logs(&self, run: &RunId, stage: Option<&str>, after: i64) -> Result<Vec<LogRow>> {
+    /// At most `limit` lines after line `after`.
+    pub(crate) async fn logs(&self, run: &RunId, stage: Option<&str>, after: i64, limit: u32) -> Result<Vec<LogRow>> {
         let stage = stage.map(|stage| format!("&stage={stage}")).unwrap_or_default();
-        self.get(&format!("/v1/runs/{run}/logs?after={after}&limit=1000{stage}")).await
+        self.get(&format!("/v1/runs/{run}/logs?after={after}&limit={limit}{stage}")).await
     }
 
     pub(crate) async fn workers(&self) -> Result<Vec<WorkerView>> {
@@ -173,29 +171,6 @@ impl Client {
         let answer = self.send(self.server.request(Method::GET, &format!("/v1/blobs/{digest}"))).await?;
         let bytes = answer.bytes().await.map_err(|error| Problem::failed(explain(&error)))?;
         Ok(bytes.into())
-    }
-
-    /// The run that `text` means: its name, a unique beginning of it, or `@last`.
-    pub(crate) async fn find(&self, text: &str) -> Result<RunView> {
-        let runs = if text == "@last" { self.newest_runs(1).await? } else { self.runs().await? };
-        let not_found = |message: String| Problem::new(exit::NOT_FOUND, anyhow::anyhow!("{message}"));
-        if text == "@last" {
-            return runs.into_iter().next_back().ok_or_else(|| {
-                not_found("there are no runs yet".into()).hint("`trainer run configs/quickstart.yaml` makes one")
-            });
-        }
-        if let Some(exact) = runs.iter().find(|run| run.run.as_str() == text) {
-            return Ok(exact.clone());
-        }
-        let begins: Vec<&RunView> = runs.iter().filter(|run| run.run.as_str().starts_with(text)).collect();
-        match begins.as_slice() {
-            [run] => Ok((*run).clone()),
-            [] => Err(not_found(format!("there is no run `{text}`")).hint("`trainer status --all` lists runs")),
-            several => {
-                let names: Vec<&str> = several.iter().map(|run| run.run.as_str()).collect();
-                Err(Problem::usage(format!("`{text}` could be {}", names.join(", "))).hint("give more of the name"))
-            }
-        }
     }
 }
 

@@ -11,6 +11,7 @@ mod plan;
 mod print;
 mod problem;
 mod progress;
+mod reader;
 mod run;
 mod summary;
 mod sweep_plot;

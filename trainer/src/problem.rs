@@ -107,6 +107,15 @@ impl From<coordinator::StartError> for Problem {
     }
 }
 
+impl From<coordinator::RecordsError> for Problem {
+    fn from(error: coordinator::RecordsError) -> Self {
+        match error {
+            coordinator::RecordsError::Open(error) => error.into(),
+            coordinator::RecordsError::Recover(error) => error.into(),
+        }
+    }
+}
+
 impl From<coordinator::Refused> for Problem {
     fn from(error: coordinator::Refused) -> Self {
         let exit = match &error {

@@ -38,7 +38,7 @@ pub(crate) struct Options {
 #[derive(Debug)]
 pub(crate) enum Work {
     Pipeline { file: Box<PipelineFile>, until: Option<StageName> },
-    Run(String),
+    Run(RunId),
 }
 
 /// Ctrl-C and SIGTERM.
@@ -116,17 +116,9 @@ async fn begin(handle: &Handle, store: &Store, work: Work) -> Result<(RunId, Pip
             let run = handle.submit(Submit { pipeline: json, source, idempotency_key: None, until }).await?;
             Ok((run, pipeline))
         }
-        Work::Run(name) => {
-            let rows = store.runs().await?;
-            let row = match name.as_str() {
-                "@last" => rows.iter().max_by_key(|row| row.created_ms),
-                name => rows.iter().find(|row| row.run.as_str() == name).or_else(|| {
-                    let mut begins = rows.iter().filter(|row| row.run.as_str().starts_with(name));
-                    begins.next().filter(|_| begins.next().is_none())
-                }),
-            };
-            let row = row.ok_or_else(|| {
-                Problem::new(exit::NOT_FOUND, anyhow::anyhow!("there is no one run `{name}` in this store"))
+        Work::Run(run) => {
+            let row = store.run(&run).await?.ok_or_else(|| {
+                Problem::new(exit::NOT_FOUND, anyhow::anyhow!("there is no run `{run}` in this store"))
                     .hint("`trainer status --all` lists runs")
             })?;
             let pipeline = serde_json::from_value(row.pipeline.clone()).map_err(|error| {

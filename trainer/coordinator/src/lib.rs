@@ -30,6 +30,6 @@ pub use fact::Fact;
 pub use observe::observe;
 pub use outcome::refused_for_good;
 pub use policy::{GrantOrder, Policy};
-pub use shell::{Config, Connections, Coordinator, Handle, Refused, StartError};
+pub use shell::{Config, Connections, Coordinator, Handle, Records, RecordsError, Refused, StartError};
 pub use state::State;
 pub use view::WorkerView;

@@ -12,9 +12,10 @@ use stages::generate::{Generated, Generator};
 
 use super::model::{self, Found};
 use super::remote::check_parent;
-use crate::client::{Client, Target};
+use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result};
+use crate::reader::Reader;
 
 #[derive(Debug, Args)]
 pub(crate) struct GenerateArgs {
@@ -69,9 +70,9 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
         check_parent(path)?;
     }
     let start = Instant::now();
-    let client = Client::connect(&args.target).await?;
-    let Found { manifest, blobs, label } = model::version(&client, &args.model).await?;
-    client.close().await;
+    let reader = Reader::open(&args.target).await?;
+    let Found { manifest, blobs, label } = model::version(&reader, &args.model).await?;
+    reader.close().await;
     let (device, _) = model::device(args.backend.as_deref())?;
     let generator = Generator::load(&manifest, &blobs, &device).map_err(Problem::failed)?;
     let loaded = start.elapsed();

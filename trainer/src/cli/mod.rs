@@ -14,11 +14,12 @@ use std::process::ExitCode;
 use access::ServerOptions;
 use clap::{Args, Parser, Subcommand};
 use protocol::StageName;
-use registry::{Holder, OpenError, ReadStore, Store};
+use registry::{OpenError, ReadStore};
 
 use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result, exit};
+use crate::reader::Reader;
 use crate::{pipeline_file, plan, run, verify};
 
 /// Trains text-to-motion models across workers and keeps what came out of it
@@ -197,7 +198,7 @@ impl Verb {
     /// What a store gets is its user's alone; what else a command writes, the user's umask decides.
     fn keep_to_oneself(&self) {
         let store_only = match self {
-            Self::Run(_) | Self::Serve(_) | Self::Resume(_) => true,
+            Self::Run(_) | Self::Serve(_) | Self::Resume(_) | Self::Cancel(_) | Self::Pause(_) => true,
             Self::Registry(args) => !matches!(args.verb, registry::cli::Verb::Export { .. }),
             _ => false,
         };
@@ -288,25 +289,23 @@ async fn show_plan(args: PlanArgs) -> Result<u8> {
 }
 
 async fn resume(args: ResumeArgs) -> Result<u8> {
-    if args.target.server.server.is_none() {
-        match Store::open_existing(&args.target.store, Holder::this_process("trainer resume")).await {
-            Ok(store) => {
-                // Nobody holds it, so nobody would do the work: this process does.
-                drop(store);
-                let options = run::Options {
-                    store: args.target.store,
-                    workers: args.workers,
-                    output: args.output,
-                    command: command_line(),
-                };
-                return run::run(run::Work::Run(args.run), options).await;
-            }
-            Err(OpenError::Busy { holder: Holder { address: Some(_), .. }, .. }) => {}
-            Err(error) => return Err(error.into()),
+    // Looked up first: nothing is started for a run that does not exist.
+    let reader = Reader::open(&args.target).await?;
+    let found = reader.find(&args.run).await?;
+    let client = match reader {
+        Reader::Server(client) => client,
+        Reader::Store(records) => {
+            // Nobody holds it, so nobody would do the work: this process does.
+            records.close().await;
+            let options = run::Options {
+                store: args.target.store,
+                workers: args.workers,
+                output: args.output,
+                command: command_line(),
+            };
+            return run::run(run::Work::Run(found.run), options).await;
         }
-    }
-    let client = crate::client::Client::connect(&args.target).await?;
-    let found = client.find(&args.run).await?;
+    };
     let view = client.control(&found.run, "resume").await?;
     remote::show(&view, args.output);
     Ok(0)

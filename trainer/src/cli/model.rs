@@ -13,8 +13,8 @@ use protocol::{Digest, Manifest};
 use registry::cli::{Command, Data};
 use stages::context::StageError;
 
-use crate::client::Client;
 use crate::problem::{Problem, Result, exit};
+use crate::reader::Reader;
 
 /// A model with all that it needs.
 #[derive(Debug)]
@@ -59,18 +59,18 @@ impl Blobs for Fetched {
 
 impl Fetched {
     /// The files of a manifest.
-    async fn files(client: &Client, manifest: &Manifest) -> Result<Self> {
+    async fn files(reader: &Reader, manifest: &Manifest) -> Result<Self> {
         let blobs = Self::default();
         for file in manifest.files.values() {
-            let bytes = verified(client, file.digest).await?;
+            let bytes = verified(reader, file.digest).await?;
             blobs.0.lock().unwrap_or_else(PoisonError::into_inner).insert(file.digest, bytes.into());
         }
         Ok(blobs)
     }
 }
 
-async fn verified(client: &Client, name: Digest) -> Result<Vec<u8>> {
-    let bytes = client.blob(name).await?;
+async fn verified(reader: &Reader, name: Digest) -> Result<Vec<u8>> {
+    let bytes = reader.blob(name).await?;
     let found = Digest::of(&bytes);
     if found != name {
         return Err(Problem::failed(BlobError::Corrupt { expected: name, found })
@@ -80,8 +80,8 @@ async fn verified(client: &Client, name: Digest) -> Result<Vec<u8>> {
 }
 
 /// A version of the registry: MODEL@ALIAS, MODEL@best or MODEL:VERSION.
-pub(super) async fn version(client: &Client, name: &str) -> Result<Found> {
-    let answer = client.registry(&Command::Show { reference: name.to_owned() }).await?;
+pub(super) async fn version(reader: &Reader, name: &str) -> Result<Found> {
+    let answer = reader.registry(&Command::Show { reference: name.to_owned() }).await?;
     if let Some(error) = answer.error {
         let mut problem = Problem::new(answer.exit, anyhow::anyhow!("{}", error.message));
         problem.hint = error.hint;
@@ -101,12 +101,12 @@ pub(super) async fn version(client: &Client, name: &str) -> Result<Found> {
             ));
         }
     };
-    let blobs = Fetched::files(client, &manifest).await?;
+    let blobs = Fetched::files(reader, &manifest).await?;
     Ok(Found { manifest, blobs, label: Label::Version(name.to_owned(), version.version) })
 }
 
 /// The denoiser that a stage of `run` gave, with the VAE whose latents it makes.
-pub(super) async fn stage(client: &Client, run: &RunView, name: &str) -> Result<Found> {
+pub(super) async fn stage(reader: &Reader, run: &RunView, name: &str) -> Result<Found> {
     let denoiser = run.stages.iter().find(|stage| stage.name.as_str() == name).map(|stage| stage.outputs.get(DENOISER));
     let Some(Some(denoiser)) = denoiser else {
         let have = run.stages.iter().filter(|stage| stage.of.is_none() && stage.outputs.contains_key(DENOISER));
@@ -119,7 +119,7 @@ pub(super) async fn stage(client: &Client, run: &RunView, name: &str) -> Result<
         }));
     };
     let manifest = async |digest: Digest| -> Result<Manifest> {
-        let manifest: Manifest = serde_json::from_slice(&verified(client, digest).await?)
+        let manifest: Manifest = serde_json::from_slice(&verified(reader, digest).await?)
             .map_err(|error| Problem::failed(format!("{digest} is no manifest: {error}")))?;
         if manifest.format != Manifest::FORMAT {
             let (found, known) = (manifest.format, Manifest::FORMAT);
@@ -130,7 +130,7 @@ pub(super) async fn stage(client: &Client, run: &RunView, name: &str) -> Result<
     let denoiser = manifest(*denoiser).await?;
     let vae = manifest(vae_of(&denoiser).map_err(Problem::failed)?).await?;
     let model = bundle(&denoiser, &vae).map_err(|error| Problem::failed(format!("stage `{name}`: {error}")))?;
-    let blobs = Fetched::files(client, &model).await?;
+    let blobs = Fetched::files(reader, &model).await?;
     Ok(Found { manifest: model, blobs, label: Label::Stage(run.run.to_string(), name.to_owned()) })
 }
 

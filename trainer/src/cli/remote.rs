@@ -1,4 +1,4 @@
-//! Verbs that ask a coordinator: submit, status, logs, pause, cancel.
+//! Verbs about runs: submit, status, logs, pause, cancel.
 
 use std::path::Path;
 use std::time::Duration;
@@ -13,6 +13,7 @@ use crate::pipeline_file;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result, exit};
 use crate::progress::Progress;
+use crate::reader::Reader;
 use crate::summary::{self, Summary};
 
 #[derive(Debug, Args)]
@@ -103,12 +104,10 @@ pub(crate) async fn submit(args: SubmitArgs) -> Result<u8> {
     let file = pipeline_file::read_with_data(&args.pipeline.pipeline, &args.pipeline.set)?;
     let until = args.until.map(StageName::new);
     pipeline_file::check_stage(&file.pipeline, until.as_ref())?;
-    let client = Client::connect(&args.target).await?;
-    if client.is_own() {
-        client.close().await;
+    let Some(client) = Client::running(&args.target).await? else {
         let problem = Problem::usage("no server is running on this store, so nobody would do the work");
         return Err(problem.hint("`trainer serve` starts one, `trainer run` needs none; or name one with --server"));
-    }
+    };
     let pipeline = serde_json::to_value(&file.pipeline).map_err(|error| Problem::new(exit::FAULT, error))?;
     let submit = Submit { pipeline, source: file.source, idempotency_key: args.idempotency_key, until };
     let run = client.submit(&submit).await?;
@@ -142,9 +141,9 @@ fn exit_code(state: RunState) -> u8 {
 }
 
 pub(crate) async fn status(args: StatusArgs) -> Result<u8> {
-    let client = Client::connect(&args.target).await?;
+    let reader = Reader::open(&args.target).await?;
     if args.all {
-        let runs = client.runs().await?;
+        let runs = reader.runs().await?;
         match args.output {
             Output::Json => {
                 let runs: Vec<Summary> = runs.iter().map(|run| Summary::of(run, false)).collect();
@@ -161,21 +160,21 @@ pub(crate) async fn status(args: StatusArgs) -> Result<u8> {
             }
         }
     } else {
-        show(&client.find(&args.run).await?, args.output);
+        show(&reader.find(&args.run).await?, args.output);
     }
-    client.close().await;
+    reader.close().await;
     Ok(0)
 }
 
 pub(crate) async fn logs(args: LogsArgs) -> Result<u8> {
-    let client = Client::connect(&args.target).await?;
-    let run = client.find(&args.run).await?.run;
+    let reader = Reader::open(&args.target).await?;
+    let run = reader.find(&args.run).await?.run;
     let mut after = 0;
     loop {
         // Asked first: what is logged before the end is then read after it.
-        let state = client.run(&run).await?.state;
+        let state = reader.run(&run).await?.state;
         loop {
-            let rows = client.logs(&run, args.stage.as_deref(), after).await?;
+            let rows = reader.logs(&run, args.stage.as_deref(), after).await?;
             let Some(last) = rows.last() else { break };
             after = last.id;
             for row in &rows {
@@ -189,8 +188,8 @@ pub(crate) async fn logs(args: LogsArgs) -> Result<u8> {
                 }
             }
         }
-        if !args.follow || state.is_final() || client.is_own() {
-            client.close().await;
+        if !args.follow || state.is_final() || !reader.is_live() {
+            reader.close().await;
             return Ok(0);
         }
         tokio::time::sleep(Duration::from_millis(500)).await;
@@ -198,8 +197,11 @@ pub(crate) async fn logs(args: LogsArgs) -> Result<u8> {
 }
 
 pub(crate) async fn control(args: ControlArgs, action: &str) -> Result<u8> {
+    // Looked up first: nothing is started for a run that does not exist.
+    let reader = Reader::open(&args.target).await?;
+    let run = reader.find(&args.run).await?.run;
+    reader.close().await;
     let client = Client::connect(&args.target).await?;
-    let run = client.find(&args.run).await?.run;
     let view = client.control(&run, action).await?;
     show(&view, args.output);
     client.close().await;
@@ -207,8 +209,8 @@ pub(crate) async fn control(args: ControlArgs, action: &str) -> Result<u8> {
 }
 
 pub(crate) async fn workers(args: WorkersArgs) -> Result<u8> {
-    let client = Client::connect(&args.target).await?;
-    let workers = client.workers().await?;
+    let reader = Reader::open(&args.target).await?;
+    let workers = reader.workers().await?;
     match args.output {
         Output::Json => print::json(&workers),
         Output::Table => {
@@ -223,7 +225,7 @@ pub(crate) async fn workers(args: WorkersArgs) -> Result<u8> {
             ));
         }
     }
-    client.close().await;
+    reader.close().await;
     Ok(0)
 }
 

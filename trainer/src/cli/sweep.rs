@@ -7,9 +7,10 @@ use protocol::message::{RunView, SweepView, TrialState, TrialView};
 use protocol::stage::Mode;
 use serde_json::{Value, json};
 
-use crate::client::{Client, Target};
+use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result, exit};
+use crate::reader::Reader;
 use crate::{pipeline_file, summary, sweep_plot};
 
 #[derive(Debug, Subcommand)]
@@ -134,19 +135,19 @@ async fn best(args: BestArgs) -> Result<u8> {
 async fn find(which: &Which) -> Result<(RunView, Vec<SweepView>)> {
     let is_file = which.run.ends_with(".yaml") || which.run.ends_with(".yml");
     let pipeline = is_file.then(|| pipeline_file::read(Path::new(&which.run), &[])).transpose()?;
-    let client = Client::connect(&which.target).await?;
+    let reader = Reader::open(&which.target).await?;
     let run = match &pipeline {
-        None => client.find(&which.run).await,
+        None => reader.find(&which.run).await,
         Some(file) => {
             let name = &file.pipeline.name;
-            let newest = client.runs().await?.into_iter().rfind(|run| &run.pipeline == name);
+            let newest = reader.runs().await?.into_iter().rfind(|run| &run.pipeline == name);
             newest.ok_or_else(|| {
                 let problem = Problem::new(exit::NOT_FOUND, anyhow::anyhow!("pipeline `{name}` was never run here"));
                 problem.hint(format!("`trainer run {}` runs it", which.run))
             })
         }
     };
-    client.close().await;
+    reader.close().await;
     let run = run?;
     let wanted = |sweep: &&SweepView| which.stage.as_deref().is_none_or(|stage| sweep.stage.as_str() == stage);
     let sweeps: Vec<SweepView> = run.sweeps.iter().filter(wanted).cloned().collect();

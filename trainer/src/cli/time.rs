@@ -10,9 +10,10 @@ use stages::generate::{DEFAULT_FRAMES, Generator};
 use stages::timing::{self, Times, WARM_UP};
 
 use super::model;
-use crate::client::{Client, Target};
+use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result};
+use crate::reader::Reader;
 
 #[derive(Debug, Args)]
 pub(crate) struct TimeArgs {
@@ -55,18 +56,18 @@ struct Row {
 }
 
 pub(crate) async fn time(args: TimeArgs) -> Result<u8> {
-    let client = Client::connect(&args.target).await?;
+    let reader = Reader::open(&args.target).await?;
     let mut found = Vec::new();
     if !args.stage.is_empty() {
-        let run = client.find(&args.run).await?;
+        let run = reader.find(&args.run).await?;
         for name in &args.stage {
-            found.push(model::stage(&client, &run, name).await?);
+            found.push(model::stage(&reader, &run, name).await?);
         }
     }
     for name in &args.model {
-        found.push(model::version(&client, name).await?);
+        found.push(model::version(&reader, name).await?);
     }
-    client.close().await;
+    reader.close().await;
     let (device, info) = model::device(args.backend.as_deref())?;
     let mut models: Vec<(String, Generator)> = Vec::new();
     for found in &found {

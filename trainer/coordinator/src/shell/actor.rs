@@ -14,11 +14,11 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 use protocol::message::{Poll, RunView, Submit};
 use protocol::pipeline::Pipeline;
 use protocol::{Digest, RunId, WorkerId};
-use registry::{Store, Write, WriteError};
+use registry::{ReadStore, Store, Write, WriteError};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 
-use super::{answer, effects};
+use super::{Records, answer, effects};
 use crate::decide::decide;
 use crate::event::{Control, Effect, Event, Millis, Moment, Observation, Rejected};
 use crate::observe::{is_quiet, observe};
@@ -66,7 +66,7 @@ pub(crate) struct ActorHandle {
 }
 
 /// What the tables keep of a run that ended.
-fn read<T: serde::de::DeserializeOwned>(run: &RunId, text: &str) -> Result<T, Refused> {
+pub(super) fn read<T: serde::de::DeserializeOwned>(run: &RunId, text: &str) -> Result<T, Refused> {
     serde_json::from_str(text).map_err(|error| {
         Rejected::Conflict(format!("what is kept of run `{run}` does not read: {error}; use the build that wrote it"))
             .into()
@@ -159,14 +159,13 @@ impl ActorHandle {
 
     /// A run as clients see it, whether it is in memory or has ended.
     pub(crate) async fn run_view(&self, run: &RunId) -> Result<RunView, Refused> {
-        let state = self.state();
-        match state.run(run) {
-            Ok(run) => Ok(state.view(run, self.now())),
-            Err(unknown) => match self.store.ended(run).await.map_err(WriteError::from)? {
-                Some(row) => read(run, &row.view),
-                None => Err(unknown.into()),
-            },
-        }
+        self.records().run_view(run).await
+    }
+
+    /// What there is to tell of runs now. The state is read before the tables: a run that ends in between is in both, and not in
+    /// neither.
+    pub(crate) fn records(&self) -> Records {
+        Records::new(ReadStore::clone(&self.store), self.state(), self.now())
     }
 
     /// The newest published state.
@@ -218,6 +217,12 @@ impl ActorHandle {
     }
 }
 
+/// The machine's wall clock.
+pub(super) fn wall_clock() -> Millis {
+    let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_millis();
+    Millis(u64::try_from(wall).unwrap_or(u64::MAX))
+}
+
 /// The machine's wall clock when the process started, and its monotonic clock since: a wall clock that is set while we run
 /// would end every lease.
 #[derive(Debug)]
@@ -228,8 +233,7 @@ struct Clock {
 
 impl Clock {
     fn new(not_before: Millis) -> Self {
-        let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_millis();
-        Self { start: Instant::now(), start_ms: u64::try_from(wall).unwrap_or(u64::MAX).max(not_before.0) }
+        Self { start: Instant::now(), start_ms: wall_clock().0.max(not_before.0) }
     }
 
     fn now(&self) -> Millis {

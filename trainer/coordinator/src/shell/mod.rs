@@ -11,6 +11,7 @@ mod effects;
 mod listener;
 mod polls;
 mod queries;
+mod records;
 mod uploads;
 
 use std::net::{Ipv4Addr, SocketAddr};
@@ -36,6 +37,7 @@ use self::auth::Gate;
 use self::listener::Listener;
 pub use self::listener::{Connections, raise_descriptor_limit};
 pub use self::queries::{BlobStored, StageMetrics, Submitted};
+pub use self::records::{Records, RecordsError};
 
 /// How a coordinator is run.
 #[derive(Debug, Clone)]

@@ -96,22 +96,7 @@ pub(crate) async fn runs(
     State(actor_handle): State<Arc<ActorHandle>>,
     Query(query): Query<RunsQuery>,
 ) -> Result<impl IntoResponse, Failure> {
-    // Read before the tables: a run that ends in between is in both, and not in neither.
-    let (state, now) = (actor_handle.state(), actor_handle.now());
-    let ended = actor_handle.store.ended_views(query.limit).await?;
-    let mut views: Vec<(u64, String)> = Vec::new();
-    for run in state.runs.values() {
-        let view = serde_json::to_string(&state.view(run, now));
-        views.push((run.number, view.map_err(|e| Failure::invalid(format!("run `{}`: {e}", run.id)))?));
-    }
-    for (run, view) in ended {
-        let number = crate::state::run::number_of(&run).unwrap_or_default();
-        if !state.runs.contains_key(&number) {
-            views.push((number, view));
-        }
-    }
-    views.sort_by_key(|(number, _)| *number);
-    let views: Vec<String> = views.into_iter().map(|(_, view)| view).collect();
+    let views = actor_handle.records().run_views(query.limit).await?;
     Ok(([(header::CONTENT_TYPE, "application/json")], format!("[{}]", views.join(","))))
 }
 
@@ -139,45 +124,12 @@ pub(crate) async fn control(
     Ok(Json(actor_handle.run_view(&run).await?))
 }
 
-/// By the name of a stage in this run: the run and the stage under whose names its logs and values are stored. A stage that another run
-/// computes has them under that run's name.
-async fn sources(
-    actor_handle: &ActorHandle,
-    run: &RunId,
-    stage: Option<&StageName>,
-) -> Result<Vec<(StageName, (RunId, StageName))>, Failure> {
-    let view = actor_handle.run_view(run).await?;
-    if let Some(stage) = stage
-        && !view.stages.iter().any(|known| known.name == *stage)
-    {
-        return Err(Rejected::NotFound(format!("run `{run}` has no stage `{stage}`")).into());
-    }
-    let begun = view.stages.into_iter().filter(|known| stage.is_none_or(|stage| known.name == *stage));
-    let begun: Vec<(StageName, Digest)> = begun.filter_map(|known| Some((known.name, known.key?))).collect();
-    let state = actor_handle.state();
-    let left: Vec<Digest> =
-        begun.iter().map(|(_, key)| *key).filter(|key| !state.executions.contains_key(key)).collect();
-    let stored = if left.is_empty() { BTreeMap::new() } else { actor_handle.store.sources(&left).await? };
-    let source = |(name, key): (StageName, Digest)| {
-        let known = state.executions.get(&key).map(|execution| (execution.run.clone(), execution.stage.clone()));
-        let source = known.or_else(|| stored.get(&key).cloned()).unwrap_or_else(|| (run.clone(), name.clone()));
-        (name, source)
-    };
-    Ok(begun.into_iter().map(source).collect())
-}
-
 pub(crate) async fn logs(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(run): Path<RunId>,
     Query(query): Query<LogQuery>,
 ) -> Result<Json<Vec<LogRow>>, Failure> {
-    let mut rows = Vec::new();
-    for (_, source) in sources(&actor_handle, &run, query.stage.as_ref()).await? {
-        rows.extend(actor_handle.store.logs(&source.0, Some(&source.1), query.after, query.limit).await?);
-    }
-    rows.sort_by_key(|row| row.id);
-    rows.truncate(query.limit as usize);
-    Ok(Json(rows))
+    Ok(Json(actor_handle.records().logs(&run, query.stage.as_ref(), query.after, query.limit).await?))
 }
 
 pub(crate) async fn metrics(
@@ -185,11 +137,7 @@ pub(crate) async fn metrics(
     Path(run): Path<RunId>,
     Query(query): Query<MetricQuery>,
 ) -> Result<Json<StageMetrics>, Failure> {
-    let mut stages = StageMetrics::new();
-    for (name, source) in sources(&actor_handle, &run, query.stage.as_ref()).await? {
-        stages.insert(name, actor_handle.store.metrics(&source.0, &source.1, None, query.points).await?);
-    }
-    Ok(Json(stages))
+    Ok(Json(actor_handle.records().metrics(&run, query.stage.as_ref(), query.points).await?))
 }
 
 /// The registry's commands, on behalf of a client: this process holds the store.

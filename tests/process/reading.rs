@@ -1,0 +1,113 @@
+//! Commands that only read, on a store that nobody holds: they start nobody and leave every file as it is.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use cluster_tests::{Bench, Running, wait_for};
+use nix::sys::signal::Signal;
+use protocol::Digest;
+
+const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
+
+/// Each file with its time and content. The logs of workers are theirs, who may outlive a trainer that was killed.
+fn files(dir: &Path) -> BTreeMap<PathBuf, (SystemTime, Digest)> {
+    let mut found = BTreeMap::new();
+    for entry in fs::read_dir(dir).expect("a folder").map(|entry| entry.expect("an entry")) {
+        let (path, kind) = (entry.path(), entry.file_type().expect("a kind"));
+        if kind.is_dir() {
+            found.extend(if path.ends_with("workers") { BTreeMap::new() } else { files(&path) });
+        } else {
+            let changed = entry.metadata().and_then(|metadata| metadata.modified()).expect("a time");
+            found.insert(path.clone(), (changed, Digest::of(&fs::read(&path).expect("a file"))));
+        }
+    }
+    found
+}
+
+/// Every command that reads, and those that change something when they are told of what does not exist.
+fn read_everything(bench: &Bench, finished: &str, interrupted: &str) {
+    // To read what is in the log alone SQLite maps its index.
+    let state = || {
+        let mut all = files(&bench.store());
+        all.retain(|path, _| !path.ends_with("stride.db-shm"));
+        all
+    };
+    let (config, before) = (Bench::config("smoke.yaml"), state());
+    for (line, code) in [
+        ("status", 0),
+        ("status --all", 0),
+        (&*format!("status {interrupted} -o json"), 0),
+        ("logs", 0),
+        (&*format!("logs {interrupted} --stage vae --follow"), 0),
+        ("sweep status", 3),
+        ("worker list", 0),
+        (&*format!("plan {config}"), 0),
+        ("registry list", 0),
+        ("registry show smoke@best", 0),
+        ("registry history smoke", 0),
+        ("registry lineage smoke@best", 0),
+        ("registry gc --dry-run --grace 0", 0),
+        ("registry fsck", 0),
+        (&*format!("time smoke@best --stage mld --run {finished} --sentences 1"), 0),
+        (&*format!("submit {config}"), 2),
+        ("resume nobody", 3),
+        ("pause nobody", 3),
+        ("cancel nobody", 3),
+    ] {
+        bench.run(&line.split(' ').collect::<Vec<_>>()).expect_code(code);
+        assert_eq!(state(), before, "`trainer {line}` changed a file");
+    }
+    bench.run(&["generate", "a person walks", "--model", "smoke@best", "-o", "walk.npy"]).expect_code(0);
+    assert_eq!(state(), before, "`trainer generate` changed a file");
+}
+
+/// A run's name, its state and that of its stage `vae`.
+fn state(bench: &Bench, run: &str) -> [String; 3] {
+    let view = bench.run(&["status", run, "-o", "json"]).expect_code(0).json();
+    let stages = view["stages"].as_array().expect("stages");
+    let vae = stages.iter().find(|stage| stage["name"] == "vae").expect("a stage `vae`");
+    [&view["run"], &view["state"], &vae["state"]].map(|value| value.as_str().expect("a word").to_owned())
+}
+
+/// Waits until the newest run trains, and gives its name. The process that holds the store says so.
+fn trains(bench: &Bench, mut running: Running) -> (Running, String) {
+    let run = wait_for("the stage to run", || {
+        if !running.alive() {
+            return Some(None);
+        }
+        let [run, _, vae] = state(bench, "@last");
+        (vae == "running").then_some(Some(run))
+    });
+    match run {
+        Some(run) => (running, run),
+        None => panic!("the run is over: {:?}", running.wait()),
+    }
+}
+
+#[test]
+fn reading_a_store_that_nobody_holds_changes_nothing() {
+    let bench = Bench::new(TRAINER);
+    let finished = bench.pipeline("smoke.yaml", &["--workers", "1"])["run"].as_str().expect("a run").to_owned();
+    let config = Bench::config("smoke.yaml");
+    let sets = ["--set", "seed=7", "--set", "stages.vae.steps=20000"];
+    let killed = bench.spawn(&[&["run", &config, "--workers", "1"][..], &sets].concat());
+    let (mut killed, interrupted) = trains(&bench, killed);
+    killed.kill();
+    assert_eq!(killed.wait().code, None);
+
+    assert!(fs::metadata(bench.store().join("stride.db-wal")).expect("a log").len() > 0);
+    assert_eq!(state(&bench, "@last"), [&*interrupted, "paused", "ready"], "nobody works on it");
+    assert_eq!(state(&bench, &finished), [&*finished, "finished", "ran"]);
+    let logs = bench.run(&["logs"]).expect_code(0).stdout;
+    assert!(logs.starts_with("dataset w1 "), "{logs}");
+    read_everything(&bench, &finished, &interrupted);
+
+    let (resumed, again) = trains(&bench, bench.spawn(&["resume", &interrupted, "--workers", "1"]));
+    assert_eq!(again, interrupted);
+    resumed.signal(Signal::SIGINT);
+    resumed.wait().expect_code(130);
+    assert_eq!(state(&bench, "@last"), [&*interrupted, "paused", "ready"]);
+    read_everything(&bench, &finished, &interrupted);
+}
