@@ -1,6 +1,5 @@
-//! A disk that fills up, and one that cannot be written to. They need file systems of their own: `STRIDE_SMALL_DISK` names a
-//! folder on one of 20 to 64 MB (`mount -t tmpfs -o size=40m none DIR`), `STRIDE_READ_ONLY_DISK` a store on one that is
-//! mounted read-only. Without them these tests say so and pass.
+//! A disk that fills up, and one that cannot be written to. They are mounted for the test; where that is not allowed it says
+//! so and passes.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;
@@ -8,22 +7,16 @@ mod common;
 use std::path::PathBuf;
 
 use checkpoint::BlobError;
+use cluster_tests::mounted::Mounted;
 use registry::{Holder, OpenError, Store, WriteError};
 use serde_json::json;
 
-fn folder(variable: &str) -> Option<PathBuf> {
-    let folder = std::env::var_os(variable).map(PathBuf::from);
-    if folder.is_none() {
-        eprintln!("SKIPPED: {variable} is not set");
-    }
-    folder
-}
-
 #[tokio::test]
-async fn a_full_disk_is_a_storage_error_and_loses_nothing() {
-    let Some(disk) = folder("STRIDE_SMALL_DISK") else { return };
-    let dir = tempfile::tempdir_in(&disk).unwrap();
-    let store = common::open(dir.path()).await;
+async fn p7_a_full_disk_is_a_storage_error_loses_nothing_and_can_be_collected() {
+    let disk = tempfile::tempdir().unwrap();
+    let Some(_mounted) = Mounted::tmpfs(disk.path(), "size=40m") else { return };
+    let (disk, dir) = (disk.path(), disk.path().join("store"));
+    let store = common::open(&dir).await;
     store.write(vec![common::note(json!("before"))]).await.unwrap();
 
     let mut stored = Vec::new();
@@ -48,18 +41,19 @@ async fn a_full_disk_is_a_storage_error_and_loses_nothing() {
     let error = store.write(vec![common::note(event)]).await.unwrap_err();
     assert!(matches!(&error, WriteError::Storage(m) if m.contains("full")), "{error:?}");
     drop(store);
-    let error = Store::open(dir.path(), Holder::this_process("t")).await.unwrap_err();
+    assert_eq!(nix::sys::statvfs::statvfs(disk).unwrap().blocks_available(), 0, "nothing at all is free");
+    let error = Store::open(&dir, Holder::this_process("t")).await.unwrap_err();
     assert!(matches!(error, OpenError::Full { .. }), "{error}");
     assert!(error.hint().contains("`registry gc`"));
     // The advice works while the disk is as full as it was.
     let mut gc = std::process::Command::new(env!("CARGO_BIN_EXE_registry"));
-    let gc = gc.arg("--store").arg(dir.path()).args(["gc", "--grace", "0"]).output().unwrap();
+    let gc = gc.arg("--store").arg(&dir).args(["gc", "--grace", "0"]).output().unwrap();
     assert!(gc.status.success(), "{}", String::from_utf8_lossy(&gc.stderr));
-    let left = walk(&dir.path().join("blobs/sha256"));
+    let left = walk(&dir.join("blobs/sha256"));
     assert!(left.is_empty(), "{} blobs that nothing needs are left", left.len());
 
     std::fs::remove_file(&ballast).unwrap();
-    let store = common::open(dir.path()).await;
+    let store = common::open(&dir).await;
     assert_eq!(common::notes(&store).await, [json!("before")]);
     store.write(vec![common::note(json!("after"))]).await.unwrap();
     assert!(store.fsck().await.unwrap().problems.is_empty());
@@ -72,8 +66,12 @@ fn walk(dir: &std::path::Path) -> Vec<PathBuf> {
 
 #[tokio::test]
 async fn a_read_only_disk_is_refused_as_such() {
-    let Some(disk) = folder("STRIDE_READ_ONLY_DISK") else { return };
-    for dir in [disk.clone(), disk.join("new")] {
+    let disk = tempfile::tempdir().unwrap();
+    let Some(mounted) = Mounted::tmpfs(disk.path(), "size=40m") else { return };
+    let store = disk.path().join("store");
+    drop(common::open(&store).await);
+    mounted.remount("ro");
+    for dir in [store, disk.path().join("new")] {
         let error = Store::open(&dir, Holder::this_process("t")).await.unwrap_err();
         assert!(matches!(error, OpenError::ReadOnly { .. }), "{error:?}");
     }

@@ -1,40 +1,9 @@
 //! A full disk and a read-only store: nothing is half written, and the message says what to do.
 
-use std::fs;
-use std::path::Path;
-use std::process::Command;
-
 use cluster_tests::Bench;
+use cluster_tests::mounted::Mounted;
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
-
-/// A small file system of its own, unmounted on drop.
-struct Mounted<'a>(&'a Path);
-
-impl<'a> Mounted<'a> {
-    /// `None`, loudly, where mounting is not allowed.
-    fn tmpfs(path: &'a Path, options: &str) -> Option<Self> {
-        fs::create_dir_all(path).expect("created");
-        let done = Command::new("mount").args(["-t", "tmpfs", "-o", options, "tmpfs"]).arg(path).output();
-        if done.is_ok_and(|output| output.status.success()) {
-            Some(Self(path))
-        } else {
-            eprintln!("SKIPPED: this test mounts a small file system and needs root");
-            None
-        }
-    }
-
-    fn remount(&self, options: &str) {
-        let done = Command::new("mount").args(["-o", &format!("remount,{options}")]).arg(self.0).status();
-        assert!(done.expect("mount runs").success(), "remount {options}");
-    }
-}
-
-impl Drop for Mounted<'_> {
-    fn drop(&mut self) {
-        drop(Command::new("umount").arg("-l").arg(self.0).status());
-    }
-}
 
 #[test]
 fn p7_a_full_disk_stops_the_run_and_freeing_space_lets_it_go_on() {

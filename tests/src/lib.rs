@@ -6,6 +6,7 @@
 pub mod cluster;
 pub mod disk;
 pub mod documented;
+pub mod mounted;
 pub mod network;
 
 use std::collections::BTreeMap;

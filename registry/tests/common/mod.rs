@@ -1,11 +1,12 @@
 //! What the tests of this crate share.
 #![allow(dead_code, unreachable_pub, reason = "not every test file uses all of it")]
 
+pub mod database_power;
 pub mod power;
 
 use std::collections::BTreeMap;
 
-use protocol::message::Grant;
+use protocol::message::{Grant, MetricRow};
 use protocol::{ArtifactKind, Attempt, Digest, Fence, FileEntry, Incarnation, Manifest, TaskId};
 use registry::{BlobStore, Holder, OpenError, Store, Write};
 use serde_json::json;
@@ -71,5 +72,25 @@ pub fn version(model: &str, artifact: Digest, fid: f64) -> Write {
         artifact,
         metrics: metrics(&[("latent_fid", fid)]),
         source: json!({"run": "r", "stage": "release", "metric": "latent_fid", "mode": "min"}),
+    }
+}
+
+/// Values of one curve.
+pub fn rows(steps: std::ops::Range<u64>, value: f64) -> Vec<MetricRow> {
+    steps.map(|step| MetricRow { step, key: "loss".into(), value }).collect()
+}
+
+/// A stage's value that the coordinator made.
+pub fn result(key: &str, output: Digest) -> Write {
+    Write::StageResult {
+        grant: None,
+        key: Digest::of(key.as_bytes()),
+        run: "r".into(),
+        stage: "s".into(),
+        kind: "train.vae".into(),
+        outputs: [("vae".to_owned(), output)].into(),
+        metrics: metrics(&[("loss", 0.5), ("bad", f64::NAN)]),
+        inputs: [("dataset".to_owned(), Digest::of(b"data"))].into(),
+        wall_s: 1.5,
     }
 }
