@@ -1,4 +1,13 @@
-//! Forgetting runs that have ended: their rows go, and their blobs with the next collection.
+//! Forgetting runs that have ended: their rows go, and their blobs with the next collection. What each may take:
+//!
+//! | what | goes |
+//! |---|---|
+//! | a checkpoint | as its stage's `checkpoint.keep` says, while it is trained |
+//! | a shard | once its run is finished |
+//! | the values, states, logs and curves of a sweep's trials that are not the best | with the run, or before it by [`Store::forget_leftovers`] |
+//! | checkpoints, shards, logs and curves of work that was cancelled, failed or taken over and has no value | likewise |
+//! | everything else of a run | with the run |
+//! | a model version, and what it was made of | never |
 //!
 //! A stage of the run stays, with all its rows, as long as somebody needs it: a model version or a pin whose lineage it is in,
 //! another run that has its value, or a run under way that has a stage of its name and may be about to use it. What stays is
@@ -10,6 +19,8 @@ use protocol::{RunId, StageName};
 use serde::{Deserialize, Serialize};
 use sqlx::{Row, SqliteConnection};
 
+#[cfg(doc)]
+use crate::Store;
 use crate::db::apply::{one, run as execute};
 use crate::db::write_error;
 use crate::query::QueryError;
@@ -63,6 +74,35 @@ pub(crate) async fn forget(conn: &mut SqliteConnection, run: &RunId) -> Result<F
     Ok(gone)
 }
 
+/// Forgets what a run that ended before a time has left behind and nobody needs; the run itself, and what its stages gave, stay. To
+/// take it up again is to compute that anew.
+pub(crate) async fn forget_leftovers(
+    conn: &mut SqliteConnection,
+    run: &RunId,
+    before_ms: i64,
+) -> Result<Forgotten, WriteError> {
+    let mut gone = Forgotten::default();
+    let ended = "SELECT 1 FROM runs WHERE run = ? AND view IS NOT NULL AND state IN ('finished', 'failed', 'cancelled') AND updated_ms < ?";
+    if one(conn, sqlx::query(ended).bind(run.as_str()).bind(before_ms)).await?.is_none() {
+        return Ok(gone);
+    }
+    let run = run.as_str();
+    let kept = sqlx::query(STILL_NEEDED).bind(run).bind(before_ms).fetch_all(&mut *conn).await.map_err(write_error)?;
+    let kept: BTreeSet<String> = kept.iter().map(|row| row.get(0)).collect();
+    let under_way = stages(conn, UNDER_WAY, run).await?;
+    let valued = stages(conn, "SELECT stage FROM stage_results WHERE run = ?1", run).await?;
+    let left = stages(conn, LEFT, run).await?;
+    let left: BTreeSet<&str> = left.iter().map(|name| name.split('/').next().unwrap_or_default()).collect();
+    for stage in left {
+        let is_trial = stage.contains('.');
+        let is_needed = kept.contains(stage) || under_way.contains(stage.split('.').next().unwrap_or_default());
+        if (is_trial || !valued.contains(stage)) && !is_needed {
+            forget_stage(conn, run, &StageName::new(stage), &mut gone).await?;
+        }
+    }
+    Ok(gone)
+}
+
 async fn stages(conn: &mut SqliteConnection, sql: &'static str, run: &str) -> Result<BTreeSet<String>, WriteError> {
     let rows = sqlx::query(sql).bind(run).fetch_all(conn).await.map_err(write_error)?;
     Ok(rows.iter().map(|row| row.get(0)).collect())
@@ -81,6 +121,21 @@ const NEEDED: &str = "WITH RECURSIVE lineage (digest) AS (SELECT artifact FROM v
     SELECT stage FROM stage_results, json_each(outputs) AS output WHERE run = ?1 AND output.value IN (SELECT digest FROM lineage) \
     UNION SELECT stage FROM stage_results WHERE run = ?1 AND key IN (SELECT key FROM held) \
     UNION SELECT stage FROM executions WHERE run = ?1 AND key IN (SELECT key FROM held)";
+
+/// Stages in whose name there is something that names blobs.
+const LEFT: &str = "SELECT stage FROM stage_results WHERE run = ?1 \
+    UNION SELECT substr(task, length(?1) + 2) FROM checkpoints WHERE task >= ?1 || '/' AND task < ?1 || '0' \
+    UNION SELECT substr(task, length(?1) + 2) FROM shards WHERE task >= ?1 || '/' AND task < ?1 || '0'";
+
+/// Stages that the lineage of a version or a pin names, whose value a stage has that is no trial, or that a run which ended since has.
+const STILL_NEEDED: &str = "WITH RECURSIVE lineage (digest) AS (SELECT artifact FROM versions UNION SELECT digest FROM pins \
+    UNION SELECT parent FROM edges JOIN lineage ON child = lineage.digest), \
+    held (key, is_trial, is_recent) AS (SELECT json_extract(stage.value, '$.key'), \
+        json_extract(stage.value, '$.of') IS NOT NULL, updated_ms >= ?2 \
+        FROM runs, json_each(runs.view, '$.stages') AS stage) \
+    SELECT stage FROM stage_results, json_each(outputs) AS output WHERE run = ?1 AND output.value IN (SELECT digest FROM lineage) \
+    UNION SELECT stage FROM stage_results WHERE run = ?1 AND key IN (SELECT key FROM held WHERE NOT is_trial OR is_recent) \
+    UNION SELECT stage FROM executions WHERE run = ?1 AND key IN (SELECT key FROM held WHERE is_recent)";
 
 /// Names of the stages of runs under way.
 const UNDER_WAY: &str = "SELECT json_extract(stage.value, '$.name') FROM runs, json_each(runs.pipeline, '$.stages') AS stage \

@@ -1,10 +1,11 @@
 //! What may go. Marks from roots, then sweeps what was not marked and is old enough; forgets checkpoints by policy.
 //!
 //! Roots: every version (so whatever an alias points at), every stage result, every checkpoint that was not pruned, every
-//! shard of a run that may still need it, and every pin. From a root the mark follows the
+//! shard of a run that may still need it, and every pin; and without a row what tasks that are held have uploaded, and what
+//! somebody is about to name ([`BlobStore::held`]). From a root the mark follows the
 //! manifest's files, digests in the manifest's own words (`meta`), and the lineage. A blob that was put within the grace
-//! period is never collected: the row that will name it may be on its way. After a restart nobody knows any more what a
-//! held task had uploaded before; so while a run is under way, blobs from before the restart have the usual grace however
+//! period is never collected: the row that will name it may be on its way. A loss of power may take the note of what a
+//! held task had uploaded; so while a run is under way, blobs from before the store was opened have the usual grace however
 //! short a one was asked for.
 //!
 //! The writer goes on meanwhile. Marking reads one moment of the database; from just before that moment on the writer notes
@@ -326,7 +327,15 @@ pub(crate) fn needed(blobs: &BlobStore, rows: &Rows) -> Result<BTreeSet<Digest>,
 fn plan(blobs: &BlobStore, rows: &Rows, ages: &Ages) -> Result<Plan, QueryError> {
     let all = blobs.list().map_err(|e| QueryError::Blob(e.to_string()))?;
     let mut marked = BTreeSet::new();
-    mark(blobs, rows, |digest| all.contains_key(&digest), rows.roots.keys().copied().collect(), &mut marked)?;
+    let is_there = |digest| all.contains_key(&digest);
+    mark(blobs, rows, is_there, rows.roots.keys().copied().collect(), &mut marked)?;
+    // Nobody relies yet on what no row names: if it is damaged, that stops nothing.
+    let (damaged, held): (Vec<_>, Vec<_>) = blobs
+        .held()
+        .into_iter()
+        .partition(|digest| matches!(blobs.manifest(*digest), Err(ManifestError::Blob(BlobError::Corrupt { .. }))));
+    mark(blobs, rows, is_there, held, &mut marked)?;
+    marked.extend(damaged);
     let mut plan = Plan { forget_shards: rows.forget_shards.clone(), ..Plan::default() };
     for (digest, entry) in all {
         if marked.contains(&digest) {

@@ -24,7 +24,7 @@ use protocol::{Alias, Digest, ModelName, RunId, TaskId};
 use sqlx::SqlitePool;
 
 use crate::blob::BlobStore;
-use crate::blob::fs::{Folder, free_bytes, is_full, is_read_only};
+use crate::blob::fs::{free_bytes, is_full, is_read_only};
 use crate::catalog::{Expect, Pick, PromoteOrder, Promotion, Which};
 use crate::db::writer::{Done, Order, Session, Writer};
 use crate::db::{self, Opened};
@@ -219,7 +219,7 @@ impl ReadStore {
         // Before the database: the witness never knows of more than what is committed.
         let found = found(&dir)?;
         let id = db::check_to_read(&dir, &found, closed.is_some()).await?;
-        let blobs = BlobStore::new(Folder::to_read(&dir));
+        let blobs = BlobStore::folder_to_read(&dir);
         let readers = db::open_readers(&dir, closed.is_some());
         let opened_ms = clock::now_ms();
         Ok(Self(Arc::new(Reading { dir, id, opened_ms, blobs, readers, _closed: closed })))
@@ -417,6 +417,15 @@ impl Store {
     /// Forgets a run that has ended. Its blobs go with the next [`Self::gc`].
     pub async fn forget(&self, run: &RunId) -> Result<Forgotten, WriteError> {
         match self.order(Order::Forget(run.clone())).await? {
+            Done::Forgotten(gone) => Ok(gone),
+            done => Err(unexpected(&done)),
+        }
+    }
+
+    /// Forgets what a run that ended before a time has left behind and nobody needs: trials of sweeps that are not the best, and
+    /// checkpoints and shards of stages that came to no value. The run stays. Blobs go with the next [`Self::gc`].
+    pub async fn forget_leftovers(&self, run: &RunId, before_ms: i64) -> Result<Forgotten, WriteError> {
+        match self.order(Order::ForgetLeftovers { run: run.clone(), before_ms }).await? {
             Done::Forgotten(gone) => Ok(gone),
             done => Err(unexpected(&done)),
         }

@@ -11,9 +11,10 @@ use std::sync::Arc;
 use checkpoint::{BlobError, Blobs};
 use common::power::Power;
 use protocol::{ArtifactKind, Digest, FileEntry, Manifest};
+use registry::blob::disk::{Disk as _, DiskFile, Os};
 use registry::blob::fs::Folder;
 use registry::blob::memory::Memory;
-use registry::blob::{Backend, BlobStore, ManifestError, PART_BYTES, ResumeError};
+use registry::blob::{Backend, BlobStore, IDLE, ManifestError, PART_BYTES, ResumeError};
 use serde_json::json;
 
 fn what_was_put_is_read(store: &BlobStore) {
@@ -103,13 +104,13 @@ fn a_cut_upload_goes_on(store: &BlobStore) {
     assert!(matches!(store.take_up(&grant, digest, 0, total), Err(ResumeError::Busy)), "one request at a time");
     drop(arriving);
     assert!(!store.exists(digest).unwrap(), "nothing is shown before all of it is there");
-    assert_eq!(store.staged(&grant, digest), 60_000);
+    assert_eq!(store.staged(&grant, digest).unwrap(), 60_000);
 
     // Of the next generation of the same gang, and of somebody else.
     let next = common::grant("r/s", 2);
-    assert_eq!(store.staged(&next, digest), 60_000);
+    assert_eq!(store.staged(&next, digest).unwrap(), 60_000);
     let other = protocol::message::Grant { worker: "other".into(), ..grant.clone() };
-    assert_eq!(store.staged(&other, digest), 0);
+    assert_eq!(store.staged(&other, digest).unwrap(), 0);
 
     let wrong = store.take_up(&next, digest, 50_000, total);
     assert!(matches!(wrong, Err(ResumeError::Offset { staged: 60_000, offset: 50_000 })));
@@ -117,9 +118,9 @@ fn a_cut_upload_goes_on(store: &BlobStore) {
     arriving.write(&bytes[60_000..]).unwrap();
     assert!(arriving.finish().unwrap());
     assert_eq!(store.get(digest).unwrap(), bytes);
-    assert_eq!(store.staged(&next, digest), 0);
+    assert_eq!(store.staged(&next, digest).unwrap(), 0);
     assert!(store.held().contains(&digest), "until its task is let go");
-    store.let_go(|_| false);
+    store.let_go(IDLE, |_| false);
     assert!(store.held().is_empty());
 
     // More bytes than were announced, and other bytes, are refused and forgotten.
@@ -129,9 +130,9 @@ fn a_cut_upload_goes_on(store: &BlobStore) {
     let mut arriving = store.take_up(&grant, Digest::of(b"abc"), 0, 3).unwrap();
     arriving.write(b"abx").unwrap();
     assert!(matches!(arriving.finish(), Err(BlobError::Corrupt { .. })));
-    assert_eq!(store.staged(&grant, Digest::of(b"abc")), 0);
+    assert_eq!(store.staged(&grant, Digest::of(b"abc")).unwrap(), 0);
     drop(store.take_up(&grant, Digest::of(b"abc"), 0, 3).unwrap());
-    store.let_go(|_| false);
+    store.let_go(IDLE, |_| false);
     assert!(matches!(store.take_up(&grant, Digest::of(b"abc"), 1, 3), Err(ResumeError::Offset { staged: 0, .. })));
 }
 
@@ -259,6 +260,81 @@ fn change(path: &Path, bytes: &[u8]) {
         std::fs::write(path, bytes).unwrap();
         std::fs::metadata(path).unwrap().modified().unwrap() == before
     } {}
+}
+
+/// Another process goes on with an upload whose holder still has its task, and keeps what that task has stored.
+#[test]
+fn a_folder_goes_on_with_uploads_after_a_restart() {
+    let dir = tempfile::tempdir().unwrap();
+    let open = || BlobStore::open_folder(dir.path()).unwrap();
+    let (bytes, grant) = (vec![7; 3 << 20], common::grant("r/s", 1));
+    let (digest, total) = (Digest::of(&bytes), bytes.len() as u64);
+    let store = open();
+    let mut arriving = store.take_up(&grant, digest, 0, total).unwrap();
+    arriving.write(&bytes[..2 << 20]).unwrap();
+    // As `kill -9` does: nothing is put back, nothing is cleared.
+    std::mem::forget(arriving);
+    let store = open();
+    let other = protocol::message::Grant { worker: "other".into(), ..grant.clone() };
+    assert_eq!((store.staged(&grant, digest).unwrap(), store.staged(&other, digest).unwrap()), (2 << 20, 0));
+    let mut arriving = store.take_up(&grant, digest, 2 << 20, total).unwrap();
+    arriving.write(&bytes[2 << 20..]).unwrap();
+    assert!(arriving.finish().unwrap());
+    drop(store);
+
+    let store = open();
+    assert!(store.get(digest).unwrap() == bytes);
+    assert!(store.strays().unwrap().is_empty());
+    assert!(store.held().contains(&digest) && BlobStore::folder_to_read(dir.path()).held().contains(&digest));
+    store.let_go(IDLE, |_| false);
+    assert!(store.held().is_empty() && open().held().is_empty());
+
+    // What arrived is damaged: noticed at the end, and begun anew.
+    let other = Digest::of(b"another upload");
+    store.take_up(&grant, other, 0, 14).unwrap().write(b"another").unwrap();
+    let part = std::fs::read_dir(dir.path().join("staging")).unwrap().next().unwrap().unwrap().path();
+    std::fs::write(part, b"anothEr").unwrap();
+    let store = open();
+    let mut arriving = store.take_up(&grant, other, 7, 14).unwrap();
+    arriving.write(b" upload").unwrap();
+    assert!(matches!(arriving.finish(), Err(BlobError::Corrupt { .. })));
+    assert_eq!(store.staged(&grant, other).unwrap(), 0);
+    assert!(matches!(store.take_up(&grant, other, 7, 14), Err(ResumeError::Offset { staged: 0, .. })));
+}
+
+#[test]
+fn uploads_that_nobody_asks_for_after_a_restart_go_in_the_end() {
+    let dir = tempfile::tempdir().unwrap();
+    let parts = || std::fs::read_dir(dir.path().join("staging")).unwrap().count();
+    let (digest, task) = (Digest::of(b"three parts"), |task| common::grant(task, 1));
+    let store = BlobStore::open_folder(dir.path()).unwrap();
+    for name in ["r/a", "r/b", "r/c"] {
+        store.take_up(&task(name), digest, 0, 11).unwrap().write(b"three").unwrap();
+    }
+    drop(store);
+    let store = BlobStore::open_folder(dir.path()).unwrap();
+    assert_eq!((parts(), store.staged(&task("r/a"), digest).unwrap()), (3, 5));
+    let writing = store.take_up(&task("r/b"), digest, 5, 11).unwrap();
+    store.let_go(IDLE, |_| true);
+    assert_eq!(parts(), 3, "their holders may still come");
+    store.let_go(std::time::Duration::ZERO, |_| true);
+    assert_eq!(parts(), 1, "but for the one that a request writes to");
+    drop(writing);
+    store.let_go(IDLE, |task| task.as_str() != "r/b");
+    assert_eq!(parts(), 0);
+}
+
+/// A kernel refuses to sync a pipe and the folder of processes; who does not ask it is not refused.
+#[cfg(target_os = "linux")]
+#[test]
+fn p7_syncs_reach_the_operating_system() {
+    let (_reader, writer) = std::io::pipe().unwrap();
+    let mut pipe: Box<dyn DiskFile> = Box::new(std::fs::File::from(std::os::fd::OwnedFd::from(writer)));
+    assert!(pipe.sync().is_err());
+    assert!(Os.sync_dir(Path::new("/proc")).is_err());
+    let dir = tempfile::tempdir().unwrap();
+    Os.create(&dir.path().join("file")).unwrap().sync().unwrap();
+    Os.sync_dir(dir.path()).unwrap();
 }
 
 /// What was hashed is not hashed again by the next process, unless it was written to.

@@ -3,10 +3,11 @@
 //! A blob arrives in `staging/`, is synced, renamed to its name, and its folder synced: under a name there is never a part
 //! of a blob, and once it is committed the blob outlives a loss of power. A name that is taken is not given again; what
 //! lies there is put aside first, in `quarantine/`, if it is damaged. What a killed process left in `staging/` is removed by
-//! the next one that opens the store; it holds the store's lock, so nobody is writing there.
+//! the next one that opens the store, but for uploads that go on; it holds the store's lock, so nobody is writing there.
 //!
 //! Files that are not ours are left alone and never opened: a symbolic link is not followed, a pipe does not block.
 
+use std::collections::BTreeSet;
 use std::fs::{self, OpenOptions};
 use std::io::{self, ErrorKind, Read, Seek, SeekFrom};
 use std::os::unix::fs::MetadataExt;
@@ -192,6 +193,24 @@ impl Backend for Folder {
             Err(e) if e.kind() == ErrorKind::NotFound => Ok(Vec::new()),
             Err(e) => Err(error("list", &folder, &e)),
         }
+    }
+
+    fn stage_as(&self, name: &str, bytes: u64) -> Result<Box<dyn Staged>, BlobError> {
+        let part = self.0.staging.create_as(name, bytes)?;
+        Ok(Box::new(StagedFile { part, folder: Arc::clone(&self.0) }))
+    }
+
+    fn staged_as(&self, name: &str, read: &mut dyn FnMut(&[u8])) -> Result<Option<Box<dyn Staged>>, BlobError> {
+        let part = self.0.staging.open_as(name, read)?;
+        Ok(part.map(|part| -> Box<dyn Staged> { Box::new(StagedFile { part, folder: Arc::clone(&self.0) }) }))
+    }
+
+    fn unstage(&self, name: &str) -> Result<(), BlobError> {
+        self.0.staging.remove(name)
+    }
+
+    fn unstage_but(&self, names: &BTreeSet<String>) -> Result<(), BlobError> {
+        self.0.staging.remove_but(names)
     }
 }
 

@@ -9,13 +9,14 @@
 
 pub mod disk;
 pub mod fs;
+mod holds;
 mod known;
 pub mod memory;
 mod reader;
 mod staging;
 mod uploads;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::io::Read;
 use std::path::Path;
@@ -26,10 +27,14 @@ use protocol::digest::Hasher;
 use protocol::{Digest, Manifest};
 
 pub use self::reader::{PART_BYTES, Reader};
-pub use self::uploads::{Arriving, IDLE, ResumeError};
+pub use self::uploads::{Arriving, IDLE, Protected, ResumeError};
 
+use self::holds::Holds;
 use self::known::{Finding, Known};
 use self::uploads::Uploads;
+
+/// The file that remembers what held tasks have stored.
+const HELD: &str = "held";
 
 /// The largest manifest that is read; ours are at most a few megabytes.
 pub const MANIFEST_BYTES: u64 = 64 << 20;
@@ -76,6 +81,28 @@ pub trait Backend: Send + Sync + fmt::Debug {
     fn strays(&self) -> Result<Vec<String>, BlobError>;
     /// What was put aside.
     fn aside(&self) -> Result<Vec<String>, BlobError>;
+
+    /// As [`stage`](Self::stage), in place of what is staged under a name of 64 hexadecimal digits. A backend that can keeps what has
+    /// arrived when it is dropped, and when the process ends.
+    fn stage_as(&self, name: &str, bytes: u64) -> Result<Box<dyn Staged>, BlobError> {
+        let _ = name;
+        self.stage(bytes)
+    }
+    /// Goes on with what is staged under a name, if there is something, and gives what has arrived to `read`.
+    fn staged_as(&self, name: &str, read: &mut dyn FnMut(&[u8])) -> Result<Option<Box<dyn Staged>>, BlobError> {
+        let _ = (name, read);
+        Ok(None)
+    }
+    /// Forgets what is staged under a name, if there is something.
+    fn unstage(&self, name: &str) -> Result<(), BlobError> {
+        let _ = name;
+        Ok(())
+    }
+    /// Forgets what is staged under other names than these.
+    fn unstage_but(&self, names: &BTreeSet<String>) -> Result<(), BlobError> {
+        let _ = names;
+        Ok(())
+    }
 }
 
 /// A blob on its way into a [`Backend`]. It is gone if it is dropped.
@@ -145,21 +172,27 @@ impl BlobStore {
 
     /// Over a backend that is chosen at run time.
     pub fn over(backend: Arc<dyn Backend>) -> Self {
-        Self::with(backend, Known::default())
+        Self::with(backend, Known::default(), Holds::default())
     }
 
-    /// Over a backend; `verified` is the file that remembers what was hashed.
+    /// Over a backend; `verified` is the file that remembers what was hashed, and beside it lies another, `held`, that remembers what
+    /// held tasks have stored. Only for the holder of the store's lock.
     pub fn remembering(backend: Arc<dyn Backend>, verified: &Path) -> Self {
-        Self::with(backend, Known::read(verified))
+        Self::with(backend, Known::read(verified), Holds::keep(&verified.with_file_name(HELD)))
     }
 
-    fn with(backend: Arc<dyn Backend>, known: Known) -> Self {
+    /// Over a backend, beside the holder of the store's lock, who remembers at `verified`.
+    pub fn beside(backend: Arc<dyn Backend>, verified: &Path) -> Self {
+        Self::with(backend, Known::default(), Holds::of_others(&verified.with_file_name(HELD)))
+    }
+
+    fn with(backend: Arc<dyn Backend>, known: Known, held: Holds) -> Self {
         Self(Arc::new(Shared {
             backend,
             removal: RwLock::default(),
             mending: Mutex::default(),
             known: Mutex::new(known),
-            uploads: Uploads::default(),
+            uploads: Uploads::new(held),
         }))
     }
 
@@ -167,6 +200,11 @@ impl BlobStore {
     pub fn open_folder(dir: &Path) -> std::io::Result<Self> {
         let folder = fs::Folder::open(dir)?;
         Ok(Self::remembering(Arc::new(folder), &dir.join("blobs/verified")))
+    }
+
+    /// The blobs of the store in a folder, for reading only, whoever holds its lock.
+    pub fn folder_to_read(dir: &Path) -> Self {
+        Self::beside(Arc::new(fs::Folder::to_read(dir)), &dir.join("blobs/verified"))
     }
 
     /// In memory, for tests.

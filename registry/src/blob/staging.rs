@@ -1,7 +1,9 @@
-//! Where blobs lie while they arrive: numbered files that have no meaning yet.
+//! Where blobs lie while they arrive: files that have no meaning yet. Numbered ones are this process's; those with a name of 64
+//! hexadecimal digits are uploads that another process may go on with.
 
-use std::fs;
-use std::io;
+use std::collections::BTreeSet;
+use std::fs::{self, OpenOptions};
+use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -9,7 +11,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use checkpoint::BlobError;
 use fail::fail_point;
 
-use super::disk::{Disk, DiskFile};
+use super::disk::{Disk, DiskFile, regular};
 use super::fs::{error, free_bytes, full};
 
 /// Free space that a blob must leave, so that the database can still be written to.
@@ -32,9 +34,9 @@ impl Staging {
         fs::create_dir_all(&dir)?;
         for entry in fs::read_dir(&dir)? {
             let entry = entry?;
-            if is_ours(&entry) {
+            if is_numbered(&entry) {
                 disk.remove(&entry.path())?;
-            } else {
+            } else if uploads_name(&entry).is_none() {
                 tracing::warn!("`{}` is not the store's and is left alone", entry.path().display());
             }
         }
@@ -48,20 +50,82 @@ impl Staging {
 
     /// A file for a blob of `bytes` bytes.
     pub(super) fn create(&self, bytes: u64) -> Result<Part, BlobError> {
-        let free = free_bytes(&self.dir).map_err(|e| error("ask for free space on", &self.dir, &e))?;
-        if free < bytes.saturating_add(RESERVE_BYTES) {
-            return Err(BlobError::Storage(full(&self.dir, bytes, free)));
-        }
+        self.check_space(bytes)?;
         fail_point!("blob::before_write");
         loop {
-            let path = self.dir.join(format!("{}{SUFFIX}", self.next.fetch_add(1, Ordering::Relaxed)));
+            let path = self.path(&self.next.fetch_add(1, Ordering::Relaxed).to_string());
             match self.disk.create(&path) {
-                Ok(file) => return Ok(Part { path, file, disk: Arc::clone(&self.disk), moved: false }),
+                Ok(file) => return Ok(self.part(path, file, false)),
                 // Somebody else's folder of that name.
                 Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {}
                 Err(e) => return Err(error("write", &path, &e)),
             }
         }
+    }
+
+    /// The file of an upload, in place of what has arrived of it before.
+    pub(super) fn create_as(&self, name: &str, bytes: u64) -> Result<Part, BlobError> {
+        self.check_space(bytes)?;
+        fail_point!("blob::before_write");
+        self.remove(name)?;
+        let path = self.path(name);
+        let file = self.disk.create(&path).map_err(|e| error("write", &path, &e))?;
+        Ok(self.part(path, file, true))
+    }
+
+    /// The file of an upload that was begun before, once what has arrived of it was given to `read`.
+    pub(super) fn open_as(&self, name: &str, read: &mut dyn FnMut(&[u8])) -> Result<Option<Part>, BlobError> {
+        let path = self.path(name);
+        let failed = |e: io::Error| error("read", &path, &e);
+        let mut arrived = match regular(OpenOptions::new().read(true), &path) {
+            Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
+            opened => opened.map_err(failed)?,
+        };
+        let mut part = vec![0; 1 << 20];
+        loop {
+            match arrived.read(&mut part).map_err(failed)? {
+                0 => break,
+                bytes => read(&part[..bytes]),
+            }
+        }
+        let file = self.disk.open(&path).map_err(failed)?;
+        Ok(Some(self.part(path, file, true)))
+    }
+
+    /// Removes the file of an upload; there need be none.
+    pub(super) fn remove(&self, name: &str) -> Result<(), BlobError> {
+        let path = self.path(name);
+        match self.disk.remove(&path) {
+            Err(e) if e.kind() != io::ErrorKind::NotFound => Err(error("remove", &path, &e)),
+            _ => Ok(()),
+        }
+    }
+
+    /// Removes the files of all uploads but these.
+    pub(super) fn remove_but(&self, names: &BTreeSet<String>) -> Result<(), BlobError> {
+        let failed = |e: io::Error| error("list", &self.dir, &e);
+        for entry in fs::read_dir(&self.dir).map_err(failed)? {
+            if let Some(name) = uploads_name(&entry.map_err(failed)?).filter(|name| !names.contains(name)) {
+                self.remove(&name)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.dir.join(format!("{name}{SUFFIX}"))
+    }
+
+    fn part(&self, path: PathBuf, file: Box<dyn DiskFile>, stays: bool) -> Part {
+        Part { path, file, disk: Arc::clone(&self.disk), stays }
+    }
+
+    fn check_space(&self, bytes: u64) -> Result<(), BlobError> {
+        let free = free_bytes(&self.dir).map_err(|e| error("ask for free space on", &self.dir, &e))?;
+        if free < bytes.saturating_add(RESERVE_BYTES) {
+            return Err(BlobError::Storage(full(&self.dir, bytes, free)));
+        }
+        Ok(())
     }
 
     /// What lies here and is not ours.
@@ -70,23 +134,38 @@ impl Staging {
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
             entries => entries?.collect::<io::Result<Vec<_>>>()?,
         };
-        Ok(entries.iter().filter(|entry| !is_ours(entry)).map(fs::DirEntry::path).collect())
+        let is_strange = |entry: &&fs::DirEntry| !is_numbered(entry) && uploads_name(entry).is_none();
+        Ok(entries.iter().filter(is_strange).map(fs::DirEntry::path).collect())
     }
 }
 
-fn is_ours(entry: &fs::DirEntry) -> bool {
+/// What stands before the suffix of a file here.
+fn stem(entry: &fs::DirEntry) -> Option<String> {
     let name = entry.file_name();
-    let number = name.to_str().and_then(|name| name.strip_suffix(SUFFIX));
-    number.is_some_and(|number| number.parse::<u64>().is_ok()) && entry.file_type().is_ok_and(|kind| kind.is_file())
+    let stem = name.to_str()?.strip_suffix(SUFFIX)?;
+    entry.file_type().is_ok_and(|kind| kind.is_file()).then(|| stem.to_owned())
 }
 
-/// A blob on its way; its file goes with it unless it was moved to its name.
+fn is_numbered(entry: &fs::DirEntry) -> bool {
+    stem(entry).is_some_and(|stem| stem.parse::<u64>().is_ok())
+}
+
+/// The name of the upload whose file it is.
+fn uploads_name(entry: &fs::DirEntry) -> Option<String> {
+    stem(entry).filter(|stem| is_uploads(stem))
+}
+
+fn is_uploads(stem: &str) -> bool {
+    stem.len() == 64 && stem.bytes().all(|b| b.is_ascii_hexdigit())
+}
+
+/// A blob on its way; its file goes with it unless it was moved to its name, or somebody may go on with it.
 #[derive(Debug)]
 pub(super) struct Part {
     pub(super) path: PathBuf,
     pub(super) file: Box<dyn DiskFile>,
     disk: Arc<dyn Disk>,
-    moved: bool,
+    stays: bool,
 }
 
 impl Part {
@@ -96,14 +175,14 @@ impl Part {
 
     pub(super) fn rename(&mut self, to: &Path) -> io::Result<()> {
         self.disk.rename(&self.path, to)?;
-        self.moved = true;
+        self.stays = true;
         Ok(())
     }
 }
 
 impl Drop for Part {
     fn drop(&mut self) {
-        if !self.moved {
+        if !self.stays {
             // The next open clears what is left.
             let _ = self.disk.remove(&self.path);
         }

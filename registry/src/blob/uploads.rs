@@ -1,18 +1,20 @@
 //! Uploads that arrive in several requests, and what tasks that are still held have uploaded.
 //!
-//! A cut upload keeps what has arrived: its holder asks how much that is and goes on from there. What has arrived belongs to
-//! one worker's hold on one task, is in nobody else's way, and goes when the hold ends or when nothing came for
-//! [`IDLE`]. A stored blob is noted for its task until the task is let go, so that collection leaves it alone however long the
-//! row that will name it takes.
+//! A cut upload keeps what has arrived: its holder asks how much that is and goes on from there, of another process that opens
+//! the store as well. What has arrived belongs to one worker's hold on one task, is in nobody else's way, and goes when the hold
+//! ends or when nothing came for [`IDLE`]. A stored blob is noted for its task until the task is let go, so that collection leaves it
+//! alone however long the row that will name it takes ([`Holds`]).
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use checkpoint::BlobError;
+use protocol::digest::Hasher;
 use protocol::message::Grant;
 use protocol::{Digest, Incarnation, TaskId, WorkerId};
 
+use super::holds::Holds;
 use super::{BlobStore, Upload};
 
 /// How long an upload may rest.
@@ -23,17 +25,27 @@ const PER_HOLDER: usize = 8;
 /// Whose upload it is. The fence is left out: it grows when a gang regroups, and its lead uploads on.
 type Holder = (TaskId, WorkerId, Incarnation);
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Uploads {
     begun: Mutex<HashMap<(Holder, Digest), Begun>>,
-    held: Mutex<BTreeMap<TaskId, BTreeSet<Digest>>>,
+    held: Mutex<Holds>,
+    /// Blobs that somebody in this process is about to name in a row, and how many do.
+    protected: Mutex<BTreeMap<Digest, usize>>,
+    since: Instant,
+}
+
+impl Uploads {
+    pub(super) fn new(held: Holds) -> Self {
+        Self { begun: Mutex::default(), held: Mutex::new(held), protected: Mutex::default(), since: Instant::now() }
+    }
 }
 
 #[derive(Debug)]
 struct Begun {
     /// `None` while a request writes to it.
     upload: Option<Upload>,
-    bytes: u64,
+    /// `None` if it was begun by an earlier process, which was told.
+    bytes: Option<u64>,
     touched: Instant,
 }
 
@@ -59,6 +71,12 @@ pub enum ResumeError {
     Blob(#[from] BlobError),
 }
 
+/// What an upload is called where blobs arrive: the same in every process, and nobody else's.
+fn name((holder, digest): &(Holder, Digest)) -> String {
+    let (task, worker, incarnation) = holder;
+    Digest::of(format!("{task}\n{worker}\n{incarnation}\n{digest}").as_bytes()).hex()
+}
+
 fn holder(grant: &Grant) -> Holder {
     (grant.task.clone(), grant.worker.clone(), grant.incarnation)
 }
@@ -69,67 +87,140 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 
 impl BlobStore {
     /// How many bytes of a blob have arrived in the name of a grant.
-    pub fn staged(&self, grant: &Grant, digest: Digest) -> u64 {
+    pub fn staged(&self, grant: &Grant, digest: Digest) -> Result<u64, BlobError> {
+        let place = (holder(grant), digest);
+        self.recall(&place)?;
         let begun = lock(&self.uploads().begun);
-        let upload = begun.get(&(holder(grant), digest)).and_then(|begun| begun.upload.as_ref());
-        upload.map_or(0, Upload::written)
+        let upload = begun.get(&place).and_then(|begun| begun.upload.as_ref());
+        Ok(upload.map_or(0, Upload::written))
     }
 
     /// Takes up an upload of `bytes` bytes at byte `offset`; at 0 it begins, anew if need be. What has arrived when it is
     /// dropped waits for the holder's next request.
     pub fn take_up(&self, grant: &Grant, digest: Digest, offset: u64, bytes: u64) -> Result<Arriving, ResumeError> {
         let arriving = |upload| Arriving { store: self.clone(), holder: holder(grant), digest, upload: Some(upload) };
-        let mut all = lock(&self.uploads().begun);
         let place = (holder(grant), digest);
+        self.recall(&place)?;
+        let mut all = lock(&self.uploads().begun);
         if let Some(begun) = all.get_mut(&place) {
-            let Some(upload) = begun.upload.take() else { return Err(ResumeError::Busy) };
+            let Some(mut upload) = begun.upload.take() else { return Err(ResumeError::Busy) };
             begun.touched = Instant::now();
             let staged = upload.written();
-            if staged == offset && begun.bytes == bytes {
+            let fits = begun.bytes.is_none_or(|announced| announced == bytes) && staged <= bytes;
+            if staged == offset && fits {
+                begun.bytes = Some(bytes);
+                upload.bytes = bytes;
                 return Ok(arriving(upload));
             }
-            if offset != 0 {
+            if offset != 0 && staged <= bytes {
                 begun.upload = Some(upload);
                 return Err(ResumeError::Offset { staged, offset });
             }
             drop(upload);
-        } else if offset != 0 {
-            return Err(ResumeError::Offset { staged: 0, offset });
-        } else {
-            let of_holder = all.keys().filter(|(holder, _)| *holder == place.0).count();
-            if of_holder >= PER_HOLDER {
-                return Err(ResumeError::TooMany(of_holder));
-            }
         }
-        match self.begin(bytes) {
-            Ok(upload) => {
-                all.insert(place, Begun { upload: None, bytes, touched: Instant::now() });
-                Ok(arriving(upload))
+        if offset != 0 {
+            self.discard(&mut all, &place);
+            return Err(ResumeError::Offset { staged: 0, offset });
+        }
+        let of_holder = all.keys().filter(|other| other.0 == place.0 && **other != place).count();
+        if of_holder >= PER_HOLDER {
+            return Err(ResumeError::TooMany(of_holder));
+        }
+        match self.backend().stage_as(&name(&place), bytes) {
+            Ok(staged) => {
+                all.insert(place, Begun { upload: None, bytes: Some(bytes), touched: Instant::now() });
+                Ok(arriving(Upload { staged, hasher: Hasher::default(), written: 0, bytes }))
             }
             Err(error) => {
-                all.remove(&place);
+                self.discard(&mut all, &place);
                 Err(error.into())
             }
         }
     }
 
+    /// Takes up what has arrived of an upload for an earlier process, if this one knows nothing of it.
+    fn recall(&self, place: &(Holder, Digest)) -> Result<(), BlobError> {
+        if lock(&self.uploads().begun).contains_key(place) {
+            return Ok(());
+        }
+        // Hashed without the lock, which every other upload takes.
+        let (mut hasher, mut written) = (Hasher::default(), 0);
+        let mut read = |part: &[u8]| {
+            hasher.update(part);
+            written += part.len() as u64;
+        };
+        let Some(staged) = self.backend().staged_as(&name(place), &mut read)? else { return Ok(()) };
+        let upload = Upload { staged, hasher, written, bytes: written };
+        // Another request may have been as fast, and be writing to it.
+        let begun = || Begun { upload: Some(upload), bytes: None, touched: Instant::now() };
+        lock(&self.uploads().begun).entry(place.clone()).or_insert_with(begun);
+        Ok(())
+    }
+
+    /// Forgets an upload, and what has arrived of it.
+    fn discard(&self, all: &mut HashMap<(Holder, Digest), Begun>, place: &(Holder, Digest)) {
+        all.remove(place);
+        if let Err(error) = self.backend().unstage(&name(place)) {
+            tracing::warn!(%error, "a part of a blob stays where blobs arrive");
+        }
+    }
+
     /// Notes that a held task has stored a blob, which is kept until [`Self::let_go`].
     pub fn hold(&self, task: &TaskId, digest: Digest) {
-        lock(&self.uploads().held).entry(task.clone()).or_default().insert(digest);
+        lock(&self.uploads().held).hold(task, digest);
     }
 
-    /// What held tasks have stored: roots of a collection.
+    /// Keeps a blob, which need not be there yet, for as long as what is returned lives: until the row that names it is stored.
+    #[must_use = "the blob is kept only as long as this lives"]
+    pub fn protect(&self, digest: Digest) -> Protected {
+        *lock(&self.uploads().protected).entry(digest).or_default() += 1;
+        Protected { store: self.clone(), digest }
+    }
+
+    /// What held tasks have stored, and what is protected: roots of a collection.
     pub fn held(&self) -> BTreeSet<Digest> {
-        lock(&self.uploads().held).values().flatten().copied().collect()
+        let mut held = lock(&self.uploads().held).all();
+        held.extend(lock(&self.uploads().protected).keys());
+        held
     }
 
-    /// Forgets what belongs to tasks that are not held any more, and uploads at which nothing came for long.
-    pub fn let_go(&self, is_held: impl Fn(&TaskId) -> bool) {
-        lock(&self.uploads().held).retain(|task, _| is_held(task));
+    /// Forgets what belongs to tasks that are not held any more, and uploads at which nothing came for `idle`, usually [`IDLE`].
+    pub fn let_go(&self, idle: Duration, is_held: impl Fn(&TaskId) -> bool) {
+        lock(&self.uploads().held).let_go(&is_held);
+        let mut all = lock(&self.uploads().begun);
         // One that a request writes to right now ends with that request.
-        lock(&self.uploads().begun).retain(|((task, _, _), _), begun| {
-            begun.upload.is_none() || (is_held(task) && begun.touched.elapsed() < IDLE)
-        });
+        let over = |begun: &Begun, task| begun.upload.is_some() && (begun.touched.elapsed() >= idle || !is_held(task));
+        let gone = all.iter().filter(|(((task, _, _), _), begun)| over(begun, task)).map(|(place, _)| place.clone());
+        for place in gone.collect::<Vec<_>>() {
+            self.discard(&mut all, &place);
+        }
+        if self.uploads().since.elapsed() < idle {
+            return;
+        }
+        // Nobody has asked for what else an earlier process has left.
+        let known: BTreeSet<String> = all.keys().map(name).collect();
+        if let Err(error) = self.backend().unstage_but(&known) {
+            tracing::warn!(%error, "parts of blobs stay where blobs arrive");
+        }
+    }
+}
+
+/// Keeps a blob from collection.
+#[derive(Debug)]
+pub struct Protected {
+    store: BlobStore,
+    digest: Digest,
+}
+
+impl Drop for Protected {
+    fn drop(&mut self) {
+        let mut protected = lock(&self.store.uploads().protected);
+        if let Some(count) = protected.get_mut(&self.digest) {
+            *count -= 1;
+            if *count == 0 {
+                protected.remove(&self.digest);
+            }
+        }
     }
 }
 
@@ -178,7 +269,7 @@ impl Drop for Arriving {
                 begun.upload = Some(upload);
                 begun.touched = Instant::now();
             }
-            _ => drop(all.remove(&place)),
+            _ => self.store.discard(&mut all, &place),
         }
     }
 }

@@ -112,11 +112,15 @@ pub enum Verb {
     /// Forgets runs that have ended, but not what models are made of or other runs need; `gc` then frees the space
     Forget {
         /// The run
-        #[arg(required_unless_present = "ended_before")]
+        #[arg(required_unless_present_any = ["ended_before", "leftovers_before"])]
         run: Option<String>,
         /// All runs that ended longer ago than this, such as `30d`, `12h` or `90m`
         #[arg(long, value_name = "AGE", value_parser = age, conflicts_with = "run")]
         ended_before: Option<i64>,
+        /// Of all runs that ended longer ago than this only what nobody needs to look at them: trials of sweeps that are not the
+        /// best, and checkpoints of stages that were never finished. To resume such a run is to compute that anew
+        #[arg(long, value_name = "AGE", value_parser = age, conflicts_with_all = ["run", "ended_before"])]
+        leftovers_before: Option<i64>,
     },
     /// Makes or renews a backup of the store in a folder of this machine, while runs go on
     Backup {
@@ -175,7 +179,10 @@ impl Verb {
             Self::Gc { dry_run, grace } => Command::Gc { dry_run, grace_minutes: Some(grace) },
             Self::Adopt => Command::Adopt,
             Self::Forget { run: Some(run), .. } => Command::Forget { run },
-            Self::Forget { run: None, ended_before } => {
+            Self::Forget { leftovers_before: Some(age_ms), .. } => {
+                Command::ForgetLeftovers { before_ms: crate::clock::now_ms().saturating_sub(age_ms) }
+            }
+            Self::Forget { ended_before, .. } => {
                 let age_ms = ended_before.unwrap_or(i64::MAX);
                 Command::ForgetEnded { before_ms: crate::clock::now_ms().saturating_sub(age_ms) }
             }

@@ -114,6 +114,11 @@ pub enum Command {
         /// In milliseconds since 1970.
         before_ms: i64,
     },
+    /// Forgets what runs that ended before a time have left behind and nobody needs; the runs stay.
+    ForgetLeftovers {
+        /// In milliseconds since 1970.
+        before_ms: i64,
+    },
     /// Makes one store of what is left after a loss. Only on a store that no process holds.
     Adopt,
 }
@@ -130,7 +135,12 @@ impl Command {
             | Self::Lineage { .. } => Scope::Read,
             Self::Promote { .. } | Self::Rollback { .. } => Scope::Promote,
             // Reads every byte of the store.
-            Self::Fsck | Self::Gc { .. } | Self::Forget { .. } | Self::ForgetEnded { .. } | Self::Adopt => Scope::Admin,
+            Self::Fsck
+            | Self::Gc { .. }
+            | Self::Forget { .. }
+            | Self::ForgetEnded { .. }
+            | Self::ForgetLeftovers { .. }
+            | Self::Adopt => Scope::Admin,
         }
     }
 
@@ -149,6 +159,7 @@ impl Command {
             | Self::Rollback { .. }
             | Self::Forget { .. }
             | Self::ForgetEnded { .. }
+            | Self::ForgetLeftovers { .. }
             | Self::Adopt => false,
         }
     }
@@ -391,6 +402,16 @@ async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &st
             for run in store.ended_before(before_ms).await? {
                 let gone = writes()?.0.forget(&run).await?;
                 runs.push((run, gone));
+            }
+            Data::Forgotten { runs }
+        }
+        Command::ForgetLeftovers { before_ms } => {
+            let mut runs = Vec::new();
+            for run in store.ended_before(before_ms).await? {
+                let gone = writes()?.0.forget_leftovers(&run, before_ms).await?;
+                if gone != Forgotten::default() {
+                    runs.push((run, gone));
+                }
             }
             Data::Forgotten { runs }
         }

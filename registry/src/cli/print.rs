@@ -179,7 +179,7 @@ pub fn render(data: &Data) -> String {
         Data::Adopted { store } => {
             format!("the parts are store {store} again; `registry fsck` says what is missing\n")
         }
-        Data::Forgotten { runs } if runs.is_empty() => "no run ended before that\n".into(),
+        Data::Forgotten { runs } if runs.is_empty() => "no run that ended before that has anything to forget\n".into(),
         Data::Forgotten { runs } => {
             let mut text = String::new();
             for (run, gone) in runs {

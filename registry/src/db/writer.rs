@@ -49,6 +49,10 @@ pub(crate) enum Order {
         reason: Option<String>,
     },
     Forget(RunId),
+    ForgetLeftovers {
+        run: RunId,
+        before_ms: i64,
+    },
     /// Forgets what a collection may take. From here on what rows come to name is noted.
     BeginCollection,
 }
@@ -214,6 +218,9 @@ async fn run(conn: &mut SqliteConnection, blobs: &Vouched, order: &Order) -> Res
             retention::pin(conn, blobs, *digest, reason.as_deref()).await.map(|()| Done::Nothing)
         }
         Order::Forget(run) => forget::forget(conn, run).await.map(Done::Forgotten),
+        Order::ForgetLeftovers { run, before_ms } => {
+            forget::forget_leftovers(conn, run, *before_ms).await.map(Done::Forgotten)
+        }
         Order::BeginCollection => {
             // Rows of this transaction before here are committed when the answer comes, which is when marking begins.
             blobs.named.begin();

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use checkpoint::bundle::bundle;
 use protocol::{Digest, RunId, StageName, TaskId};
+use registry::blob::{IDLE, Protected};
 use registry::{BlobStore, QueryError};
 use tokio::sync::watch;
 
@@ -97,13 +98,19 @@ async fn known(actor_handle: &ActorHandle, key: Digest) -> Result<Option<(Known,
 async fn register(actor_handle: Arc<ActorHandle>, key: Digest, candidates: Vec<Candidate>) {
     let blobs = actor_handle.store.blobs().clone();
     let event = match blocking(move || bundles(&blobs, &candidates)).await {
-        Ok(bundles) => Event::Bundled { key, bundles },
+        Ok((bundles, protected)) => {
+            tell(&actor_handle, Event::Bundled { key, bundles }).await;
+            // Rows name them by now.
+            drop(protected);
+            return;
+        }
         Err(message) => Event::RegisterRefused { key, message },
     };
     tell(&actor_handle, event).await;
 }
 
-fn bundles(blobs: &BlobStore, candidates: &[Candidate]) -> Result<Vec<Digest>, String> {
+/// Stores the bundles, which are kept for as long as what comes with them lives.
+fn bundles(blobs: &BlobStore, candidates: &[Candidate]) -> Result<(Vec<Digest>, Vec<Protected>), String> {
     candidates
         .iter()
         .map(|candidate| {
@@ -111,10 +118,19 @@ fn bundles(blobs: &BlobStore, candidates: &[Candidate]) -> Result<Vec<Digest>, S
                 |e: &dyn std::fmt::Display| format!("the model of stage `{}` cannot be made: {e}", candidate.stage);
             let denoiser = blobs.manifest(candidate.denoiser).map_err(|e| at(&e))?;
             let vae = blobs.manifest(candidate.vae).map_err(|e| at(&e))?;
-            let model = bundle(&denoiser, &vae).map_err(|e| at(&e))?;
-            blobs.put(&model.to_bytes()).map_err(|e| at(&e))
+            let model = bundle(&denoiser, &vae).map_err(|e| at(&e))?.to_bytes();
+            let protected = blobs.protect(Digest::of(&model));
+            Ok((blobs.put(&model).map_err(|e| at(&e))?, protected))
         })
-        .collect()
+        .collect::<Result<Vec<_>, _>>()
+        .map(|bundles| bundles.into_iter().unzip())
+}
+
+/// Gives up what tasks have uploaded that nobody holds any more.
+pub(crate) fn let_go(actor_handle: &ActorHandle) {
+    let state = actor_handle.state();
+    let is_held = |task: &TaskId| state.task(task).is_ok_and(|(_, task)| !task.holders().is_empty());
+    actor_handle.store.blobs().let_go(IDLE, is_held);
 }
 
 /// Runs what blocks on a disk outside the threads that serve requests.
@@ -156,9 +172,7 @@ pub(crate) async fn tick(actor_handle: Arc<ActorHandle>, every_ms: u64, mut stop
         if collected.elapsed() > COLLECT_EVERY {
             collected = tokio::time::Instant::now();
             let actor_handle = Arc::clone(&actor_handle);
-            let state = actor_handle.state();
-            let is_held = |task: &TaskId| state.task(task).is_ok_and(|(_, task)| !task.holders().is_empty());
-            actor_handle.store.blobs().let_go(is_held);
+            let_go(&actor_handle);
             tokio::spawn(async move {
                 if let Err(error) = actor_handle.store.gc(registry::retention::GRACE_MS).await {
                     tracing::warn!(%error, "unneeded blobs stay");

@@ -164,6 +164,7 @@ impl Coordinator {
 
         let (actor_handle, actor) = actor::start(store, state);
         actor_handle.decide(Event::Started { alone: config.alone, park: config.park }).await?;
+        effects::let_go(&actor_handle);
         let (stop, stopped) = watch::channel(false);
         let clock = tokio::spawn(effects::tick(actor_handle.clone(), config.policy.tick_ms, stopped.clone()));
         let gate = Arc::new(Gate::new(tokens, &config.hosts));
@@ -273,6 +274,7 @@ impl Handle {
             // Ended tasks and cancelled ones alike are what we want here.
             let _ = task.await;
         }
+        effects::let_go(&self.actor_handle);
         actor::snapshot(self.actor_handle.store.clone(), self.actor_handle.state()).await;
     }
 }

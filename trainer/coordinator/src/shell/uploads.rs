@@ -107,7 +107,7 @@ pub(crate) async fn staged(
     blocking(move || {
         blobs.hold(&grant.task, digest);
         let stored = blobs.reuse(digest)?;
-        Ok(Json(BlobStored { digest, stored, staged: blobs.staged(&grant, digest) }))
+        Ok(Json(BlobStored { digest, stored, staged: blobs.staged(&grant, digest)? }))
     })
     .await
 }
