@@ -65,3 +65,23 @@ fn p7_a_worker_dies_at_every_point_of_a_checkpoint() {
         bench.run(&["registry", "fsck"]).expect_code(0);
     }
 }
+
+#[test]
+fn a_panic_in_the_coordinator_ends_the_command_and_the_next_goes_on() {
+    let reference = undisturbed();
+    let bench = Bench::new(TRAINER);
+    let config = Bench::config("smoke.yaml");
+    let mut command = bench.command(&["run", &config, "--workers", "1"]);
+    command.env("STRIDE_COORDINATOR_PANIC", "20");
+    let ended = Running::start(command).wait().expect_code(3);
+    assert!(ended.stderr.contains("the coordinator has failed"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("goes on from it"), "{}", ended.stderr);
+    // A server's clock alone makes a batch every second.
+    let mut command = bench.command(&["serve", "--bind", "127.0.0.1:0"]);
+    command.env("STRIDE_COORDINATOR_PANIC", "3");
+    let ended = Running::start(command).wait().expect_code(3);
+    assert!(ended.stderr.contains("the coordinator has failed"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("start the server again"), "{}", ended.stderr);
+    let report = bench.pipeline("smoke.yaml", &["--workers", "1"]);
+    assert_eq!(digests(&report), digests(&reference));
+}

@@ -11,11 +11,14 @@ use protocol::message::{
 use protocol::{Digest, Incarnation, RunId, WorkerId};
 use registry::cli::{Answer, Command};
 use registry::{Holder, LogRow, ReadStore, Store};
-use reqwest::Method;
+use reqwest::{Method, RequestBuilder, Response, StatusCode};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::problem::{Problem, Result, exit};
+
+/// How often a server that has too much to do is asked again.
+const BUSY_TRIES: usize = 20;
 
 /// Where a command is sent.
 #[derive(Debug, Clone, clap::Args)]
@@ -73,12 +76,24 @@ impl Client {
         }
     }
 
-    async fn send(&self, request: reqwest::RequestBuilder) -> Result<reqwest::Response> {
+    async fn try_send(&self, request: RequestBuilder) -> Result<Response> {
         let url = self.server.url();
-        let answer = request.send().await.map_err(|error| {
+        request.send().await.map_err(|error| {
             let problem = Problem::new(exit::UNREACHABLE, anyhow::anyhow!("cannot reach `{url}`: {}", explain(&error)));
             problem.hint("start it with `trainer serve`, or give its address with --server")
-        })?;
+        })
+    }
+
+    async fn send(&self, request: RequestBuilder) -> Result<Response> {
+        let url = self.server.url();
+        let mut tries = std::iter::successors(request.try_clone(), RequestBuilder::try_clone).take(BUSY_TRIES);
+        let mut answer = self.try_send(request).await?;
+        while answer.status() == StatusCode::TOO_MANY_REQUESTS
+            && let Some(again) = tries.next()
+        {
+            tokio::time::sleep(access::retry_after(&answer)).await;
+            answer = self.try_send(again).await?;
+        }
         if answer.status().is_success() {
             return Ok(answer);
         }
@@ -101,7 +116,7 @@ impl Client {
         Err(problem)
     }
 
-    async fn read<T: DeserializeOwned>(&self, request: reqwest::RequestBuilder) -> Result<T> {
+    async fn read<T: DeserializeOwned>(&self, request: RequestBuilder) -> Result<T> {
         let answer = self.send(request).await?;
         answer.json().await.map_err(|error| {
             let problem =

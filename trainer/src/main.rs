@@ -25,5 +25,6 @@ fn main() -> ExitCode {
     // First of all: the allocator can be tuned only while there is one thread.
     worker::process::tune_allocator();
     registry::failpoints::arm_from_env();
+    coordinator::failpoints::arm_from_env();
     cli::main(cli::Cli::parse())
 }

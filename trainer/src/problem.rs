@@ -41,6 +41,11 @@ impl Problem {
         Self::new(exit::FAILED, anyhow::anyhow!("{message}"))
     }
 
+    /// A part of the coordinator in this process has panicked.
+    pub(crate) fn coordinator_failed(why: impl Display) -> Self {
+        Self::new(exit::FAULT, anyhow::anyhow!("the coordinator has failed: {why}"))
+    }
+
     pub(crate) fn hint(mut self, hint: impl Into<String>) -> Self {
         self.hint = Some(hint.into());
         self
@@ -123,6 +128,7 @@ impl From<coordinator::Refused> for Problem {
             coordinator::Refused::Rejected(coordinator::Rejected::NotFound(_)) => exit::NOT_FOUND,
             coordinator::Refused::Rejected(coordinator::Rejected::Conflict(_)) => exit::CONFLICT,
             coordinator::Refused::Write(registry::WriteError::Storage(_)) => exit::USAGE,
+            coordinator::Refused::Failed(_) => exit::FAULT,
             _ => exit::FAILED,
         };
         Self::new(exit, error)

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use coordinator::shell::raise_descriptor_limit;
-use coordinator::{Config, Control, Coordinator, Handle, WorkerView};
+use coordinator::{Config, Control, Coordinator, Handle, Trouble, WorkerView};
 use protocol::message::{FailureClass, RunState, RunView, StageState, Submit};
 use protocol::pipeline::Pipeline;
 use protocol::{RunId, StageName};
@@ -66,7 +66,7 @@ impl Stop {
 enum End {
     Final,
     Interrupted { killed: bool },
-    Trouble(String),
+    Trouble(Trouble),
 }
 
 /// Runs to the end and gives the exit code.
@@ -250,8 +250,14 @@ fn report(view: &RunView, pipeline: &Pipeline, end: &End, options: &Options) -> 
     }
     match end {
         End::Trouble(trouble) => {
-            let problem = Problem::usage(format!("the store takes no writes: {trouble}"))
-                .hint(format!("free some space or make the store writable, then `{}` goes on", options.command));
+            let problem = match trouble {
+                Trouble::Store(why) => Problem::usage(format!("the store takes no writes: {why}"))
+                    .hint(format!("free some space or make the store writable, then `{}` goes on", options.command)),
+                Trouble::Failed(why) => Problem::coordinator_failed(why).hint(format!(
+                    "what was saved is kept, and `{}` goes on from it; please report this",
+                    options.command
+                )),
+            };
             print::problem(&problem, options.output);
             return problem.exit;
         }

@@ -155,7 +155,12 @@ async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Option<Jo
                 tracing::info!(worker = %join.worker, incarnation = %joined.incarnation, peer_address = join.peer_address, "joined");
                 return Ok(Some(joined));
             }
-            Err(CallError::Away(message) | CallError::Full(message) | CallError::Fault(message)) => {
+            Err(
+                CallError::Away(message)
+                | CallError::Busy(message, _)
+                | CallError::Full(message)
+                | CallError::Fault(message),
+            ) => {
                 if !std::mem::replace(&mut said, true) {
                     tracing::warn!("the coordinator cannot take this worker yet: {message}; trying again");
                 }
@@ -201,7 +206,8 @@ pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> En
             }
             answer = client.poll(&path, &poll, patience(&joined)) => answer,
         };
-        let answered = !matches!(answer, Err(CallError::Away(_) | CallError::Full(_) | CallError::Fault(_)));
+        let answered =
+            !matches!(answer, Err(CallError::Away(_) | CallError::Busy(..) | CallError::Full(_) | CallError::Fault(_)));
         shared.flags.away.store(!answered, Ordering::SeqCst);
         match answer {
             Ok(desired) => {
@@ -222,7 +228,12 @@ pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> En
                 // A coordinator that forgets again at once is not asked in a tight loop.
                 pause = (pause * 2).min(LONGEST);
             }
-            Err(CallError::Away(message) | CallError::Full(message) | CallError::Fault(message)) => {
+            Err(
+                CallError::Away(message)
+                | CallError::Busy(message, _)
+                | CallError::Full(message)
+                | CallError::Fault(message),
+            ) => {
                 if !std::mem::replace(&mut away, true) {
                     tracing::warn!("the coordinator takes nothing, work goes on: {message}");
                 }

@@ -19,6 +19,9 @@ pub(crate) enum CallError {
     /// The coordinator is away or overloaded: the same call may succeed later.
     #[error("{0}")]
     Away(String),
+    /// It has too much to do: the same call may succeed after this time.
+    #[error("{0}")]
+    Busy(String, Duration),
     /// It answered that it failed, by a fault of its own.
     #[error("{0}")]
     Fault(String),
@@ -168,6 +171,7 @@ async fn check(sent: Result<Response, reqwest::Error>) -> Result<Response, CallE
     if status.is_success() {
         return Ok(response);
     }
+    let after = access::retry_after(&response);
     let body = response.bytes().await.unwrap_or_default();
     let error = serde_json::from_slice::<ApiError>(&body).unwrap_or_else(|_| ApiError {
         code: String::new(),
@@ -185,7 +189,8 @@ async fn check(sent: Result<Response, reqwest::Error>) -> Result<Response, CallE
         (_, "damaged") => CallError::Damaged(message),
         // What has arrived is asked for again.
         (StatusCode::RANGE_NOT_SATISFIABLE, "offset") => CallError::Away(message),
-        (StatusCode::REQUEST_TIMEOUT | StatusCode::TOO_MANY_REQUESTS, _) => CallError::Away(message),
+        (StatusCode::TOO_MANY_REQUESTS, _) => CallError::Busy(message, after),
+        (StatusCode::REQUEST_TIMEOUT, _) => CallError::Away(message),
         (StatusCode::INTERNAL_SERVER_ERROR, _) => CallError::Fault(message),
         (status, _) if status.is_server_error() => CallError::Away(message),
         _ => CallError::Refused(message),

@@ -51,13 +51,14 @@ pub(crate) fn until_ended<T>(
             Err(CallError::Fault(message)) if faults == FAULTS => {
                 return Err(GaveUp::Answer(CallError::Fault(message)));
             }
-            Err(error @ (CallError::Away(_) | CallError::Full(_) | CallError::Fault(_))) => {
+            Err(error @ (CallError::Away(_) | CallError::Busy(..) | CallError::Full(_) | CallError::Fault(_))) => {
                 faults += u32::from(matches!(error, CallError::Fault(_)));
                 if warned == begun || warned.elapsed() > Duration::from_secs(10) {
                     tracing::warn!("{what}: {error}; trying again");
                     warned = Instant::now();
                 }
-                held.pause(pause).map_err(GaveUp::Ended)?;
+                let asked = if let CallError::Busy(_, after) = error { after } else { Duration::ZERO };
+                held.pause(pause.max(asked)).map_err(GaveUp::Ended)?;
                 pause = (pause * 2).min(LONGEST);
             }
             Err(error) => return Err(GaveUp::Answer(error)),

@@ -71,6 +71,9 @@ struct ActorHandle {
     refuses: bool,
 }
 
+/// For how long a coordinator that has too much to do wants to be left alone: longer than any pause of ours between two tries.
+const BUSY_S: u64 = 2;
+
 /// The coordinator.
 #[derive(Debug, Default)]
 struct Fake {
@@ -81,6 +84,11 @@ struct Fake {
     full: AtomicBool,
     /// How often it said so.
     turned_down: AtomicU64,
+    /// Tells the next batch of values to come again, and when it did.
+    busy: AtomicBool,
+    told: Mutex<Option<Instant>>,
+    /// How much later it came.
+    waited: Mutex<Option<Duration>>,
     /// Every third write is done, and then its answer is lost.
     lossy: AtomicBool,
     /// The next so many polls are never answered.
@@ -108,6 +116,17 @@ impl Fake {
         full.then(|| {
             self.turned_down.fetch_add(1, Ordering::SeqCst);
             refuse(StatusCode::INSUFFICIENT_STORAGE, "storage")
+        })
+    }
+
+    /// The answer of one that has too much to do, if it has.
+    fn too_much(&self) -> Option<Response> {
+        if let Some(told) = lock(&self.told).take() {
+            *lock(&self.waited) = Some(told.elapsed());
+        }
+        self.busy.swap(false, Ordering::SeqCst).then(|| {
+            *lock(&self.told) = Some(Instant::now());
+            ([("retry-after", BUSY_S.to_string())], refuse(StatusCode::TOO_MANY_REQUESTS, "busy")).into_response()
         })
     }
 
@@ -182,6 +201,9 @@ async fn poll(State(fake): State<Arc<Fake>>, Path(worker): Path<String>, Json(po
 }
 
 async fn metrics(State(fake): State<Arc<Fake>>, Json(batch): Json<MetricBatch>) -> Response {
+    if let Some(response) = fake.too_much() {
+        return response;
+    }
     fake.write(&batch.grant, |coordinator| {
         for row in batch.rows {
             let before = coordinator.metrics.insert((row.step, row.key.clone()), row.value);
@@ -538,6 +560,19 @@ fn a_coordinator_whose_disk_is_full_is_waited_for() {
     let coordinator = worker.leave();
     assert_eq!(coordinator.metrics.len(), 200, "no row was lost");
     assert!(matches!(coordinator.outcomes[..], [ReportOutcome { outcome: TaskOutcome::Finished { .. }, .. }]));
+}
+
+#[test]
+fn a_coordinator_that_has_too_much_to_do_is_left_alone_for_as_long_as_it_says() {
+    let worker = Worker::start(Box::new(|context| train(context, 1000, Duration::from_millis(5))));
+    worker.grant(1);
+    worker.wait("some steps", |coordinator| coordinator.metrics.len() > 10);
+    worker.fake.busy.store(true, Ordering::SeqCst);
+    worker.wait("another try", |_| lock(&worker.fake.waited).is_some());
+    let waited = lock(&worker.fake.waited).expect("waited");
+    assert!(waited >= Duration::from_secs(BUSY_S), "came again after {waited:?}");
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    assert_eq!(worker.leave().metrics.len(), 1000, "no row was lost");
 }
 
 #[test]

@@ -96,6 +96,13 @@ impl Server {
     }
 }
 
+/// How long a server that has too much to do wants to be left alone: what its answer says, between a moment and a minute.
+pub fn retry_after(answer: &reqwest::Response) -> Duration {
+    let seconds =
+        answer.headers().get(reqwest::header::RETRY_AFTER).and_then(|value| value.to_str().ok()?.parse().ok());
+    Duration::from_secs(seconds.unwrap_or(1).clamp(1, 60))
+}
+
 /// What went wrong with a call, down to its cause, in words that say what to do where TLS is at fault; `reqwest` alone says
 /// only "error sending request".
 pub fn explain(error: &reqwest::Error) -> String {

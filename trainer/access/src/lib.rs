@@ -15,7 +15,7 @@ mod secret;
 pub mod tls;
 mod tokens;
 
-pub use connection::{ConnectError, Server, explain};
+pub use connection::{ConnectError, Server, explain, retry_after};
 pub use options::{ConnectionOptions, ServerOptions, TokenOptions};
 pub use scope::{Scope, Scopes};
 pub use secret::{FileError, Token, TokenError};

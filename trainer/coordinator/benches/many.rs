@@ -1,16 +1,22 @@
-//! A coordinator that has been running for long: 10,000 runs that ended and 1,000,000 facts. How many submissions a second become durable
-//! before and after, how long a restart takes, and how much memory it needs. `cargo bench -p coordinator --bench many`.
+//! A coordinator that has been running for long: 10,000 runs that ended and 1,000,000 facts. How long a restart takes and how much memory it
+//! needs, how many submissions a second become durable compared with an empty store, and how long heartbeats take while clients ask
+//! for much. `cargo bench -p coordinator --bench many`.
 //!
-//! The restarted coordinator is a process of its own, so that its memory is not that of the years before.
+//! The restarted coordinator is a process of its own, so that its memory is not that of the years before. What is compared is
+//! measured in turns within one run, medians by medians: the machine's other work is the same for both.
 
-use std::io::Write as _;
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use coordinator::{Config, Control, Coordinator, Handle};
-use protocol::message::Submit;
+use protocol::limits;
+use protocol::message::{DesiredAssignments, Join, Joined, PROTOCOL_VERSION, Poll, Submit};
 use protocol::pipeline::Pipeline;
+use protocol::stage::Backend;
 use registry::{Holder, Store};
 
 type Result<T = ()> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>>;
@@ -19,8 +25,15 @@ const RUNS: u64 = 10_000;
 const FACTS: u64 = 1_000_000;
 /// Clients at a time.
 const CLIENTS: u64 = 64;
-/// Submissions that are timed.
-const TIMED: u64 = 2_000;
+/// Times that each store is measured, and submissions of each time.
+const ROUNDS: u64 = 7;
+const TIMED: u64 = 300;
+/// How long heartbeats are measured beside each thing that clients ask for.
+const BESIDE: Duration = Duration::from_secs(8);
+/// Between two heartbeats.
+const PAUSE: Duration = Duration::from_millis(3);
+/// Bytes that are exported.
+const EXPORT: usize = 256 << 20;
 
 fn pipeline(seed: u64) -> Result<Pipeline> {
     let text = format!(
@@ -94,15 +107,194 @@ async fn shut(handle: Arc<Handle>) -> Result {
     Ok(())
 }
 
-/// The second life: a restart, timed; and submissions.
+/// A connection that is kept.
+struct Caller {
+    stream: TcpStream,
+    token: String,
+}
+
+impl Caller {
+    fn connect(handle: &Handle) -> Result<Self> {
+        let stream = TcpStream::connect(handle.address())?;
+        stream.set_nodelay(true)?;
+        Ok(Self { stream, token: handle.token().secret().to_owned() })
+    }
+
+    /// The status and the answer.
+    fn call(&mut self, method: &str, path: &str, body: &[u8]) -> Result<(u16, Vec<u8>)> {
+        let head = format!("authorization: Bearer {}\r\ncontent-type: application/json\r\n", self.token);
+        let length = body.len();
+        let head = format!("{method} {path} HTTP/1.1\r\nhost: localhost\r\n{head}content-length: {length}\r\n\r\n");
+        self.stream.write_all(&[head.as_bytes(), body].concat())?;
+        let (mut answer, mut part) = (Vec::new(), vec![0; 256 << 10]);
+        let end = loop {
+            if let Some(end) = answer.windows(4).position(|bytes| bytes == b"\r\n\r\n") {
+                break end + 4;
+            }
+            let n = self.stream.read(&mut part)?;
+            answer.extend_from_slice(part.get(..n).filter(|part| !part.is_empty()).ok_or("the server hung up")?);
+        };
+        let head = String::from_utf8_lossy(&answer[..end]).to_lowercase();
+        let status = head.split(' ').nth(1).ok_or("no status")?.parse()?;
+        let length: usize =
+            head.lines().find_map(|l| l.strip_prefix("content-length: ")).ok_or("no length")?.parse()?;
+        let mut body = answer.split_off(end);
+        while body.len() < length {
+            let n = self.stream.read(&mut part)?;
+            body.extend_from_slice(part.get(..n).filter(|part| !part.is_empty()).ok_or("the server hung up")?);
+        }
+        Ok((status, body))
+    }
+
+    fn post<T: serde::de::DeserializeOwned>(&mut self, path: &str, body: &impl serde::Serialize) -> Result<T> {
+        let (status, answer) = self.call("POST", path, &serde_json::to_vec(body)?)?;
+        if status != 200 {
+            return Err(format!("{path}: {status} {}", String::from_utf8_lossy(&answer)).into());
+        }
+        Ok(serde_json::from_slice(&answer)?)
+    }
+}
+
+/// How long heartbeats take until `stop`, each answered at once because it says another version than the newest. Sorted.
+fn beat(handle: &Handle, stop: &AtomicBool) -> Result<Vec<Duration>> {
+    let mut caller = Caller::connect(handle)?;
+    let join = Join {
+        protocol: PROTOCOL_VERSION,
+        worker: "w".into(),
+        pid: 7,
+        backend: Backend::Ndarray,
+        instruction_set: "avx2".into(),
+        peer_address: "127.0.0.1:1".into(),
+    };
+    let joined: Joined = caller.post("/v1/workers", &join)?;
+    let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: u64::MAX };
+    let mut times = Vec::new();
+    while !stop.load(Ordering::Relaxed) {
+        let begun = Instant::now();
+        let _: DesiredAssignments = caller.post("/v1/workers/w/poll", &poll)?;
+        times.push(begun.elapsed());
+        std::thread::sleep(PAUSE);
+    }
+    times.sort();
+    Ok(times)
+}
+
+/// Heartbeats while `clients` threads each call `work` again and again, and how often all of them did.
+fn beside(handle: &Handle, what: &str, clients: usize, work: impl Fn(&mut Caller) -> Result + Sync) -> Result {
+    let (stop, calls) = (AtomicBool::new(false), std::sync::atomic::AtomicU64::new(0));
+    let times = std::thread::scope(|scope| {
+        let heartbeats = scope.spawn(|| beat(handle, &stop));
+        let clients: Vec<_> = (0..clients)
+            .map(|_| {
+                scope.spawn(|| {
+                    let mut caller = Caller::connect(handle)?;
+                    while !stop.load(Ordering::Relaxed) {
+                        work(&mut caller)?;
+                        calls.fetch_add(1, Ordering::Relaxed);
+                    }
+                    Result::Ok(())
+                })
+            })
+            .collect();
+        std::thread::sleep(BESIDE);
+        stop.store(true, Ordering::Relaxed);
+        for client in clients {
+            client.join().map_err(|_| "a client panicked")??;
+        }
+        heartbeats.join().map_err(|_| "the heartbeats panicked")?
+    })?;
+    let of = |percent: usize| times[(times.len() - 1) * percent / 100];
+    let calls = calls.into_inner();
+    let mut out = std::io::stdout();
+    writeln!(
+        out,
+        "| {what} | {calls} | {} | {:.2?} | {:.2?} | {:.2?} |",
+        times.len(),
+        of(50),
+        of(99),
+        times[times.len() - 1]
+    )?;
+    Ok(())
+}
+
+/// A pipeline of `stages` stages, as JSON.
+fn large(stages: usize, seed: u64) -> Result<serde_json::Value> {
+    let mut text =
+        format!("name: large\nseed: {seed}\ndataset: {{format: synthetic}}\nstages:\n  vae: {{kind: train.vae}}\n");
+    for i in 0..stages.saturating_sub(2) {
+        text += &format!("  latents{i}: {{kind: encode.latents}}\n");
+    }
+    let read = protocol::pipeline::read("large.yaml", &text, &[]).map_err(|mistakes| mistakes.to_string())?;
+    Ok(serde_json::to_value(read)?)
+}
+
+fn heartbeats(handle: &Handle) -> Result {
+    let mut out = std::io::stdout();
+    writeln!(out, "\n| beside | calls | heartbeats | median | p99 | longest |\n|---|---|---|---|---|---|")?;
+    beside(handle, "nothing", 0, |_| Ok(()))?;
+    let small = serde_json::to_value(pipeline(77)?)?;
+    let submit = |caller: &mut Caller, pipeline: &serde_json::Value| {
+        let submit = Submit { pipeline: pipeline.clone(), source: String::new(), idempotency_key: None, until: None };
+        let submitted: coordinator::shell::Submitted = caller.post("/v1/runs", &submit)?;
+        caller.post::<serde_json::Value>(&format!("/v1/runs/{}/cancel", submitted.run), &())?;
+        Result::Ok(())
+    };
+    beside(handle, "submissions, 8 clients", 8, |caller| submit(caller, &small))?;
+    let most = large(limits::STAGES, 78)?;
+    beside(handle, "submissions of 1,000 stages, 4 clients", 4, |caller| submit(caller, &most))?;
+    let ask = |caller: &mut Caller, path: &str| match caller.call("GET", path, b"")? {
+        (200, _) => Result::Ok(()),
+        (status, answer) => Err(format!("{path}: {status} {}", String::from_utf8_lossy(&answer)).into()),
+    };
+    beside(handle, "lists of all 10,000 runs, 4 clients", 4, |caller| ask(caller, "/v1/runs?limit=1000000"))?;
+    let blob = format!("/v1/blobs/{}", std::env::var("MANY_EXPORT")?);
+    beside(handle, "exports of 256 MiB, 4 clients", 4, |caller| ask(caller, &blob))?;
+    Ok(())
+}
+
+/// The second life: a restart, timed; submissions, in turns with an empty store; heartbeats.
 async fn again(dir: &Path) -> Result {
+    let mut out = std::io::stdout();
     let begun = Instant::now();
     let handle = Arc::new(start(dir).await?);
     let took = begun.elapsed();
-    let mut out = std::io::stdout();
     writeln!(out, "restart in {took:.2?}, resident {} MB", resident_mb()?)?;
-    let rate = submit_and_cancel(&handle, 2_000_000..2_000_000 + TIMED).await?;
-    writeln!(out, "then: {rate:.0} submissions a second, resident {} MB", resident_mb()?)?;
+    let store = tempfile::tempdir()?;
+    let empty = Arc::new(start(store.path()).await?);
+    let (mut old, mut new, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
+    for round in 0..ROUNDS {
+        let first = 2_000_000 + round * TIMED;
+        new.push(submit_and_cancel(&empty, first..first + TIMED).await?);
+        old.push(submit_and_cancel(&handle, first..first + TIMED).await?);
+        ratios.push(old[old.len() - 1] / new[new.len() - 1]);
+    }
+    let median = |rates: &mut Vec<f64>| {
+        rates.sort_by(f64::total_cmp);
+        rates[rates.len() / 2]
+    };
+    writeln!(
+        out,
+        "submissions a second, each with its cancellation, {CLIENTS} clients, medians of {ROUNDS} times {TIMED}: {:.0} on an empty store, {:.0} on the old one; the median ratio is {:.2}",
+        median(&mut new),
+        median(&mut old),
+        median(&mut ratios),
+    )?;
+    shut(empty).await?;
+    match handle
+        .submit(Submit {
+            pipeline: large(limits::STAGES + 1, 79)?,
+            source: String::new(),
+            idempotency_key: None,
+            until: None,
+        })
+        .await
+    {
+        Err(refused) => writeln!(out, "a pipeline of one stage too many: {refused}")?,
+        Ok(_) => return Err("a pipeline of too many stages was taken".into()),
+    }
+    let beating = Arc::clone(&handle);
+    tokio::task::spawn_blocking(move || heartbeats(&beating)).await??;
+    writeln!(out, "\nresident at the end {} MB", resident_mb()?)?;
     shut(handle).await
 }
 
@@ -113,20 +305,16 @@ async fn main() -> Result {
     }
     let mut out = std::io::stdout();
     let dir = tempfile::tempdir()?;
+    let store = Store::open(dir.path(), Holder::this_process("a bench")).await?;
+    let export = store.blobs().put(&vec![7; EXPORT])?;
+    drop(store);
     let handle = Arc::new(start(dir.path()).await?);
-    let rate = submit_and_cancel(&handle, 1_000_000..1_000_000 + TIMED).await?;
-    writeln!(out, "an empty store: {rate:.0} submissions a second (each with its cancellation), {CLIENTS} clients")?;
-    submit_and_cancel(&handle, 0..RUNS - TIMED).await?;
     let begun = Instant::now();
+    submit_and_cancel(&handle, 0..RUNS - CLIENTS).await?;
     record_facts(&handle, FACTS).await?;
-    writeln!(
-        out,
-        "{RUNS} runs ended, {} facts recorded; the facts beyond the runs took {:.0?}",
-        handle.facts(),
-        begun.elapsed()
-    )?;
+    writeln!(out, "{RUNS} runs ended, {} facts recorded, in {:.0?}", handle.facts(), begun.elapsed())?;
     shut(handle).await?;
     let mut child = std::process::Command::new(std::env::current_exe()?);
-    let ended = child.env("MANY_AGAIN", dir.path()).status()?;
+    let ended = child.env("MANY_AGAIN", dir.path()).env("MANY_EXPORT", export.to_string()).status()?;
     if ended.success() { Ok(()) } else { Err("the second life failed".into()) }
 }

@@ -18,8 +18,10 @@
 //! | C13 | A stage that is swept has a searcher that is not over, and a place for each of its tickets. |
 //! | C14 | What is known twice agrees: which tasks are held or wait, where a task is, what a worker holds, who holds nothing, which stages are active, who uses an execution. |
 //! | C15 | Memory holds what may still matter: no ended run, and no execution that no run uses and nobody works on. |
+//! | C16 | What must survive a restart changes only together with a write. |
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 use protocol::message::RunState;
 
@@ -235,4 +237,29 @@ pub fn check_change(before: &State, after: &State) -> Vec<String> {
         }
     }
     broken
+}
+
+/// What of `before` is not in `after` as it was, though it must survive a restart and no event has changed it: an event that is refused, or
+/// writes nothing, leaves all of it.
+pub fn check_unchanged(before: &State, after: &State) -> Vec<String> {
+    let numbers =
+        |state: &State| (state.draining, state.now, state.seq, state.submitted, state.incarnation, state.fence);
+    let mut broken = Vec::new();
+    let mut same = |what: &str, is_same: bool| {
+        if !is_same {
+            broken.push(format!("C16: {what} changed without a write"));
+        }
+    };
+    same("numbers", numbers(before) == numbers(after));
+    same("workers", Arc::ptr_eq(&before.workers, &after.workers) || before.workers == after.workers);
+    same("unused workers", Arc::ptr_eq(&before.unused, &after.unused) || before.unused == after.unused);
+    same("runs", is_same_map(&before.runs, &after.runs));
+    same("executions", is_same_map(&before.executions, &after.executions));
+    same("tasks", Arc::ptr_eq(&before.tasks, &after.tasks) || before.tasks == after.tasks);
+    broken
+}
+
+fn is_same_map<K: Ord, V: PartialEq>(before: &BTreeMap<K, Arc<V>>, after: &BTreeMap<K, Arc<V>>) -> bool {
+    let pairs = || before.iter().zip(after);
+    before.len() == after.len() && pairs().all(|(a, b)| a.0 == b.0 && (Arc::ptr_eq(a.1, b.1) || a.1 == b.1))
 }

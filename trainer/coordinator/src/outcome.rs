@@ -19,7 +19,9 @@ use protocol::sweep::STATE_OUTPUT;
 use protocol::{Digest, WorkerId};
 use registry::{Write, WriteError};
 
-use crate::decide::{Deciding, Loss, result};
+use crate::decide::attempts::Loss;
+use crate::decide::deciding::Deciding;
+use crate::decide::executions::result;
 use crate::event::{Effect, Event, Known, Rejected};
 use crate::fact::Fact;
 use crate::state::execution::ExecutionState;

@@ -8,7 +8,7 @@ use protocol::message::{RunState, StageState};
 use protocol::stage::{Register, Shape};
 use protocol::{Digest, StageName};
 
-use crate::decide::Deciding;
+use crate::decide::deciding::Deciding;
 use crate::event::{Effect, Millis};
 use crate::fact::Fact;
 use crate::register::Registration;

@@ -15,7 +15,7 @@ use protocol::Digest;
 use protocol::message::Member;
 use protocol::stage::Backend;
 
-use crate::decide::Deciding;
+use crate::decide::deciding::Deciding;
 use crate::fact::Fact;
 use crate::policy::GrantOrder;
 use crate::state::State;

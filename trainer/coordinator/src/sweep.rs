@@ -17,7 +17,7 @@ use std::sync::Arc;
 use protocol::message::{RunState, StageState, SweepView, TrialState, TrialView};
 use protocol::{Digest, Steps};
 
-use crate::decide::Deciding;
+use crate::decide::deciding::Deciding;
 use crate::event::Known;
 use crate::search::{Score, Search, Ticket};
 use crate::state::State;

@@ -16,6 +16,13 @@ pub const SUBMISSION_BYTES: usize = 8 << 20;
 pub const BLOB_BYTES: usize = 8 << 30;
 /// Bytes of all calls together, blobs excepted, that are in memory at a time; more wait.
 pub const CALLS_BYTES: usize = 32 << 20;
+/// Calls of clients that change something (submissions, commands about runs) that wait to be decided; one more is told to come again.
+/// Workers' reports stand in the same queue, which must never be long.
+pub const CLIENTS_WAITING: usize = 64;
+/// Batches of values and log lines that wait to be stored; one more is told to come again.
+pub const BATCHES_WAITING: usize = 64;
+/// After how many seconds whoever is told so should come again.
+pub const COME_AGAIN_S: u32 = 1;
 
 // Pipelines. The range of each numeric setting of a stage stands beside its name, in `pipeline::ranges`.
 

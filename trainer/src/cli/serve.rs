@@ -76,12 +76,18 @@ pub(crate) async fn serve(args: ServeArgs) -> Result<u8> {
         "listening on {url} with the store {}\n  trainer worker join {url}{token}\n  trainer submit PIPELINE --server {url}{token}",
         args.store.display(),
     ));
-    tokio::select! {
-        _ = interrupt.recv() => {}
-        _ = terminate.recv() => {}
-    }
+    let failure = tokio::select! {
+        _ = interrupt.recv() => None,
+        _ = terminate.recv() => None,
+        why = handle.failed() => Some(why),
+    };
     drop(announced);
     // Workers keep training without us and re-attach to the next server.
     handle.shutdown().await;
-    Ok(0)
+    match failure {
+        None => Ok(0),
+        Some(why) => Err(Problem::coordinator_failed(why).hint(
+            "what was acknowledged is stored: start the server again, and workers re-attach; please report this",
+        )),
+    }
 }

@@ -244,6 +244,26 @@ mod tests {
     }
 
     #[test]
+    fn a_recorded_proof_is_of_no_use() {
+        let dial = Dial { task: TaskId::from("t"), generation: Generation(1), from: 1, to: 0, nonce: [7; 16] };
+        let mut recorded = None;
+        let mut play = || {
+            let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
+            let stream = TcpStream::connect(listener.local_addr().expect("bound")).expect("listening");
+            let server = thread::spawn(move || answer(&listener, "s"));
+            let stream = &mut Hurried::new(&stream, Instant::now()).expect("connected");
+            send(stream, Kind::Dial, &dial).expect("sent");
+            let challenge: Challenge = receive(stream, Kind::Challenge).expect("challenged");
+            let proof = *recorded.get_or_insert_with(|| proof("s", "dial", &dial, &challenge.nonce));
+            send(stream, Kind::Proof, &Proof { proof }).expect("sent");
+            server.join().expect("no panic")
+        };
+        assert!(play().is_ok(), "who knows the secret is let in");
+        let again = play();
+        assert!(matches!(again, Err(HandshakeError::Secret(_))), "who has only heard it is not: {again:?}");
+    }
+
+    #[test]
     fn another_secret_is_refused_by_both() {
         let (dialer, dialled) = meet("mine", "yours");
         assert!(matches!(dialer, Err(HandshakeError::Secret(Generation(3)))), "{dialer:?}");

@@ -1,65 +1,45 @@
-//! The one task that decides. Events come over a queue; each is decided on a copy of the state, stored, then published.
+//! The one task that decides. Events come over a queue; what has gathered there is decided and answered by [`Batches`], which
+//! says what to store and does no more than that. This file brings the queue, the clock and the disk.
 //!
-//! What has gathered in the queue while the disk was busy is decided together: one event after the other on one copy, and
-//! all that they write in one transaction. Nobody is answered before it is stored. If the store refuses it, none of it has
-//! happened, and each is tried alone, so that only the one at fault is refused.
-//!
-//! Polls from which nothing follows, nearly all, do not queue behind the disk: they are noted beside the queue and answered at once,
-//! and the actor takes the notes up before it decides anything.
+//! If a part without which nothing goes on panics, the coordinator has failed: everybody who waits and everybody who comes is told so
+//! at once, and [`Handle::trouble`](super::Handle::trouble) says it to whoever runs the process. What was acknowledged is stored.
 
-use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::future::Future;
+use std::panic::AssertUnwindSafe;
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
+use futures::FutureExt as _;
 use protocol::message::{Poll, RunView, Submit};
 use protocol::pipeline::Pipeline;
-use protocol::{Digest, RunId, WorkerId};
+use protocol::{Digest, RunId, WorkerId, limits};
 use registry::{ReadStore, Store, Write, WriteError};
-use tokio::sync::{mpsc, oneshot, watch};
+use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 
-use super::{Records, answer, effects};
-use crate::decide::decide;
+use super::{Records, effects};
+use crate::batch::{Ask, Batches, Done, Front, Refused, Turn};
 use crate::event::{Control, Effect, Event, Millis, Moment, Observation, Rejected};
-use crate::observe::{is_quiet, observe};
-use crate::outcome::refused_for_good;
+use crate::journal;
 use crate::state::State;
-use crate::{invariants, journal};
 
-/// How many events are decided together at most.
-const TOGETHER: usize = 128;
+/// How many asks wait for the actor; more wait for room.
+const QUEUE: usize = 1024;
 
-/// Why a call was refused. Nothing has changed.
-#[derive(Debug, thiserror::Error)]
-pub enum Refused {
-    /// It does not fit what is.
-    #[error(transparent)]
-    Rejected(#[from] Rejected),
-    /// The store did not take it.
-    #[error(transparent)]
-    Write(#[from] WriteError),
-    /// The coordinator is stopping.
-    #[error("the coordinator is stopping")]
-    Stopped,
-}
-
-/// What the actor is asked.
-#[derive(Debug)]
-enum Ask {
-    Event(Box<Event>, oneshot::Sender<Result<Vec<Effect>, Refused>>),
-    /// With the time when it was made: the actor may get to it later, when the disk is slow.
-    Observation(Observation, Millis, oneshot::Sender<Result<(), Refused>>),
-}
+/// Where an answer goes.
+type Reply = oneshot::Sender<Result<Vec<Effect>, Refused>>;
 
 /// What is shared between the actor and those who ask it.
 #[derive(Debug)]
 pub(crate) struct ActorHandle {
-    asks: mpsc::Sender<Ask>,
-    /// The newest quiet poll of each worker that the actor has not taken up yet, and when it came.
-    polls: Mutex<BTreeMap<WorkerId, (Millis, Poll)>>,
-    published: RwLock<Arc<State>>,
+    asks: mpsc::Sender<(Ask, Reply)>,
+    /// Places for calls of clients, and for batches that go past the actor to the disk.
+    pub(crate) clients: Semaphore,
+    pub(crate) batches: Semaphore,
+    front: Arc<Front>,
     changed: watch::Sender<u64>,
     trouble: Mutex<Option<String>>,
+    failure: OnceLock<String>,
     stop: watch::Sender<bool>,
     clock: Clock,
     pub(crate) store: Store,
@@ -74,27 +54,39 @@ pub(super) fn read<T: serde::de::DeserializeOwned>(run: &RunId, text: &str) -> R
 }
 
 impl ActorHandle {
+    async fn ask(&self, ask: Ask) -> Result<Vec<Effect>, Refused> {
+        let (reply, receiver) = oneshot::channel();
+        if self.asks.send((ask, reply)).await.is_ok()
+            && let Ok(answer) = receiver.await
+        {
+            return answer;
+        }
+        // The actor is gone. What it panicked of is known only after all that it held was dropped.
+        let _ = self.stopped().wait_for(|stop| *stop).await;
+        Err(self.over())
+    }
+
+    /// Why nobody answers any more.
+    pub(crate) fn over(&self) -> Refused {
+        self.failure.get().map_or(Refused::Stopped, |failure| Refused::Failed(failure.clone()))
+    }
+
     /// Decides an event; returns once it is stored.
     pub(crate) async fn decide(&self, event: Event) -> Result<Vec<Effect>, Refused> {
-        let (reply, receiver) = oneshot::channel();
-        self.asks.send(Ask::Event(Box::new(event), reply)).await.map_err(|_| Refused::Stopped)?;
-        answer(receiver).await
+        self.ask(Ask::Event(Box::new(event))).await
     }
 
     /// Takes note of what was heard, and decides what follows from it.
     pub(crate) async fn observe(&self, observation: Observation) -> Result<(), Refused> {
-        let (reply, receiver) = oneshot::channel();
-        self.asks.send(Ask::Observation(observation, self.now(), reply)).await.map_err(|_| Refused::Stopped)?;
-        answer(receiver).await
+        self.ask(Ask::Observation(observation, self.now())).await.map(drop)
     }
 
     /// Takes note of a poll; returns once what follows from it is stored.
     pub(crate) async fn poll(&self, worker: WorkerId, poll: Poll) -> Result<(), Refused> {
-        if is_quiet(&self.state(), &worker, &poll)? {
-            self.polls.lock().unwrap_or_else(PoisonError::into_inner).insert(worker, (self.now(), poll));
-            return Ok(());
+        match self.front.poll(self.now(), worker, poll)? {
+            None => Ok(()),
+            Some(ask) => self.ask(ask).await.map(drop),
         }
-        self.observe(Observation::Poll { worker, poll }).await
     }
 
     /// Submits a pipeline.
@@ -168,9 +160,9 @@ impl ActorHandle {
         Records::new(ReadStore::clone(&self.store), self.state(), self.now())
     }
 
-    /// The newest published state.
+    /// The newest stored state.
     pub(crate) fn state(&self) -> Arc<State> {
-        Arc::clone(&self.published.read().unwrap_or_else(PoisonError::into_inner))
+        self.front.state()
     }
 
     /// Ticks with every durable change.
@@ -181,6 +173,36 @@ impl ActorHandle {
     /// Why the store takes no writes, if it does not.
     pub(crate) fn trouble(&self) -> Option<String> {
         self.trouble.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// What has panicked, if something has.
+    pub(crate) fn failure(&self) -> Option<&str> {
+        self.failure.get().map(String::as_str)
+    }
+
+    /// Nothing goes on from here: `what` has panicked.
+    fn fail(&self, what: &str, panic: &(dyn std::any::Any + Send)) {
+        let said = panic.downcast_ref::<String>().map(String::as_str).or(panic.downcast_ref::<&str>().copied());
+        let message = format!("{what} panicked: {}", said.unwrap_or("it did not say why"));
+        tracing::error!("{message}");
+        // The first one tells; those that follow are mostly its consequences.
+        let _ = self.failure.set(message);
+        self.stop();
+        self.changed.send_modify(|version| *version += 1);
+    }
+
+    /// Starts `part`, without which nothing goes on: if it panics, the coordinator has failed.
+    pub(crate) fn spawn(
+        self: &Arc<Self>,
+        what: &'static str,
+        part: impl Future<Output = ()> + Send + 'static,
+    ) -> JoinHandle<()> {
+        let actor_handle = Arc::clone(self);
+        tokio::spawn(async move {
+            if let Err(panic) = AssertUnwindSafe(part).catch_unwind().await {
+                actor_handle.fail(what, &*panic);
+            }
+        })
     }
 
     /// Takes note of whether the store took a write.
@@ -207,13 +229,6 @@ impl ActorHandle {
     /// Becomes true when the coordinator stops.
     pub(crate) fn stopped(&self) -> watch::Receiver<bool> {
         self.stop.subscribe()
-    }
-
-    fn publish(&self, state: &Arc<State>, durable: bool) {
-        *self.published.write().unwrap_or_else(PoisonError::into_inner) = Arc::clone(state);
-        if durable {
-            self.changed.send_modify(|version| *version += 1);
-        }
     }
 }
 
@@ -266,28 +281,43 @@ impl Entropy {
 
 /// Starts the actor on a recovered state.
 pub(crate) fn start(store: Store, state: State) -> (Arc<ActorHandle>, JoinHandle<()>) {
-    let (asks, queue) = mpsc::channel(1024);
-    let state = Arc::new(state);
+    let (asks, queue) = mpsc::channel(QUEUE);
+    let (clock, snapshot_at) = (Clock::new(state.now), state.seq);
+    let batches = Batches::new(state);
     let actor_handle = Arc::new(ActorHandle {
         asks,
-        polls: Mutex::default(),
-        published: RwLock::new(Arc::clone(&state)),
+        clients: Semaphore::new(limits::CLIENTS_WAITING),
+        batches: Semaphore::new(limits::BATCHES_WAITING),
+        front: Arc::clone(batches.front()),
         changed: watch::Sender::new(0),
         trouble: Mutex::new(None),
+        failure: OnceLock::new(),
         stop: watch::Sender::new(false),
-        clock: Clock::new(state.now),
+        clock,
         store,
     });
-    let snapshot_at = state.seq;
-    let actor =
-        Actor { actor_handle: Arc::clone(&actor_handle), state, entropy: Entropy::new(), snapshot_at, snapshot: None };
-    (actor_handle, tokio::spawn(actor.run(queue)))
+    let moments = Moments { actor_handle: Arc::clone(&actor_handle), entropy: Entropy::new() };
+    let actor = Actor { actor_handle: Arc::clone(&actor_handle), batches, moments, snapshot_at, snapshot: None };
+    let task = actor_handle.spawn("the actor, which decides everything,", actor.run(queue));
+    (actor_handle, task)
+}
+
+/// When events are decided, and what is unpredictable about them.
+struct Moments {
+    actor_handle: Arc<ActorHandle>,
+    entropy: Entropy,
+}
+
+impl Moments {
+    fn next(&mut self) -> Moment {
+        Moment { now: self.actor_handle.now(), entropy: self.entropy.next() }
+    }
 }
 
 struct Actor {
     actor_handle: Arc<ActorHandle>,
-    state: Arc<State>,
-    entropy: Entropy,
+    batches: Batches<Reply>,
+    moments: Moments,
     /// The decision at which the newest snapshot was begun.
     snapshot_at: u64,
     /// A snapshot on its way.
@@ -295,166 +325,59 @@ struct Actor {
 }
 
 impl Actor {
-    async fn run(mut self, mut queue: mpsc::Receiver<Ask>) {
+    async fn run(mut self, mut queue: mpsc::Receiver<(Ask, Reply)>) {
         let mut stopped = self.actor_handle.stopped();
         loop {
-            let ask = tokio::select! {
-                biased;
-                _ = stopped.wait_for(|stop| *stop) => return,
-                ask = queue.recv() => ask,
-            };
-            let Some(first) = ask else { return };
-            self.snapshot_if_due();
-            let mut asks = vec![first];
-            while asks.len() < TOGETHER
-                && let Ok(more) = queue.try_recv()
+            if self.batches.is_idle() {
+                let first = tokio::select! {
+                    biased;
+                    _ = stopped.wait_for(|stop| *stop) => return,
+                    first = queue.recv() => first,
+                };
+                let Some((ask, reply)) = first else { return };
+                self.batches.ask(ask, reply);
+            }
+            while self.batches.has_room()
+                && let Ok((ask, reply)) = queue.try_recv()
             {
-                asks.push(more);
+                self.batches.ask(ask, reply);
             }
-            self.take_up_polls();
-            if asks.len() > 1 && self.all_happen(&mut asks).await {
-                continue;
+            self.snapshot_if_due();
+            fail::fail_point!("actor::decide");
+            let mut turn = self.batches.decide(|| self.moments.next());
+            while let Turn::Store(writes) = turn {
+                let written = self.actor_handle.store.write(writes).await;
+                self.actor_handle.wrote(&written);
+                turn = self.batches.stored(written, || self.moments.next());
             }
-            for ask in asks {
-                match ask {
-                    // Whoever asked may have gone away meanwhile; what was decided stands.
-                    Ask::Event(event, reply) => drop(reply.send(self.happen(*event).await)),
-                    Ask::Observation(observation, at, reply) => drop(reply.send(self.hear(observation, at).await)),
-                }
+            if let Turn::Done(done) = turn {
+                self.done(done);
             }
+        }
+    }
+
+    fn done(&self, done: Done<Reply>) {
+        if done.durable {
+            self.actor_handle.changed.send_modify(|version| *version += 1);
+        }
+        for (reply, answer) in done.answers {
+            // Whoever asked may have gone away meanwhile; what was decided stands.
+            let _ = reply.send(answer);
+        }
+        for effect in &done.effects {
+            effects::perform(&self.actor_handle, effect);
         }
     }
 
     /// Stores the state as a whole every so many decisions, beside whatever goes on.
     fn snapshot_if_due(&mut self) {
+        let state = self.batches.state();
         let is_over = self.snapshot.as_ref().is_none_or(JoinHandle::is_finished);
-        if is_over && self.state.seq >= self.snapshot_at + self.state.policy.snapshot_every {
-            self.snapshot_at = self.state.seq;
-            self.snapshot = Some(tokio::spawn(snapshot(self.actor_handle.store.clone(), Arc::clone(&self.state))));
+        if is_over && state.seq >= self.snapshot_at + state.policy.snapshot_every {
+            self.snapshot_at = state.seq;
+            let storing = snapshot(self.actor_handle.store.clone(), Arc::clone(state));
+            self.snapshot = Some(self.actor_handle.spawn("the storing of a snapshot", storing));
         }
-    }
-
-    /// Takes the noted polls for heard, each at its own time.
-    fn take_up_polls(&mut self) {
-        let polls = std::mem::take(&mut *self.actor_handle.polls.lock().unwrap_or_else(PoisonError::into_inner));
-        for (worker, (at, poll)) in polls {
-            // What has changed since it was noted makes it moot; the worker polls again within a second.
-            if matches!(is_quiet(&self.state, &worker, &poll), Ok(true)) {
-                let heard = observe(Arc::make_mut(&mut self.state), at, Observation::Poll { worker, poll });
-                debug_assert!(matches!(&heard, Ok(events) if events.is_empty()), "{heard:?}");
-            }
-        }
-    }
-
-    /// Decides all `asks` in their order, stores what they write at once, and answers them. `false`: the store refused it,
-    /// and nothing has happened.
-    async fn all_happen(&mut self, asks: &mut Vec<Ask>) -> bool {
-        let (mut next, mut writes, mut effects) = (State::clone(&self.state), Vec::new(), Vec::new());
-        let mut decided = Vec::with_capacity(asks.len());
-        for ask in asks.iter() {
-            decided.push(match ask {
-                Ask::Event(event, _) => self.decide_on(&mut next, (**event).clone(), &mut writes),
-                Ask::Observation(observation, at, _) => observe(&mut next, *at, observation.clone()).map(|events| {
-                    let mut follow = Vec::new();
-                    for event in events {
-                        match self.decide_on(&mut next, event, &mut writes) {
-                            Ok(mut effects) => follow.append(&mut effects),
-                            Err(rejected) => tracing::debug!(%rejected, "moot"),
-                        }
-                    }
-                    follow
-                }),
-            });
-        }
-        let durable = !writes.is_empty();
-        if durable {
-            let written = self.actor_handle.store.write(writes).await;
-            self.actor_handle.wrote(&written);
-            if written.is_err() {
-                return false;
-            }
-        }
-        self.state = Arc::new(next);
-        self.actor_handle.publish(&self.state, durable);
-        for (ask, decided) in asks.drain(..).zip(decided) {
-            if let Ok(done) = &decided {
-                effects.extend(done.iter().cloned());
-            }
-            match ask {
-                Ask::Event(_, reply) => drop(reply.send(decided.map_err(Refused::Rejected))),
-                Ask::Observation(_, _, reply) => drop(reply.send(decided.map(drop).map_err(Refused::Rejected))),
-            }
-        }
-        for effect in &effects {
-            effects::perform(&self.actor_handle, effect);
-        }
-        true
-    }
-
-    /// One event on `next`; what it writes is added to `writes`.
-    fn decide_on(&mut self, next: &mut State, event: Event, writes: &mut Vec<Write>) -> Result<Vec<Effect>, Rejected> {
-        let before = cfg!(debug_assertions).then(|| next.clone());
-        let moment = Moment { now: self.actor_handle.now(), entropy: self.entropy.next() };
-        tracing::debug!(?event, "event");
-        let mut effects = decide(next, moment, event)?;
-        if let Some(before) = before {
-            let broken = invariants::check_change(&before, next);
-            assert!(broken.is_empty(), "broken invariants: {broken:#?}");
-        }
-        if let Some(i) = effects.iter().position(|effect| matches!(effect, Effect::Store(_)))
-            && let Effect::Store(mut stored) = effects.remove(i)
-        {
-            writes.append(&mut stored);
-        }
-        Ok(effects)
-    }
-
-    async fn hear(&mut self, observation: Observation, at: Millis) -> Result<(), Refused> {
-        let events = observe(Arc::make_mut(&mut self.state), at, observation)?;
-        for event in events {
-            match self.happen(event).await {
-                Ok(_) => {}
-                // What one event of a batch did may make the next one moot.
-                Err(Refused::Rejected(rejected)) => tracing::debug!(%rejected, "moot"),
-                Err(refused) => return Err(refused),
-            }
-        }
-        self.actor_handle.publish(&self.state, false);
-        Ok(())
-    }
-
-    async fn happen(&mut self, event: Event) -> Result<Vec<Effect>, Refused> {
-        match self.try_happen(event.clone()).await {
-            Err(Refused::Write(error)) => {
-                let Some(instead) = refused_for_good(&event, &error) else { return Err(Refused::Write(error)) };
-                tracing::warn!(%error, "refused by the store");
-                self.try_happen(instead).await?;
-                Err(Refused::Write(error))
-            }
-            result => result,
-        }
-    }
-
-    async fn try_happen(&mut self, event: Event) -> Result<Vec<Effect>, Refused> {
-        let mut next = State::clone(&self.state);
-        let moment = Moment { now: self.actor_handle.now(), entropy: self.entropy.next() };
-        tracing::debug!(?event, "event");
-        let mut effects = decide(&mut next, moment, event)?;
-        let position = effects.iter().position(|effect| matches!(effect, Effect::Store(_)));
-        let Some(Effect::Store(writes)) = position.map(|i| effects.remove(i)) else { return Ok(effects) };
-        if cfg!(debug_assertions) {
-            let broken = invariants::check_change(&self.state, &next);
-            assert!(broken.is_empty(), "broken invariants: {broken:#?}");
-        }
-        let written = self.actor_handle.store.write(writes).await;
-        self.actor_handle.wrote(&written);
-        written?;
-        self.state = Arc::new(next);
-        self.actor_handle.publish(&self.state, true);
-        for effect in &effects {
-            effects::perform(&self.actor_handle, effect);
-        }
-        Ok(effects)
     }
 }
 

@@ -4,9 +4,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use access::Scope::{self, Admin, Promote, Read, Submit, Worker};
-use axum::extract::DefaultBodyLimit;
+use axum::extract::{DefaultBodyLimit, Request, State};
 use axum::handler::Handler;
-use axum::http::{Method, StatusCode};
+use axum::http::{HeaderValue, Method, StatusCode, header};
+use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodFilter, MethodRouter, get, on};
 use axum::{Json, Router, middleware};
@@ -15,9 +16,10 @@ use protocol::limits;
 use protocol::message::ApiError;
 use registry::{QueryError, WriteError};
 
-use super::actor::{ActorHandle, Refused};
+use super::actor::ActorHandle;
 use super::auth::{self, Gate};
 use super::{polls, queries, uploads};
+use crate::batch::Refused;
 use crate::event::Rejected;
 
 /// How long a call may take that waits for nothing but the disk.
@@ -95,8 +97,20 @@ pub(crate) fn router(actor_handle: Arc<ActorHandle>, gate: &Arc<Gate>) -> Router
         // Says nothing but that somebody listens, so that it may be asked without a token.
         .route("/v1/health", get(queries::health))
         .fallback(|| async { Failure::new(StatusCode::NOT_FOUND, "not-found", "there is no such address".to_owned()) })
+        .layer(middleware::from_fn_with_state(Arc::clone(&actor_handle), until_failed))
         .layer(middleware::from_fn_with_state(Arc::clone(gate), auth::check_host))
         .with_state(actor_handle)
+}
+
+/// Lets a request wait for its answer only as long as there is somebody to give it.
+async fn until_failed(State(actor_handle): State<Arc<ActorHandle>>, request: Request, next: Next) -> Response {
+    let mut stopped = actor_handle.stopped();
+    tokio::select! {
+        biased;
+        // An error means that the actor's side is gone, which is a stop too.
+        _ = stopped.wait_for(|stop| *stop) => Failure::from(actor_handle.over()).into_response(),
+        response = next.run(request) => response,
+    }
 }
 
 /// A refused call.
@@ -104,11 +118,19 @@ pub(crate) fn router(actor_handle: Arc<ActorHandle>, gate: &Arc<Gate>) -> Router
 pub(crate) struct Failure {
     status: StatusCode,
     error: ApiError,
+    /// After how many seconds the same call may succeed.
+    retry_after: Option<u32>,
 }
 
 impl Failure {
     pub(crate) fn new(status: StatusCode, code: &str, message: String) -> Self {
-        Self { status, error: ApiError { code: code.to_owned(), message, hint: None } }
+        Self { status, error: ApiError { code: code.to_owned(), message, hint: None }, retry_after: None }
+    }
+
+    /// There is too much of this already; it may come again.
+    pub(crate) fn busy(message: String) -> Self {
+        let failure = Self::new(StatusCode::TOO_MANY_REQUESTS, "busy", message);
+        Self { retry_after: Some(limits::COME_AGAIN_S), ..failure }
     }
 
     pub(crate) fn hint(mut self, hint: &str) -> Self {
@@ -133,7 +155,11 @@ impl Failure {
 
 impl IntoResponse for Failure {
     fn into_response(self) -> Response {
-        (self.status, Json(self.error)).into_response()
+        let mut response = (self.status, Json(self.error)).into_response();
+        if let Some(seconds) = self.retry_after {
+            response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from(seconds));
+        }
+        response
     }
 }
 
@@ -171,6 +197,8 @@ impl From<Refused> for Failure {
             Refused::Rejected(rejected) => rejected.into(),
             Refused::Write(error) => error.into(),
             Refused::Stopped => Self::new(StatusCode::SERVICE_UNAVAILABLE, "internal", refused.to_string()),
+            Refused::Failed(_) => Self::new(StatusCode::SERVICE_UNAVAILABLE, "failed", refused.to_string())
+                .hint("start it again: what was acknowledged is stored; and report this, for it is a bug of Stride's"),
         }
     }
 }

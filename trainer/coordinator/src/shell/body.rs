@@ -11,6 +11,7 @@ use axum::extract::{FromRequest, Request};
 use axum::http::{StatusCode, header};
 use http_body::{Frame, SizeHint};
 use serde::de::DeserializeOwned;
+use tokio::sync::OwnedSemaphorePermit;
 use tokio::time::{Instant, Sleep};
 
 use super::api::{Failure, Route};
@@ -64,9 +65,13 @@ impl HttpBody for Paced {
     }
 }
 
-/// A message as JSON, like `axum::Json`, but bounded by its route and by what all bodies together may take.
+/// A message as JSON, like `axum::Json`, but bounded by its route and by what all bodies together may take: a large one gives its share
+/// of that back when it is answered.
 #[derive(Debug)]
-pub(crate) struct Message<T>(pub(crate) T);
+pub(crate) struct Message<T>(
+    pub(crate) T,
+    #[allow(dead_code, reason = "held for as long as the message is, not read")] pub(crate) Option<OwnedSemaphorePermit>,
+);
 
 impl<S: Sync, T: DeserializeOwned + Send + 'static> FromRequest<S> for Message<T> {
     type Rejection = Failure;
@@ -92,7 +97,8 @@ impl<S: Sync, T: DeserializeOwned + Send + 'static> FromRequest<S> for Message<T
         let most = most.unwrap_or(route.body).min(route.body);
         let permit = if most > LARGE {
             let kibibytes = u32::try_from(most.div_ceil(1 << 10)).unwrap_or(u32::MAX);
-            Some(gate.bodies.clone().acquire_many_owned(kibibytes).await)
+            // The semaphore is never closed.
+            gate.bodies.clone().acquire_many_owned(kibibytes).await.ok()
         } else {
             None
         };
@@ -102,8 +108,9 @@ impl<S: Sync, T: DeserializeOwned + Send + 'static> FromRequest<S> for Message<T
         } else {
             serde_json::from_slice(&bytes)
         };
-        drop(permit);
-        parsed.map(Self).map_err(|error| Failure::invalid(format!("the body does not parse: {error}")))
+        parsed
+            .map(|message| Self(message, permit))
+            .map_err(|error| Failure::invalid(format!("the body does not parse: {error}")))
     }
 }
 

@@ -9,7 +9,8 @@ use registry::blob::{IDLE, Protected};
 use registry::{BlobStore, QueryError};
 use tokio::sync::watch;
 
-use super::actor::{ActorHandle, Refused};
+use super::actor::ActorHandle;
+use crate::batch::Refused;
 use crate::event::{Candidate, Effect, Event, Known, Observation};
 
 /// How long after a failed read of the store it is tried again.
@@ -23,8 +24,14 @@ pub(crate) fn perform(actor_handle: &Arc<ActorHandle>, effect: &Effect) {
     match effect.clone() {
         // Done already, or an answer to whoever sent the event.
         Effect::Store(_) | Effect::Submitted(_) | Effect::Joined(_) | Effect::Wake => {}
-        Effect::Lookup { key } => drop(tokio::spawn(look_up(actor_handle, key))),
-        Effect::Register { key, candidates } => drop(tokio::spawn(register(actor_handle, key, candidates))),
+        Effect::Lookup { key } => {
+            let looking = look_up(Arc::clone(&actor_handle), key);
+            drop(actor_handle.spawn("a look for a stage's value", looking));
+        }
+        Effect::Register { key, candidates } => {
+            let registering = register(Arc::clone(&actor_handle), key, candidates);
+            drop(actor_handle.spawn("the registration of a model", registering));
+        }
         Effect::Prune { task, keep } => drop(tokio::spawn(async move {
             // What is not pruned now is pruned after the next checkpoint.
             if let Err(error) = actor_handle.store.prune_checkpoints(&task, keep).await {
@@ -37,7 +44,7 @@ pub(crate) fn perform(actor_handle: &Arc<ActorHandle>, effect: &Effect) {
 async fn tell(actor_handle: &ActorHandle, event: Event) {
     loop {
         match actor_handle.decide(event.clone()).await {
-            Ok(_) | Err(Refused::Stopped) => return,
+            Ok(_) | Err(Refused::Stopped | Refused::Failed(_)) => return,
             // The state has moved on, or another event has taken this one's place.
             Err(Refused::Rejected(rejected)) => return tracing::debug!(%rejected, "moot"),
             Err(Refused::Write(error)) => {
@@ -164,7 +171,7 @@ pub(crate) async fn tick(actor_handle: Arc<ActorHandle>, every_ms: u64, mut stop
             let overslept = u64::try_from(std::mem::take(&mut overslept).as_millis()).unwrap_or(u64::MAX);
             told = Some(tokio::spawn(async move {
                 match actor_handle.observe(Observation::Tick { overslept }).await {
-                    Ok(()) | Err(Refused::Stopped) => {}
+                    Ok(()) | Err(Refused::Stopped | Refused::Failed(_)) => {}
                     Err(error) => tracing::warn!(%error, "a tick was not stored; trying again"),
                 }
             }));

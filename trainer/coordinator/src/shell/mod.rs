@@ -22,16 +22,16 @@ use protocol::message::{RunView, Submit};
 use protocol::{RunId, WorkerId};
 use registry::{QueryError, Store, WriteError};
 use rustls::ServerConfig;
-use tokio::sync::{oneshot, watch};
+use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
+use crate::batch::Refused;
 use crate::event::{Control, Event, Rejected};
 use crate::journal::{self, RecoverError};
 use crate::policy::Policy;
 use crate::view::WorkerView;
 
 use self::actor::ActorHandle;
-pub use self::actor::Refused;
 pub use self::api::{Route, routes};
 use self::auth::Gate;
 use self::listener::Listener;
@@ -124,6 +124,9 @@ pub enum StartError {
     /// The first event cannot be stored.
     #[error("cannot write to the store: {0}")]
     Store(#[from] WriteError),
+    /// A fault of ours.
+    #[error("{0}; this is a bug of Stride's")]
+    Failed(String),
     /// The first event is refused.
     #[error("cannot recover: {0}")]
     Rejected(#[from] Rejected),
@@ -135,8 +138,19 @@ impl From<Refused> for StartError {
             Refused::Rejected(rejected) => Self::Rejected(rejected),
             Refused::Write(write) => Self::Store(write),
             Refused::Stopped => Self::Rejected(Rejected::Conflict("it was stopped while it started".to_owned())),
+            Refused::Failed(failure) => Self::Failed(failure),
         }
     }
+}
+
+/// Why a coordinator does not go on.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Trouble {
+    /// The store refused the newest write, for want of space or permission; it may take the next one.
+    Store(String),
+    /// A part of the coordinator has panicked: every request is refused from then on. What was acknowledged is stored, and
+    /// another process goes on from there.
+    Failed(String),
 }
 
 /// Starts coordinators.
@@ -166,10 +180,12 @@ impl Coordinator {
         actor_handle.decide(Event::Started { alone: config.alone, park: config.park }).await?;
         effects::let_go(&actor_handle);
         let (stop, stopped) = watch::channel(false);
-        let clock = tokio::spawn(effects::tick(actor_handle.clone(), config.policy.tick_ms, stopped.clone()));
+        let tick = effects::tick(actor_handle.clone(), config.policy.tick_ms, stopped.clone());
+        let clock = actor_handle.spawn("the clock", tick);
         let gate = Arc::new(Gate::new(tokens, &config.hosts));
         let router = api::router(actor_handle.clone(), &gate);
-        let server = tokio::spawn(listener::serve(listeners, router, config.connections.clone(), stopped));
+        let serve = listener::serve(listeners, router, config.connections.clone(), stopped);
+        let server = actor_handle.spawn("the server", serve);
         tracing::info!(%address, "coordinator listens");
         let tls = config.tls.is_some();
         Ok(Handle { address, local, tls, token, actor_handle, stop, tasks: vec![clock, server, actor] })
@@ -260,10 +276,24 @@ impl Handle {
         self.actor_handle.changes()
     }
 
-    /// Why the store refused the newest write for want of space or permission; `None` while it takes writes. As long as it
-    /// stands, nothing goes on: whoever runs the coordinator should say so and stop.
-    pub fn trouble(&self) -> Option<String> {
-        self.actor_handle.trouble()
+    /// Why nothing goes on, if that is so: whoever runs the coordinator should say it and stop.
+    pub fn trouble(&self) -> Option<Trouble> {
+        let failure = self.actor_handle.failure().map(|failure| Trouble::Failed(failure.to_owned()));
+        failure.or_else(|| self.actor_handle.trouble().map(Trouble::Store))
+    }
+
+    /// Returns once a part of the coordinator has panicked, with what it said.
+    pub async fn failed(&self) -> String {
+        let mut changes = self.changes();
+        loop {
+            changes.mark_unchanged();
+            if let Some(failure) = self.actor_handle.failure() {
+                return failure.to_owned();
+            }
+            if changes.changed().await.is_err() {
+                return std::future::pending().await;
+            }
+        }
     }
 
     /// Stops at once. What was acknowledged is in the store; a later start goes on from there, and from a snapshot of the end.
@@ -284,9 +314,4 @@ impl Drop for Handle {
         let _ = self.stop.send(true);
         self.actor_handle.stop();
     }
-}
-
-/// Waits for an answer that may never come because the actor has ended.
-async fn answer<T>(receiver: oneshot::Receiver<Result<T, Refused>>) -> Result<T, Refused> {
-    receiver.await.unwrap_or(Err(Refused::Stopped))
 }

@@ -8,14 +8,14 @@ use axum::extract::{Path, State};
 use protocol::WorkerId;
 use protocol::message::{DesiredAssignments, Join, Joined, PROTOCOL_VERSION, Poll};
 
-use super::actor::{ActorHandle, Refused};
+use super::actor::ActorHandle;
 use super::api::Failure;
 use super::body::Message;
 use crate::event::{Effect, Event, Rejected};
 
 pub(crate) async fn join(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Message(join): Message<Join>,
+    Message(join, _): Message<Join>,
 ) -> Result<Json<Joined>, Failure> {
     if join.protocol != PROTOCOL_VERSION {
         let message = format!(
@@ -38,7 +38,7 @@ pub(crate) async fn join(
 pub(crate) async fn poll(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(worker): Path<WorkerId>,
-    Message(poll): Message<Poll>,
+    Message(poll, _): Message<Poll>,
 ) -> Result<Json<DesiredAssignments>, Failure> {
     let (incarnation, version) = (poll.incarnation, poll.version);
     let mut changes = actor_handle.changes();
@@ -57,7 +57,7 @@ pub(crate) async fn poll(
                     return Ok(Json(desired));
                 }
             }
-            _ = stopped.wait_for(|stop| *stop) => return Err(Refused::Stopped.into()),
+            _ = stopped.wait_for(|stop| *stop) => return Err(actor_handle.over().into()),
         }
     }
 }

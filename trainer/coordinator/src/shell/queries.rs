@@ -9,15 +9,17 @@ use axum::http::header;
 use axum::response::IntoResponse;
 use axum::{Extension, Json};
 use protocol::message::{RunView, Submit};
-use protocol::{Digest, RunId, StageName};
+use protocol::{Digest, RunId, StageName, limits};
 use registry::Curve;
 use registry::LogRow;
 use serde::{Deserialize, Serialize};
+use tokio::sync::SemaphorePermit;
 
 use super::actor::ActorHandle;
 use super::api::Failure;
 use super::auth;
 use super::body::Message;
+use super::effects::blocking;
 use crate::event::{Control, Rejected};
 use crate::view::WorkerView;
 
@@ -84,10 +86,17 @@ pub(crate) async fn workers(State(actor_handle): State<Arc<ActorHandle>>) -> Jso
     Json(actor_handle.state().worker_views())
 }
 
+/// A place among the clients whose calls wait to be decided.
+fn place(actor_handle: &ActorHandle) -> Result<SemaphorePermit<'_>, Failure> {
+    let full = |_| Failure::busy(format!("{} calls of clients wait to be decided already", limits::CLIENTS_WAITING));
+    actor_handle.clients.try_acquire().map_err(full)
+}
+
 pub(crate) async fn submit(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Message(submit): Message<Submit>,
+    Message(submit, _): Message<Submit>,
 ) -> Result<Json<Submitted>, Failure> {
+    let _place = place(&actor_handle)?;
     Ok(Json(Submitted { run: actor_handle.submit(submit).await? }))
 }
 
@@ -97,7 +106,9 @@ pub(crate) async fn runs(
     Query(query): Query<RunsQuery>,
 ) -> Result<impl IntoResponse, Failure> {
     let views = actor_handle.records().run_views(query.limit).await?;
-    Ok(([(header::CONTENT_TYPE, "application/json")], format!("[{}]", views.join(","))))
+    // Beside the threads that answer heartbeats: there may be thousands.
+    let list = blocking(move || format!("[{}]", views.join(","))).await;
+    Ok(([(header::CONTENT_TYPE, "application/json")], list))
 }
 
 pub(crate) async fn run(
@@ -120,7 +131,9 @@ pub(crate) async fn control(
             return Err(Rejected::NotFound(message).into());
         }
     };
+    let place = place(&actor_handle)?;
     actor_handle.control(&run, action).await?;
+    drop(place);
     Ok(Json(actor_handle.run_view(&run).await?))
 }
 
@@ -144,7 +157,7 @@ pub(crate) async fn metrics(
 pub(crate) async fn registry(
     State(actor_handle): State<Arc<ActorHandle>>,
     Extension(caller): Extension<Arc<Caller>>,
-    Message(command): Message<registry::cli::Command>,
+    Message(command, _): Message<registry::cli::Command>,
 ) -> Result<Json<registry::cli::Answer>, Failure> {
     let scope = command.scope();
     if !caller.scopes.allow(scope) {

@@ -34,7 +34,12 @@ const MAX_BLOB_BYTES: u64 = limits::BLOB_BYTES as u64;
 /// How long a body may rest before the upload counts as cut.
 const BODY_IDLE: Duration = Duration::from_secs(30);
 
+/// Stores a batch of values or lines, unless too many wait for that already.
 async fn write(actor_handle: &ActorHandle, write: Write) -> Result<Json<()>, Failure> {
+    let Ok(_place) = actor_handle.batches.try_acquire() else {
+        let most = limits::BATCHES_WAITING;
+        return Err(Failure::busy(format!("{most} batches of values and lines wait for the disk already")));
+    };
     let written = actor_handle.store.write(vec![write]).await;
     actor_handle.wrote(&written);
     written?;
@@ -43,7 +48,7 @@ async fn write(actor_handle: &ActorHandle, write: Write) -> Result<Json<()>, Fai
 
 pub(crate) async fn metrics(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Message(batch): Message<MetricBatch>,
+    Message(batch, _): Message<MetricBatch>,
 ) -> Result<Json<()>, Failure> {
     actor_handle.state().check_telemetry(&batch.grant)?;
     write(&actor_handle, Write::Metrics { grant: batch.grant, rows: batch.rows }).await
@@ -51,7 +56,7 @@ pub(crate) async fn metrics(
 
 pub(crate) async fn logs(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Message(batch): Message<LogBatch>,
+    Message(batch, _): Message<LogBatch>,
 ) -> Result<Json<()>, Failure> {
     actor_handle.state().check_telemetry(&batch.grant)?;
     write(&actor_handle, Write::Logs { grant: batch.grant, first: batch.first, lines: batch.lines }).await
@@ -59,7 +64,7 @@ pub(crate) async fn logs(
 
 pub(crate) async fn checkpoint(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Message(commit): Message<CommitCheckpoint>,
+    Message(commit, _): Message<CommitCheckpoint>,
 ) -> Result<Json<()>, Failure> {
     actor_handle.decide(Event::Checkpoint { commit }).await?;
     Ok(Json(()))
@@ -67,7 +72,7 @@ pub(crate) async fn checkpoint(
 
 pub(crate) async fn outcome(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Message(report): Message<ReportOutcome>,
+    Message(report, _): Message<ReportOutcome>,
 ) -> Result<Json<()>, Failure> {
     actor_handle.decide(Event::Outcome { report }).await?;
     Ok(Json(()))
@@ -206,9 +211,7 @@ impl From<Unstored> for Failure {
             Unstored::Resume(ResumeError::Offset { .. }) => {
                 Self::new(StatusCode::RANGE_NOT_SATISFIABLE, "offset", message)
             }
-            Unstored::Resume(ResumeError::Busy | ResumeError::TooMany(_)) => {
-                Self::new(StatusCode::TOO_MANY_REQUESTS, "busy", message)
-            }
+            Unstored::Resume(ResumeError::Busy | ResumeError::TooMany(_)) => Self::busy(message),
             // These bytes came damaged, which says nothing about what is stored.
             Unstored::Resume(ResumeError::Blob(BlobError::Corrupt { .. } | BlobError::Refused(_))) => {
                 Self::invalid(message)

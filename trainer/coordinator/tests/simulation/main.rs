@@ -1,6 +1,7 @@
-//! The real `decide` among fake workers, a fake store and virtual time, all driven by one seed: calls are dropped, doubled,
-//! delayed and so reordered, workers die and hang, the store fills up, the coordinator is killed between any two events
-//! and on either side of a commit, and comes back by replay. Invariants are checked after every event; in the end
+//! The real `decide` and the batches of the real actor among fake workers, a fake store and virtual time, all driven by one seed: calls
+//! are dropped, doubled, delayed and so reordered, workers die, hang, are slow or cannot reach each other, the clock is late, the store
+//! fills up and is collected, the coordinator is killed between any two events and while a commit is in flight, with the power or
+//! without, and comes back by replay. [`INJECTED`] lists it all. Invariants are checked after every event; in the end
 //! everything that was submitted is done exactly once.
 //!
 //! `SIM_SEED=n` replays one seed; `SIM_SEEDS=n` runs so many instead of the 2,000 of every `cargo test`. A seed that fails
@@ -15,6 +16,7 @@ mod wild;
 mod worker;
 mod world;
 
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use coordinator::event::Known;
@@ -22,10 +24,12 @@ use coordinator::{Event, Millis};
 use protocol::message::StageState;
 use protocol::stage::WorkerRange;
 
-use crate::world::{CHAOS_MS, World};
+use crate::world::{CHAOS_MS, INJECTED, World};
 
 /// Seeds of every run of the tests, beside those that once failed.
 const SEEDS: u64 = 2_000;
+/// Of so many seeds at least one has each thing that goes wrong.
+const ENOUGH: usize = 100;
 
 /// What a seed came to.
 #[derive(Debug, Default)]
@@ -33,13 +37,25 @@ struct Tally {
     events: u64,
     runs: usize,
     restarts: usize,
-    torn: u64,
+    injected: BTreeMap<&'static str, u64>,
+}
+
+impl Tally {
+    fn add(&mut self, other: Self) {
+        self.events += other.events;
+        self.runs += other.runs;
+        self.restarts += other.restarts;
+        for (what, times) in other.injected {
+            *self.injected.entry(what).or_default() += times;
+        }
+    }
 }
 
 fn simulate(seed: u64) -> Tally {
     let mut world = World::new(seed);
     world.run();
-    Tally { events: world.events, runs: world.runs().len(), restarts: world.starts, torn: world.torn }
+    let runs = world.runs().len();
+    Tally { events: world.events, runs, restarts: world.starts, injected: world.injected }
 }
 
 fn seeds_file() -> std::path::PathBuf {
@@ -67,12 +83,7 @@ fn whatever_happens_every_run_ends_and_every_task_is_done_once() {
         let (mut sum, mut failed) = (Tally::default(), Vec::new());
         while let Some(seed) = seeds.get(next.fetch_add(1, Ordering::Relaxed)) {
             match std::panic::catch_unwind(|| simulate(*seed)) {
-                Ok(tally) => {
-                    sum.events += tally.events;
-                    sum.runs += tally.runs;
-                    sum.restarts += tally.restarts;
-                    sum.torn += tally.torn;
-                }
+                Ok(tally) => sum.add(tally),
                 Err(_) => failed.push(*seed),
             }
         }
@@ -83,20 +94,25 @@ fn whatever_happens_every_run_ends_and_every_task_is_done_once() {
         let threads: Vec<_> = (0..threads).map(|_| scope.spawn(execution)).collect();
         threads.into_iter().map(|thread| thread.join().expect("panics are caught")).collect()
     });
-    let sum = |of: fn(&Tally) -> u64| done.iter().map(|(tally, _)| of(tally)).sum::<u64>();
+    let (mut sum, mut failed) = (Tally::default(), Vec::new());
+    for (tally, seeds) in done {
+        sum.add(tally);
+        failed.extend(seeds);
+    }
     let took = begun.elapsed().as_secs_f64();
-    eprintln!(
-        "{} seeds in {took:.1} s, {:.0} a second: {} events, {} runs, {} starts, {} kills at a commit",
-        seeds.len(),
-        seeds.len() as f64 / took,
-        sum(|tally| tally.events),
-        sum(|tally| tally.runs as u64),
-        sum(|tally| tally.restarts as u64),
-        sum(|tally| tally.torn),
-    );
-    let failed: Vec<u64> = done.into_iter().flat_map(|(_, failed)| failed).collect();
+    let each = seeds.len() as f64 / took;
+    eprintln!("{} seeds in {took:.1} s, {each:.0} a second", seeds.len());
+    eprintln!("{} events, {} runs, {} starts", sum.events, sum.runs, sum.restarts);
+    let times = |what| sum.injected.get(what).copied().unwrap_or_default();
+    for what in INJECTED {
+        eprintln!("{:>9} times {what}", times(what));
+    }
     keep(&failed);
     assert!(failed.is_empty(), "replay with SIM_SEED={}; these seeds failed: {failed:?}", failed[0]);
+    if seeds.len() >= ENOUGH {
+        let missing: Vec<&str> = INJECTED.into_iter().filter(|what| times(what) == 0).collect();
+        assert!(missing.is_empty(), "none of {} seeds had {missing:?}", seeds.len());
+    }
 }
 
 /// Adds seeds that failed to those that are always run.

@@ -44,16 +44,16 @@ fn make_the_store() {
     let submit = Event::Submit { pipeline, source: String::new(), idempotency_key: Some("once".into()), until: None };
     world.submissions = vec![(world.now, submit)];
     let trials_done =
-        |world: &World| world.state.runs.values().flat_map(|run| &run.sweeps).any(|s| s.search.score(14).is_some());
+        |world: &World| world.state().runs.values().flat_map(|run| &run.sweeps).any(|s| s.search.score(14).is_some());
     for _ in 0..4_000 {
         world.step();
-        if trials_done(&world) && holds_with_a_checkpoint(&world.state) {
+        if trials_done(&world) && holds_with_a_checkpoint(world.state()) {
             break;
         }
     }
-    let lost = world.state.workers.iter().find(|(_, worker)| worker.holds.is_some()).expect("one works").0.clone();
+    let lost = world.state().workers.iter().find(|(_, worker)| worker.holds.is_some()).expect("one works").0.clone();
     world.happen(Event::WorkerGone { worker: lost }).expect("taken");
-    while !holds_with_a_checkpoint(&world.state) {
+    while !holds_with_a_checkpoint(world.state()) {
         world.step();
     }
     let first = world.store.recovery.facts.len() / 2;
@@ -78,10 +78,10 @@ fn a_store_of_another_build_opens_under_another_policy_and_goes_on() {
             Policy { grants, lease_ms, backoff_ms, fault_budget: 3, infrastructure_budget: 3, ..world.policy };
         world.store = FakeStore::from_json(&text);
         assert!(world.store.recovery.snapshot.is_some() && world.store.recovery.facts.len() > 50, "both are there");
-        world.state = journal::recover(world.policy.clone(), &world.store.recovery).expect("it opens");
-        assert!(holds_with_a_checkpoint(&world.state), "a task is held");
-        let run = world.state.runs.values().next().expect("a run").id.clone();
-        world.now = world.state.now.after(60_000);
+        world.recovered();
+        assert!(holds_with_a_checkpoint(world.state()), "a task is held");
+        let run = world.state().runs.values().next().expect("a run").id.clone();
+        world.now = world.state().now.after(60_000);
         world.happen(Event::Started { alone: false, park: false }).expect("starts");
         world.run();
         let run = *world.store.archived(&run).expect("it ended");

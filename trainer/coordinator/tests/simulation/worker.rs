@@ -25,6 +25,20 @@ pub(crate) enum Call {
     Report(ReportOutcome),
 }
 
+impl Call {
+    /// What was uploaded before.
+    pub(crate) fn uploaded(&self) -> Option<Digest> {
+        match self {
+            Self::Join(_) | Self::Poll(_) => None,
+            Self::Commit(commit) => Some(commit.manifest),
+            Self::Report(report) => match report.outcome {
+                TaskOutcome::Finished { output, .. } => Some(output),
+                TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => None,
+            },
+        }
+    }
+}
+
 /// What travels back.
 #[derive(Debug, Clone)]
 pub(crate) enum Answer {
@@ -97,14 +111,15 @@ impl FakeWorker {
         if is_odd { "avx512".to_owned() } else { "avx2".to_owned() }
     }
 
-    /// A new process.
-    pub(crate) fn launch(&mut self) {
+    /// A new process; `true` if it is slow to fetch what a task needs.
+    pub(crate) fn launch(&mut self) -> bool {
         // Half of them are on a slow line.
         let fetches_ms = match lot(&format!("{} {}", self.name, self.process)) {
             quick @ 0..128 => u64::from(quick),
             slow => u64::from(slow) * 100,
         };
         *self = Self { process: self.process + 1, alive: true, fetches_ms, ..Self::new(self.name.as_str()) };
+        fetches_ms >= 10_000
     }
 
     pub(crate) fn runs(&self, now: Millis) -> bool {

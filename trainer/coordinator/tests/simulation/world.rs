@@ -1,21 +1,51 @@
 //! The world of a seed: the coordinator as it is, what it stores, and everything that is on its way.
 
+mod disk;
 mod steps;
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
-use coordinator::observe::is_quiet;
+use coordinator::batch::{Ask, Batches};
 use coordinator::state::run::Run;
-use coordinator::{Control, Effect, Event, Millis, Moment, Observation, Policy, Rejected, State};
-use coordinator::{decide, invariants, journal, observe, refused_for_good};
-use protocol::message::{RunState, TaskOutcome};
+use coordinator::{Control, Effect, Event, Millis, Policy, Refused, State, journal};
+use protocol::message::RunState;
 use protocol::stage::WorkerRange;
-use protocol::{Digest, RunId, WorkerId};
+use protocol::{Digest, Incarnation, RunId, WorkerId};
 
+use self::disk::{Disk, Ticket};
 use crate::pipelines;
 use crate::random::Random;
-use crate::store::{FakeStore, Refusal};
+use crate::store::FakeStore;
 use crate::worker::{Answer, Call, FakeWorker};
+
+/// Everything that goes wrong in some seed. What is never counted has silently gone missing from the simulation.
+pub(crate) const INJECTED: [&str; 24] = [
+    "a call that was lost",
+    "a call that came twice",
+    "a worker that died",
+    "a worker that was stopped",
+    "a cut between peers that both reach the coordinator",
+    "a member whom its peers could not reach",
+    "a slow joiner",
+    "a late tick of a clock that overslept",
+    "a late tick of a slow disk",
+    "a lease that expired",
+    "a batch of several",
+    "a batch that the store refused, each tried alone",
+    "a full disk",
+    "an ask that came while a commit was in flight",
+    "a quiet poll answered while a commit was in flight",
+    "a collection of what was not named yet",
+    "a checkpoint refused for a missing blob",
+    "an outcome refused for a missing blob",
+    "a gate that does not hold",
+    "a crash between decide and commit",
+    "a crash between commit and answer",
+    "a loss of power before the commit was synced",
+    "a loss of power that spared what was synced",
+    "a snapshot that was overtaken by facts",
+];
 
 /// How long things go wrong.
 pub(crate) const CHAOS_MS: u64 = 180_000;
@@ -26,7 +56,23 @@ pub(crate) struct World {
     pub(crate) random: Random,
     pub(crate) now: Millis,
     pub(crate) store: FakeStore,
-    pub(crate) state: State,
+    /// What the coordinator's actor drives, too.
+    batches: Batches<u64>,
+    disk: Disk,
+    /// Who waits for an answer.
+    asked: BTreeMap<u64, Ticket>,
+    tickets: u64,
+    /// The answer for whoever waits in [`World::happen`].
+    answered: Option<Result<Vec<Effect>, Refused>>,
+    /// Snapshots on their way, and when they get there.
+    snapshots: Vec<(Millis, Arc<State>)>,
+    /// The newest poll of each process that was answered, and the same when the batch in flight was decided.
+    heard: BTreeMap<(WorkerId, Incarnation), Millis>,
+    heard_then: BTreeMap<(WorkerId, Incarnation), Millis>,
+    /// The processes that had a lease after the newest batch.
+    present: BTreeMap<WorkerId, Incarnation>,
+    /// What went wrong, and how often.
+    pub(crate) injected: BTreeMap<&'static str, u64>,
     /// The coordinator runs.
     pub(crate) up: bool,
     pub(crate) back_at: Millis,
@@ -39,34 +85,19 @@ pub(crate) struct World {
     pub(crate) submissions: Vec<(Millis, Event)>,
     pub(crate) checkpoint_steps: BTreeMap<Digest, u64>,
     pub(crate) events: u64,
+    /// Runs that somebody asked to cancel.
     pub(crate) cancelled: Vec<RunId>,
-    /// Kills on either side of a commit: what the disk has is all that is left.
-    pub(crate) torn: u64,
     /// Try every event now and then.
     pub(crate) wild: bool,
-    /// Kill the coordinator after each stored event whose number is a multiple of the first, from the second on; its answer is lost.
+    /// Kill the coordinator after each stored batch whose number is a multiple of the first, from the second on; its answers are lost.
     pub(crate) kills: Option<(u64, u64)>,
     /// Only the first of them.
     pub(crate) once: bool,
     pub(crate) stored: u64,
     /// Starts of the coordinator.
     pub(crate) starts: usize,
-    /// Reports that named what was collected before.
-    pub(crate) missing: usize,
     /// Until when nobody looks at the clock, and since when.
     pub(crate) asleep: Option<(Millis, Millis)>,
-}
-
-/// What a worker uploaded before it reported this.
-fn named(event: &Event) -> Option<Digest> {
-    match event {
-        Event::Checkpoint { commit } => Some(commit.manifest),
-        Event::Outcome { report } => match report.outcome {
-            TaskOutcome::Finished { output, .. } => Some(output),
-            TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => None,
-        },
-        _ => None,
-    }
 }
 
 fn policy() -> Policy {
@@ -100,7 +131,16 @@ impl World {
             now: Millis(0),
             store: FakeStore::default(),
             policy: policy(),
-            state: State::new(policy()),
+            batches: Batches::new(State::new(policy())),
+            disk: Disk::Idle,
+            asked: BTreeMap::new(),
+            tickets: 0,
+            answered: None,
+            snapshots: Vec::new(),
+            heard: BTreeMap::new(),
+            heard_then: BTreeMap::new(),
+            present: BTreeMap::new(),
+            injected: BTreeMap::new(),
             up: true,
             back_at: Millis(0),
             effects: Vec::new(),
@@ -112,13 +152,11 @@ impl World {
             checkpoint_steps: BTreeMap::new(),
             events: 0,
             cancelled: Vec::new(),
-            torn: 0,
             wild: false,
             kills: None,
             once: false,
             stored: 0,
             starts: 0,
-            missing: 0,
             asleep: None,
         }
     }
@@ -127,144 +165,66 @@ impl World {
         self.now.0 < CHAOS_MS
     }
 
-    /// One event through the real thing: decide on a copy, store, publish.
+    /// Counts something that went wrong.
+    pub(crate) fn count(&mut self, what: &'static str) {
+        debug_assert!(INJECTED.contains(&what), "`{what}` is not in the list");
+        *self.injected.entry(what).or_default() += 1;
+    }
+
+    /// The newest stored state that the coordinator knows of.
+    pub(crate) fn state(&self) -> &State {
+        self.batches.state()
+    }
+
+    /// Somebody asks, and waits until it is answered, while everything else stands still.
     pub(crate) fn happen(&mut self, event: Event) -> Result<Vec<Effect>, Refused> {
-        self.events += 1;
-        let moment = Moment { now: self.now, entropy: self.random.digest() };
-        let mut next = self.state.clone();
         let starts = matches!(event, Event::Started { .. });
-        let joins = matches!(event, Event::Join { .. });
-        let decided = decide(&mut next, moment, event.clone());
-        let mut effects = match decided {
-            Ok(effects) => effects,
-            Err(rejected) => {
-                assert_eq!(durable(&next), durable(&self.state), "a rejected {event:?} changed the state");
-                return Err(Refused::Rejected(rejected));
-            }
-        };
-        let broken = invariants::check_change(&self.state, &next);
-        let what: String = format!("{event:?}").chars().take(300).collect();
-        assert!(broken.is_empty(), "after {what} at {:?}: {broken:#?}", self.now);
-        let wrote = matches!(effects.first(), Some(Effect::Store(_)));
-        if wrote {
-            let Effect::Store(writes) = effects.remove(0) else { unreachable!() };
-            if self.chaos() && self.random.chance(1) {
-                return Err(Refused::Store(Refusal::Full));
-            }
-            let torn = (self.chaos() && self.random.chance(1)).then(|| self.random.below(2));
-            if torn == Some(0) {
-                // The transaction was being written: the database rolls it back, whatever part of it lay on the disk.
-                self.torn += 1;
-                self.crash();
-                return Err(Refused::Killed);
-            }
-            if self.chaos() && self.random.chance(1) {
-                // The collector comes between an upload and the report that names it.
-                self.store.collected.extend(named(&event));
-            }
-            let written = self.store.write(&writes);
-            if let Err(Refusal::Missing(digest)) = written {
-                // Whoever tries again uploads it again.
-                self.store.collected.clear();
-                let error = registry::WriteError::NotFound(format!("blob {digest} is not in the store"));
-                self.missing += 1;
-                if let Some(instead) = refused_for_good(&event, &error) {
-                    self.happen(instead)?;
-                }
-                return Err(Refused::Store(Refusal::Missing(digest)));
-            }
-            self.store.collected.clear();
-            written.map_err(Refused::Store)?;
-            if torn == Some(1) {
-                // It is durable, and nobody was told: the caller hears nothing, no other effect happens.
-                self.torn += 1;
-                self.crash();
-                self.state = next;
-                return Err(Refused::Killed);
-            }
-        } else {
-            assert_eq!(durable(&next), durable(&self.state), "{event:?} changed something without a write");
+        self.ask(Ask::Event(Box::new(event)), Ticket::Caller);
+        let ticket = self.tickets;
+        while self.up && self.asked.contains_key(&ticket) {
+            self.disk.hurry();
+            self.turn();
         }
-        self.state = next;
-        self.stored += 1;
-        self.starts += usize::from(starts);
-        if self.chaos() && self.random.chance(2) {
-            self.store.snapshot(&self.state);
-        }
-        // Whoever never hears that it has joined joins for ever.
-        let spared = !wrote || starts || (joins && !self.once);
-        if let Some((every, from)) = self.kills
-            && !spared
-            && self.stored >= from
-            && self.stored.is_multiple_of(every)
-        {
-            self.effects.clear();
-            if self.once {
-                self.kills = None;
-            }
-            self.recovered();
-            self.happen(Event::Started { alone: false, park: false }).expect("starts again");
-            return Err(Refused::Store(Refusal::Full));
-        }
-        for effect in &effects {
-            if let Effect::Lookup { .. } | Effect::Register { .. } = effect {
-                let at = self.now.after(self.random.below(if self.chaos() { 3000 } else { 10 }));
-                self.effects.push((at, effect.clone()));
-            }
-        }
-        Ok(effects)
+        let answer = self.answered.take().unwrap_or(Err(Refused::Stopped));
+        self.starts += usize::from(starts && answer.is_ok());
+        answer
     }
 
-    fn hear(&mut self, observation: Observation) -> Result<(), Refused> {
-        let quiet = match &observation {
-            Observation::Poll { worker, poll } => is_quiet(&self.state, worker, poll) == Ok(true),
-            Observation::Tick { .. } => false,
-        };
-        let events = observe(&mut self.state, self.now, observation).map_err(Refused::Rejected)?;
-        assert!(!quiet || events.is_empty(), "a poll from which nothing follows gave {events:?}");
-        for event in events {
-            match self.happen(event) {
-                Ok(_) => {}
-                Err(Refused::Rejected(rejected)) => drop(rejected.to_string()),
-                Err(refused @ (Refused::Store(_) | Refused::Killed)) => return Err(refused),
-            }
-        }
-        Ok(())
-    }
-
-    fn perform(&mut self, effect: Effect) {
-        let event = match &effect {
-            Effect::Lookup { key } => self.store.look_up(*key),
-            Effect::Register { key, candidates } => Event::Bundled {
-                key: *key,
-                bundles: candidates.iter().map(|c| Digest::of(c.stage.as_str().as_bytes())).collect(),
-            },
-            _ => return,
-        };
-        match (self.happen(event), &effect) {
-            (Ok(_) | Err(Refused::Rejected(_) | Refused::Killed), _) => {}
-            (Err(Refused::Store(Refusal::Gate)), Effect::Register { key, .. }) => {
-                let refused = Event::RegisterRefused { key: *key, message: "a gate does not hold".into() };
-                if self.happen(refused).is_err() {
-                    self.effects.push((self.now.after(1000), effect));
-                }
-            }
-            (Err(Refused::Store(_)), _) => self.effects.push((self.now.after(1000), effect)),
-        }
-    }
-
+    /// The process is gone: what is stored is what was, and whoever waits hears nothing.
     fn crash(&mut self) {
         self.up = false;
         self.back_at = self.now.after(self.random.below(40_000));
+        self.forget();
+    }
+
+    /// All that was in the memory of the coordinator is gone.
+    fn forget(&mut self) {
         self.effects.clear();
+        self.snapshots.clear();
+        match self.disk.lose() {
+            Disk::Idle => {}
+            Disk::Writing { .. } => self.count("a crash between decide and commit"),
+            Disk::Written { .. } => self.count("a crash between commit and answer"),
+        }
+        for ticket in std::mem::take(&mut self.asked).into_values() {
+            // Whoever cannot know whether it was taken sends it again, under a key; without one, it may count twice.
+            if let Ticket::Submission(event) = ticket {
+                self.submissions.push((self.now.after(500), *event));
+            }
+        }
     }
 
     /// What is stored is what was; whoever comes back goes on from it.
-    fn recovered(&mut self) {
+    pub(crate) fn recovered(&mut self) {
         let recovered =
             journal::recover(self.policy.clone(), &self.store.recovery).expect("what is stored can be recovered");
-        assert_eq!(durable(&recovered), durable(&self.state), "recovery gives what was");
-        self.state = recovered;
+        // A commit that was in flight may be there, though nobody was told.
+        assert!(recovered.seq >= self.state().seq, "what was acknowledged is gone");
+        if recovered.seq == self.state().seq {
+            assert_eq!(durable(&recovered), durable(self.state()), "recovery gives what was");
+        }
+        self.batches = Batches::new(recovered);
+        self.present = self.present_now();
     }
 
     fn recover(&mut self) {
@@ -277,17 +237,11 @@ impl World {
             }
         }
         // A coordinator that cannot store its first event does not start.
-        loop {
-            match self.happen(Event::Started { alone, park: false }) {
-                Ok(_) => return,
-                Err(Refused::Killed) => return,
-                Err(Refused::Rejected(_) | Refused::Store(_)) => {}
-            }
-        }
+        while self.up && self.happen(Event::Started { alone, park: false }).is_err() {}
     }
 
     pub(crate) fn is_over(&self) -> bool {
-        self.submissions.is_empty() && self.up && self.state.runs.is_empty()
+        self.submissions.is_empty() && self.up && self.asked.is_empty() && self.state().runs.is_empty()
     }
 
     pub(crate) fn run(&mut self) {
@@ -295,7 +249,7 @@ impl World {
             self.step();
         }
         let held: Vec<_> = self
-            .state
+            .state()
             .executions
             .values()
             .flat_map(|execution| &execution.tasks)
@@ -319,23 +273,23 @@ impl World {
             assert_eq!(*times, 1, "{task} was accepted {times} times");
         }
         self.recovered();
-        let held: usize = self.state.executions.values().map(|execution| execution.tasks.held().count()).sum();
-        assert!(self.state.executions.len() <= held, "all that is left in memory is what workers are leaving");
+        let held: usize = self.state().executions.values().map(|execution| execution.tasks.held().count()).sum();
+        assert!(self.state().executions.len() <= held, "all that is left in memory is what workers are leaving");
     }
 
     /// All runs, whether they go on or have ended, by submission.
     pub(crate) fn runs(&self) -> Vec<Run> {
-        let ended = self.store.ended.keys().filter(|run| self.state.run(run).is_err());
+        let ended = self.store.ended.keys().filter(|run| self.state().run(run).is_err());
         let ended = ended.map(|run| *self.store.archived(run).expect("it ended"));
-        let mut runs: Vec<Run> = self.state.runs.values().map(|run| Run::clone(run)).chain(ended).collect();
+        let mut runs: Vec<Run> = self.state().runs.values().map(|run| Run::clone(run)).chain(ended).collect();
         runs.sort_by_key(|run| run.number);
         runs
     }
 
     /// As clients see them.
     pub(crate) fn views(&self) -> Vec<protocol::message::RunView> {
-        let view = |run: Run| match self.state.run(&run.id) {
-            Ok(run) => self.state.view(run, self.now),
+        let view = |run: Run| match self.state().run(&run.id) {
+            Ok(run) => self.state().view(run, self.now),
             Err(_) => self.store.view(&run.id).expect("it ended"),
         };
         self.runs().into_iter().map(view).collect()
@@ -343,17 +297,14 @@ impl World {
 
     /// As the shell does: a run that has ended is handed in.
     pub(crate) fn control(&mut self, run: &RunId, action: Control) -> Result<Vec<Effect>, Refused> {
-        let archived = if self.state.run(run).is_ok() { None } else { self.store.archived(run) };
-        self.happen(Event::Control { run: run.clone(), action, archived })
+        let event = self.control_event(run, action);
+        self.happen(event)
     }
-}
 
-#[derive(Debug)]
-pub(crate) enum Refused {
-    Rejected(Rejected),
-    Store(Refusal),
-    /// The coordinator was killed while it stored the event; who asked hears nothing.
-    Killed,
+    fn control_event(&self, run: &RunId, action: Control) -> Event {
+        let archived = if self.state().run(run).is_ok() { None } else { self.store.archived(run) };
+        Event::Control { run: run.clone(), action, archived }
+    }
 }
 
 /// What must survive a restart.

@@ -1,82 +1,128 @@
 //! What happens in a quarter of a second: mischief, what the coordinator hears and does, what the workers say and compute.
 
-use coordinator::event::Observation;
-use coordinator::{Control, Effect, Event, Millis, Moment, Rejected, decide, invariants};
-use protocol::message::RunState;
-use protocol::{Digest, WorkerId};
+use coordinator::batch::Ask;
+use coordinator::{Control, Effect, Event, Millis, Moment, Observation, Refused, Rejected, decide, invariants};
+use protocol::message::{Poll, RunState};
+use protocol::{Digest, Incarnation, WorkerId};
+use registry::WriteError;
 
-use super::{Refused, World, durable};
-use crate::store::Refusal;
+use super::disk::{Disk, Ticket};
+use super::{World, durable};
 use crate::wild;
 use crate::worker::{Answer, Call, FakeWorker, Saving};
 
 impl World {
     fn deliver(&mut self, i: usize, process: u32, call: Call) {
         let name = self.workers[i].name.clone();
+        let ask = match &call {
+            Call::Join(join) => Ask::Event(Box::new(Event::Join { join: join.clone() })),
+            Call::Poll(poll) => match self.poll(&name, poll) {
+                Ok(Some(ask)) => ask,
+                Ok(None) => return self.send_desired(i, process, poll.incarnation),
+                Err(_) => return self.send_away(i, process),
+            },
+            Call::Commit(commit) => {
+                self.checkpoint_steps.insert(commit.manifest, commit.step);
+                Ask::Event(Box::new(Event::Checkpoint { commit: commit.clone() }))
+            }
+            Call::Report(report) => Ask::Event(Box::new(Event::Outcome { report: report.clone() })),
+        };
+        let stale = match &call {
+            Call::Report(report) => {
+                matches!(self.state().check_write(&report.grant), Err(Rejected::StaleFence { .. }))
+            }
+            _ => false,
+        };
+        let ticket = Ticket::Call { i, process, call: Box::new(call), at: self.now, stale };
+        self.ask(ask, ticket);
+    }
+
+    /// Polls from which nothing follows are answered beside the queue.
+    fn poll(&mut self, name: &WorkerId, poll: &Poll) -> Result<Option<Ask>, Rejected> {
+        let asked = self.batches.front().poll(self.now, name.clone(), poll.clone())?;
+        if asked.is_none() {
+            self.heard.insert((name.clone(), poll.incarnation), self.now);
+            if !matches!(self.disk, Disk::Idle) {
+                self.count("a quiet poll answered while a commit was in flight");
+            }
+        }
+        Ok(asked)
+    }
+
+    /// Whoever sent the call is told what came of it.
+    pub(super) fn answer_call(
+        &mut self,
+        (i, process): (usize, u32),
+        call: Call,
+        (at, stale): (Millis, bool),
+        answer: Result<Vec<Effect>, Refused>,
+    ) {
         let saving = match &call {
             Call::Join(_) | Call::Poll(_) => Saving::No,
             Call::Commit(commit) => Saving::Commit(commit.clone()),
             Call::Report(report) => Saving::Report(report.clone()),
         };
-        let done = Answer::Done(saving.clone());
-        let (lifetime, answer) = match call {
-            Call::Join(join) => (
-                true,
-                self.happen(Event::Join { join }).map(|effects| {
-                    let joined = effects.into_iter().find_map(|effect| match effect {
-                        Effect::Joined(incarnation) => Some(Answer::Joined(incarnation)),
-                        _ => None,
-                    });
-                    joined.expect("a join gives an incarnation")
-                }),
-            ),
-            Call::Poll(poll) => {
-                let incarnation = poll.incarnation;
-                let heard = self.hear(Observation::Poll { worker: name.clone(), poll });
-                let desired = self.state.desired(&name, incarnation).map_err(Refused::Rejected);
-                (true, heard.and(desired).map(Answer::DesiredAssignments))
+        let answer = match (call, answer) {
+            (Call::Poll(poll), Ok(_)) => {
+                let name = self.workers[i].name.clone();
+                let heard = self.heard.entry((name, poll.incarnation)).or_default();
+                *heard = at.max(*heard);
+                return self.send_desired(i, process, poll.incarnation);
             }
-            Call::Commit(commit) => {
-                self.checkpoint_steps.insert(commit.manifest, commit.step);
-                (false, self.happen(Event::Checkpoint { commit }).map(|_| done))
+            (Call::Join(_), Ok(effects)) => {
+                let joined = effects.into_iter().find_map(|effect| match effect {
+                    Effect::Joined(incarnation) => Some(Answer::Joined(incarnation)),
+                    _ => None,
+                });
+                joined.expect("a join gives an incarnation")
             }
-            Call::Report(report) => {
-                let known = self.state.check_write(&report.grant);
-                let stored = self.happen(Event::Outcome { report });
-                if let Err(Rejected::StaleFence { .. }) = known {
-                    let counted = match stored {
-                        Ok(effects) => !effects.is_empty(),
-                        Err(Refused::Killed) => true,
-                        Err(Refused::Rejected(_) | Refused::Store(_)) => false,
-                    };
-                    assert!(!counted, "a stale report counted");
-                    (false, Err(Refused::Rejected(Rejected::Conflict("stale".into()))))
-                } else {
-                    (false, stored.map(|_| done))
-                }
+            (Call::Commit(_), Ok(_)) => Answer::Done(saving),
+            (Call::Report(_), Ok(effects)) => {
+                assert!(!stale || effects.is_empty(), "a stale report counted");
+                if stale { Answer::Refused(saving) } else { Answer::Done(saving) }
             }
-        };
-        let answer = match answer {
-            Ok(answer) => answer,
+            // The process is not known any more.
+            (Call::Join(_) | Call::Poll(_), Err(Refused::Rejected(_))) => return self.send_away(i, process),
+            (Call::Commit(_) | Call::Report(_), Err(Refused::Rejected(_))) => Answer::Refused(saving),
             // What it named is gone; the try has failed.
-            Err(Refused::Store(Refusal::Missing(_))) => Answer::Refused(saving),
-            Err(Refused::Store(_)) => Answer::Later,
-            // The connection is gone with whoever held it.
-            Err(Refused::Killed) => return,
-            Err(Refused::Rejected(_)) if lifetime => {
-                if self.workers[i].process == process {
-                    self.workers[i].forget();
-                }
-                return;
+            (call, Err(Refused::Write(WriteError::NotFound(_)))) => {
+                self.count(match call {
+                    Call::Commit(_) => "a checkpoint refused for a missing blob",
+                    _ => "an outcome refused for a missing blob",
+                });
+                // Whoever tries again uploads it again.
+                self.store.collected.clear();
+                Answer::Refused(saving)
             }
-            Err(Refused::Rejected(_)) => Answer::Refused(saving),
+            (_, Err(_)) => Answer::Later,
         };
+        self.acknowledge(&answer);
         self.send_answer(i, process, answer);
+    }
+
+    fn send_desired(&mut self, i: usize, process: u32, incarnation: Incarnation) {
+        let name = self.workers[i].name.clone();
+        let desired = self.batches.front().state().desired(&name, incarnation);
+        match desired {
+            Ok(desired) => {
+                let answer = Answer::DesiredAssignments(desired);
+                self.acknowledge(&answer);
+                self.send_answer(i, process, answer);
+            }
+            Err(_) => self.send_away(i, process),
+        }
+    }
+
+    /// The worker is to join again.
+    fn send_away(&mut self, i: usize, process: u32) {
+        if self.workers[i].process == process {
+            self.workers[i].forget();
+        }
     }
 
     fn send_answer(&mut self, i: usize, process: u32, answer: Answer) {
         if self.chaos() && self.random.chance(8) {
-            return;
+            return self.count("a call that was lost");
         }
         let delay = self.delay();
         self.answers.push((self.now.after(delay), i, process, answer));
@@ -96,10 +142,13 @@ impl World {
             0..12 => {
                 let was_alive = self.workers[i].alive;
                 self.workers[i].alive = false;
+                if was_alive {
+                    self.count("a worker that died");
+                }
                 if was_alive && self.up && self.random.chance(50) {
                     let worker = self.workers[i].name.clone();
                     // The launcher tells what it saw; if that is lost, the lease does.
-                    let _ = self.happen(Event::WorkerGone { worker });
+                    self.ask(Ask::Event(Box::new(Event::WorkerGone { worker })), Ticket::Nobody);
                 }
             }
             40..48 => {
@@ -107,9 +156,13 @@ impl World {
                 if other != i {
                     let until = self.now.after(self.random.below(20_000));
                     self.cuts.push((self.workers[i].name.clone(), self.workers[other].name.clone(), until));
+                    self.count("a cut between peers that both reach the coordinator");
                 }
             }
-            12..20 => self.workers[i].hung_until = self.now.after(self.random.below(40_000)),
+            12..20 => {
+                self.workers[i].hung_until = self.now.after(self.random.below(40_000));
+                self.count("a worker that was stopped");
+            }
             20..24 if self.up => self.crash(),
             24..40 if self.up && !self.store.runs.is_empty() => {
                 let run = self.random.below(self.store.runs.len() as u64) as usize;
@@ -119,18 +172,36 @@ impl World {
                     2 | 3 => Control::Resume,
                     _ => Control::Cancel,
                 };
-                // Whether it was taken shows in the state: a coordinator that is killed after the commit does not answer.
-                let _ = self.control(&run, action);
-                if action == Control::Cancel && self.store.runs[&run] == "cancelled" {
-                    self.cancelled.push(run);
+                if action == Control::Cancel {
+                    self.cancelled.push(run.clone());
                 }
+                let event = self.control_event(&run, action);
+                self.ask(Ask::Event(Box::new(event)), Ticket::Nobody);
             }
+            48 => self.lose_power(),
+            50..60 => self.collect(),
             _ => {}
         }
-        for worker in &mut self.workers {
-            if !worker.alive && self.random.chance(4) {
-                worker.launch();
+        for i in 0..self.workers.len() {
+            if !self.workers[i].alive && self.random.chance(4) {
+                self.launch(i);
             }
+        }
+    }
+
+    fn launch(&mut self, i: usize) {
+        if self.workers[i].launch() {
+            self.count("a slow joiner");
+        }
+    }
+
+    /// The collector runs: whatever is on its way here and named by nothing that is stored goes.
+    fn collect(&mut self) {
+        let named: Vec<Digest> = self.calls.iter().filter_map(|(.., call)| call.uploaded()).collect();
+        let loose: Vec<Digest> = named.into_iter().filter(|digest| !self.store.is_rooted(*digest)).collect();
+        if !loose.is_empty() {
+            self.count("a collection of what was not named yet");
+            self.store.collected.extend(loose);
         }
     }
 
@@ -139,16 +210,16 @@ impl World {
         if self.chaos() {
             self.mischief();
         } else {
-            for worker in &mut self.workers {
-                if !worker.alive {
-                    worker.launch();
+            for i in 0..self.workers.len() {
+                if !self.workers[i].alive {
+                    self.launch(i);
                 }
             }
             if self.up {
-                for run in self.state.runs.values().cloned().collect::<Vec<_>>() {
-                    if run.state == RunState::Paused && self.up {
-                        self.control(&run.id, Control::Resume).expect("resumes");
-                    }
+                let paused = self.state().runs.values().filter(|run| run.state == RunState::Paused);
+                for run in paused.map(|run| run.id.clone()).collect::<Vec<_>>() {
+                    // It may end meanwhile.
+                    drop(self.control(&run, Control::Resume));
                 }
             }
         }
@@ -170,24 +241,20 @@ impl World {
 
     fn coordinator_step(&mut self) {
         let now = self.now;
+        self.advance();
         let (due, later) = std::mem::take(&mut self.submissions).into_iter().partition(|(at, _)| *at <= now);
         self.submissions = later;
         for (_, event) in due {
-            if !self.up {
-                self.submissions.push((now.after(500), event));
-                continue;
-            }
             // The shell looks for the key in the tables first.
             if let Event::Submit { idempotency_key: Some(key), .. } = &event
-                && self.store.keys.contains_key(key)
+                && self.synced().keys.contains_key(key)
             {
                 continue;
             }
-            match self.happen(event.clone()) {
-                Err(Refused::Store(_)) => self.submissions.push((now.after(500), event)),
-                // Whoever cannot know whether it was taken sends it again, under a key; without one, it may count twice.
-                Err(Refused::Killed) => self.submissions.push((now.after(500), event)),
-                Ok(_) | Err(Refused::Rejected(_)) => {}
+            if self.up {
+                self.ask(Ask::Event(Box::new(event.clone())), Ticket::Submission(Box::new(event)));
+            } else {
+                self.submissions.push((now.after(500), event));
             }
         }
         let (due, later): (Vec<_>, Vec<_>) =
@@ -202,39 +269,64 @@ impl World {
         for (_, i, process, call) in extract(&mut self.calls, now) {
             if self.up {
                 self.deliver(i, process, call);
+                // What comes close together is decided together, or not.
+                if self.random.chance(30) {
+                    self.advance();
+                }
             }
         }
+        self.clock();
+        self.advance();
+    }
+
+    /// The clock is looked at every second, but for when it oversleeps or its look waits for the disk.
+    fn clock(&mut self) {
+        let now = self.now;
         if self.chaos() && self.asleep.is_none() && self.random.chance(1) {
             self.asleep = Some((now.after(self.random.below(12_000)), now));
         }
-        match self.asleep {
-            Some((until, _)) if now < until => {}
+        let overslept = match self.asleep {
+            Some((until, _)) if now < until => return,
             Some((_, since)) => {
                 self.asleep = None;
-                // A slow disk or a process that was stopped: the clock knows which.
-                let overslept = if self.random.chance(50) { now.since(since) } else { 0 };
-                if self.up && self.hear(Observation::Tick { overslept }).is_err() {
-                    // Stored at the next tick.
-                }
+                // A process that was stopped, or a slow disk: the clock knows which.
+                let is_stopped = self.random.chance(50);
+                self.count(match is_stopped {
+                    true => "a late tick of a clock that overslept",
+                    false => "a late tick of a slow disk",
+                });
+                if is_stopped { now.since(since) } else { 0 }
             }
-            None => {
-                if self.up && now.0.is_multiple_of(1000) && self.hear(Observation::Tick { overslept: 0 }).is_err() {
-                    // Stored at the next tick.
-                }
-            }
+            None if now.0.is_multiple_of(1000) => 0,
+            None => return,
+        };
+        if self.up {
+            self.ask(Ask::Observation(Observation::Tick { overslept }, now), Ticket::Tick { at: now });
         }
+    }
+
+    fn perform(&mut self, effect: Effect) {
+        let event = match &effect {
+            Effect::Lookup { key } => self.store.look_up(*key),
+            Effect::Register { key, candidates } => Event::Bundled {
+                key: *key,
+                bundles: candidates.iter().map(|c| Digest::of(c.stage.as_str().as_bytes())).collect(),
+            },
+            _ => return,
+        };
+        self.ask(Ask::Event(Box::new(event)), Ticket::Effect(Box::new(effect)));
     }
 
     /// Whatever could happen now, on copies: nothing panics, and the invariants hold.
     fn try_everything(&mut self) {
-        for event in wild::events(&self.state, &self.runs()) {
+        for event in wild::events(self.state(), &self.runs()) {
             let moment = Moment { now: self.now, entropy: Digest::of(b"wild") };
-            let mut next = self.state.clone();
+            let mut next = self.state().clone();
             let result = decide(&mut next, moment, event.clone());
-            let broken = invariants::check_change(&self.state, &next);
+            let broken = invariants::check_change(self.state(), &next);
             assert!(broken.is_empty(), "after {event:?}: {broken:#?}");
             if !matches!(result.as_ref().map(|effects| effects.first()), Ok(Some(Effect::Store(_)))) {
-                assert_eq!(durable(&next), durable(&self.state), "{event:?} gave {result:?} and changed the state");
+                assert_eq!(durable(&next), durable(self.state()), "{event:?} gave {result:?} and changed the state");
             }
         }
     }
@@ -253,16 +345,21 @@ impl World {
                 .map(|other| other.name.clone())
                 .collect();
             for call in self.workers[i].speak(now, &unreachable) {
-                let copies = if self.chaos() && self.random.chance(8) { 2 } else { 1 };
-                for _ in 0..copies {
-                    if !(self.chaos() && self.random.chance(8)) {
+                let twice = self.chaos() && self.random.chance(8);
+                if twice {
+                    self.count("a call that came twice");
+                }
+                for _ in 0..1 + usize::from(twice) {
+                    if self.chaos() && self.random.chance(8) {
+                        self.count("a call that was lost");
+                    } else {
                         let delay = self.delay();
                         self.calls.push((now.after(delay), i, process, call.clone()));
                     }
                 }
             }
             let Some(grant) = self.workers[i].grant().cloned() else { continue };
-            let task = self.state.task(&grant.task).ok().map(|(_, task)| task);
+            let task = self.state().task(&grant.task).ok().map(|(_, task)| task);
             let members = task.map(|task| task.holders().to_vec()).unwrap_or_default();
             let peers: Vec<&FakeWorker> =
                 self.workers.iter().filter(|w| members.iter().any(|member| member.worker == w.name)).collect();

@@ -1,0 +1,115 @@
+//! Tries at tasks: how one ends, whether another follows, and with which members a gang goes on.
+
+use protocol::message::Member;
+use protocol::{Digest, Fence, TaskId, WorkerId};
+
+use super::deciding::Deciding;
+use crate::event::Rejected;
+use crate::fact::Fact;
+use crate::state::execution::ExecutionState;
+use crate::state::gang::{self, Change};
+use crate::state::task::{Lease, Part, Task};
+
+/// Why a worker no longer holds what it held.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Loss {
+    /// It was lost: counts against the task's budget.
+    Lost,
+    /// The coordinator's own restart: counts against nothing.
+    Restart,
+}
+
+impl Deciding<'_> {
+    pub(crate) fn take_from(&mut self, key: Digest, i: usize, lost: &[WorkerId], loss: Loss) {
+        let execution = &self.state.executions[&key];
+        let task = &execution.tasks[i];
+        let change = match task.part {
+            Part::Gang => gang::without(task.holders(), lost, execution.range()),
+            Part::Alone | Part::Shard { .. } | Part::Merge => Change::Disband,
+        };
+        match change {
+            Change::Keep => {}
+            Change::Regroup(members) => self.regroup(key, i, members),
+            Change::Disband if loss == Loss::Restart => {
+                let fence = self.change(key, i, |task| task.release(None));
+                self.fences.push(fence);
+            }
+            Change::Disband => {
+                let names: Vec<&str> = lost.iter().map(WorkerId::as_str).collect();
+                self.try_again(key, i, &format!("lost worker {}", names.join(", ")), false);
+            }
+        }
+    }
+
+    /// Ends a try. The next begins after a back-off, unless the budget is spent: then the work has failed.
+    pub(crate) fn try_again(&mut self, key: Digest, i: usize, why: &str, fault: bool) {
+        let (now, policy) = (self.now(), self.state.policy.clone());
+        let tried = self.change(key, i, |task| {
+            let drain_by = matches!(task.lease, Lease::Held { drain_by: Some(_), .. });
+            task.streak += 1;
+            let (count, budget, what) = if fault {
+                (&mut task.faults, policy.fault_budget, "faults")
+            } else {
+                (&mut task.losses, policy.infrastructure_budget, "lost workers and network errors")
+            };
+            *count += u32::from(!drain_by);
+            if *count > budget {
+                return Err(format!("gave up after {count} {what}; the last: {why}"));
+            }
+            Ok(task.release((!drain_by).then(|| now.after(policy.backoff(task.streak)))))
+        });
+        match tried {
+            Ok(fence) => self.fences.push(fence),
+            Err(message) => self.fail_execution(key, message, fault),
+        }
+    }
+
+    pub(crate) fn fail_execution(&mut self, key: Digest, message: String, own: bool) {
+        self.record(Fact::ExecutionState { key, state: ExecutionState::Failed { message, own } });
+        // Whoever still works on it can write no more.
+        let held: Vec<usize> = self.state.executions[&key].tasks.held().collect();
+        for i in held {
+            let fence = self.change(key, i, |task| task.release(None));
+            self.fences.push(fence);
+        }
+    }
+
+    pub(crate) fn regroup(&mut self, key: Digest, i: usize, members: Vec<Member>) {
+        let secret = self.secret(&self.state.executions[&key].tasks[i]);
+        let fence = self.change(key, i, |task| task.regroup(members, secret));
+        self.fences.push(fence);
+    }
+
+    /// Unpredictable, and different for every generation.
+    pub(crate) fn secret(&self, task: &Task) -> impl FnOnce(Fence) -> String + use<> {
+        let (entropy, id) = (self.moment.entropy, task.id.clone());
+        move |fence| Digest::of(format!("{entropy} {id} {fence}").as_bytes()).hex()
+    }
+
+    pub(crate) fn grace_over(&mut self, task: &TaskId, fence: Fence) -> Result<bool, Rejected> {
+        let now = self.now();
+        let (key, i) = self.place(task)?;
+        let task = &self.state.executions[&key].tasks[i];
+        let over = match task.lease {
+            Lease::Held { drain_by, .. } => drain_by.is_some_and(|deadline| deadline <= now) && task.fence == fence,
+            Lease::Waiting { .. } | Lease::Done { .. } => false,
+        };
+        if over {
+            let fence = self.change(key, i, |task| task.release(None));
+            self.fences.push(fence);
+        }
+        Ok(over)
+    }
+
+    pub(crate) fn backoff_over(&mut self, task: &TaskId) -> Result<bool, Rejected> {
+        let now = self.now();
+        let (key, i) = self.place(task)?;
+        Ok(self.change(key, i, |task| match &mut task.lease {
+            Lease::Waiting { not_before } if not_before.is_some_and(|time| time <= now) => {
+                *not_before = None;
+                true
+            }
+            Lease::Waiting { .. } | Lease::Held { .. } | Lease::Done { .. } => false,
+        }))
+    }
+}

@@ -1,0 +1,166 @@
+//! A decision under way: the facts so far, what they imply for the store, and what they touch. [`Deciding::record`] is the one way to
+//! change the state; every part of a decision goes through it.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use protocol::{Digest, TaskId};
+use registry::Write;
+
+use crate::event::{Effect, Millis, Moment, Rejected};
+use crate::fact::{Fact, TaskChange};
+use crate::state::State;
+use crate::state::run::{Run, Status};
+use crate::state::task::Task;
+
+/// A decision under way.
+#[derive(Debug)]
+pub(crate) struct Deciding<'a> {
+    pub(crate) state: &'a mut State,
+    pub(crate) moment: Moment,
+    pub(crate) facts: Vec<Fact>,
+    pub(crate) writes: Vec<Write>,
+    pub(crate) fences: Vec<Write>,
+    pub(crate) effects: Vec<Effect>,
+    /// Runs that were touched and are not reconciled yet.
+    pub(crate) unsettled: BTreeSet<u64>,
+    /// Runs that were touched.
+    pub(crate) runs: BTreeSet<u64>,
+    /// Executions that were touched, or whose users were.
+    pub(crate) touched: BTreeSet<Digest>,
+}
+
+impl<'a> Deciding<'a> {
+    pub(crate) fn new(state: &'a mut State, moment: Moment) -> Self {
+        Self {
+            state,
+            moment,
+            facts: Vec::new(),
+            writes: Vec::new(),
+            fences: Vec::new(),
+            effects: Vec::new(),
+            unsettled: BTreeSet::new(),
+            runs: BTreeSet::new(),
+            touched: BTreeSet::new(),
+        }
+    }
+
+    /// Makes a fact true, and keeps it: the only way to change the state.
+    pub(crate) fn record(&mut self, fact: Fact) {
+        self.touch(&fact);
+        if let Err(misfit) = self.state.apply(&fact) {
+            panic!("{misfit}: {fact:?}");
+        }
+        self.facts.push(fact);
+    }
+
+    /// Notes what `fact`, which comes next, may have consequences for.
+    fn touch(&mut self, fact: &Fact) {
+        let mut runs = Vec::new();
+        match fact {
+            Fact::Run { run } => runs.push(run.number),
+            Fact::RunState { run, .. } => {
+                runs.push(*run);
+                let known = self.state.runs.get(run).into_iter();
+                self.touched.extend(known.flat_map(|run| &run.stages).filter_map(|status| match status {
+                    Status::Active { key } => Some(*key),
+                    _ => None,
+                }));
+            }
+            Fact::Stages { run, stages } => {
+                runs.push(*run);
+                if let Some(run) = self.state.runs.get(run) {
+                    let before = stages.iter().filter_map(|(i, _)| run.stages.get(*i)?.key());
+                    self.touched.extend(before);
+                }
+                self.touched.extend(stages.iter().filter_map(|(_, status)| status.key()));
+            }
+            Fact::StagesAdded { run, .. } | Fact::SweepBegun { run, .. } | Fact::SweepMoved { run, .. } => {
+                runs.push(*run)
+            }
+            Fact::RunForgotten { run } => {
+                let known = self.state.runs.get(run).into_iter();
+                self.touched.extend(known.flat_map(|run| &run.stages).filter_map(Status::key));
+            }
+            Fact::Execution { execution } => drop(self.touched.insert(execution.key)),
+            Fact::ExecutionState { key, .. } => {
+                self.touched.insert(*key);
+                runs.extend(self.state.executions.get(key).into_iter().flat_map(|execution| execution.users.keys()));
+            }
+            Fact::ExecutionPlacement { key, .. }
+            | Fact::ExecutionSource { key, .. }
+            | Fact::ExecutionTime { key, .. }
+            | Fact::ExecutionResumed { key }
+            | Fact::ExecutionInstructions { key, .. }
+            | Fact::Tasks { key, .. }
+            | Fact::Task { key, .. } => drop(self.touched.insert(*key)),
+            Fact::Draining { .. } => {
+                let held = self.state.workers.values().filter_map(|worker| worker.holds);
+                self.touched.extend(held.map(|(key, _)| key));
+            }
+            Fact::ExecutionForgotten { .. } | Fact::Worker { .. } | Fact::WorkerForgotten { .. } => {}
+        }
+        self.unsettled.extend(&runs);
+        self.runs.extend(runs);
+    }
+
+    /// Changes a task: what `change` makes of it is the fact, not how.
+    pub(crate) fn change<T>(&mut self, key: Digest, i: usize, change: impl FnOnce(&mut Task) -> T) -> T {
+        let before = &self.state.executions[&key].tasks[i];
+        let mut after = before.clone();
+        let made = change(&mut after);
+        let new = TaskChange::between(before, &after);
+        if !new.is_nothing() {
+            self.record(Fact::Task { key, task: i, change: Box::new(new) });
+        }
+        debug_assert_eq!(self.state.executions[&key].tasks[i], after);
+        made
+    }
+
+    /// Changes a run: what `change` makes of it is the fact, not how.
+    pub(crate) fn change_run<T>(&mut self, number: u64, change: impl FnOnce(&mut Run) -> T) -> T {
+        let before = Arc::clone(&self.state.runs[&number]);
+        let mut after = Run::clone(&before);
+        let made = change(&mut after);
+        let stages = after.pipeline.stages[before.pipeline.stages.len()..].to_vec();
+        if !stages.is_empty() {
+            self.record(Fact::StagesAdded { run: number, stages });
+        }
+        for sweep in &after.sweeps {
+            match before.sweep(sweep.stage) {
+                Some(old) if Arc::ptr_eq(old, sweep) => {}
+                Some(old) => {
+                    let is_new = |(trial, why): &(&usize, &String)| old.failures.get(*trial) != Some(*why);
+                    let failures = sweep.failures.iter().filter(is_new).map(|(trial, why)| (*trial, why.clone()));
+                    self.record(Fact::SweepMoved {
+                        run: number,
+                        stage: sweep.stage,
+                        progress: sweep.search.since(&old.search),
+                        places: sweep.places[old.places.len()..].to_vec(),
+                        failures: failures.collect(),
+                    });
+                }
+                None => self.record(Fact::SweepBegun { run: number, sweep: Box::new(Clone::clone(&**sweep)) }),
+            }
+        }
+        let is_new = |(i, status): &(usize, &Status)| before.stages.get(*i).unwrap_or(&Status::Waiting) != *status;
+        let stages: Vec<(usize, Status)> =
+            after.stages.iter().enumerate().filter(is_new).map(|(i, status)| (i, status.clone())).collect();
+        if !stages.is_empty() {
+            self.record(Fact::Stages { run: number, stages });
+        }
+        if (before.state, before.parked) != (after.state, after.parked) {
+            self.record(Fact::RunState { run: number, state: after.state, parked: after.parked });
+        }
+        debug_assert_eq!(*self.state.runs[&number], after);
+        made
+    }
+
+    pub(crate) fn now(&self) -> Millis {
+        self.moment.now
+    }
+
+    pub(crate) fn place(&self, task: &TaskId) -> Result<(Digest, usize), Rejected> {
+        self.state.place(task)
+    }
+}

@@ -1,0 +1,115 @@
+//! Executions: what the store knows of a stage, what an earlier try left, and what becomes of it.
+
+use std::sync::Arc;
+
+use protocol::message::Grant;
+use protocol::{Digest, RunId, StageName};
+use registry::Write;
+
+use super::deciding::Deciding;
+use crate::event::{Effect, Known, Millis, Rejected};
+use crate::fact::Fact;
+use crate::state::execution::{ExecutionState, StageExecution};
+use crate::state::task::Task;
+
+impl Deciding<'_> {
+    pub(crate) fn looked_up(
+        &mut self,
+        key: Digest,
+        known: Option<Known>,
+        source: Option<(RunId, StageName)>,
+        archived: Option<Box<StageExecution>>,
+    ) -> bool {
+        let Some(execution) = self.state.executions.get(&key).map(Arc::clone) else { return false };
+        if execution.state != ExecutionState::Looking {
+            return false;
+        }
+        match (known, &execution.registration) {
+            (Some(known), _) => {
+                if let Some((run, stage)) = source
+                    && execution.tasks.is_empty()
+                {
+                    self.record(Fact::ExecutionSource { key, run, stage });
+                }
+                let state = ExecutionState::Done { known: Arc::new(known), cached: true };
+                self.record(Fact::ExecutionState { key, state });
+            }
+            (None, Some(registration)) => {
+                let candidates = registration.candidates.clone();
+                self.record(Fact::ExecutionState { key, state: ExecutionState::Bundling });
+                self.effects.push(Effect::Register { key, candidates });
+            }
+            (None, None) => {
+                let fence = self.state.fence;
+                match archived.filter(|archived| archived.key == key && !archived.tasks.is_empty()) {
+                    _ if !execution.tasks.is_empty() => {}
+                    Some(archived) => self.take_up(&archived),
+                    None => self.record(Fact::Tasks { key, tasks: execution.new_tasks(fence) }),
+                }
+                self.record(Fact::ExecutionState { key, state: ExecutionState::Open });
+            }
+        }
+        true
+    }
+
+    /// Goes on from what an earlier try left.
+    fn take_up(&mut self, archived: &StageExecution) {
+        let (key, fence) = (archived.key, self.state.fence);
+        let again = |task: &Task| {
+            let mut task = Task { fence: task.fence.max(fence), ..task.clone() };
+            task.reset_budgets();
+            task
+        };
+        let (run, stage) = (archived.run.clone(), archived.stage.clone());
+        self.record(Fact::ExecutionSource { key, run: run.clone(), stage });
+        self.record(Fact::Tasks { key, tasks: archived.tasks.iter().map(again).collect() });
+        if let Some(instruction_set) = archived.instruction_set.clone() {
+            self.record(Fact::ExecutionInstructions { key, instruction_set });
+        }
+        self.record(Fact::ExecutionTime { key, wall_ms: archived.wall_ms, busy_since: None });
+        if archived.resumed || archived.has_something() {
+            self.resumed(key);
+        }
+        self.writes.push(Write::Archive { key, run, stage: archived.stage.clone(), execution: None });
+    }
+
+    /// It goes on from something that an earlier try has saved.
+    pub(crate) fn resumed(&mut self, key: Digest) {
+        if !self.state.executions[&key].resumed {
+            self.record(Fact::ExecutionResumed { key });
+        }
+    }
+
+    pub(crate) fn bundled(&mut self, key: Digest, bundles: &[Digest]) -> Result<bool, Rejected> {
+        if self.state.executions.get(&key).is_none_or(|execution| execution.state != ExecutionState::Bundling) {
+            return Ok(false);
+        }
+        let now = self.now();
+        let execution = Arc::clone(&self.state.executions[&key]);
+        let registration = execution.registration.as_ref().expect("bundling is registering");
+        if bundles.len() != registration.candidates.len() {
+            return Err(Rejected::Invalid(format!("stage `{}` needs a bundle for each candidate", execution.stage)));
+        }
+        let (known, mut writes) = registration.writes(&execution.run, &execution.stage, bundles);
+        writes.push(result(&execution, None, &known, now));
+        let state = ExecutionState::Done { known: Arc::new(known), cached: false };
+        self.record(Fact::ExecutionState { key, state });
+        self.writes.append(&mut writes);
+        Ok(true)
+    }
+}
+
+/// The write that makes a stage's value known under its key.
+pub(crate) fn result(execution: &StageExecution, grant: Option<Grant>, known: &Known, now: Millis) -> Write {
+    Write::StageResult {
+        grant,
+        key: execution.key,
+        run: execution.run.clone(),
+        stage: execution.stage.clone(),
+        kind: execution.settings.kind().to_owned(),
+        outputs: known.outputs.clone(),
+        metrics: known.metrics.clone(),
+        inputs: execution.inputs.clone(),
+        wall_s: execution.wall_s(now),
+    }
+}

@@ -1,0 +1,115 @@
+//! The only one who decides: (state, moment, event) to facts and effects.
+//!
+//! Nothing here reads a clock, a socket or a generator. What is decided is a list of facts; `Deciding::record` is the one way to
+//! change the state, and keeps each fact. They are stored in the same transaction as the rows that they imply, before any other effect;
+//! recovery applies them and decides nothing again. After the event itself, every run that it touched is reconciled (stages whose work is
+//! over, stages whose inputs are there), work that nobody wants is asked to wind down, idle workers are given what is ready, and what has
+//! ended leaves memory for the tables.
+//!
+//! A decision looks at what its facts touch, and at no other run or execution: what it costs does not grow with what there ever was.
+//!
+//! This file says in which order things happen, one file for each topic what happens: those beside it, `outcome`, `reconcile`, `sweep` and
+//! `schedule`. All of them stand on `deciding`.
+
+pub(crate) mod attempts;
+pub(crate) mod deciding;
+pub(crate) mod executions;
+mod forget;
+mod runs;
+mod start;
+mod workers;
+
+use registry::Write;
+
+use self::attempts::Loss;
+use self::deciding::Deciding;
+use crate::event::{Effect, Event, Moment, Rejected};
+use crate::fact::Fact;
+use crate::journal::Decision;
+use crate::schedule;
+use crate::state::State;
+use crate::state::execution::ExecutionState;
+use crate::state::worker::Sign;
+
+/// Decides what `event` does. `state` is changed only by an accepted event; an event that changes nothing has no effect
+/// but the answer to whoever sent it.
+pub fn decide(state: &mut State, moment: Moment, event: Event) -> Result<Vec<Effect>, Rejected> {
+    let moment = Moment { now: moment.now.max(state.now), ..moment };
+    let mut cx = Deciding::new(state, moment);
+    if !cx.happen(event)? {
+        assert!(cx.facts.is_empty(), "an event that changes nothing left {:?}", cx.facts);
+        return Ok(cx.effects);
+    }
+    cx.reconcile();
+    cx.drain();
+    cx.count_time();
+    schedule::schedule(&mut cx);
+    cx.count_time();
+    cx.forget();
+    let Deciding { state, facts, mut writes, mut fences, mut effects, .. } = cx;
+    (state.seq, state.now) = (state.seq + 1, moment.now);
+    state.recorded += facts.len() as u64;
+    let decision = Decision { now: moment.now, facts };
+    let mut stored = vec![Write::Facts { seq: state.seq, facts: decision.to_json() }];
+    // What a grant vouches for comes before the fences that may end that very grant.
+    stored.append(&mut writes);
+    stored.append(&mut fences);
+    effects.insert(0, Effect::Store(stored));
+    effects.push(Effect::Wake);
+    Ok(effects)
+}
+
+impl Deciding<'_> {
+    /// The event itself. `false`: it changes nothing.
+    fn happen(&mut self, event: Event) -> Result<bool, Rejected> {
+        match event {
+            Event::Started { alone, park } => self.started(alone, park),
+            Event::Submit { pipeline, source, idempotency_key, until } => {
+                return self.submit(*pipeline, source, idempotency_key, until);
+            }
+            Event::Join { join } => self.join(join)?,
+            Event::WorkerBack { worker } => return self.sign(&worker, Sign::Back),
+            Event::WorkerReady { worker, incarnation, tasks } => return self.ready(worker, incarnation, tasks),
+            Event::LeaseExpired { worker, incarnation } => {
+                if self.state.process(&worker, incarnation).is_err() || !self.sign(&worker, Sign::LeaseExpired)? {
+                    return Ok(false);
+                }
+                self.drop_worker(&worker, Loss::Lost);
+            }
+            Event::WorkerForgotten { worker, incarnation } => {
+                let forgotten = self.state.process(&worker, incarnation).is_ok_and(|worker| worker.is_away());
+                if !forgotten {
+                    return Ok(false);
+                }
+                self.record(Fact::WorkerForgotten { worker });
+            }
+            Event::WorkerGone { worker } => {
+                if !self.sign(&worker, Sign::Gone)? {
+                    return Ok(false);
+                }
+                self.drop_worker(&worker, Loss::Lost);
+            }
+            Event::PeersLost { grant, lost } => return self.peers_lost(&grant, &lost),
+            Event::Checkpoint { commit } => return self.checkpoint(commit),
+            Event::Outcome { report } => return self.outcome(report),
+            Event::Control { run, action, archived } => return self.control(&run, action, archived),
+            Event::Drain => {
+                if self.state.draining {
+                    return Ok(false);
+                }
+                self.record(Fact::Draining { draining: true });
+            }
+            Event::BackoffOver { task } => return self.backoff_over(&task),
+            Event::GraceOver { task, fence } => return self.grace_over(&task, fence),
+            Event::LookedUp { key, known, source, archived } => return Ok(self.looked_up(key, known, source, archived)),
+            Event::Bundled { key, bundles } => return self.bundled(key, &bundles),
+            Event::RegisterRefused { key, message } => {
+                if self.state.executions.get(&key).is_none_or(|execution| execution.state != ExecutionState::Bundling) {
+                    return Ok(false);
+                }
+                self.fail_execution(key, message, true);
+            }
+        }
+        Ok(true)
+    }
+}

@@ -1,0 +1,127 @@
+//! Runs: how they begin, and what clients ask of them.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use protocol::message::RunState;
+use protocol::pipeline::Pipeline;
+use protocol::{RunId, StageName, limits};
+use registry::Write;
+
+use super::deciding::Deciding;
+use crate::event::{Control, Effect, Rejected};
+use crate::fact::Fact;
+use crate::state::run::Run;
+
+impl Deciding<'_> {
+    pub(crate) fn submit(
+        &mut self,
+        pipeline: Pipeline,
+        source: String,
+        key: Option<String>,
+        until: Option<StageName>,
+    ) -> Result<bool, Rejected> {
+        // A run that has ended is found in the tables, before the event.
+        let twin = self.state.runs.values().find(|run| key.is_some() && run.idempotency_key == key);
+        if let Some(twin) = twin {
+            self.effects.push(Effect::Submitted(twin.id.clone()));
+            return Ok(false);
+        }
+        check_pipeline(&pipeline, until.as_ref())?;
+        let run = Run::new(self.state.submitted + 1, Arc::new(pipeline), key, until);
+        for old in self.state.runs.values().cloned().collect::<Vec<_>>() {
+            if old.parked && old.state == RunState::Paused && old.submitted.digest() == run.submitted.digest() {
+                self.change_run(old.number, |old| old.skip_rest(&format!("taken over by run `{}`", run.id)));
+                self.set_run_state(old.number, RunState::Cancelled, old.parked);
+            }
+        }
+        self.writes.push(Write::Run {
+            run: run.id.clone(),
+            pipeline: serde_json::to_value(&*run.submitted).expect("a pipeline serialises"),
+            source,
+            state: word(run.state),
+            idempotency_key: run.idempotency_key.clone(),
+        });
+        self.effects.push(Effect::Submitted(run.id.clone()));
+        self.record(Fact::Run { run: Box::new(run) });
+        Ok(true)
+    }
+
+    pub(crate) fn control(
+        &mut self,
+        id: &RunId,
+        action: Control,
+        archived: Option<Box<Run>>,
+    ) -> Result<bool, Rejected> {
+        let archived = archived.filter(|run| run.id == *id);
+        let (run, known) = match (self.state.run(id), archived) {
+            (Ok(run), _) => (Arc::clone(run), true),
+            (Err(_), Some(run)) => (Arc::from(run), false),
+            (Err(unknown), None) => return Err(unknown),
+        };
+        let before = run.state;
+        let Some(after) = run.after(action) else {
+            return Err(Rejected::Conflict(format!("run `{id}` is {before:?} and cannot be asked to {action:?}")));
+        };
+        if after == before && !run.parked {
+            return Ok(false);
+        }
+        if !known {
+            self.record(Fact::Run { run: Box::new(Run::clone(&run)) });
+        }
+        match action {
+            Control::Pause => {}
+            Control::Cancel => self.change_run(run.number, |run| run.skip_rest("cancelled")),
+            Control::Resume => self.change_run(run.number, Run::reopen),
+        }
+        self.set_run_state(run.number, after, false);
+        Ok(true)
+    }
+
+    pub(crate) fn set_run_state(&mut self, number: u64, state: RunState, parked: bool) {
+        let run = self.state.runs[&number].id.clone();
+        self.record(Fact::RunState { run: number, state, parked });
+        // The row of one that ends is written when it leaves memory, at the end of this decision.
+        if !state.is_final() {
+            self.writes.push(Write::RunState { run, state: word(state) });
+        }
+    }
+}
+
+/// A run's state as it stands in its row.
+pub(crate) fn word(state: RunState) -> String {
+    let state = serde_json::to_value(state).expect("a state is a word");
+    state.as_str().unwrap_or_default().to_owned()
+}
+
+/// What even a pipeline from an honest client of another build may get wrong.
+fn check_pipeline(pipeline: &Pipeline, until: Option<&StageName>) -> Result<(), Rejected> {
+    if pipeline.stages.len() > limits::STAGES {
+        let stages = pipeline.stages.len();
+        return Err(Rejected::Invalid(format!(
+            "the pipeline has {stages} stages; expected at most {}",
+            limits::STAGES
+        )));
+    }
+    let mut seen = BTreeSet::new();
+    for stage in &pipeline.stages {
+        for input in &stage.inputs {
+            if !seen.contains(&input.stage) {
+                return Err(Rejected::Invalid(format!(
+                    "stage `{}`: `{}` names stage `{}`, which does not stand before it",
+                    stage.name, input.field, input.stage
+                )));
+            }
+        }
+        if !seen.insert(&stage.name) {
+            return Err(Rejected::Invalid(format!("stage `{}` stands twice in the pipeline", stage.name)));
+        }
+    }
+    match until {
+        Some(until) if !seen.contains(until) => {
+            let names: Vec<&str> = seen.iter().map(|name| name.as_str()).collect();
+            Err(Rejected::Invalid(format!("`until`: there is no stage `{until}`; there is: {}", names.join(", "))))
+        }
+        Some(_) | None => Ok(()),
+    }
+}

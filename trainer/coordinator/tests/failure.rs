@@ -1,0 +1,97 @@
+//! A panic in the actor: whoever waits and whoever comes is told at once, and the next coordinator goes on from what was acknowledged.
+
+use std::time::Duration;
+
+use access::Server;
+use coordinator::{Config, Coordinator, Handle, Refused, Trouble};
+use protocol::message::{Join, Joined, PROTOCOL_VERSION, Poll, Submit};
+use protocol::stage::Backend;
+use registry::{Holder, Store};
+use reqwest::{Method, Response};
+
+type TestResult<T = ()> = Result<T, Box<dyn std::error::Error + Send + Sync>>;
+
+const TEXT: &str = "name: p\nseed: 1\ndataset: {format: synthetic}\nstages: {vae: {kind: train.vae}}\n";
+/// Much shorter than any wait of the coordinator's own: a poll's is 2 s by default, here a minute.
+const AT_ONCE: Duration = Duration::from_secs(10);
+
+async fn start(dir: &std::path::Path) -> TestResult<Handle> {
+    let store = Store::open(dir, Holder::this_process("a test")).await?;
+    let mut config = Config { alone: false, park: false, ..Config::embedded() };
+    config.policy.poll_ms = 60_000;
+    Ok(Coordinator::start(store, config).await?)
+}
+
+fn submission() -> TestResult<Submit> {
+    let pipeline = protocol::pipeline::read("p.yaml", TEXT, &[]).map_err(|mistakes| mistakes.to_string())?;
+    Ok(Submit { pipeline: serde_json::to_value(pipeline)?, source: TEXT.into(), idempotency_key: None, until: None })
+}
+
+fn server(handle: &Handle) -> TestResult<Server> {
+    Ok(Server::new(&handle.url(), Some(handle.token().clone()), None)?)
+}
+
+async fn is_refused(answer: Result<Response, reqwest::Error>, what: &str) -> TestResult {
+    let answer = answer?;
+    let status = answer.status();
+    let text = answer.text().await?;
+    assert_eq!(status, 503, "{what}: {text}");
+    assert!(text.contains("\"failed\"") && text.contains("start it again"), "{what}: {text}");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_panic_of_the_actor_is_told_to_everybody_at_once() -> TestResult {
+    let dir = tempfile::tempdir()?;
+    let handle = start(dir.path()).await?;
+    let server = server(&handle)?;
+    let run = handle.submit(submission()?).await?;
+    let join = Join {
+        protocol: PROTOCOL_VERSION,
+        worker: "a".into(),
+        pid: 1,
+        backend: Backend::Flex,
+        instruction_set: "avx2".into(),
+        peer_address: "a:1".into(),
+    };
+    let joined: Joined = server.request(Method::POST, "/v1/workers").json(&join).send().await?.json().await?;
+    // The first poll knows of nothing and is answered; the next one has nothing new to hear and waits.
+    let poll = |version| Poll { incarnation: joined.incarnation, doing: Vec::new(), ready: Vec::new(), version };
+    let path = "/v1/workers/a/poll";
+    let mut version = 0;
+    let waiting = loop {
+        let answer = server.request(Method::POST, path).json(&poll(version)).send();
+        let mut answer = tokio::spawn(answer);
+        match tokio::time::timeout(Duration::from_millis(500), &mut answer).await {
+            Ok(answer) => {
+                let desired: protocol::message::DesiredAssignments = answer??.json().await?;
+                version = desired.version;
+            }
+            Err(_) => break answer,
+        }
+    };
+    assert_eq!(handle.trouble(), None);
+
+    fail::cfg("actor::decide", "panic(made up)")?;
+    let told = tokio::time::timeout(AT_ONCE, async {
+        let refused = handle.submit(submission()?).await;
+        assert!(matches!(&refused, Err(Refused::Failed(why)) if why.contains("made up")), "{refused:?}");
+        is_refused(waiting.await?, "the poll that waited").await?;
+        is_refused(server.request(Method::POST, path).json(&poll(version)).send().await, "the next poll").await?;
+        is_refused(server.request(Method::POST, "/v1/runs").json(&submission()?).send().await, "a submission").await?;
+        is_refused(server.request(Method::GET, "/v1/runs").send().await, "a look").await?;
+        is_refused(server.request(Method::GET, "/v1/health").send().await, "whoever asks how it is").await?;
+        TestResult::Ok(handle.failed().await)
+    });
+    let why = told.await.map_err(|_| "somebody was left waiting")??;
+    assert!(why.contains("the actor") && why.contains("made up"), "{why}");
+    assert_eq!(handle.trouble(), Some(Trouble::Failed(why)));
+    fail::remove("actor::decide");
+    handle.shutdown().await;
+
+    let handle = start(dir.path()).await?;
+    assert_eq!(handle.run_view(&run).await?.run, run, "what was acknowledged is there");
+    handle.submit(submission()?).await?;
+    handle.shutdown().await;
+    Ok(())
+}

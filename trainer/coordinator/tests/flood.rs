@@ -1,0 +1,123 @@
+//! Too much at once: what does not fit into the queues is told to come again, heartbeats pass by, and what was taken is done.
+
+use std::time::{Duration, Instant};
+
+use access::Server;
+use coordinator::{Config, Coordinator, Handle};
+use fail::FailScenario;
+use protocol::message::{Grant, Join, Joined, MetricBatch, MetricRow, PROTOCOL_VERSION, Poll, Submit};
+use protocol::stage::Backend;
+use protocol::{Attempt, Fence, Incarnation, limits};
+use registry::{Holder, Store};
+use reqwest::{Method, StatusCode};
+use tokio::task::JoinSet;
+
+type TestResult<T = ()> = Result<T, Box<dyn std::error::Error + Send + Sync>>;
+
+const TEXT: &str = "name: p\nseed: 1\ndataset: {format: synthetic}\nstages: {vae: {kind: train.vae}}\n";
+
+/// A client of a coordinator.
+struct Caller {
+    handle: Handle,
+    server: Server,
+}
+
+impl Caller {
+    async fn start(dir: &std::path::Path) -> TestResult<Self> {
+        let store = Store::open(dir, Holder::this_process("a test")).await?;
+        let mut config = Config { alone: false, park: false, ..Config::embedded() };
+        config.policy.poll_ms = 1;
+        let handle = Coordinator::start(store, config).await?;
+        let server = Server::new(&handle.url(), Some(handle.token().clone()), None)?;
+        Ok(Self { handle, server })
+    }
+
+    fn post(&self, path: &str, body: &impl serde::Serialize) -> reqwest::RequestBuilder {
+        self.server.request(Method::POST, path).json(body)
+    }
+
+    /// Sends more of a call at once than `wait`, of which the server can do none as long as `point` stands still, and lets it go once
+    /// all that are too many were told to come again.
+    async fn flood(&self, path: &str, body: &impl serde::Serialize, wait: usize, point: &str) -> TestResult {
+        const TOO_MANY: usize = 40;
+        let mut calls = JoinSet::new();
+        for _ in 0..wait + TOO_MANY {
+            calls.spawn(self.post(path, body).send());
+        }
+        for told in 0..TOO_MANY {
+            let answer = tokio::time::timeout(Duration::from_secs(60), calls.join_next()).await;
+            let answer =
+                answer.map_err(|_| format!("only {told} were told to come again"))?.ok_or("a call each")???;
+            assert_eq!(answer.status(), StatusCode::TOO_MANY_REQUESTS);
+            assert_eq!(answer.headers()["retry-after"], limits::COME_AGAIN_S.to_string());
+            assert!(answer.text().await?.contains("already"));
+        }
+        fail::remove(point);
+        while let Some(answer) = calls.join_next().await {
+            let status = answer??.status();
+            assert!(status != StatusCode::TOO_MANY_REQUESTS && !status.is_server_error(), "{status}");
+        }
+        Ok(())
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_flood_of_submissions_fills_a_short_queue_and_delays_no_heartbeat() -> TestResult {
+    let scenario = FailScenario::setup();
+    let dir = tempfile::tempdir()?;
+    let caller = Caller::start(dir.path()).await?;
+    let join = Join {
+        protocol: PROTOCOL_VERSION,
+        worker: "a".into(),
+        pid: 1,
+        backend: Backend::Flex,
+        instruction_set: "avx2".into(),
+        peer_address: "a:1".into(),
+    };
+    let joined: Joined = caller.post("/v1/workers", &join).send().await?.json().await?;
+    let pipeline = protocol::pipeline::read("p.yaml", TEXT, &[]).map_err(|mistakes| mistakes.to_string())?;
+    let pipeline = serde_json::to_value(pipeline)?;
+    let submit = Submit { pipeline, source: TEXT.into(), idempotency_key: None, until: None };
+
+    fail::cfg("actor::decide", "pause")?;
+    let beats = async {
+        let poll = Poll { incarnation: joined.incarnation, doing: Vec::new(), ready: Vec::new(), version: 0 };
+        for _ in 0..20 {
+            let begun = Instant::now();
+            let status = caller.post("/v1/workers/a/poll", &poll).send().await?.status();
+            assert!(status.is_success() && begun.elapsed() < Duration::from_secs(2), "{status} {:?}", begun.elapsed());
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+        TestResult::Ok(())
+    };
+    let flood = caller.flood("/v1/runs", &submit, limits::CLIENTS_WAITING, "actor::decide");
+    let (flood, beats) = tokio::join!(flood, beats);
+    beats?;
+    flood?;
+    // The worker's place in the queue is its own.
+    assert!(caller.post("/v1/workers", &Join { worker: "b".into(), ..join }).send().await?.status().is_success());
+    caller.handle.shutdown().await;
+    scenario.teardown();
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_flood_of_values_is_told_to_come_again() -> TestResult {
+    let scenario = FailScenario::setup();
+    let dir = tempfile::tempdir()?;
+    let caller = Caller::start(dir.path()).await?;
+    // Of a task that left memory long ago: the store alone can say that it is none.
+    let grant = Grant {
+        task: "r-1/gone".into(),
+        attempt: Attempt(1),
+        fence: Fence(1),
+        worker: "a".into(),
+        incarnation: Incarnation(1),
+    };
+    let batch = MetricBatch { grant, rows: vec![MetricRow { step: 1, key: "loss".into(), value: 1.0 }] };
+    fail::cfg("db::before_commit", "pause")?;
+    caller.flood("/v1/metrics", &batch, limits::BATCHES_WAITING, "db::before_commit").await?;
+    caller.handle.shutdown().await;
+    scenario.teardown();
+    Ok(())
+}

@@ -1,0 +1,358 @@
+//! The coordinator's batches on a disk that takes its time: what is asked waits in the queue while a transaction is in flight, and
+//! whoever is answered is answered what is stored.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use coordinator::batch::{Ask, Done, Turn};
+use coordinator::state::worker::Presence;
+use coordinator::{Effect, Event, Millis, Moment, Refused};
+use protocol::message::TaskOutcome;
+use protocol::{Digest, Incarnation, WorkerId};
+use registry::{Write, WriteError};
+
+use super::World;
+use crate::random::Random;
+use crate::store::{FakeStore, Refusal};
+use crate::worker::{Answer, Call, Saving};
+
+/// How long a transaction may take, at its worst.
+const SLOW_MS: u64 = 4_000;
+
+/// The transaction in flight.
+#[derive(Debug, Default)]
+pub(super) enum Disk {
+    #[default]
+    Idle,
+    /// Decided; nothing of it is on the disk.
+    Writing { until: Millis, writes: Vec<Write> },
+    /// Another process would read it, but power that fails takes it back to `before`.
+    Written { until: Millis, before: Box<FakeStore> },
+}
+
+impl Disk {
+    /// What is in flight arrives now.
+    pub(super) fn hurry(&mut self) {
+        match self {
+            Self::Idle => {}
+            Self::Writing { until, .. } | Self::Written { until, .. } => *until = Millis(0),
+        }
+    }
+
+    /// What was in flight.
+    pub(super) fn lose(&mut self) -> Self {
+        std::mem::take(self)
+    }
+}
+
+/// Who asked.
+#[derive(Debug)]
+pub(super) enum Ticket {
+    /// A worker; whether its report was stale when it came.
+    Call { i: usize, process: u32, call: Box<Call>, at: Millis, stale: bool },
+    /// A client, who asks again until it is answered.
+    Submission(Box<Event>),
+    /// The coordinator itself, about something that it wants done.
+    Effect(Box<Effect>),
+    /// Its clock.
+    Tick { at: Millis },
+    /// Whoever waits in [`World::happen`].
+    Caller,
+    /// Somebody who has gone away.
+    Nobody,
+}
+
+fn moment(now: Millis, random: &mut Random) -> impl FnMut() -> Moment {
+    move || Moment { now, entropy: random.digest() }
+}
+
+/// What was uploaded for what is to be stored.
+fn named(writes: &[Write]) -> Vec<Digest> {
+    let named = writes.iter().flat_map(|write| match write {
+        Write::Checkpoint { manifest, .. } => vec![*manifest],
+        Write::Shard { output, .. } => vec![*output],
+        Write::StageResult { grant: Some(_), outputs, .. } => outputs.values().copied().collect(),
+        _ => Vec::new(),
+    });
+    named.collect()
+}
+
+impl World {
+    pub(super) fn ask(&mut self, ask: Ask, ticket: Ticket) {
+        if !matches!(self.disk, Disk::Idle) {
+            self.count("an ask that came while a commit was in flight");
+        }
+        self.tickets += 1;
+        self.asked.insert(self.tickets, ticket);
+        self.batches.ask(ask, self.tickets);
+    }
+
+    /// Whatever the coordinator and its disk can do by now.
+    pub(super) fn advance(&mut self) {
+        while self.up && self.turn() {}
+        let now = self.now;
+        let (due, later): (Vec<_>, Vec<_>) =
+            std::mem::take(&mut self.snapshots).into_iter().partition(|(at, _)| *at <= now);
+        self.snapshots = later;
+        for (_, state) in due {
+            // Of those that overtake one another the newest stays, as in the store.
+            let newest = self.store.recovery.snapshot.as_ref().map_or(0, |(seq, _)| *seq);
+            if self.up && state.seq > newest {
+                if state.seq < self.store.seq() {
+                    self.count("a snapshot that was overtaken by facts");
+                }
+                self.store.snapshot(&state);
+            }
+        }
+    }
+
+    /// One thing that the coordinator or its disk does; `false` if there is nothing to do now.
+    pub(super) fn turn(&mut self) -> bool {
+        let now = self.now;
+        match std::mem::take(&mut self.disk) {
+            Disk::Idle => {
+                if !self.batches.is_idle() {
+                    self.heard_then.clone_from(&self.heard);
+                }
+                let turn = self.batches.decide(moment(now, &mut self.random));
+                self.take(turn)
+            }
+            Disk::Writing { until, writes } if until <= now => self.write(writes),
+            Disk::Written { until, .. } if until <= now => self.conclude(Ok(())),
+            busy @ (Disk::Writing { .. } | Disk::Written { .. }) => {
+                self.disk = busy;
+                false
+            }
+        }
+    }
+
+    fn take(&mut self, turn: Turn<u64>) -> bool {
+        match turn {
+            Turn::Idle => return false,
+            Turn::Store(writes) => {
+                let until = if self.chaos() && self.random.chance(15) {
+                    self.now.after(self.random.below(SLOW_MS))
+                } else {
+                    self.now
+                };
+                self.disk = Disk::Writing { until, writes };
+            }
+            Turn::Done(done) => self.done(done),
+        }
+        true
+    }
+
+    fn write(&mut self, writes: Vec<Write>) -> bool {
+        if self.chaos() && self.random.chance(1) {
+            self.count("a full disk");
+            return self.conclude(Err(WriteError::Storage("full".into())));
+        }
+        if self.chaos() && self.random.chance(1) {
+            // It was being written: the database rolls it back, whatever part of it lay on the disk.
+            self.disk = Disk::Writing { until: self.now, writes };
+            self.crash();
+            return false;
+        }
+        if self.chaos() && self.random.chance(1) {
+            let loose = named(&writes).into_iter().filter(|digest| !self.store.is_rooted(*digest));
+            let loose: Vec<Digest> = loose.collect();
+            if !loose.is_empty() {
+                self.count("a collection of what was not named yet");
+                self.store.collected.extend(loose);
+            }
+        }
+        let is_slow = self.chaos() && self.random.chance(3);
+        let before = is_slow.then(|| Box::new(self.store.clone()));
+        let written = self.store.write(&writes).map_err(|refusal| match refusal {
+            Refusal::Gate => WriteError::Gate("a gate does not hold".into()),
+            Refusal::Missing(digest) => WriteError::NotFound(format!("blob {digest} is not in the store")),
+        });
+        match (written, before) {
+            (Ok(()), Some(before)) => {
+                self.disk = Disk::Written { until: self.now.after(self.random.below(SLOW_MS)), before };
+                if self.random.chance(20) {
+                    self.crash();
+                }
+                true
+            }
+            (written, _) => self.conclude(written),
+        }
+    }
+
+    fn conclude(&mut self, written: Result<(), WriteError>) -> bool {
+        if let Err(WriteError::Gate(_)) = &written {
+            self.count("a gate that does not hold");
+        }
+        let stored = written.is_ok();
+        let turn = self.batches.stored(written, moment(self.now, &mut self.random));
+        match &turn {
+            Turn::Done(done) if stored && done.answers.len() > 1 => self.count("a batch of several"),
+            Turn::Done(done) if !stored && done.answers.is_empty() => {
+                self.count("a batch that the store refused, each tried alone");
+            }
+            Turn::Done(_) | Turn::Store(_) | Turn::Idle => {}
+        }
+        self.take(turn)
+    }
+
+    /// What survives a loss of power now.
+    pub(super) fn synced(&self) -> &FakeStore {
+        match &self.disk {
+            Disk::Written { before, .. } => before,
+            Disk::Idle | Disk::Writing { .. } => &self.store,
+        }
+    }
+
+    /// The power fails: every process on the machine ends, and what was not synced has never been.
+    pub(super) fn lose_power(&mut self) {
+        if let Disk::Written { before, .. } = self.disk.lose() {
+            self.store = *before;
+            self.count("a loss of power before the commit was synced");
+        } else {
+            self.count("a loss of power that spared what was synced");
+        }
+        for worker in &mut self.workers {
+            worker.alive = false;
+        }
+        self.calls.clear();
+        self.answers.clear();
+        if self.up {
+            self.crash();
+        }
+    }
+
+    fn done(&mut self, done: Done<u64>) {
+        let tickets =
+            done.answers.into_iter().filter_map(|(ticket, answer)| Some((self.asked.remove(&ticket)?, answer)));
+        let answers: Vec<(Ticket, Result<Vec<Effect>, Refused>)> = tickets.collect();
+        self.events += answers.len() as u64;
+        self.check_leases(&answers);
+        self.present = self.present_now();
+        let state = self.state();
+        let suspected = |presence| matches!(presence, Presence::Suspect { since } if since == state.now);
+        if done.durable && state.workers.values().any(|worker| suspected(worker.presence)) {
+            self.count("a member whom its peers could not reach");
+        }
+        if done.durable {
+            self.stored += 1;
+            if self.chaos() && self.random.chance(2) {
+                let at = self.now.after(self.random.below(2_000));
+                self.snapshots.push((at, Arc::clone(self.batches.state())));
+            }
+            if self.is_killed_now(&answers) {
+                return;
+            }
+        }
+        for effect in done.effects {
+            if let Effect::Lookup { .. } | Effect::Register { .. } = effect {
+                let at = self.now.after(self.random.below(if self.chaos() { 3000 } else { 10 }));
+                self.effects.push((at, effect));
+            }
+        }
+        for (ticket, answer) in answers {
+            self.answer(ticket, answer);
+        }
+    }
+
+    /// Kills the coordinator if a test wants that after this batch.
+    fn is_killed_now(&mut self, answers: &[(Ticket, Result<Vec<Effect>, Refused>)]) -> bool {
+        // Whoever never hears that it has joined joins for ever.
+        let joins = |ticket: &Ticket| matches!(ticket, Ticket::Call { call, .. } if matches!(**call, Call::Join(_)));
+        let spared = answers.iter().any(|(ticket, _)| matches!(ticket, Ticket::Caller) || joins(ticket) && !self.once);
+        let Some((every, from)) = self.kills else { return false };
+        if spared || self.stored < from || !self.stored.is_multiple_of(every) {
+            return false;
+        }
+        if self.once {
+            self.kills = None;
+        }
+        for (ticket, _) in answers {
+            if let Ticket::Submission(event) = ticket {
+                self.submissions.push((self.now.after(500), Event::clone(event)));
+            }
+        }
+        self.forget();
+        self.recovered();
+        // Mostly facts are replayed, but not all of them each time.
+        if self.stored.is_multiple_of(40) {
+            let state = Arc::clone(self.batches.state());
+            self.store.snapshot(&state);
+        }
+        self.happen(Event::Started { alone: false, park: false }).expect("starts again");
+        true
+    }
+
+    fn answer(&mut self, ticket: Ticket, answer: Result<Vec<Effect>, Refused>) {
+        match ticket {
+            Ticket::Call { i, process, call, at, stale } => self.answer_call((i, process), *call, (at, stale), answer),
+            Ticket::Submission(event) => match answer {
+                Ok(effects) => {
+                    for effect in effects {
+                        if let Effect::Submitted(run) = effect {
+                            assert!(self.synced().runs.contains_key(&run), "{run} was promised and is not stored");
+                        }
+                    }
+                }
+                Err(Refused::Write(_)) => self.submissions.push((self.now.after(500), *event)),
+                Err(_) => {}
+            },
+            Ticket::Effect(effect) => {
+                if let Err(Refused::Write(WriteError::Storage(_))) = answer {
+                    self.effects.push((self.now.after(1000), *effect));
+                }
+            }
+            Ticket::Caller => self.answered = Some(answer),
+            Ticket::Tick { .. } | Ticket::Nobody => {}
+        }
+    }
+
+    /// Nobody is told what a loss of power would take back.
+    pub(super) fn acknowledge(&self, answer: &Answer) {
+        let (synced, told) = (self.synced(), self.batches.front().state());
+        assert!(told.seq <= synced.seq(), "decision {} is told and not stored", told.seq);
+        match answer {
+            Answer::DesiredAssignments(desired) => {
+                for assignment in &desired.assignments {
+                    let (task, fence) = (&assignment.grant.task, assignment.grant.fence);
+                    let stored = synced.fences.get(task);
+                    assert!(stored.is_some_and(|stored| *stored >= fence), "{fence} of {task} is told, not {stored:?}");
+                }
+            }
+            Answer::Done(Saving::Commit(commit)) => {
+                let at = (commit.grant.task.clone(), commit.step);
+                assert_eq!(synced.checkpoints.get(&at), Some(&commit.manifest), "a checkpoint is told and not stored");
+            }
+            Answer::Done(Saving::Report(report)) => {
+                let is_finished = matches!(report.outcome, TaskOutcome::Finished { .. });
+                let stored = synced.accepted.contains_key(&report.grant.task);
+                assert!(stored || !is_finished, "the end of {} is told and not stored", report.grant.task);
+            }
+            Answer::Joined(_) | Answer::Done(_) | Answer::Refused(_) | Answer::Later => {}
+        }
+    }
+
+    /// A worker whose polls were answered keeps its lease, by whichever way they were.
+    fn check_leases(&mut self, answers: &[(Ticket, Result<Vec<Effect>, Refused>)]) {
+        let ticks = answers.iter().filter_map(|(ticket, _)| match ticket {
+            Ticket::Tick { at } => Some(*at),
+            _ => None,
+        });
+        let Some(at) = ticks.max() else { return };
+        let state = Arc::clone(self.batches.state());
+        let present = std::mem::take(&mut self.present);
+        let was_here = |name: &WorkerId, incarnation| present.get(name) == Some(&incarnation);
+        let silent = state.workers.iter().filter(|(_, worker)| worker.presence == Presence::Silent);
+        for (name, worker) in silent.filter(|(name, worker)| was_here(name, worker.incarnation)) {
+            self.count("a lease that expired");
+            let heard = self.heard_then.get(&(name.clone(), worker.incarnation)).copied().unwrap_or_default();
+            let silent = at.since(heard);
+            assert!(silent > self.policy.lease_ms, "`{name}` was heard {silent} ms before its lease ended");
+        }
+    }
+
+    /// The processes that have a lease.
+    pub(super) fn present_now(&self) -> BTreeMap<WorkerId, Incarnation> {
+        let here = self.state().workers.iter().filter(|(_, worker)| !worker.is_away());
+        here.map(|(name, worker)| (name.clone(), worker.incarnation)).collect()
+    }
+}
