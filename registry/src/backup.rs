@@ -10,20 +10,25 @@
 //!
 //! Any process that reads the store's folder makes it, whether or not another one holds the store and goes on working; only
 //! collection waits. A blob is linked where both
-//! folders are on one file system, else copied, and hashed either way. A second backup into the same folder adds what is new;
+//! folders are on one file system, else copied, and hashed either way; blobs in a bucket are fetched, so a backup holds them too. A second backup into the same folder adds what is new;
 //! until its `backup.json` is in place the one before is whole. One that was cut short is made again by the same command.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, DirBuilder, File};
-use std::io::{self, ErrorKind, Read};
+use std::io::{self, ErrorKind, Read, Write as _};
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 
+use checkpoint::BlobError;
 use protocol::Digest;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 use sqlx::{Connection, Row};
 
+use crate::blob::Backend;
+use crate::blob::fs::Folder;
+use crate::blob::place::Place;
+use crate::identity::Marker;
 use crate::lock::CollectionLock;
 use crate::retention::{self, Rows};
 use crate::{BlobStore, QueryError, ReadStore, StoreId, clock, db, identity};
@@ -216,7 +221,9 @@ impl ReadStore {
 /// Makes the folder one that a backup of this store may be in.
 fn prepare(store: &ReadStore, to: &Path) -> Result<(), BackupError> {
     let names = names(to)?;
-    let is_ours = matches!(identity::beside_blobs(to), Ok(Some(id)) if id == *store.id());
+    let folder = Folder::to_read(to);
+    let marker = Marker::read(&folder).map_err(|e| BackupError::Damaged(e.to_string()))?;
+    let is_ours = marker.as_ref().is_some_and(|marker| marker.store == *store.id());
     let is_store = names.iter().any(|name| name == db::FILE || name == "lock");
     if !names.is_empty() && (!is_ours || is_store) {
         return Err(BackupError::Folder(format!(
@@ -225,7 +232,19 @@ fn prepare(store: &ReadStore, to: &Path) -> Result<(), BackupError> {
         )));
     }
     make_dir(&to.join("blobs/sha256"))?;
-    identity::mark_blobs(to, store.id()).map_err(disk("cannot write to", to))
+    claim(&folder, marker, store.id())
+}
+
+/// Says beside the blobs at `place` that they are the store's, unless somebody else says otherwise at the same time.
+fn claim(place: &dyn Backend, old: Option<Marker>, store: &StoreId) -> Result<(), BackupError> {
+    if old.is_some() {
+        return Ok(());
+    }
+    let written = Marker { store: store.clone(), epoch: 0 }.write(None, place);
+    if written.map_err(|e| BackupError::Damaged(e.to_string()))? {
+        return Ok(());
+    }
+    Err(BackupError::Folder(format!("`{}` has just been written by another process", place.marker_place())))
 }
 
 fn copy_blobs(
@@ -260,11 +279,11 @@ fn copy_blob(blobs: &BlobStore, source: &Path, target: &Path, digest: Digest) ->
     let part = target.with_extension("part");
     let _ = fs::remove_file(&part);
     if fs::hard_link(source, &part).is_err() {
-        if source.is_file() {
-            fs::copy(source, &part).map_err(disk("cannot write", &part))?;
-        } else {
-            let bytes = blobs.get(digest).map_err(|e| BackupError::Damaged(e.to_string()))?;
-            fs::write(&part, bytes).map_err(disk("cannot write", &part))?;
+        let damaged = |e: BlobError| BackupError::Damaged(e.to_string());
+        let mut reader = blobs.read(digest).map_err(damaged)?;
+        let mut file = File::create(&part).map_err(disk("cannot write", &part))?;
+        while let Some(bytes) = reader.next_part().map_err(damaged)? {
+            file.write_all(&bytes).map_err(disk("cannot write", &part))?;
         }
     }
     let bytes = expect(&part, digest)?;
@@ -293,8 +312,9 @@ fn remove_what_is_over(to: &Path, manifest: &Manifest) -> Result<(), BackupError
     Ok(())
 }
 
-/// Makes a store of a backup in `to`, which is missing or empty. The store appears under its name once all of it was verified.
-pub async fn restore(backup: &Path, to: &Path) -> Result<Summary, BackupError> {
+/// Makes a store of a backup in `to`, which is missing or empty, with its blobs at `place` if that is given: a place without blobs,
+/// or where the same store's are. The store appears under its name once all of it was verified.
+pub async fn restore(backup: &Path, to: &Path, place: Option<&Place>) -> Result<Summary, BackupError> {
     let Some(manifest) = Manifest::read(backup)? else {
         return Err(BackupError::Folder(format!(
             "there is no finished backup in `{}`: `{MANIFEST}` is missing",
@@ -317,7 +337,7 @@ pub async fn restore(backup: &Path, to: &Path) -> Result<Summary, BackupError> {
         Err(e) if e.kind() != ErrorKind::NotFound => return Err(disk("cannot remove", &fresh)(e)),
         _ => {}
     }
-    let made = verified(backup, &fresh, &manifest).await;
+    let made = verified(backup, &fresh, &manifest, place).await;
     if let Err(e) = made {
         // What went wrong matters more than how cleaning up goes; the next try cleans up as well.
         let _ = fs::remove_dir_all(&fresh);
@@ -329,10 +349,12 @@ pub async fn restore(backup: &Path, to: &Path) -> Result<Summary, BackupError> {
 }
 
 /// Makes a store of a backup in `fresh`, and checks it as `fsck` does.
-async fn verified(backup: &Path, fresh: &Path, manifest: &Manifest) -> Result<(), BackupError> {
-    let (from, to, parts) = (backup.to_owned(), fresh.to_owned(), manifest.clone());
+async fn verified(backup: &Path, fresh: &Path, manifest: &Manifest, place: Option<&Place>) -> Result<(), BackupError> {
+    let (from, to, parts, place) = (backup.to_owned(), fresh.to_owned(), manifest.clone(), place.cloned());
     let ended = |e: tokio::task::JoinError| BackupError::Damaged(format!("the copying ended early: {e}"));
-    tokio::task::spawn_blocking(move || copy_back(&from, &to, &parts)).await.map_err(ended)??;
+    let copied = tokio::task::spawn_blocking(move || copy_back(&from, &to, &parts, place)).await.map_err(ended)?;
+    // Every other copy of the database is refused from here on.
+    db::reach_epoch(fresh, copied?).await?;
     let unsound = |problem: String| {
         BackupError::Damaged(format!("the backup is not whole, and no store was made of it: {problem}"))
     };
@@ -345,27 +367,58 @@ async fn verified(backup: &Path, fresh: &Path, manifest: &Manifest) -> Result<()
     }
 }
 
-fn copy_back(backup: &Path, fresh: &Path, manifest: &Manifest) -> Result<(), BackupError> {
-    let copy = |from: &Path, to: &Path, digest: Digest| {
-        // Not linked: a store must not share its files with what is to bring it back.
-        fs::copy(from, to).map_err(disk("cannot copy", from))?;
-        expect(to, digest)?;
-        sync(to)
-    };
-    make_dir(&fresh.join("blobs/sha256"))?;
-    copy(&backup.join(&manifest.database), &fresh.join(db::FILE), manifest.database_digest)?;
-    let mut shards = BTreeSet::new();
-    for digest in manifest.blobs.keys() {
-        let to = blob_path(fresh, *digest);
-        let shard = to.parent().unwrap_or(fresh).to_owned();
-        if shards.insert(shard.clone()) {
-            make_dir(&shard)?;
-        }
-        copy(&blob_path(backup, *digest), &to, *digest)?;
+/// Copies a backup to `fresh`, and its blobs to `place`; returns the epoch that is known there.
+fn copy_back(backup: &Path, fresh: &Path, manifest: &Manifest, place: Option<Place>) -> Result<u64, BackupError> {
+    make_dir(&fresh.join("blobs"))?;
+    let (from, to) = (backup.join(&manifest.database), fresh.join(db::FILE));
+    // Not linked: a store must not share its files with what is to bring it back.
+    fs::copy(&from, &to).map_err(disk("cannot copy", &from))?;
+    expect(&to, manifest.database_digest)?;
+    sync(&to)?;
+
+    let unusable = |e: BlobError| BackupError::Folder(e.to_string());
+    if let Some(place) = &place {
+        place.remember(fresh).map_err(disk("cannot write to", fresh))?;
     }
-    identity::mark_blobs(fresh, &manifest.store).map_err(disk("cannot write to", fresh))?;
+    let looked = place.unwrap_or_else(|| Place::Folder(fresh.to_owned())).look(fresh).map_err(unusable)?;
+    let seen = looked.to_read().map_err(disk("cannot read", fresh))?;
+    let marker = Marker::read(&*seen).map_err(|e| BackupError::Folder(e.to_string()))?;
+    let is_foreign = match &marker {
+        Some(marker) => marker.store != manifest.store,
+        None => !seen.is_empty().map_err(unusable)?,
+    };
+    if is_foreign {
+        let why = format!("there are blobs of another store: see `{}`", seen.marker_place());
+        return Err(BackupError::Folder(why));
+    }
+    let epoch = marker.as_ref().map_or(0, |marker| marker.epoch);
+    claim(&*seen, marker, &manifest.store)?;
+    let blobs = looked.open().map_err(disk("cannot open the blobs of", fresh))?;
+    for digest in manifest.blobs.keys() {
+        put_back(&blobs, &blob_path(backup, *digest), *digest)?;
+    }
     File::create(fresh.join("lock")).map_err(disk("cannot write to", fresh))?;
-    shards.iter().try_for_each(|shard| sync(shard))?;
-    sync(&fresh.join("blobs/sha256"))?;
-    sync(fresh)
+    sync(fresh)?;
+    Ok(epoch)
+}
+
+/// Stores a backup's blob, unless it is there already.
+fn put_back(blobs: &BlobStore, from: &Path, digest: Digest) -> Result<(), BackupError> {
+    let stored = |e: BlobError| match e {
+        e @ BlobError::Corrupt { .. } => BackupError::Damaged(format!("`{}` is damaged: {e}", from.display())),
+        e => BackupError::Folder(e.to_string()),
+    };
+    if blobs.reuse(digest).map_err(stored)? {
+        return Ok(());
+    }
+    let mut file = File::open(from).map_err(disk("cannot read", from))?;
+    let bytes = file.metadata().map_err(disk("cannot read", from))?.len();
+    let (mut upload, mut part) = (blobs.begin(bytes).map_err(stored)?, vec![0; 1 << 20]);
+    loop {
+        let read = file.read(&mut part).map_err(disk("cannot read", from))?;
+        if read == 0 {
+            return blobs.commit(upload, digest).map_err(stored);
+        }
+        upload.write(&part[..read]).map_err(stored)?;
+    }
 }

@@ -1,21 +1,27 @@
 //! Whether a database, its blobs and its folder belong together, and whether the database is all that it was.
 //!
-//! A store draws a random name when it is made. The name stands in the database (table `store`), beside the blobs
-//! (`blobs/IDENTITY`) and in the *witness*, a small file beside the database. The database counts its committed
+//! A store draws a random name when it is made. The name stands in the database (table `store`), in the *marker* beside the
+//! blobs (`IDENTITY`, wherever they lie) and in the *witness*, a small file beside the database. The database counts its committed
 //! transactions; the witness holds a number that this count had reached. It is written when the store is opened and closed,
 //! after the first commit of every cycle of the database's write-ahead log, and else every few seconds at most. So a
 //! database whose log was lost, or an older copy in its place, counts less than the witness, and is told from the one that
 //! was there. Without this an emptied database file would be a new store in which nothing needs any blob.
 //!
-//! | database | beside the blobs | witness | the folder is |
+//! Blobs in a bucket can be reached by two copies of a database, each of which would collect what only the other needs. So
+//! the marker also holds the database's epoch, the number of its openings; whoever opens the store raises both, the marker by
+//! a compare-and-set. A database that was opened less often than the marker says is a copy, and a holder whose epoch the marker
+//! has left behind collects nothing.
+//!
+//! | database | marker | witness | the store is |
 //! |---|---|---|---|
 //! | absent | nothing | none | to become a new store, if nothing else lies in it |
-//! | absent | name or blobs | any | refused: blobs without their database |
+//! | absent | any, or blobs | any | refused: blobs without their database |
 //! | a | nothing | none | a store whose making was cut short, if it holds nothing yet; else refused |
 //! | a | nothing | a | refused: a database without its blobs |
 //! | a | b | any | refused: parts of two stores |
 //! | a | a | a, at most the count | whole |
 //! | a | a | a, beyond the count | refused: the database has gone back |
+//! | a | a, of a later epoch | any | refused: another copy of the database uses the blobs |
 
 use std::fmt;
 use std::fs::{self, File};
@@ -23,10 +29,13 @@ use std::io::{self, ErrorKind, Read as _, Write as _};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use checkpoint::BlobError;
 use serde::{Deserialize, Serialize};
 
+use crate::blob::Backend;
 use crate::db;
 
 /// The random name of a store: 32 hexadecimal digits.
@@ -92,22 +101,22 @@ pub enum Mismatch {
         evidence: String,
     },
     /// The blobs are missing.
-    #[error("the blobs of the database `{}` are missing: `{}` does not exist", database.display(), marker.display())]
+    #[error("the blobs of the database `{}` are missing: `{marker}` does not exist", database.display())]
     NoBlobs {
         /// The database.
         database: PathBuf,
-        /// The marker that stands beside the blobs.
-        marker: PathBuf,
+        /// Where the marker should be that stands beside the blobs.
+        marker: String,
     },
     /// Parts of two stores.
-    #[error("`{}` is of store {one} and `{}` of store {other}", first.display(), second.display())]
+    #[error("`{}` is of store {one} and `{second}` of store {other}", first.display())]
     Mixed {
         /// A part.
         first: PathBuf,
         /// Whose it is.
         one: StoreId,
         /// Another part.
-        second: PathBuf,
+        second: String,
         /// Whose that is.
         other: StoreId,
     },
@@ -125,11 +134,27 @@ pub enum Mismatch {
         /// Transactions that it once had.
         known: u64,
     },
+    /// A copy of the database has used the blobs meanwhile, or uses them now.
+    #[error(
+        "the database `{}` was opened {found} times, and `{marker}` knows of {known}: the database is an older copy, or \
+         another copy of the store uses the same blobs",
+        database.display()
+    )]
+    Copied {
+        /// The database.
+        database: PathBuf,
+        /// How often it was opened.
+        found: u64,
+        /// The marker beside the blobs.
+        marker: String,
+        /// How often a database of this store was opened by its word.
+        known: u64,
+    },
     /// A marker does not read.
-    #[error("`{}` does not read: {message}", path.display())]
+    #[error("`{path}` does not read: {message}")]
     Unreadable {
         /// The marker.
-        path: PathBuf,
+        path: String,
         /// What is wrong with it.
         message: String,
     },
@@ -150,6 +175,10 @@ impl Mismatch {
             Self::Mixed { .. } | Self::Unreadable { .. } => {
                 "nothing was changed: put back what belongs together, or restore a backup (`registry restore BACKUP --to DIR`)"
             }
+            Self::Copied { .. } => {
+                "nothing was changed: use the newest copy of the store. `registry adopt` makes this one the store that has the \
+                 blobs, and every other copy is refused from then on"
+            }
             Self::WentBack { .. } => {
                 "nothing was changed: put the newer database with its log back or restore a backup (`registry restore BACKUP --to \
                  DIR`); `registry adopt` goes on with what is left, and blobs that only the lost transactions named go with \
@@ -160,7 +189,7 @@ impl Mismatch {
 
     /// Whether a user may decide to go on all the same.
     pub(crate) fn may_be_adopted(&self) -> bool {
-        matches!(self, Self::NoBlobs { .. } | Self::WentBack { .. })
+        matches!(self, Self::NoBlobs { .. } | Self::WentBack { .. } | Self::Copied { .. })
     }
 }
 
@@ -172,11 +201,50 @@ pub(crate) struct Stored {
     pub(crate) commits: u64,
 }
 
-/// What the folder shows without the database.
+/// What stands beside the blobs.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Marker {
+    pub(crate) store: StoreId,
+    /// How often the store's database had been opened when it last took the blobs for its own.
+    pub(crate) epoch: u64,
+}
+
+impl Marker {
+    /// Of the blobs at `place`, if there is one.
+    pub(crate) fn read(place: &dyn Backend) -> Result<Option<Self>, MarkerError> {
+        let text = place.marker()?;
+        let unreadable = |e: serde_json::Error| {
+            MarkerError::Mismatch(Mismatch::Unreadable { path: place.marker_place(), message: e.to_string() })
+        };
+        text.map(|text| serde_json::from_str(&text)).transpose().map_err(unreadable)
+    }
+
+    /// Puts it in the place of `old`; `false` if another one is there by now.
+    pub(crate) fn write(&self, old: Option<&Self>, place: &dyn Backend) -> Result<bool, BlobError> {
+        place.set_marker(old.map(Self::text).as_deref(), &self.text())
+    }
+
+    fn text(&self) -> String {
+        serde_json::json!({"store": self.store, "epoch": self.epoch}).to_string()
+    }
+}
+
+/// Why there is no word of a marker.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum MarkerError {
+    #[error(transparent)]
+    Blob(#[from] BlobError),
+    #[error(transparent)]
+    Mismatch(#[from] Mismatch),
+}
+
+/// What can be seen of a store without its database.
 #[derive(Debug)]
 pub(crate) struct Found {
     dir: PathBuf,
-    beside_blobs: Option<StoreId>,
+    marker: Option<Marker>,
+    /// Where the marker is, or would be.
+    marker_place: String,
     any_blob: bool,
     witness: Option<Testimony>,
     log: bool,
@@ -191,11 +259,6 @@ pub(crate) enum Verdict {
     Unfinished(StoreId),
     /// All parts are of this store.
     Whole(StoreId),
-}
-
-/// Where the name stands beside the blobs of a folder.
-pub(crate) fn marker_path(dir: &Path) -> PathBuf {
-    dir.join("blobs/IDENTITY")
 }
 
 fn witness_path(dir: &Path) -> PathBuf {
@@ -216,19 +279,7 @@ fn is_absent(e: &io::Error) -> bool {
 }
 
 fn unreadable(path: &Path, message: impl fmt::Display) -> Mismatch {
-    Mismatch::Unreadable { path: path.to_owned(), message: message.to_string() }
-}
-
-/// The name beside the blobs in `dir`, if one stands there.
-pub(crate) fn beside_blobs(dir: &Path) -> Result<Option<StoreId>, Mismatch> {
-    let path = marker_path(dir);
-    let text = read_if_there(&path).map_err(|e| unreadable(&path, e))?;
-    text.map(|text| text.trim_end().parse()).transpose().map_err(|e: String| unreadable(&path, e))
-}
-
-/// Writes the name beside the blobs.
-pub(crate) fn mark_blobs(dir: &Path, id: &StoreId) -> io::Result<()> {
-    write_whole(&marker_path(dir), format!("{id}\n").as_bytes())
+    Mismatch::Unreadable { path: path.display().to_string(), message: message.to_string() }
 }
 
 /// Replaces a small file: after a loss of power it holds the old bytes or the new ones.
@@ -241,42 +292,37 @@ pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     path.parent().map_or(Ok(()), |dir| File::open(dir)?.sync_all())
 }
 
-fn any_blob(dir: &Path) -> io::Result<bool> {
-    let entries = match fs::read_dir(dir.join("blobs/sha256")) {
-        Ok(entries) => entries,
-        Err(e) if is_absent(&e) => return Ok(false),
-        Err(e) => return Err(e),
-    };
-    for shard in entries {
-        let shard = shard?.path();
-        if shard.is_dir() && fs::read_dir(shard)?.next().is_some() {
-            return Ok(true);
-        }
-    }
-    Ok(false)
-}
-
 impl Found {
-    /// Looks at `dir`, changing nothing. It need not exist.
-    pub(crate) fn look(dir: &Path) -> Result<Self, Mismatch> {
-        let blobs = dir.join("blobs");
+    /// Looks at `dir` and its blobs, changing nothing. The folder need not exist.
+    pub(crate) fn look(dir: &Path, blobs: &dyn Backend) -> Result<Self, MarkerError> {
         Ok(Self {
             dir: dir.to_owned(),
-            beside_blobs: beside_blobs(dir)?,
-            any_blob: any_blob(dir).map_err(|e| unreadable(&blobs, e))?,
+            marker: Marker::read(blobs)?,
+            marker_place: blobs.marker_place(),
+            any_blob: !blobs.is_empty()?,
             witness: Testimony::read(dir)?,
             // Beside a database that is there the log is a part of it.
             log: !db::is_there(dir) && db::log_bytes(dir) > 0,
         })
     }
 
+    /// The marker beside the blobs.
+    pub(crate) fn marker(&self) -> Option<&Marker> {
+        self.marker.as_ref()
+    }
+
+    /// The epoch that the marker knows of.
+    pub(crate) fn marked_epoch(&self) -> u64 {
+        self.marker.as_ref().map_or(0, |marker| marker.epoch)
+    }
+
     /// What shows that the folder is, or was, a store.
     pub(crate) fn evidence(&self) -> Option<String> {
         if self.any_blob {
-            return Some(format!("there are blobs in `{}`", self.dir.join("blobs").display()));
+            return Some(format!("there are blobs in `{}`", self.marker_place.trim_end_matches("/IDENTITY")));
         }
-        if let Some(id) = &self.beside_blobs {
-            return Some(format!("`{}` is of store {id}", marker_path(&self.dir).display()));
+        if let Some(marker) = &self.marker {
+            return Some(format!("`{}` is of store {}", self.marker_place, marker.store));
         }
         if let Some(witness) = &self.witness {
             return Some(format!("it had {} transactions once", witness.commits));
@@ -298,47 +344,63 @@ impl Found {
                 Some(evidence) => Err(Mismatch::NoDatabase { database, evidence }),
             };
         };
-        let mixed = |second: PathBuf, other: &StoreId| Mismatch::Mixed {
+        let mixed = |second: &str, other: &StoreId| Mismatch::Mixed {
             first: database.clone(),
             one: stored.id.clone(),
-            second,
+            second: second.to_owned(),
             other: other.clone(),
         };
         if let Some(witness) = &self.witness {
             if witness.store != stored.id {
-                return Err(mixed(witness_path(&self.dir), &witness.store));
+                return Err(mixed(&witness_path(&self.dir).display().to_string(), &witness.store));
             }
             if witness.commits > stored.commits {
                 return Err(Mismatch::WentBack { database, found: stored.commits, known: witness.commits });
             }
         }
-        match &self.beside_blobs {
-            Some(id) if *id == stored.id => Ok(Verdict::Whole(id.clone())),
-            Some(id) => Err(mixed(marker_path(&self.dir), id)),
+        match &self.marker {
+            Some(marker) if marker.store != stored.id => Err(mixed(&self.marker_place, &marker.store)),
+            Some(marker) if marker.epoch > stored.epoch => {
+                let (found, marker, known) = (stored.epoch, self.marker_place.clone(), marker.epoch);
+                Err(Mismatch::Copied { database, found, marker, known })
+            }
+            Some(_) => Ok(Verdict::Whole(stored.id.clone())),
             // The marker is written right after the store's row and before the first opening raises the epoch.
             None if self.witness.is_none() && !self.any_blob && stored.epoch == 0 => {
                 Ok(Verdict::Unfinished(stored.id.clone()))
             }
-            None => Err(Mismatch::NoBlobs { database, marker: marker_path(&self.dir) }),
+            None => Err(Mismatch::NoBlobs { database, marker: self.marker_place.clone() }),
         }
     }
 }
 
 /// Whether the parts of an open store are still its own: a process that holds a store for weeks must not take an emptied
 /// database for one that needs no blobs.
-pub(crate) async fn check(id: &StoreId, dir: &Path, readers: &sqlx::SqlitePool) -> Result<(), String> {
+pub(crate) async fn check(
+    id: &StoreId,
+    dir: &Path,
+    blobs: Arc<dyn Backend>,
+    readers: &sqlx::SqlitePool,
+) -> Result<(), String> {
     if !db::is_there(dir) {
         return Err(format!("the database `{}` is missing or empty", db::path(dir).display()));
     }
-    match beside_blobs(dir).map_err(|e| e.to_string())? {
-        Some(beside) if beside == *id => {}
-        Some(beside) => return Err(format!("`{}` is of store {beside}, not {id}", marker_path(dir).display())),
-        None => return Err(format!("`{}`, which says whose the blobs are, is missing", marker_path(dir).display())),
-    }
+    let place = blobs.marker_place();
+    // Before the database: its epoch is raised first.
+    let marker = tokio::task::spawn_blocking(move || Marker::read(&*blobs)).await.map_err(|e| e.to_string())?;
+    let marker = match marker.map_err(|e| e.to_string())? {
+        Some(marker) if marker.store == *id => marker,
+        Some(marker) => return Err(format!("`{place}` is of store {}, not {id}", marker.store)),
+        None => return Err(format!("`{place}`, which says whose the blobs are, is missing")),
+    };
     let mut conn = readers.acquire().await.map_err(|e| format!("the database does not open: {e}"))?;
     match db::stored_now(&mut conn).await.map_err(|e| format!("the database does not read: {e}"))? {
-        Some(stored) if stored.id == *id => Ok(()),
-        Some(stored) => Err(format!("the database is of store {}, not {id}", stored.id)),
+        Some(stored) if stored.id != *id => Err(format!("the database is of store {}, not {id}", stored.id)),
+        Some(stored) if marker.epoch > stored.epoch => {
+            let (found, known) = (stored.epoch, marker.epoch);
+            Err(Mismatch::Copied { database: db::path(dir), found, marker: place, known }.to_string())
+        }
+        Some(_) => Ok(()),
         None => Err("the database names no store".into()),
     }
 }
@@ -446,7 +508,8 @@ mod tests {
     fn parts_are_opened_only_if_they_belong_together() {
         let found = |beside: Option<char>, any_blob, witness: Option<(char, u64)>| Found {
             dir: "/s".into(),
-            beside_blobs: beside.map(id),
+            marker: beside.map(|store| Marker { store: id(store), epoch: 2 }),
+            marker_place: "/s/blobs/IDENTITY".into(),
             any_blob,
             witness: witness.map(|(store, commits)| Testimony { store: id(store), commits }),
             log: false,
@@ -467,6 +530,8 @@ mod tests {
         assert_eq!(whole.judge(Some(&stored(3))), Ok(Verdict::Whole(id('a'))));
         assert_eq!(whole.judge(Some(&stored(4))), Ok(Verdict::Whole(id('a'))));
         assert!(matches!(whole.judge(Some(&stored(2))), Err(Mismatch::WentBack { found: 2, known: 3, .. })));
+        let copied = found(Some('a'), true, None);
+        assert!(matches!(copied.judge(Some(&stored(1))), Err(Mismatch::Copied { found: 1, known: 2, .. })));
     }
 
     #[test]

@@ -26,6 +26,7 @@ mod store;
 mod write;
 
 pub use blob::BlobStore;
+pub use blob::place::Place;
 pub use catalog::{Expect, Gate, Model, ModelRef, Pick, Promotion, Version};
 pub use db::apply::two_states;
 pub use identity::{Mismatch, StoreId};

@@ -6,6 +6,7 @@
 //!   witness          how many transactions the database has had, at least
 //!   blobs/IDENTITY   which store the blobs belong to
 //!   blobs/sha256/    bytes by digest
+//!   blobs/PLACE      where else these two are, if they are elsewhere
 //!   reserve          given up on a full disk, so that there is space to collect in
 //!   staging/         blobs on their way; emptied when the store is opened
 //!   lock             the operating system's lock, and who holds it
@@ -19,17 +20,19 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use checkpoint::BlobError;
 use protocol::stage::Keep;
 use protocol::{Alias, Digest, ModelName, RunId, TaskId};
 use sqlx::SqlitePool;
 
-use crate::blob::BlobStore;
 use crate::blob::fs::{free_bytes, is_full, is_read_only};
+use crate::blob::place::{Looked, Place};
+use crate::blob::{Backend, BlobStore};
 use crate::catalog::{Expect, Pick, PromoteOrder, Promotion, Which};
 use crate::db::writer::{Done, Order, Session, Writer};
 use crate::db::{self, Opened};
 use crate::forget::Forgotten;
-use crate::identity::{self, Found, Mismatch, StoreId, Verdict, Witness};
+use crate::identity::{self, Found, Marker, MarkerError, Mismatch, StoreId, Stored, Verdict, Witness};
 use crate::lock::{self, Holder, SharedLock, StoreLock, Taken, network_filesystem};
 use crate::reserve::{self, OPEN_NEEDS_BYTES};
 use crate::retention::{Named, Vouched};
@@ -53,6 +56,24 @@ pub enum OpenError {
         dir: PathBuf,
         /// What does not fit.
         mismatch: Mismatch,
+    },
+    /// Its blobs lie elsewhere than where it was said.
+    #[error("the blobs of store `{}` are at `{place}`, not at `{asked}`", dir.display())]
+    Elsewhere {
+        /// The store.
+        dir: PathBuf,
+        /// Where they are.
+        place: Place,
+        /// Where they were said to be.
+        asked: Place,
+    },
+    /// The place of its blobs cannot be used; the message says why and what to do.
+    #[error("store `{}`: {message}", dir.display())]
+    Blobs {
+        /// The store.
+        dir: PathBuf,
+        /// What is wrong.
+        message: String,
     },
     /// No store, and the folder is somebody else's.
     #[error("there is no store in `{}`, and none is made among other files: it holds {found}", dir.display())]
@@ -138,6 +159,11 @@ impl OpenError {
                 format!("wait for process {} to end, or choose another folder with `--store`", holder.pid)
             }
             Self::Mismatch { mismatch, .. } => mismatch.hint().into(),
+            Self::Elsewhere { asked, .. } => format!(
+                "leave `--blobs` out, or choose another folder with `--store`; if the blobs were moved, `registry adopt --blobs \
+                 {asked}` goes on with them there"
+            ),
+            Self::Blobs { .. } => "nothing was changed; see to it and run the same command again".into(),
             Self::NotEmpty { .. } => "choose a folder that is empty or does not exist with `--store`".into(),
             Self::NotAStore(_) => "`trainer run PIPELINE` makes one; name its folder with `--store`".into(),
             Self::ReadOnly { .. } => "make the folder writable for this user, or choose another with `--store`".into(),
@@ -204,9 +230,7 @@ impl std::ops::Deref for Store {
 impl ReadStore {
     /// Opens the store in `dir` for reading only.
     pub async fn open(dir: &Path) -> Result<Self, OpenError> {
-        if !db::is_there(dir) && found(dir)?.evidence().is_none() {
-            return Err(OpenError::NotAStore(dir.to_owned()));
-        }
+        there(dir).await?;
         let io = |path: &Path, e: io::Error| OpenError::io(path, &e);
         let dir = dir.canonicalize().map_err(|e| io(dir, e))?;
         if let Some(kind) = network_filesystem(&dir).map_err(|e| io(&dir, e))? {
@@ -216,10 +240,10 @@ impl ReadStore {
         // as a file: reading through a log would have to make one. With a log, SQLite keeps readers and the writer apart.
         let shared = SharedLock::try_take(&dir.join("lock")).map_err(|e| io(&dir.join("lock"), e))?;
         let closed = shared.filter(|_| db::log_bytes(&dir) == 0);
-        // Before the database: the witness never knows of more than what is committed.
-        let found = found(&dir)?;
-        let id = db::check_to_read(&dir, &found, closed.is_some()).await?;
-        let blobs = BlobStore::folder_to_read(&dir);
+        // Before the database: the witness and the marker never know of more than what is committed.
+        let seen = Seen::of(&dir, None, false).await?;
+        let id = db::check_to_read(&dir, &seen.found, closed.is_some()).await?;
+        let blobs = BlobStore::beside(seen.blobs, &seen.looked.verified());
         let readers = db::open_readers(&dir, closed.is_some());
         let opened_ms = clock::now_ms();
         Ok(Self(Arc::new(Reading { dir, id, opened_ms, blobs, readers, _closed: closed })))
@@ -263,47 +287,46 @@ impl ReadStore {
     /// Says what is wrong if the database or the blobs are not those that were opened: somebody has removed, emptied or replaced
     /// them since.
     pub(crate) async fn check_identity(&self) -> Result<(), String> {
-        identity::check(self.id(), self.dir(), self.readers()).await
+        identity::check(self.id(), self.dir(), self.blobs().place(), self.readers()).await
     }
 }
 
 impl Store {
     /// Opens the store in `dir`, making it if there is none. `holder` says to others what this process is.
     pub async fn open(dir: &Path, holder: Holder) -> Result<Self, OpenError> {
+        Self::open_with(dir, None, holder).await
+    }
+
+    /// The same; `blobs` is where the blobs of a new store are to lie, and where those of one that is there must be.
+    pub async fn open_with(dir: &Path, blobs: Option<&Place>, holder: Holder) -> Result<Self, OpenError> {
         let io = |path: &Path, e: io::Error| OpenError::io(path, &e);
-        if !db::is_there(dir) && found(dir)?.evidence().is_none() {
+        if !db::is_there(dir) && Seen::of(dir, None, false).await?.found.evidence().is_none() {
             refuse_other_files(dir)?;
         }
         DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(|e| io(dir, e))?;
-        Self::take(dir, holder, Purpose::Work).await
+        Self::take(dir, blobs, holder, Purpose::Work).await
     }
 
     /// Opens a store that is there.
     pub async fn open_existing(dir: &Path, holder: Holder) -> Result<Self, OpenError> {
-        if !db::is_there(dir) && found(dir)?.evidence().is_none() {
-            return Err(OpenError::NotAStore(dir.to_owned()));
-        }
-        Self::take(dir, holder, Purpose::Work).await
+        there(dir).await?;
+        Self::take(dir, None, holder, Purpose::Work).await
     }
 
-    /// Opens a store whose blobs are missing or whose database has gone back, and makes what is left one store again. What was lost
-    /// stays lost: blobs that only lost rows named go with the next collection.
-    pub async fn adopt(dir: &Path, holder: Holder) -> Result<Self, OpenError> {
-        if !db::is_there(dir) && found(dir)?.evidence().is_none() {
-            return Err(OpenError::NotAStore(dir.to_owned()));
-        }
-        Self::take(dir, holder, Purpose::Adopt).await
+    /// Opens a store whose blobs are missing or were moved to `blobs`, or whose database has gone back, and makes what is left one
+    /// store again. What was lost stays lost: blobs that only lost rows named go with the next collection.
+    pub async fn adopt(dir: &Path, blobs: Option<&Place>, holder: Holder) -> Result<Self, OpenError> {
+        there(dir).await?;
+        Self::take(dir, blobs, holder, Purpose::Adopt).await
     }
 
     /// Opens a store that is there to collect what nothing needs: on a full disk as well, which is when it has to be done.
     pub async fn open_to_collect(dir: &Path, holder: Holder) -> Result<Self, OpenError> {
-        if !db::is_there(dir) && found(dir)?.evidence().is_none() {
-            return Err(OpenError::NotAStore(dir.to_owned()));
-        }
-        Self::take(dir, holder, Purpose::Collect).await
+        there(dir).await?;
+        Self::take(dir, None, holder, Purpose::Collect).await
     }
 
-    async fn take(dir: &Path, holder: Holder, purpose: Purpose) -> Result<Self, OpenError> {
+    async fn take(dir: &Path, place: Option<&Place>, holder: Holder, purpose: Purpose) -> Result<Self, OpenError> {
         let io = |path: &Path, e: io::Error| OpenError::io(path, &e);
         let dir = dir.canonicalize().map_err(|e| io(dir, e))?;
         close_to_others(&dir).map_err(|e| io(&dir, e))?;
@@ -323,13 +346,25 @@ impl Store {
             return Err(OpenError::Full { path: dir, message });
         }
         // Under the lock: nobody is making the store at the same time.
-        let Opened { mut conn, store: id, verdict } =
-            db::open_writer(&dir, &found(&dir)?, purpose == Purpose::Adopt).await?;
-        let blobs = BlobStore::open_folder(&dir).map_err(|e| io(&dir, e))?;
+        let adopt = purpose == Purpose::Adopt;
+        let seen = Seen::of(&dir, place, adopt).await?;
+        if seen.to_remember && !db::is_there(&dir) && seen.found.evidence().is_none() {
+            // Before the database is there: one that is there knows where its blobs are.
+            seen.place.remember(&dir).map_err(|e| io(&dir, e))?;
+        }
+        let Opened { mut conn, store: id, verdict } = db::open_writer(&dir, &seen.found, adopt).await?;
+        if seen.to_remember && adopt {
+            seen.place.remember(&dir).map_err(|e| io(&dir, e))?;
+        }
+        let (looked, opening) = (seen.looked, dir.clone());
+        let opened = tokio::task::spawn_blocking(move || looked.open()).await;
+        let blobs = opened.map_err(|e| io(&opening, io::Error::other(e)))?.map_err(|e| io(&opening, e))?;
+        let mut marker = seen.found.marker().cloned();
         if let Verdict::New | Verdict::Unfinished(_) = verdict {
-            identity::mark_blobs(&dir, &id).map_err(|e| io(&dir, e))?;
+            marker = Some(mark(&dir, &blobs, marker, &Stored { id: id.clone(), epoch: 0, commits: 0 }).await?);
         }
         let stored = db::raise_epoch(&dir, &mut conn).await?;
+        mark(&dir, &blobs, marker, &stored).await?;
         let witness = Witness::begin(&dir, &stored).map_err(|e| io(&dir, e))?;
         reserve::keep(&dir);
         let session = Session { conn, epoch: stored.epoch, witness };
@@ -468,8 +503,79 @@ enum Purpose {
     Adopt,
 }
 
-fn found(dir: &Path) -> Result<Found, OpenError> {
-    Found::look(dir).map_err(|mismatch| OpenError::Mismatch { dir: dir.to_owned(), mismatch })
+/// A store as it can be seen without its database.
+struct Seen {
+    place: Place,
+    /// Whether the folder does not say so yet.
+    to_remember: bool,
+    looked: Looked,
+    blobs: Arc<dyn Backend>,
+    found: Found,
+}
+
+impl Seen {
+    /// Looks, changing nothing. `asked` is where the blobs are said to be; elsewhere is an error unless they `moved` there or
+    /// the store is still to be made.
+    async fn of(dir: &Path, asked: Option<&Place>, moved: bool) -> Result<Self, OpenError> {
+        let (dir, asked) = (dir.to_owned(), asked.cloned());
+        let path = dir.clone();
+        let looking = tokio::task::spawn_blocking(move || Self::look(&dir, asked, moved));
+        looking.await.map_err(|e| OpenError::io(&path, &io::Error::other(e)))?
+    }
+
+    fn look(dir: &Path, asked: Option<Place>, moved: bool) -> Result<Self, OpenError> {
+        let io = |e: io::Error| OpenError::io(&dir.join("blobs/PLACE"), &e);
+        let here = Place::Folder(std::path::absolute(dir).map_err(io)?);
+        let remembered = Place::remembered(dir).map_err(io)?;
+        let is_new = remembered.is_none() && !db::is_there(dir);
+        let current = remembered.unwrap_or(here);
+        let asked = asked.unwrap_or_else(|| current.clone());
+        let to_remember = asked != current;
+        if to_remember && !moved && !is_new {
+            return Err(OpenError::Elsewhere { dir: dir.to_owned(), place: current, asked });
+        }
+        let place = asked;
+        let blobs_error = |e: BlobError| OpenError::Blobs { dir: dir.to_owned(), message: e.to_string() };
+        let looked = place.look(dir).map_err(blobs_error)?;
+        let blobs = looked.to_read().map_err(io)?;
+        let found = Found::look(dir, &*blobs).map_err(|e| match e {
+            MarkerError::Blob(e) => blobs_error(e),
+            MarkerError::Mismatch(mismatch) => OpenError::Mismatch { dir: dir.to_owned(), mismatch },
+        })?;
+        if to_remember && moved && found.marker().is_none() {
+            let marker = blobs.marker_place();
+            let message =
+                format!("`{marker}` does not exist; copy the blobs of the store there first, and this with them");
+            return Err(OpenError::Blobs { dir: dir.to_owned(), message });
+        }
+        Ok(Self { place, to_remember, looked, blobs, found })
+    }
+}
+
+/// Refuses a folder that is not, and never was, a store.
+async fn there(dir: &Path) -> Result<(), OpenError> {
+    if db::is_there(dir) {
+        return Ok(());
+    }
+    match Seen::of(dir, None, false).await?.found.evidence() {
+        Some(_) => Ok(()),
+        None => Err(OpenError::NotAStore(dir.to_owned())),
+    }
+}
+
+/// Puts the marker of a store that was opened beside its blobs, in the place of the `old` one.
+async fn mark(dir: &Path, blobs: &BlobStore, old: Option<Marker>, stored: &Stored) -> Result<Marker, OpenError> {
+    let marker = Marker { store: stored.id.clone(), epoch: stored.epoch };
+    let (place, written) = (blobs.place(), marker.clone());
+    let writing = tokio::task::spawn_blocking(move || written.write(old.as_ref(), &*place));
+    let failed = |message: String| OpenError::Blobs { dir: dir.to_owned(), message };
+    if writing.await.map_err(|e| failed(e.to_string()))?.map_err(|e| failed(e.to_string()))? {
+        return Ok(marker);
+    }
+    let place = blobs.place().marker_place();
+    Err(failed(format!(
+        "another process has just taken these blobs for its store: `{place}` has changed; each store needs a place of its own"
+    )))
 }
 
 /// Names that a store's folder may have before its database is there.

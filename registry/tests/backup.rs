@@ -54,7 +54,7 @@ async fn a_backup_of_a_store_in_use_is_restored_as_it_was_at_that_moment() {
     // The second one into the same folder brings what is new.
     store.backup(&backup).await.unwrap();
     let again = root.path().join("again");
-    let summary = restore(&backup, &again).await.unwrap();
+    let summary = restore(&backup, &again, None).await.unwrap();
     assert_eq!(summary.blobs, 4);
     let read = ReadStore::open(&again).await.unwrap();
     assert_eq!(artifacts(read.versions(&"m".into()).await.unwrap()), [first, later]);
@@ -76,16 +76,16 @@ async fn nothing_is_restored_of_a_backup_that_is_not_whole() {
             Some(content) => fs::write(&rotten, content).unwrap(),
             None => fs::remove_file(&rotten).unwrap(),
         }
-        let refused = restore(&backup, &back).await.unwrap_err();
+        let refused = restore(&backup, &back, None).await.unwrap_err();
         assert!(matches!(refused, BackupError::Damaged(_) | BackupError::Disk { .. }), "{refused}");
         assert!(!back.exists(), "no store appears before all of it was verified");
     }
     // Made again, it is whole again.
     store.backup(&backup).await.unwrap();
-    restore(&backup, &back).await.unwrap();
-    assert!(matches!(restore(&backup, &back).await, Err(BackupError::Folder(_))), "a store is not overwritten");
+    restore(&backup, &back, None).await.unwrap();
+    assert!(matches!(restore(&backup, &back, None).await, Err(BackupError::Folder(_))), "a store is not overwritten");
     fs::remove_file(backup.join("backup.json")).unwrap();
-    let unfinished = restore(&backup, &root.path().join("other")).await;
+    let unfinished = restore(&backup, &root.path().join("other"), None).await;
     assert!(matches!(unfinished, Err(BackupError::Folder(_))), "{unfinished:?}");
     store.backup(&backup).await.unwrap();
 }

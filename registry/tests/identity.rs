@@ -131,7 +131,7 @@ async fn a_lost_log_is_noticed() {
     refused_by_the_commands(&grown, "has gone back");
 
     let adopted = loop {
-        match Store::adopt(&grown, holder()).await {
+        match Store::adopt(&grown, None, holder()).await {
             Err(OpenError::Busy { .. }) => tokio::task::yield_now().await,
             adopted => break adopted.unwrap(),
         }
@@ -182,7 +182,7 @@ async fn parts_of_two_stores_are_not_opened_together() {
     fs::copy(other.join("stride.db"), one.join("stride.db")).unwrap();
     assert!(matches!(mismatch(&one).await, Mismatch::Mixed { .. }));
     refused_by_the_commands(&one, "of store");
-    let refused = Store::adopt(&one, holder()).await.unwrap_err();
+    let refused = Store::adopt(&one, None, holder()).await.unwrap_err();
     assert!(matches!(refused, OpenError::Mismatch { mismatch: Mismatch::Mixed { .. }, .. }), "{refused}");
 }
 

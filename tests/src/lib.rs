@@ -28,6 +28,7 @@ pub struct Bench {
     trainer: PathBuf,
     dir: tempfile::TempDir,
     token: Option<&'static str>,
+    environment: Vec<(&'static str, String)>,
 }
 
 /// What a finished command said.
@@ -63,7 +64,13 @@ impl Bench {
     /// A fresh folder. `trainer` is `env!("CARGO_BIN_EXE_trainer")`.
     pub fn new(trainer: &str) -> Self {
         let dir = tempfile::tempdir().expect("a temporary folder");
-        Self { trainer: trainer.into(), dir, token: None }
+        Self { trainer: trainer.into(), dir, token: None, environment: Vec::new() }
+    }
+
+    /// Every command has these in its environment.
+    #[must_use]
+    pub fn with_environment(self, environment: impl IntoIterator<Item = (&'static str, String)>) -> Self {
+        Self { environment: environment.into_iter().collect(), ..self }
     }
 
     /// Every command shows this token, and a server wants it.
@@ -97,6 +104,7 @@ impl Bench {
         let mut command = Command::new(&self.trainer);
         command.args(arguments).current_dir(self.path()).stdin(Stdio::null());
         command.env_remove("RUST_LOG").env("NO_COLOR", "1");
+        command.envs(self.environment.iter().map(|(name, value)| (name, value)));
         if let Some(token) = self.token {
             command.env("STRIDE_TOKEN", token);
         }

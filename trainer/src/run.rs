@@ -8,7 +8,7 @@ use coordinator::{Config, Control, Coordinator, Handle, Trouble, WorkerView};
 use protocol::message::{FailureClass, RunState, RunView, StageState, Submit};
 use protocol::pipeline::Pipeline;
 use protocol::{RunId, StageName};
-use registry::{Holder, Store};
+use registry::{Holder, Place, Store};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use crate::fleet::{self, Death, Fleet};
@@ -28,6 +28,8 @@ const PATIENCE: Duration = Duration::from_secs(45);
 #[derive(Debug)]
 pub(crate) struct Options {
     pub(crate) store: PathBuf,
+    /// Where the blobs lie, if that was said.
+    pub(crate) blobs: Option<Place>,
     pub(crate) workers: Option<usize>,
     pub(crate) output: Output,
     /// The command as typed, to show how to go on.
@@ -81,7 +83,7 @@ pub(crate) async fn run(work: Work, options: Options) -> Result<u8> {
     }
     let holder = Holder::this_process(&*options.command);
     let store = match &work {
-        Work::Pipeline { .. } => Store::open(&options.store, holder).await?,
+        Work::Pipeline { .. } => Store::open_with(&options.store, options.blobs.as_ref(), holder).await?,
         Work::Run(_) => Store::open_existing(&options.store, holder).await?,
     };
     let dir = store.dir().to_owned();

@@ -17,12 +17,14 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use checkpoint::BlobError;
 use fail::fail_point;
+use nix::fcntl::{Flock, FlockArg};
 use protocol::Digest;
 
 use super::disk::{Disk, Os, regular};
 use super::staging::{Part, RESERVE_BYTES, Staging};
 use super::{Backend, Entry, Staged, Stat};
 use crate::clock;
+use crate::identity::write_whole;
 
 /// Blobs in a folder.
 #[derive(Debug)]
@@ -70,6 +72,10 @@ impl Inner {
         self.blobs.join(&hex[..2]).join(&hex[2..])
     }
 
+    fn marker(&self) -> PathBuf {
+        self.dir.join("blobs/IDENTITY")
+    }
+
     /// The blob's file, if it is there and a file.
     fn metadata(&self, path: &Path) -> Result<Option<fs::Metadata>, BlobError> {
         let shard = path.parent().unwrap_or(&self.blobs);
@@ -78,7 +84,7 @@ impl Inner {
         });
         match found {
             Ok(metadata) => Ok(metadata.is_file().then_some(metadata)),
-            Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => Ok(None),
+            Err(e) if is_absent(&e) => Ok(None),
             Err(e) => Err(error("read", path, &e)),
         }
     }
@@ -175,6 +181,24 @@ impl Backend for Folder {
         Ok(entries)
     }
 
+    fn is_empty(&self) -> Result<bool, BlobError> {
+        let blobs = &self.0.blobs;
+        let any = || -> io::Result<bool> {
+            for shard in fs::read_dir(blobs)? {
+                let shard = shard?.path();
+                if shard.is_dir() && fs::read_dir(shard)?.next().is_some() {
+                    return Ok(true);
+                }
+            }
+            Ok(false)
+        };
+        match any() {
+            Ok(any) => Ok(!any),
+            Err(e) if is_absent(&e) => Ok(true),
+            Err(e) => Err(error("list", blobs, &e)),
+        }
+    }
+
     fn strays(&self) -> Result<Vec<String>, BlobError> {
         let mut strays = self.0.staging.strays().map_err(|e| error("list", &self.0.staging.dir, &e))?;
         let listed = for_all(&self.0.blobs, |entry, digest| {
@@ -212,6 +236,39 @@ impl Backend for Folder {
     fn unstage_but(&self, names: &BTreeSet<String>) -> Result<(), BlobError> {
         self.0.staging.remove_but(names)
     }
+
+    fn marker_place(&self) -> String {
+        self.0.marker().display().to_string()
+    }
+
+    fn marker(&self) -> Result<Option<String>, BlobError> {
+        let path = self.0.marker();
+        match regular(OpenOptions::new().read(true), &path).and_then(io::read_to_string) {
+            Ok(text) => Ok(Some(text.trim_end().to_owned())),
+            Err(e) if is_absent(&e) => Ok(None),
+            Err(e) => Err(error("read", &path, &e)),
+        }
+    }
+
+    fn set_marker(&self, old: Option<&str>, marker: &str) -> Result<bool, BlobError> {
+        let path = self.0.marker();
+        let blobs = self.0.dir.join("blobs");
+        fs::create_dir_all(&blobs).map_err(|e| error("make", &blobs, &e))?;
+        // Two processes that open stores on the same folder of blobs at once.
+        let lock = blobs.join("marking");
+        let failed = |e: io::Error| error("lock", &lock, &e);
+        let file = OpenOptions::new().create(true).truncate(false).write(true).open(&lock).map_err(failed)?;
+        let _alone = Flock::lock(file, FlockArg::LockExclusive).map_err(|(_, e)| failed(e.into()))?;
+        if self.marker()?.as_deref() != old {
+            return Ok(false);
+        }
+        write_whole(&path, format!("{marker}\n").as_bytes()).map_err(|e| error("write", &path, &e))?;
+        Ok(true)
+    }
+}
+
+fn is_absent(e: &io::Error) -> bool {
+    matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory)
 }
 
 /// Calls `see` with all entries of the folder of blobs, and with the digest of those that are blobs.

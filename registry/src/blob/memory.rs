@@ -18,6 +18,7 @@ pub struct Memory(Arc<Mutex<Held>>);
 struct Held {
     blobs: HashMap<Digest, Blob>,
     aside: Vec<String>,
+    marker: Option<String>,
     /// Makes every write's stamp another.
     writes: u64,
 }
@@ -94,12 +95,33 @@ impl Backend for Memory {
         Ok(self.lock().blobs.iter().map(entry).collect())
     }
 
+    fn is_empty(&self) -> Result<bool, BlobError> {
+        Ok(self.lock().blobs.is_empty())
+    }
+
     fn strays(&self) -> Result<Vec<String>, BlobError> {
         Ok(Vec::new())
     }
 
     fn aside(&self) -> Result<Vec<String>, BlobError> {
         Ok(self.lock().aside.clone())
+    }
+
+    fn marker_place(&self) -> String {
+        "memory".into()
+    }
+
+    fn marker(&self) -> Result<Option<String>, BlobError> {
+        Ok(self.lock().marker.clone())
+    }
+
+    fn set_marker(&self, old: Option<&str>, marker: &str) -> Result<bool, BlobError> {
+        let mut held = self.lock();
+        if held.marker.as_deref() != old {
+            return Ok(false);
+        }
+        held.marker = Some(marker.to_owned());
+        Ok(true)
     }
 }
 

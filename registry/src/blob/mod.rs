@@ -2,7 +2,7 @@
 //!
 //! [`BlobStore`] verifies what is read and what is used again, stores equal bytes once, mends what was damaged, and keeps
 //! collection away from blobs that are being put. Bytes come and go in parts; nothing here holds a whole blob unless it was
-//! asked to. Where bytes lie is a [`Backend`]'s matter: a folder ([`fs::Folder`]) or
+//! asked to. Where bytes lie is a [`Backend`]'s matter: a folder ([`fs::Folder`]), an object store ([`objects::Objects`]) or
 //! memory ([`memory::Memory`]); all pass the same functions in `registry/tests/conformance.rs`.
 //!
 //! Not its job: which blobs are needed ([`crate::retention`]), and who may write.
@@ -12,6 +12,8 @@ pub mod fs;
 mod holds;
 mod known;
 pub mod memory;
+pub mod objects;
+pub mod place;
 mod reader;
 mod staging;
 mod uploads;
@@ -77,10 +79,19 @@ pub trait Backend: Send + Sync + fmt::Debug {
     fn put_aside(&self, digest: Digest) -> Result<(), BlobError>;
     /// All blobs, in no particular order. What else lies there is left out.
     fn list(&self) -> Result<Vec<Entry>, BlobError>;
+    /// Whether there is no blob.
+    fn is_empty(&self) -> Result<bool, BlobError>;
     /// What lies among the blobs and is not the store's.
     fn strays(&self) -> Result<Vec<String>, BlobError>;
     /// What was put aside.
     fn aside(&self) -> Result<Vec<String>, BlobError>;
+    /// Where the marker lies, in words.
+    fn marker_place(&self) -> String;
+    /// The marker, a text of one line that stands beside the blobs and says whose they are.
+    fn marker(&self) -> Result<Option<String>, BlobError>;
+    /// Puts a marker in the place of `old`, `None` for none; `false`, and nothing is changed, if there is not `old`. Of two that
+    /// try this at once one is told `false`.
+    fn set_marker(&self, old: Option<&str>, marker: &str) -> Result<bool, BlobError>;
 
     /// As [`stage`](Self::stage), in place of what is staged under a name of 64 hexadecimal digits. A backend that can keeps what has
     /// arrived when it is dropped, and when the process ends.
@@ -214,6 +225,11 @@ impl BlobStore {
 
     fn backend(&self) -> &dyn Backend {
         &*self.0.backend
+    }
+
+    /// Where the bytes lie.
+    pub(crate) fn place(&self) -> Arc<dyn Backend> {
+        Arc::clone(&self.0.backend)
     }
 
     fn uploads(&self) -> &Uploads {

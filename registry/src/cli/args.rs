@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Subcommand, ValueEnum};
 
 use super::Command;
+use crate::Place;
 use crate::catalog::Expect;
 use crate::leaderboard::Style;
 
@@ -107,8 +108,12 @@ pub enum Verb {
         #[arg(long, value_name = "MINUTES", default_value_t = 60)]
         grace: u32,
     },
-    /// Goes on with what is left of a store whose blobs are missing or whose database has gone back
-    Adopt,
+    /// Goes on with what is left of a store whose blobs are missing or were moved, or whose database has gone back
+    Adopt {
+        /// Where the blobs are now: a folder, s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or az://CONTAINER/PREFIX
+        #[arg(long, value_name = "PLACE")]
+        blobs: Option<Place>,
+    },
     /// Forgets runs that have ended, but not what models are made of or other runs need; `gc` then frees the space
     Forget {
         /// The run
@@ -134,6 +139,10 @@ pub enum Verb {
         /// The store's folder; it must be empty or missing
         #[arg(long, value_name = "DIR")]
         to: PathBuf,
+        /// Where its blobs are to lie, instead of in that folder: another one, s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or
+        /// az://CONTAINER/PREFIX. They may be there already
+        #[arg(long, value_name = "PLACE")]
+        blobs: Option<Place>,
     },
     /// Copies a version's files to a folder
     Export {
@@ -154,7 +163,9 @@ pub(super) enum Asked {
     /// Likewise, and only of a store whose folder this machine has.
     Backup { dir: PathBuf },
     /// Likewise, of no store yet.
-    Restore { backup: PathBuf, to: PathBuf },
+    Restore { backup: PathBuf, to: PathBuf, blobs: Option<Place> },
+    /// Only of a store that no process holds.
+    Adopt { blobs: Option<Place> },
 }
 
 impl Verb {
@@ -177,7 +188,6 @@ impl Verb {
             Self::Lineage { artifact } => Command::Lineage { reference: artifact },
             Self::Fsck => Command::Fsck,
             Self::Gc { dry_run, grace } => Command::Gc { dry_run, grace_minutes: Some(grace) },
-            Self::Adopt => Command::Adopt,
             Self::Forget { run: Some(run), .. } => Command::Forget { run },
             Self::Forget { leftovers_before: Some(age_ms), .. } => {
                 Command::ForgetLeftovers { before_ms: crate::clock::now_ms().saturating_sub(age_ms) }
@@ -187,7 +197,8 @@ impl Verb {
                 Command::ForgetEnded { before_ms: crate::clock::now_ms().saturating_sub(age_ms) }
             }
             Self::Backup { dir } => return Asked::Backup { dir },
-            Self::Restore { backup, to } => return Asked::Restore { backup, to },
+            Self::Restore { backup, to, blobs } => return Asked::Restore { backup, to, blobs },
+            Self::Adopt { blobs } => return Asked::Adopt { blobs },
             Self::Export { model, dir } => return Asked::Export { model, dir },
         })
     }

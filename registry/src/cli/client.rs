@@ -29,7 +29,8 @@ pub async fn execute(verb: Verb, dir: &Path, options: &ServerOptions, output: Ou
             Ok(()) => backup(dir, &into).await,
             Err(refused) => *refused,
         },
-        Asked::Restore { backup, to } => match crate::backup::restore(&backup, &to).await {
+        Asked::Adopt { blobs } => adopt(dir, blobs.as_ref(), options).await,
+        Asked::Restore { backup, to, blobs } => match crate::backup::restore(&backup, &to, blobs.as_ref()).await {
             Ok(summary) => Answer::done(Data::Restored { summary, dir: to }),
             Err(e) => Answer::from(e),
         },
@@ -41,9 +42,6 @@ pub async fn execute(verb: Verb, dir: &Path, options: &ServerOptions, output: Ou
 
 /// Runs a command on the store in `dir`, or at the server of `options`.
 pub async fn ask(command: Command, dir: &Path, options: &ServerOptions) -> Answer {
-    if command == Command::Adopt {
-        return adopt(dir, options).await;
-    }
     with(dir, options, command.need(), async |place| place.ask(&command).await).await
 }
 
@@ -78,11 +76,11 @@ fn local(options: &ServerOptions, why: &str) -> Result<(), Box<Answer>> {
 }
 
 /// Only here: a store that is not whole has no server.
-async fn adopt(dir: &Path, options: &ServerOptions) -> Answer {
+async fn adopt(dir: &Path, blobs: Option<&crate::Place>, options: &ServerOptions) -> Answer {
     if let Err(refused) = local(options, "a store is adopted on its machine") {
         return *refused;
     }
-    match Store::adopt(dir, Holder::this_process("registry adopt")).await {
+    match Store::adopt(dir, blobs, Holder::this_process("registry adopt")).await {
         Ok(store) => Answer::done(Data::Adopted { store: store.id().clone() }),
         Err(e) => Answer::from(&e),
     }

@@ -119,8 +119,6 @@ pub enum Command {
         /// In milliseconds since 1970.
         before_ms: i64,
     },
-    /// Makes one store of what is left after a loss. Only on a store that no process holds.
-    Adopt,
 }
 
 impl Command {
@@ -139,8 +137,7 @@ impl Command {
             | Self::Gc { .. }
             | Self::Forget { .. }
             | Self::ForgetEnded { .. }
-            | Self::ForgetLeftovers { .. }
-            | Self::Adopt => Scope::Admin,
+            | Self::ForgetLeftovers { .. } => Scope::Admin,
         }
     }
 
@@ -159,8 +156,7 @@ impl Command {
             | Self::Rollback { .. }
             | Self::Forget { .. }
             | Self::ForgetEnded { .. }
-            | Self::ForgetLeftovers { .. }
-            | Self::Adopt => false,
+            | Self::ForgetLeftovers { .. } => false,
         }
     }
 }
@@ -414,9 +410,6 @@ async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &st
                 }
             }
             Data::Forgotten { runs }
-        }
-        Command::Adopt => {
-            return Err(invalid("the store is open, so its parts belong together: nothing is to be adopted"));
         }
     };
     Ok(Answer::done(data))

@@ -115,7 +115,8 @@ async fn belongs(
     match (found.judge(stored.as_ref()), stored) {
         (Ok(verdict), _) => Ok(verdict),
         (Err(why), Some(stored)) if adopt && why.may_be_adopted() => {
-            let reach = sqlx::query("UPDATE store SET commits = max(commits, ?)").bind(apply::int(found.witnessed()));
+            let reach = sqlx::query("UPDATE store SET commits = max(commits, ?), epoch = max(epoch, ?)");
+            let reach = reach.bind(apply::int(found.witnessed())).bind(apply::int(found.marked_epoch()));
             reach.execute(conn).await.map_err(|e| failed(&e))?;
             Ok(Verdict::Unfinished(stored.id))
         }
@@ -162,6 +163,15 @@ pub(crate) async fn raise_epoch(dir: &Path, conn: &mut SqliteConnection) -> Resu
     sqlx::query(raise).execute(&mut *conn).await.map_err(|e| failed(&e))?;
     let stored = stored(conn).await.map_err(|e| failed(&e))?;
     stored.ok_or_else(|| OpenError::Damaged { path: path(dir), message: "the row of the store is gone".into() })
+}
+
+/// Makes the epoch of a database that nobody has opened at least `epoch`.
+pub(crate) async fn reach_epoch(dir: &Path, epoch: u64) -> Result<(), sqlx::Error> {
+    let options = SqliteConnectOptions::new().filename(path(dir)).synchronous(SqliteSynchronous::Full);
+    let mut conn = SqliteConnection::connect_with(&options).await?;
+    let reach = sqlx::query("UPDATE store SET epoch = max(epoch, ?)").bind(apply::int(epoch));
+    reach.execute(&mut conn).await?;
+    conn.close().await
 }
 
 /// Read-only connections for queries. They connect when first used. `closed`: nobody writes as long as they are open, and there is
@@ -283,7 +293,8 @@ mod tests {
     use super::*;
 
     async fn opened(dir: &Path) -> SqliteConnection {
-        open_writer(dir, &Found::look(dir).unwrap(), false).await.unwrap().conn
+        let found = Found::look(dir, &crate::blob::fs::Folder::to_read(dir)).unwrap();
+        open_writer(dir, &found, false).await.unwrap().conn
     }
 
     /// A commit that SQLite does not sync is lost with the power, and with it what was acknowledged.

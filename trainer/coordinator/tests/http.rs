@@ -343,7 +343,7 @@ async fn p1_a_torn_log_is_a_whole_beginning_of_itself() -> TestResult {
         std::fs::write(torn.path().join(main.file_name().ok_or("a name")?), &database)?;
         std::fs::write(torn.path().join(wal.file_name().ok_or("a name")?), log)?;
         // As if its user had decided to go on with what is left: opened as it is, the store would be refused.
-        let store = Store::adopt(torn.path(), Holder::this_process("a test")).await?;
+        let store = Store::adopt(torn.path(), None, Holder::this_process("a test")).await?;
         let recovery = store.recovery().await?;
         Ok((torn, recovery))
     };

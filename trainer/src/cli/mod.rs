@@ -14,7 +14,7 @@ use std::process::ExitCode;
 use access::ServerOptions;
 use clap::{Args, Parser, Subcommand};
 use protocol::StageName;
-use registry::{OpenError, ReadStore};
+use registry::{OpenError, Place, ReadStore};
 
 use crate::client::Target;
 use crate::print::{self, Output};
@@ -99,6 +99,8 @@ struct RunArgs {
     /// The store's folder
     #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR")]
     store: PathBuf,
+    #[command(flatten)]
+    blobs: BlobArgs,
     /// Stop after this stage
     #[arg(long, value_name = "STAGE")]
     until: Option<String>,
@@ -108,6 +110,15 @@ struct RunArgs {
     /// How the result is printed
     #[arg(short, long, value_enum, default_value_t)]
     output: Output,
+}
+
+/// Where a store's blobs lie.
+#[derive(Debug, Args)]
+struct BlobArgs {
+    /// Where the blobs of a new store are to lie, which remembers it: another folder, s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or
+    /// az://CONTAINER/PREFIX; credentials come from AWS_*, GOOGLE_* or AZURE_* in the environment [default: in the store's folder]
+    #[arg(long, env = "STRIDE_BLOBS", value_name = "PLACE")]
+    blobs: Option<Place>,
 }
 
 #[derive(Debug, Args)]
@@ -268,8 +279,13 @@ async fn run_pipeline(args: RunArgs) -> Result<u8> {
         return verify::verify(&file.pipeline, &args.store, steps.get(), args.output).await;
     }
     let until = args.until.map(StageName::new);
-    let options =
-        run::Options { store: args.store, workers: args.workers, output: args.output, command: command_line() };
+    let options = run::Options {
+        store: args.store,
+        blobs: args.blobs.blobs,
+        workers: args.workers,
+        output: args.output,
+        command: command_line(),
+    };
     run::run(run::Work::Pipeline { file: Box::new(file), until }, options).await
 }
 
@@ -299,6 +315,7 @@ async fn resume(args: ResumeArgs) -> Result<u8> {
             records.close().await;
             let options = run::Options {
                 store: args.target.store,
+                blobs: None,
                 workers: args.workers,
                 output: args.output,
                 command: command_line(),

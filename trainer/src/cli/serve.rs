@@ -40,6 +40,8 @@ pub(crate) struct ServeArgs {
     /// The store's folder
     #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR")]
     store: PathBuf,
+    #[command(flatten)]
+    blobs: super::BlobArgs,
 }
 
 impl ServeArgs {
@@ -67,7 +69,7 @@ pub(crate) async fn serve(args: ServeArgs) -> Result<u8> {
     // Said before the store is made.
     config.check()?;
     let open = config.tokens.is_empty();
-    let store = Store::open(&args.store, Holder::this_process("trainer serve")).await?;
+    let store = Store::open_with(&args.store, args.blobs.blobs.as_ref(), Holder::this_process("trainer serve")).await?;
     let handle = Coordinator::start(store.clone(), config).await?;
     let announced = client::announce(&store, &handle)?;
     let token = if open { format!(" --token-file {}", args.store.join("token").display()) } else { String::new() };

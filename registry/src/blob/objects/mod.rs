@@ -1,0 +1,414 @@
+//! Blobs in an object store: S3 and what speaks its protocol, Google Cloud Storage, Azure.
+//!
+//! ```text
+//! PREFIX/IDENTITY           the store that the blobs belong to
+//! PREFIX/sha256/ab/cdef...  a blob
+//! PREFIX/quarantine/...     damaged blobs that were put aside
+//! ```
+//!
+//! Database, lock and arriving blobs stay in the store's folder, and so does the time when a blob was last put
+//! (`blobs/touched`). A blob is sent once all of it has arrived and hashes to its name: a small one by a put that fails if the
+//! name is taken, a large one in parts that appear as one object at the end. That end cannot be conditional everywhere, and
+//! need not be: equal names are equal bytes. A part that fails is sent again by itself; parts of an upload that was given up
+//! cost space until the bucket's own rule removes them.
+
+mod remote;
+mod touched;
+
+use std::collections::BTreeSet;
+use std::fs::OpenOptions;
+use std::io::{self, Cursor, Read};
+use std::path::Path as FilePath;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use checkpoint::BlobError;
+use fail::fail_point;
+use futures::TryStreamExt as _;
+use object_store::path::Path;
+use object_store::{
+    Error, MultipartUpload, ObjectMeta, ObjectStore, ObjectStoreExt as _, PutMode, PutOptions, PutPayload,
+    UpdateVersion,
+};
+use protocol::Digest;
+use tokio::sync::Semaphore;
+use tokio::task::JoinSet;
+
+pub use self::remote::Remote;
+pub(super) use self::remote::check_url;
+
+use self::remote::innermost;
+use self::touched::Touched;
+use super::disk::{Os, regular};
+use super::staging::{Part, Staging};
+use super::{Backend, Entry, Staged, Stat};
+use crate::clock;
+
+/// How much goes out at once. The limit of 10,000 parts to an object allows 80 GB.
+const PART_BYTES: usize = 8 << 20;
+/// Parts that are under way at once, of all blobs together: this bounds the memory that sending takes.
+const PARTS: usize = 4;
+/// A blob that is read begins with a request for as little as the reader asked for, at least this much; each further one asks
+/// for twice as much, up to [`READ_BYTES`].
+const FIRST_READ_BYTES: usize = 64 << 10;
+const READ_BYTES: usize = 4 << 20;
+
+/// Blobs in an object store.
+#[derive(Debug)]
+pub struct Objects(Arc<Inner>);
+
+#[derive(Debug)]
+struct Inner {
+    remote: Arc<Remote>,
+    staging: Staging,
+    touched: Mutex<Touched>,
+    parts: Arc<Semaphore>,
+}
+
+impl Objects {
+    /// For the store in `dir`. Only for the holder of the store's lock.
+    pub fn open(remote: Arc<Remote>, dir: &FilePath) -> io::Result<Self> {
+        let blobs = dir.join("blobs");
+        std::fs::create_dir_all(&blobs)?;
+        let staging = Staging::open(dir.join("staging"), Arc::new(Os))?;
+        Ok(Self::with(remote, staging, Touched::open(&blobs.join("touched"))?))
+    }
+
+    /// For reading only: makes and clears nothing.
+    pub fn to_read(remote: Arc<Remote>, dir: &FilePath) -> io::Result<Self> {
+        let staging = Staging::to_read(dir.join("staging"), Arc::new(Os));
+        Ok(Self::with(remote, staging, Touched::read(&dir.join("blobs/touched"))?))
+    }
+
+    fn with(remote: Arc<Remote>, staging: Staging, touched: Touched) -> Self {
+        let parts = Arc::new(Semaphore::new(PARTS));
+        Self(Arc::new(Inner { remote, staging, touched: Mutex::new(touched), parts }))
+    }
+}
+
+impl Inner {
+    fn store(&self) -> Arc<dyn ObjectStore> {
+        Arc::clone(&self.remote.store)
+    }
+
+    fn head(&self, digest: Digest) -> Result<Option<ObjectMeta>, BlobError> {
+        let (store, path) = (self.store(), self.remote.blob(digest));
+        let wanted = path.clone();
+        match self.remote.wait(async move { store.head(&wanted).await }) {
+            Ok(meta) => Ok(Some(meta)),
+            Err(Error::NotFound { .. }) => Ok(None),
+            Err(e) => Err(self.remote.error("look at", &path, &e)),
+        }
+    }
+
+    fn stat(&self, digest: Digest, meta: &ObjectMeta) -> Stat {
+        let tag = meta.e_tag.as_deref().unwrap_or("-").replace(char::is_whitespace, "_");
+        let stamp = format!("{}-{tag}-{}", meta.size, meta.last_modified.timestamp());
+        Stat { bytes: meta.size, put_ms: self.put_ms(digest, meta), stamp }
+    }
+
+    fn put_ms(&self, digest: Digest, meta: &ObjectMeta) -> i64 {
+        self.touched().at(digest).unwrap_or_else(|| meta.last_modified.timestamp_millis())
+    }
+
+    fn touched(&self) -> MutexGuard<'_, Touched> {
+        self.touched.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn note(&self, digest: Digest) -> Result<(), BlobError> {
+        let failed =
+            |e| BlobError::Storage(format!("the time of blob {digest} could not be noted in `blobs/touched`: {e}"));
+        self.touched().note(digest).map_err(failed)
+    }
+
+    fn list(&self, folder: &str) -> Result<Vec<ObjectMeta>, BlobError> {
+        let (store, path) = (self.store(), self.remote.path(folder));
+        let wanted = path.clone();
+        let listed = self.remote.wait(async move { store.list(Some(&wanted)).try_collect().await });
+        listed.map_err(|e| self.remote.error("list", &path, &e))
+    }
+
+    /// Sends `bytes` bytes, in one request if they are few; `false` if the name was taken.
+    fn send(&self, path: &Path, bytes: u64, mut source: impl Read + Send + 'static) -> Result<bool, Error> {
+        let (store, path, parts) = (self.store(), path.clone(), Arc::clone(&self.parts));
+        if bytes > PART_BYTES as u64 {
+            return self.remote.wait(async move {
+                let mut upload = store.put_multipart(&path).await?;
+                let sent = send_parts(&mut *upload, parts, source).await;
+                if sent.is_err() {
+                    // The error that it is given up for matters more.
+                    let _ = upload.abort().await;
+                }
+                sent.map(|()| true)
+            });
+        }
+        let whole = read_part(&mut source).map_err(local)?;
+        let put = self.remote.wait(async move {
+            let _one = parts.acquire().await;
+            store.put_opts(&path, PutPayload::from(whole), PutOptions::from(PutMode::Create)).await
+        });
+        match put {
+            Ok(_) => Ok(true),
+            Err(Error::AlreadyExists { .. } | Error::Precondition { .. }) => Ok(false),
+            Err(e) => Err(e),
+        }
+    }
+
+    /// Writes the marker unless there is one; `false` if there is.
+    fn create_marker(&self, marker: &str) -> Result<bool, BlobError> {
+        let path = self.remote.path("IDENTITY");
+        self.send(&path, 0, Cursor::new(marker.to_owned())).map_err(|e| self.remote.error("write", &path, &e))
+    }
+
+    /// The marker as it is now, with its version.
+    fn read_marker(&self) -> Result<Option<(String, UpdateVersion)>, BlobError> {
+        let (store, path) = (self.store(), self.remote.path("IDENTITY"));
+        let wanted = path.clone();
+        let got = self.remote.wait(async move {
+            let got = store.get(&wanted).await?;
+            let version = UpdateVersion { e_tag: got.meta.e_tag.clone(), version: got.meta.version.clone() };
+            Ok((got.bytes().await?, version))
+        });
+        match got {
+            Ok((bytes, version)) => Ok(Some((String::from_utf8_lossy(&bytes).into_owned(), version))),
+            Err(e @ Error::NotFound { .. }) => match self.remote.error("read", &path, &e) {
+                // There is no bucket either.
+                no_bucket @ BlobError::Storage(_) => Err(no_bucket),
+                _ => Ok(None),
+            },
+            Err(e) => Err(self.remote.error("read", &path, &e)),
+        }
+    }
+}
+
+fn local(source: io::Error) -> Error {
+    Error::Generic { store: "staging", source: source.into() }
+}
+
+async fn send_parts(
+    upload: &mut dyn MultipartUpload,
+    slots: Arc<Semaphore>,
+    mut source: impl Read + Send + 'static,
+) -> Result<(), Error> {
+    let mut under_way = JoinSet::new();
+    loop {
+        let slot = Arc::clone(&slots).acquire_owned().await.map_err(|e| local(io::Error::other(e)))?;
+        let (read, next) = tokio::task::spawn_blocking(move || (read_part(&mut source), source)).await?;
+        source = next;
+        let part = read.map_err(local)?;
+        if part.is_empty() {
+            break;
+        }
+        let put = upload.put_part(PutPayload::from(part));
+        under_way.spawn(async move {
+            let put = put.await;
+            drop(slot);
+            put
+        });
+        while let Some(done) = under_way.try_join_next() {
+            done??;
+        }
+    }
+    while let Some(done) = under_way.join_next().await {
+        done??;
+    }
+    upload.complete().await.map(|_| ())
+}
+
+fn read_part(source: &mut impl Read) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    source.take(PART_BYTES as u64).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+impl Backend for Objects {
+    fn stage(&self, bytes: u64) -> Result<Box<dyn Staged>, BlobError> {
+        let part = self.0.staging.create(bytes)?;
+        Ok(Box::new(StagedObject { part, objects: Arc::clone(&self.0) }))
+    }
+
+    fn stage_as(&self, name: &str, bytes: u64) -> Result<Box<dyn Staged>, BlobError> {
+        let part = self.0.staging.create_as(name, bytes)?;
+        Ok(Box::new(StagedObject { part, objects: Arc::clone(&self.0) }))
+    }
+
+    fn staged_as(&self, name: &str, read: &mut dyn FnMut(&[u8])) -> Result<Option<Box<dyn Staged>>, BlobError> {
+        let part = self.0.staging.open_as(name, read)?;
+        Ok(part.map(|part| -> Box<dyn Staged> { Box::new(StagedObject { part, objects: Arc::clone(&self.0) }) }))
+    }
+
+    fn unstage(&self, name: &str) -> Result<(), BlobError> {
+        self.0.staging.remove(name)
+    }
+
+    fn unstage_but(&self, names: &BTreeSet<String>) -> Result<(), BlobError> {
+        self.0.staging.remove_but(names)
+    }
+
+    fn read(&self, digest: Digest, from: u64) -> Result<Box<dyn Read + Send>, BlobError> {
+        let end = self.0.head(digest)?.ok_or(BlobError::NotFound(digest))?.size;
+        let remote = Arc::clone(&self.0.remote);
+        Ok(Box::new(Ranges {
+            path: remote.blob(digest),
+            remote,
+            at: from,
+            end,
+            next: FIRST_READ_BYTES,
+            part: Cursor::default(),
+        }))
+    }
+
+    fn stat(&self, digest: Digest) -> Result<Option<Stat>, BlobError> {
+        Ok(self.0.head(digest)?.map(|meta| self.0.stat(digest, &meta)))
+    }
+
+    fn touch(&self, digest: Digest) -> Result<Stat, BlobError> {
+        self.0.note(digest)?;
+        self.stat(digest)?.ok_or(BlobError::NotFound(digest))
+    }
+
+    fn remove(&self, digest: Digest) -> Result<(), BlobError> {
+        let (store, path) = (self.0.store(), self.0.remote.blob(digest));
+        let wanted = path.clone();
+        match self.0.remote.wait(async move { store.delete(&wanted).await }) {
+            Ok(()) | Err(Error::NotFound { .. }) => self.0.touched().forget(digest),
+            Err(e) => return Err(self.0.remote.error("remove", &path, &e)),
+        }
+        Ok(())
+    }
+
+    /// Copied by reading it: not every store copies large objects by itself.
+    fn put_aside(&self, digest: Digest) -> Result<(), BlobError> {
+        let Some(meta) = self.0.head(digest)? else { return Ok(()) };
+        let aside = self.0.remote.path(&format!("quarantine/{}.{}", digest.hex(), clock::now_ms()));
+        let source = self.read(digest, 0)?;
+        self.0.send(&aside, meta.size, source).map_err(|e| self.0.remote.error("write", &aside, &e))?;
+        self.remove(digest)?;
+        tracing::warn!("blob {digest} is damaged; it was put aside as `{}`", self.0.remote.shown(&aside));
+        Ok(())
+    }
+
+    fn list(&self) -> Result<Vec<Entry>, BlobError> {
+        let entry = |meta: &ObjectMeta| {
+            let digest = self.0.remote.digest(&meta.location)?;
+            Some(Entry { digest, bytes: meta.size, put_ms: self.0.put_ms(digest, meta) })
+        };
+        Ok(self.0.list("sha256")?.iter().filter_map(entry).collect())
+    }
+
+    fn is_empty(&self) -> Result<bool, BlobError> {
+        let (store, path) = (self.0.store(), self.0.remote.path("sha256"));
+        let wanted = path.clone();
+        let first = self.0.remote.wait(async move { store.list(Some(&wanted)).try_next().await });
+        first.map(|first| first.is_none()).map_err(|e| self.0.remote.error("list", &path, &e))
+    }
+
+    fn strays(&self) -> Result<Vec<String>, BlobError> {
+        let staging = &self.0.staging;
+        let here = staging.strays().map_err(|e| super::fs::error("list", &staging.dir, &e))?;
+        let mut strays: Vec<String> = here.iter().map(|path| path.display().to_string()).collect();
+        let objects = self.0.list("sha256")?;
+        let objects = objects.iter().filter(|meta| self.0.remote.digest(&meta.location).is_none());
+        strays.extend(objects.map(|meta| self.0.remote.shown(&meta.location)));
+        Ok(strays)
+    }
+
+    fn aside(&self) -> Result<Vec<String>, BlobError> {
+        Ok(self.0.list("quarantine")?.iter().map(|meta| self.0.remote.shown(&meta.location)).collect())
+    }
+
+    fn marker_place(&self) -> String {
+        self.0.remote.shown(&self.0.remote.path("IDENTITY"))
+    }
+
+    fn marker(&self) -> Result<Option<String>, BlobError> {
+        Ok(self.0.read_marker()?.map(|(text, _)| text))
+    }
+
+    /// Writes over nothing by a put that must fail where there is something; that the server keeps to this is tried each time.
+    fn set_marker(&self, old: Option<&str>, marker: &str) -> Result<bool, BlobError> {
+        let path = self.0.remote.path("IDENTITY");
+        let Some(old) = old else {
+            if !self.0.create_marker(marker)? {
+                return Ok(false);
+            }
+            return if self.0.create_marker(marker)? { Err(self.0.remote.no_conditions(&path)) } else { Ok(true) };
+        };
+        let Some((text, version)) = self.0.read_marker()?.filter(|(text, _)| text == old) else { return Ok(false) };
+        if self.0.create_marker(&text)? {
+            return Err(self.0.remote.no_conditions(&path));
+        }
+        let (store, wanted, marker) = (self.0.store(), path.clone(), marker.to_owned());
+        let put = self.0.remote.wait(async move {
+            store.put_opts(&wanted, marker.into_bytes().into(), PutOptions::from(PutMode::Update(version))).await
+        });
+        match put {
+            Ok(_) => Ok(true),
+            Err(Error::Precondition { .. } | Error::AlreadyExists { .. }) => Ok(false),
+            Err(e) => Err(self.0.remote.error("write", &path, &e)),
+        }
+    }
+}
+
+/// A blob that arrives in the store's folder, to be sent when all of it is there.
+#[derive(Debug)]
+struct StagedObject {
+    part: Part,
+    objects: Arc<Inner>,
+}
+
+impl Staged for StagedObject {
+    fn write(&mut self, bytes: &[u8]) -> Result<(), BlobError> {
+        self.part.write(bytes)
+    }
+
+    fn commit(mut self: Box<Self>, digest: Digest) -> Result<bool, BlobError> {
+        fail_point!("blob::after_write");
+        let here = |e: io::Error| super::fs::error("read", &self.part.path, &e);
+        io::Write::flush(&mut self.part.file).map_err(here)?;
+        if self.objects.head(digest)?.is_some() {
+            return Ok(false);
+        }
+        let here = |e: io::Error| super::fs::error("read", &self.part.path, &e);
+        let file = regular(OpenOptions::new().read(true), &self.part.path).map_err(here)?;
+        let bytes = file.metadata().map_err(here)?.len();
+        // Noted first: a collection that sees the object must see that it is young, whatever the other side's clock says.
+        self.objects.note(digest)?;
+        let path = self.objects.remote.blob(digest);
+        let sent = self.objects.send(&path, bytes, file).map_err(|e| self.objects.remote.error("write", &path, &e));
+        fail_point!("blob::after_rename");
+        sent
+    }
+}
+
+/// Reads an object in ranges, each with a request of its own: whoever reads slowly keeps no connection waiting.
+struct Ranges {
+    remote: Arc<Remote>,
+    path: Path,
+    at: u64,
+    end: u64,
+    /// How much the next request asks for.
+    next: usize,
+    part: Cursor<bytes::Bytes>,
+}
+
+impl Read for Ranges {
+    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+        let read = self.part.read(out)?;
+        if read > 0 || self.at >= self.end || out.is_empty() {
+            return Ok(read);
+        }
+        let length = self.next.max(out.len()).min(READ_BYTES);
+        self.next = length.saturating_mul(2);
+        let range = self.at..self.end.min(self.at + length as u64);
+        let (store, path, wanted) = (Arc::clone(&self.remote.store), self.path.clone(), range.clone());
+        let part = self.remote.wait(async move { store.get_range(&path, wanted).await });
+        let part =
+            part.map_err(|e| io::Error::other(format!("`{}`: {}", self.remote.shown(&self.path), innermost(&e))))?;
+        if part.is_empty() {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        self.at += part.len() as u64;
+        self.part = Cursor::new(part);
+        self.part.read(out)
+    }
+}

@@ -1,0 +1,321 @@
+//! Requests to an object store, and what is said when one fails.
+
+use std::fmt;
+use std::sync::Arc;
+use std::sync::mpsc;
+use std::time::Duration;
+
+use checkpoint::BlobError;
+use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey, S3ConditionalPut};
+use object_store::azure::{AzureConfigKey, MicrosoftAzureBuilder};
+use object_store::gcp::{GoogleCloudStorageBuilder, GoogleConfigKey};
+use object_store::path::Path;
+use object_store::{BackoffConfig, ClientConfigKey, Error, ObjectStore, RetryConfig};
+use protocol::Digest;
+use tokio::runtime::Runtime;
+
+/// A connection that is not there by then is tried again. A machine in the same building answers in milliseconds.
+const CONNECT: &str = "5 seconds";
+/// How long one request may take: a part of 8 MiB at 1.1 Mbit/s.
+const REQUEST: &str = "60 seconds";
+/// For how long a request is tried again. Whoever asked is told then, and decides.
+const RETRY: Duration = Duration::from_secs(30);
+const RETRIES: usize = 6;
+
+/// Which object stores there are: how a place in one is written, and where its credentials come from.
+const KINDS: [Kind; 3] = [
+    Kind {
+        scheme: "s3",
+        credentials: "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_REGION",
+        endpoint: "AWS_ENDPOINT_URL",
+        http: "AWS_ALLOW_HTTP=true",
+    },
+    Kind {
+        scheme: "gs",
+        credentials: "GOOGLE_SERVICE_ACCOUNT or GOOGLE_APPLICATION_CREDENTIALS",
+        endpoint: "GOOGLE_BASE_URL",
+        http: "GOOGLE_ALLOW_HTTP=true",
+    },
+    Kind {
+        scheme: "az",
+        credentials: "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
+        endpoint: "AZURE_ENDPOINT",
+        http: "AZURE_ALLOW_HTTP=true",
+    },
+];
+
+#[derive(Debug)]
+struct Kind {
+    scheme: &'static str,
+    credentials: &'static str,
+    endpoint: &'static str,
+    http: &'static str,
+}
+
+/// A bucket's name and a prefix in it, of `SCHEME://BUCKET/PREFIX`; otherwise what is wrong with that.
+fn split(url: &str) -> Result<(&'static Kind, &str, &str), String> {
+    let of = |kind: &'static Kind| Some((kind, url.strip_prefix(kind.scheme)?.strip_prefix("://")?));
+    let (kind, rest) =
+        KINDS.iter().find_map(of).ok_or("expected s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or az://CONTAINER/PREFIX")?;
+    let (bucket, prefix) = rest.split_once('/').unwrap_or((rest, ""));
+    let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
+    if bucket.contains(['@', ':']) {
+        return Err(format!("credentials are not part of it; they come from {} in the environment", kind.credentials));
+    }
+    if bucket.is_empty() || !bucket.chars().all(plain) {
+        return Err(format!("`{bucket}` is no bucket's name"));
+    }
+    let prefix = prefix.trim_end_matches('/');
+    let is_folder = |name: &str| !name.is_empty() && name.chars().all(plain) && !matches!(name, "." | "..");
+    if !prefix.is_empty() && !prefix.split('/').all(is_folder) {
+        return Err(format!(
+            "`{prefix}` is no prefix: expected names of letters, digits, `-`, `_` and `.` with `/` between them"
+        ));
+    }
+    Ok((kind, bucket, prefix))
+}
+
+/// Says what is wrong with a text that should name a place in an object store.
+pub(in crate::blob) fn check_url(url: &str) -> Result<(), String> {
+    split(url).map(|_| ())
+}
+
+/// A prefix in a bucket, and a runtime of its own for requests: so that calls may block in any thread.
+pub struct Remote {
+    url: String,
+    kind: &'static Kind,
+    bucket: String,
+    prefix: String,
+    pub(super) store: Arc<dyn ObjectStore>,
+    /// `None` only while it is dropped.
+    runtime: Option<Runtime>,
+}
+
+impl fmt::Debug for Remote {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Remote").field("url", &self.url).finish_non_exhaustive()
+    }
+}
+
+impl Drop for Remote {
+    fn drop(&mut self) {
+        if let Some(runtime) = self.runtime.take() {
+            // Waiting is not allowed in some threads that this may be dropped in; nothing is under way by now.
+            runtime.shutdown_background();
+        }
+    }
+}
+
+impl Remote {
+    /// The place that `url` names. Credentials and endpoint come from the environment, under the names that the clouds' own tools
+    /// use. Sends nothing yet.
+    pub fn connect(url: &str) -> Result<Self, BlobError> {
+        let wrong =
+            |message: &dyn fmt::Display| BlobError::Storage(format!("`{url}` is no place for blobs: {message}"));
+        let (kind, bucket, _) = split(url).map_err(|e| wrong(&e))?;
+        // The TLS library asks for one; another one that is installed already does as well.
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        let retry = RetryConfig {
+            backoff: BackoffConfig { max_backoff: Duration::from_secs(5), ..BackoffConfig::default() },
+            max_retries: RETRIES,
+            retry_timeout: RETRY,
+        };
+        let (connect, request) = (ClientConfigKey::ConnectTimeout, ClientConfigKey::Timeout);
+        let store: Arc<dyn ObjectStore> = match kind.scheme {
+            "s3" => Arc::new(
+                AmazonS3Builder::from_env()
+                    .with_bucket_name(bucket)
+                    .with_conditional_put(S3ConditionalPut::ETagMatch)
+                    .with_config(AmazonS3ConfigKey::Client(connect), CONNECT)
+                    .with_config(AmazonS3ConfigKey::Client(request), REQUEST)
+                    .with_retry(retry)
+                    .build()
+                    .map_err(|e| wrong(&e))?,
+            ),
+            "gs" => Arc::new(
+                GoogleCloudStorageBuilder::from_env()
+                    .with_bucket_name(bucket)
+                    .with_config(GoogleConfigKey::Client(connect), CONNECT)
+                    .with_config(GoogleConfigKey::Client(request), REQUEST)
+                    .with_retry(retry)
+                    .build()
+                    .map_err(|e| wrong(&e))?,
+            ),
+            _ => Arc::new(
+                MicrosoftAzureBuilder::from_env()
+                    .with_container_name(bucket)
+                    .with_config(AzureConfigKey::Client(connect), CONNECT)
+                    .with_config(AzureConfigKey::Client(request), REQUEST)
+                    .with_retry(retry)
+                    .build()
+                    .map_err(|e| wrong(&e))?,
+            ),
+        };
+        Self::over(url, store)
+    }
+
+    /// The place that `url` names, in any object store.
+    pub fn over(url: &str, store: Arc<dyn ObjectStore>) -> Result<Self, BlobError> {
+        let wrong =
+            |message: &dyn fmt::Display| BlobError::Storage(format!("`{url}` is no place for blobs: {message}"));
+        let (kind, bucket, prefix) = split(url).map_err(|e| wrong(&e))?;
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(2)
+            .thread_name("blobs")
+            .enable_all()
+            .build()
+            .map_err(|e| BlobError::Unavailable(format!("no threads for requests to `{url}`: {e}")))?;
+        Ok(Self {
+            url: url.trim_end_matches('/').to_owned(),
+            kind,
+            bucket: bucket.to_owned(),
+            prefix: prefix.to_owned(),
+            store,
+            runtime: Some(runtime),
+        })
+    }
+
+    /// The object called `rest` under the prefix.
+    pub(super) fn path(&self, rest: &str) -> Path {
+        if self.prefix.is_empty() { Path::from(rest) } else { Path::from(format!("{}/{rest}", self.prefix)) }
+    }
+
+    pub(super) fn blob(&self, digest: Digest) -> Path {
+        let hex = digest.hex();
+        self.path(&format!("sha256/{}/{}", &hex[..2], &hex[2..]))
+    }
+
+    /// The digest that an object's name says, if it is a blob's.
+    pub(super) fn digest(&self, location: &Path) -> Option<Digest> {
+        let rest = location.as_ref().strip_prefix(self.path("sha256").as_ref())?.strip_prefix('/')?;
+        let (start, end) = rest.split_once('/')?;
+        (start.len() == 2).then(|| format!("sha256:{start}{end}").parse().ok()).flatten()
+    }
+
+    /// An object as a user would name it.
+    pub(super) fn shown(&self, path: &Path) -> String {
+        format!("{}://{}/{path}", self.kind.scheme, self.bucket)
+    }
+
+    /// Runs a request and blocks until it has ended, in whatever thread this is.
+    pub(super) fn wait<T: Send + 'static>(
+        &self,
+        request: impl Future<Output = Result<T, Error>> + Send + 'static,
+    ) -> Result<T, Error> {
+        let ended = || Error::Generic { store: "blobs", source: "the request ended early".into() };
+        let Some(runtime) = &self.runtime else { return Err(ended()) };
+        let (answer, answered) = mpsc::sync_channel(1);
+        runtime.spawn(async move {
+            // Nobody else has the receiver, and it waits.
+            let _ = answer.send(request.await);
+        });
+        answered.recv().map_err(|_| ended())?
+    }
+
+    /// What a failed request means, and what to do: `did` to the object at `path`.
+    pub(super) fn error(&self, did: &str, path: &Path, e: &Error) -> BlobError {
+        let (text, kind, bucket) = (innermost(e), self.kind, &self.bucket);
+        let what = format!("failed to {did} `{}`", self.shown(path));
+        let says = |words: &[&str]| words.iter().any(|word| text.contains(word));
+        if says(&["NoSuchBucket", "ContainerNotFound", "bucket does not exist"]) {
+            let advice = "make it, or name another one with `--blobs`";
+            return BlobError::Storage(format!("{what}: there is no bucket `{bucket}`; {advice}"));
+        }
+        if says(&["169.254.169.254", "metadata.google.internal", "MissingCredentials"]) {
+            let set = kind.credentials;
+            return BlobError::Storage(format!("{what}: there are no credentials in the environment; set {set}"));
+        }
+        if says(&["URL scheme is not allowed"]) {
+            let (endpoint, http) = (kind.endpoint, kind.http);
+            return BlobError::Storage(format!("{what}: {endpoint} is not https; use https, or set {http}"));
+        }
+        match e {
+            Error::PermissionDenied { .. } | Error::Unauthenticated { .. } => BlobError::Storage(format!(
+                "{what}: access was refused ({}); check {}, and that they may list, read, write and delete in `{}`",
+                told(&text),
+                kind.credentials,
+                self.url
+            )),
+            Error::NotImplemented { .. } | Error::NotSupported { .. } => {
+                BlobError::Storage(format!("{what}: the server does not know how ({})", told(&text)))
+            }
+            _ => BlobError::Unavailable(format!(
+                "{what}: {}; check that the network and {} are right and that the server runs",
+                told(&text),
+                kind.endpoint
+            )),
+        }
+    }
+
+    /// A server that overwrites what it was asked to leave.
+    pub(super) fn no_conditions(&self, path: &Path) -> BlobError {
+        BlobError::Storage(format!(
+            "`{}` was written over although the request said not to (`If-None-Match: *`): the server ignores conditions, and two \
+             stores could take the same blobs for theirs; use a server that knows conditional writes",
+            self.shown(path)
+        ))
+    }
+}
+
+/// What lies at the bottom of an error, with the layers above it, which may repeat each other.
+pub(super) fn innermost(error: &Error) -> String {
+    let mut cause: &dyn std::error::Error = error;
+    let mut text = error.to_string();
+    while let Some(next) = cause.source() {
+        cause = next;
+        let said = cause.to_string();
+        if !text.contains(&said) {
+            text = format!("{text}: {said}");
+        }
+    }
+    text
+}
+
+/// What a server's answer says, without its XML and at a length that fits a line.
+fn told(text: &str) -> String {
+    let element = |name: &str| {
+        let (_, rest) = text.split_once(&format!("<{name}>"))?;
+        rest.split_once(&format!("</{name}>")).map(|(inner, _)| inner)
+    };
+    match (element("Code"), element("Message")) {
+        (Some(code), Some(message)) => format!("{code}: {message}"),
+        (Some(code), None) => code.to_owned(),
+        _ => {
+            let line = text.split_whitespace().collect::<Vec<_>>().join(" ");
+            if line.chars().count() <= 400 { line } else { line.chars().take(400).chain(['…']).collect() }
+        }
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a test may panic")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn places_read_and_what_is_wrong_with_others_is_said() {
+        assert_eq!(split("s3://b/p/q/").map(|(_, b, p)| (b, p)).unwrap(), ("b", "p/q"));
+        assert_eq!(split("gs://b").map(|(k, b, p)| (k.scheme, b, p)).unwrap(), ("gs", "b", ""));
+        for (url, says) in [
+            ("http://b/p", "expected s3://"),
+            ("s3:/b/p", "expected s3://"),
+            ("s3:///p", "no bucket's name"),
+            ("s3://key:secret@b/p", "AWS_ACCESS_KEY_ID"),
+            ("az://c@account/p", "AZURE_STORAGE_ACCOUNT_NAME"),
+            ("s3://b/../p", "no prefix"),
+            ("s3://b/p//q", "no prefix"),
+            ("s3://b/p?x=1", "no prefix"),
+        ] {
+            let wrong = split(url).err().unwrap();
+            assert!(wrong.contains(says), "{url}: {wrong}");
+        }
+    }
+
+    #[test]
+    fn answers_are_said_without_their_xml() {
+        let xml = "status 403: <Error><Code>InvalidAccessKeyId</Code><Message>no such key</Message></Error>";
+        assert_eq!(told(xml), "InvalidAccessKeyId: no such key");
+        assert_eq!(told("a\n  b"), "a b");
+        assert_eq!(told(&"x".repeat(1000)).chars().count(), 401);
+    }
+}
