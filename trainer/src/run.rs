@@ -273,14 +273,14 @@ fn report(view: &RunView, pipeline: &Pipeline, end: &End, options: &Options) -> 
     }
     match view.state {
         RunState::Finished => {
-            if let (Some((model, steps)), Output::Table) = (summary::promoted(pipeline, view), options.output) {
+            if let (Some(model), Output::Table) = (summary::promoted(pipeline, view), options.output) {
                 let store = if options.store.as_os_str() == ".stride" {
                     String::new()
                 } else {
                     format!(" --store {}", client::shown(&options.store))
                 };
                 print::out(&format!(
-                    "\n{model} is ready. Try:\n  trainer generate \"a person walks in a circle\" --model {model} --steps {steps} -o walk.gif{store}"
+                    "\n{model} is ready. Try:\n  trainer generate \"a person walks in a circle\" --model {model} -o walk.gif{store}"
                 ));
             }
             0

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use protocol::message::{RunState, RunView, StageState, StageView, SweepView};
 use protocol::pipeline::Pipeline;
-use protocol::stage::{EvaluateLatentFid, Register};
+use protocol::stage::Register;
 use protocol::{Digest, StageName};
 use serde::Serialize;
 
@@ -158,8 +158,8 @@ fn headline(stage: &StageView) -> String {
     first.map(|(key, value)| format!("{key} {}", print::number(*value))).unwrap_or_default()
 }
 
-/// The model that the run promoted, as `generate` takes it, and how many steps it samples in.
-pub(crate) fn promoted(pipeline: &Pipeline, run: &RunView) -> Option<(String, usize)> {
+/// The model that the run promoted, as `generate` takes it.
+pub(crate) fn promoted(pipeline: &Pipeline, run: &RunView) -> Option<String> {
     let done = |name: &StageName| {
         let stage = run.stages.iter().find(|stage| &stage.name == name)?;
         matches!(stage.state, StageState::Ran | StageState::Cached | StageState::Resumed).then_some(())
@@ -168,9 +168,7 @@ pub(crate) fn promoted(pipeline: &Pipeline, run: &RunView) -> Option<(String, us
         let settings = stage.settings.get::<Register>()?;
         done(&stage.name)?;
         let pick = if settings.promote.to.is_empty() { "best" } else { &settings.promote.to };
-        let evaluations = pipeline.stages.iter().filter_map(|other| other.settings.get::<EvaluateLatentFid>());
-        let steps = evaluations.into_iter().find(|found| settings.from.contains(&found.model)).map(|e| e.sampler.steps);
-        Some((format!("{}@{pick}", settings.model), steps.unwrap_or(1)))
+        Some(format!("{}@{pick}", settings.model))
     })
 }
 
@@ -252,7 +250,7 @@ mod tests {
         let text = "name: p\ndataset: {format: synthetic}\nstages:\n  vae: {kind: train.vae}\n  latents: {kind: encode.latents}\n  mld: {kind: train.mld}\n  pcm: {kind: distill.pcm, phases: 2}\n  fid: {kind: evaluate.latent_fid, model: pcm, sampler: {steps: 2}}\n  out: {kind: register, model: m, from: pcm, promote: {to: staging}}\n";
         let pipeline = protocol::pipeline::read("p.yaml", text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"));
         let ready = view(&[("out", "register", StageState::Ran)]);
-        assert_eq!(promoted(&pipeline, &ready), Some(("m@staging".to_owned(), 2)));
+        assert_eq!(promoted(&pipeline, &ready), Some("m@staging".to_owned()));
         let failed = view(&[("out", "register", StageState::Failed)]);
         assert_eq!(promoted(&pipeline, &failed), None);
     }

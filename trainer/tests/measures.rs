@@ -34,8 +34,9 @@ fn measures_are_taken_and_misused_with_the_reason() {
     println!("{table}");
     assert!(table.contains("AITS") && table.contains("3 sentences") && table.contains("threads"), "{table}");
     let unknown = bench.run(&["time", "--stage", "vae"]).expect_code(3).stderr;
-    assert!(unknown.contains("no denoiser") && unknown.contains("mld"), "{unknown}");
+    assert!(unknown.contains("no model") && unknown.contains("mld"), "{unknown}");
     bench.run(&["time"]).expect_code(2);
+    models_are_drawn_as_they_were_measured(&bench);
 
     // What is wrong stops one stage, says why, and names the stage once.
     let config = Bench::config("smoke.yaml");
@@ -57,4 +58,60 @@ fn measures_are_taken_and_misused_with_the_reason() {
     let kit = "stages.judge={kind: import.evaluator, format: kit, path: t2m}";
     let said = bench.run(&["plan", &config, "--set", kit, "--set", "stages.t2m_real.evaluator=judge"]).expect_code(2);
     assert!(said.stderr.contains("21 joints (kit)") && said.stderr.contains("22 joints"), "{}", said.stderr);
+}
+
+/// A promoted student, and what a stage gave, are drawn with the sampler of their evaluations, which is not that of the papers.
+fn models_are_drawn_as_they_were_measured(bench: &Bench) {
+    let config = Bench::config("smoke.yaml");
+    let generate = |args: &[&str]| {
+        let line = [&["generate", "a person walks", "-o", "x.npy", "--report", "json"], args].concat();
+        bench.run(&line).expect_code(0).json()
+    };
+    let features = || std::fs::read(bench.path().join("x.npy")).expect("the motion is written");
+    let own = generate(&["--model", "smoke@staging"]);
+    assert_eq!(own["sampler"], serde_json::json!({"steps": 1, "guidance": 2.5, "timesteps": []}), "{own}");
+    let drawn = features();
+    generate(&["--model", "smoke@staging", "--steps", "1", "--guidance", "2.5"]);
+    assert_eq!(drawn, features(), "what was measured, said again");
+    generate(&["--model", "smoke@staging", "--guidance", "2"]);
+    assert_ne!(drawn, features(), "what the papers' rule would give");
+    let shown = bench.run(&["registry", "show", "smoke@staging"]).expect_code(0).stdout;
+    for part in ["latent-diffusion, humanml3d", "1 step(s), guidance 2.5", "denoiser=", "text=", "vae="] {
+        assert!(shown.contains(part), "`{part}` is missing in\n{shown}");
+    }
+
+    let teacher = generate(&["--stage", "mld"]);
+    assert_eq!((&teacher["sampler"]["steps"], &teacher["sampler"]["guidance"]), (&4.into(), &3.0.into()), "{teacher}");
+    let started = generate(&["--stage", "lcm", "--timesteps", "799"]);
+    assert_eq!(started["sampler"], serde_json::json!({"steps": 1, "guidance": 2.5, "timesteps": [799]}), "{started}");
+    let refused = bench.run(&["generate", "x", "--stage", "pcm", "--timesteps", "799", "-o", "x.npy"]).expect_code(2);
+    assert!(refused.stderr.contains("LCM students"), "{}", refused.stderr);
+
+    // Evaluations that differ, and the one that `register` names.
+    let other = ["--set", "stages.t2m_pcm.sampler.guidance=3"];
+    let refused = bench.run(&[&["run", &config], &other[..]].concat()).expect_code(2).stderr;
+    assert!(refused.contains("guidance 2.5 in `fid_pcm`; 1 step(s), guidance 3 in `t2m_pcm`"), "{refused}");
+    let length = "stages.length={kind: train.length, steps: 4, batch: {global: 8, slices: 2}}";
+    let named = "stages.release.sampler={steps: 1, guidance: 3}";
+    let sets = ["--set", length, "--set", "stages.release.length=length", "--set", named];
+    bench.run(&[&["run", &config], &other[..], &sets[..]].concat()).expect_code(0);
+    let own = generate(&["--model", "smoke@staging"]);
+    assert_eq!(own["sampler"]["guidance"], 3.0, "{own}");
+    let frames = own["frames"].as_u64().expect("a length");
+    assert!(frames > 0 && frames % 4 == 0, "{own}");
+    assert_eq!(generate(&["--model", "smoke@staging", "--frames", "60"])["frames"], 60);
+    let shown = bench.run(&["registry", "show", "smoke@staging"]).expect_code(0).stdout;
+    assert!(shown.contains("length="), "{shown}");
+
+    // A whole model leaves the store part by part.
+    bench.run(&["registry", "export", "smoke@staging", "out"]).expect_code(0);
+    for file in [
+        "manifest.json",
+        "denoiser/manifest.json",
+        "vae/model.safetensors",
+        "text/manifest.json",
+        "length/manifest.json",
+    ] {
+        assert!(bench.path().join("out").join(file).is_file(), "{file}");
+    }
 }

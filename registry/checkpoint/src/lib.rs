@@ -3,7 +3,7 @@
 //! An artifact is a [`Manifest`](protocol::Manifest) that lists blobs; tensors are safetensors, everything else is JSON.
 //! Nothing in it is executable on load. Not its job: where blobs live, and whether they may be written.
 
-pub mod bundle;
+pub mod model;
 
 use std::fmt;
 use std::sync::Arc;

@@ -12,7 +12,7 @@ mod export;
 mod print;
 
 use access::Scope;
-use checkpoint::bundle;
+use checkpoint::model::Model as ModelMeta;
 use protocol::message::ApiError;
 use protocol::{Alias, Digest, Manifest, ModelName, RunId};
 use serde::{Deserialize, Serialize};
@@ -425,10 +425,10 @@ async fn one(store: &ReadStore, text: &str) -> Result<Version, Refused> {
     Ok(store.resolve(&format!("{text}@{pick}")).await?)
 }
 
-/// The data format that a version's VAE makes motion of, which is how the papers name their datasets.
+/// The data format of a version's motions, which is how the papers name their datasets.
 fn format_of(store: &ReadStore, version: &Version) -> Option<String> {
     let manifest = store.blobs().manifest(version.artifact).ok()?;
-    bundle::format(&manifest).map(str::to_owned)
+    ModelMeta::read(&manifest).ok().map(|model| model.format.name().to_owned())
 }
 
 async fn leaderboard(store: &ReadStore, of: &str, published: bool) -> Result<Leaderboard, Refused> {

@@ -2,9 +2,11 @@
 
 use std::io::{self, Write};
 
+use checkpoint::model::Model;
 use comfy_table::{ContentArrangement, Table, presets};
+use protocol::artifact::Role;
 use protocol::message::ApiError;
-use protocol::printable;
+use protocol::{Digest, Manifest, printable};
 use serde_json::json;
 
 use super::{Answer, Data, Output};
@@ -86,7 +88,7 @@ pub fn render(data: &Data) -> String {
                 ("from", source(version)),
                 ("registered", format_ms(version.created_ms)),
             ];
-            for (name, value) in lines {
+            for (name, value) in lines.into_iter().chain(drawn(manifest)) {
                 text += &format!("  {name:<11} {value}\n");
             }
             let mut values = table(&["EVALUATION", "METRIC", "VALUE, ± HALF THE 95 % INTERVAL"]);
@@ -229,6 +231,18 @@ fn dash<T: ToString>(value: Option<T>) -> String {
 fn list(items: impl Iterator<Item = String>) -> String {
     let items: Vec<_> = items.collect();
     if items.is_empty() { "-".into() } else { items.join(", ") }
+}
+
+/// How a model is drawn from, and what with.
+fn drawn(manifest: &Manifest) -> Vec<(&'static str, String)> {
+    let Ok(model) = Model::read(manifest) else { return Vec::new() };
+    let sampler = model.sampler.map_or_else(|| "nobody measured it".to_owned(), |sampler| sampler.to_string());
+    let part = |(role, digest): (&Role, &Digest)| format!("{role}={}", digest.short());
+    vec![
+        ("generator", format!("{}, {}", model.generator, model.format.name())),
+        ("sampler", sampler),
+        ("parts", list(model.parts.iter().map(part))),
+    ]
 }
 
 fn source(version: &Version) -> String {

@@ -6,9 +6,10 @@
 
 use std::collections::BTreeMap;
 
+use checkpoint::model::Parts;
 use protocol::message::{CommitCheckpoint, Grant, Join, Poll, ReportOutcome};
 use protocol::pipeline::Pipeline;
-use protocol::stage::Keep;
+use protocol::stage::{Keep, Sampler};
 use protocol::{Digest, Fence, Incarnation, RunId, StageName, TaskId, WorkerId};
 use registry::Write;
 use serde::{Deserialize, Serialize};
@@ -207,15 +208,17 @@ pub enum Observation {
     },
 }
 
-/// A denoiser that a register stage makes a version of.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+/// A model that a register stage makes a version of.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Candidate {
     /// The stage that made it.
     pub stage: StageName,
-    /// The denoiser.
-    pub denoiser: Digest,
-    /// The VAE whose latents it works on.
-    pub vae: Digest,
+    /// The model as that stage gave it.
+    pub model: Digest,
+    /// How it is drawn from when nobody says otherwise; `None` if nobody measured it.
+    pub sampler: Option<Sampler>,
+    /// Parts that are added to it.
+    pub parts: Parts,
 }
 
 /// What is to be done about an event.
@@ -228,7 +231,7 @@ pub enum Effect {
         /// The stage's key.
         key: Digest,
     },
-    /// Bundle each candidate with its VAE and answer with [`Event::Bundled`] or [`Event::RegisterRefused`].
+    /// Give each candidate its sampler and parts and answer with [`Event::Bundled`] or [`Event::RegisterRefused`].
     Register {
         /// The register stage's key.
         key: Digest,

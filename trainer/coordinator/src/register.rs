@@ -1,19 +1,20 @@
-//! What a `register` stage registers: which bundles, with which metrics, and which of them is best.
+//! What a `register` stage registers: which models, drawn from how, with which metrics, and which of them is best.
 //!
 //! The coordinator does it itself, because it changes the registry: versions, the move of the alias and the stage's value
 //! are one transaction, so that a gate that does not hold leaves nothing behind.
 
 use std::collections::BTreeMap;
 
-use protocol::pipeline::Pipeline;
-use protocol::stage::{Mode, Register};
-use protocol::{Alias, ArtifactKind, Digest, ModelName, RunId, StageName};
+use checkpoint::model::Parts;
+use protocol::pipeline::PipelineStage;
+use protocol::stage::{Mode, Register, Sampler};
+use protocol::{Alias, Digest, ModelName, RunId, StageName};
 use registry::Write;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use crate::event::{Candidate, Known};
-use crate::state::run::{Run, value};
+use crate::state::run::{Run, Status, value};
 
 /// All that a register stage needs to know, once its inputs are there.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -48,16 +49,21 @@ impl Registration {
                 Some((alias, settings.promote.require.clone()))
             }
         };
+        let mut parts = Parts::new();
+        for (role, stage) in settings.parts() {
+            let part = output(run, &StageName::new(stage));
+            parts.insert(role, part.ok_or_else(|| format!("stage `{stage}` has no output"))?);
+        }
         let (mut candidates, mut metrics, mut keys) = (Vec::new(), Vec::new(), Vec::new());
         for from in &settings.from {
             let stage = StageName::new(from.as_str());
-            let denoiser = output(run, &stage).ok_or_else(|| format!("`from`: stage `{from}` has no output"))?;
-            let vae = vae_of(&run.pipeline, &stage)
-                .and_then(|vae| output(run, &vae))
-                .ok_or_else(|| format!("`from`: no VAE is found behind stage `{from}`"))?;
+            let model = output(run, &stage).ok_or_else(|| format!("`from`: stage `{from}` has no output"))?;
+            let samplers = evaluations_of(run, from)
+                .filter_map(|(stage, _)| Some((stage.name.as_str(), stage.settings.sampler()?)));
+            let sampler = settings.sampler_of(from, samplers).map_err(|why| format!("`from`: {why}"))?.cloned();
             keys.extend(run.status(&stage).and_then(|status| status.key()));
-            metrics.push(metrics_of(run, from));
-            candidates.push(Candidate { stage, denoiser, vae });
+            metrics.push(metrics_of(run, from, sampler.as_ref()));
+            candidates.push(Candidate { stage, model, sampler, parts: parts.clone() });
         }
         let best = best(&settings.from, &metrics, settings)?;
         let by = (settings.metric.clone(), settings.mode);
@@ -97,26 +103,20 @@ fn output(run: &Run, stage: &StageName) -> Option<Digest> {
     value(run.status(stage)?.known()?).copied()
 }
 
-/// The VAE behind a denoiser: the one it reads, or its teacher's.
-fn vae_of(pipeline: &Pipeline, stage: &StageName) -> Option<StageName> {
-    let mut stage = pipeline.stages.iter().find(|s| s.name == *stage)?;
-    // Stages stand after what they read, so this ends.
-    loop {
-        let input = |kind| stage.inputs.iter().find(|input| input.kind == kind).map(|input| &input.stage);
-        if let Some(vae) = input(ArtifactKind::Vae) {
-            return Some(vae.clone());
-        }
-        let teacher = input(ArtifactKind::Denoiser)?;
-        stage = pipeline.stages.iter().find(|s| s.name == *teacher)?;
-    }
+/// The evaluations that look at `model`.
+fn evaluations_of<'a>(run: &'a Run, model: &'a str) -> impl Iterator<Item = (&'a PipelineStage, &'a Status)> {
+    let stages = run.pipeline.stages.iter().zip(&run.stages);
+    stages.filter(move |(stage, _)| stage.settings.evaluated_model().as_deref() == Some(model))
 }
 
 /// The metrics of every evaluation that looks at `model`. Of several evaluations (a student at one and at four steps, in latents and
-/// by an evaluator) each keeps its own as `stage.metric`; the plain name, with its interval, is the first one's that gives it.
-fn metrics_of(run: &Run, model: &str) -> BTreeMap<String, f64> {
-    let stages = run.pipeline.stages.iter().zip(&run.stages);
-    let looking = stages.filter(|(stage, _)| stage.settings.evaluated_model().as_deref() == Some(model));
-    let known: Vec<_> = looking.filter_map(|(stage, status)| Some((&stage.name, &status.known()?.metrics))).collect();
+/// by an evaluator) each keeps its own as `stage.metric`; the plain name, with its interval, is the first one's that gives it, and those that
+/// drew as the version is drawn from come before others.
+fn metrics_of(run: &Run, model: &str, sampler: Option<&Sampler>) -> BTreeMap<String, f64> {
+    let mut looking: Vec<_> = evaluations_of(run, model).collect();
+    looking.sort_by_key(|(stage, _)| stage.settings.sampler() != sampler);
+    let known: Vec<_> =
+        looking.into_iter().filter_map(|(stage, status)| Some((&stage.name, &status.known()?.metrics))).collect();
     together(&known)
 }
 

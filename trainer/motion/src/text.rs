@@ -192,20 +192,44 @@ fn finalise(mut h: u64) -> u64 {
     h ^ (h >> 33)
 }
 
+/// The end of a caption, which is all that an empty one has.
+const END: &str = "</s>";
+
+/// The words of a caption: lower-cased, everything outside `[a-z0-9]` separates them. Captions of the same words say the same.
+pub fn words(caption: &str) -> Vec<String> {
+    let lower = caption.to_lowercase();
+    let words = lower.split(|c: char| !matches!(c, 'a'..='z' | '0'..='9')).filter(|w| !w.is_empty());
+    words.map(str::to_owned).collect()
+}
+
+/// The coordinate that a word or a pair of words is hashed to, and its sign.
+fn hashed_gram(gram: &str) -> (usize, i32) {
+    let h = finalise(fnv1a(gram.as_bytes()));
+    ((h % EMBEDDING_WIDTH as u64) as usize, if h >> 63 == 0 { 1 } else { -1 })
+}
+
+/// The built-in text encoder, token by token: each word of the caption and its end as a signed coordinate, in order.
+pub fn hashed_tokens(caption: &str) -> Vec<[f32; EMBEDDING_WIDTH]> {
+    let token = |word: &str| {
+        let (coordinate, sign) = hashed_gram(word);
+        let mut row = [0.0; EMBEDDING_WIDTH];
+        row[coordinate] = sign as f32;
+        row
+    };
+    words(caption).iter().map(String::as_str).chain([END]).map(token).collect()
+}
+
 /// The built-in text encoder: words and word pairs hashed to signed coordinates, unit length.
 ///
-/// The caption is lower-cased and everything outside `[a-z0-9]` separates words. Hashed are `</s>`, every word and every
-/// pair of neighbours joined by one space; coordinate `h mod 768`, `+1` if bit 63 of `h` is 0, else `-1`. The empty
+/// Hashed are `</s>`, every one of its [`words`] and every pair of neighbours joined by one space; coordinate `h mod 768`, `+1` if bit 63 of `h` is 0, else `-1`. The empty
 /// caption, the null condition of classifier-free guidance, is `</s>` alone.
 pub fn hashed_embedding(caption: &str) -> [f32; EMBEDDING_WIDTH] {
-    let lower = caption.to_lowercase();
-    let words: Vec<&str> =
-        lower.split(|c: char| !matches!(c, 'a'..='z' | '0'..='9')).filter(|w| !w.is_empty()).collect();
+    let words = words(caption);
     let pairs = words.windows(2).map(|pair| pair.join(" "));
     let mut sums = [0_i32; EMBEDDING_WIDTH];
-    for gram in std::iter::once("</s>".to_owned()).chain(words.iter().map(|w| (*w).to_owned())).chain(pairs) {
-        let h = finalise(fnv1a(gram.as_bytes()));
-        sums[(h % EMBEDDING_WIDTH as u64) as usize] += if h >> 63 == 0 { 1 } else { -1 };
+    for gram in std::iter::once(END.to_owned()).chain(words.iter().cloned()).chain(pairs) {
+        let (coordinate, sign) = hashed_gram(&gram);
+        sums[coordinate] += sign;
     }
     let squares: i32 = sums.iter().map(|v| v * v).sum();
     // Grams can cancel each other out; then there is no direction to normalise.

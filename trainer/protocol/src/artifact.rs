@@ -3,7 +3,9 @@
 //! A manifest is a small canonical JSON document that lists blobs by digest; its own digest names the artifact. Parts
 //! that two artifacts share (a frozen VAE in every student) are stored once.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
+use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
@@ -21,6 +23,8 @@ pub enum ArtifactKind {
     Vae,
     /// VAE posteriors of a dataset.
     Latents,
+    /// Turns captions into vectors.
+    TextEncoder,
     /// A latent denoiser: teacher or student.
     Denoiser,
     /// Embeds captions and motions in one space.
@@ -29,7 +33,7 @@ pub enum ArtifactKind {
     Length,
     /// Metrics of an evaluation.
     Report,
-    /// A registered model: everything `generate` needs.
+    /// A generator and its parts: everything that drawing a motion needs.
     Model,
     /// All that continuing a training stage bit for bit needs.
     Checkpoint,
@@ -45,6 +49,7 @@ impl ArtifactKind {
             Self::Embeddings => "caption embeddings",
             Self::Vae => "a VAE",
             Self::Latents => "latents",
+            Self::TextEncoder => "a text encoder",
             Self::Denoiser => "a denoiser",
             Self::Evaluator => "an evaluator",
             Self::Length => "a length estimator",
@@ -53,6 +58,54 @@ impl ArtifactKind {
             Self::Checkpoint => "a checkpoint",
             Self::Shard => "a shard",
         }
+    }
+}
+
+/// What an artifact is for in a model: `denoiser`, `vae`, `text`, `length`.
+///
+/// A role is a text, not a list of those there are: whoever stores, registers, exports and shows models handles each alike. Files of a
+/// model bear it as a folder's name, so it consists of small letters, digits and `-`.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct Role(Cow<'static, str>);
+
+impl Role {
+    /// The network that removes noise.
+    pub const DENOISER: Self = Self(Cow::Borrowed("denoiser"));
+    /// Turns latents into motion.
+    pub const VAE: Self = Self(Cow::Borrowed("vae"));
+    /// Turns captions into what the generator is conditioned on.
+    pub const TEXT: Self = Self(Cow::Borrowed("text"));
+    /// Says how long a caption's motion is when nobody else does.
+    pub const LENGTH: Self = Self(Cow::Borrowed("length"));
+
+    /// Its name.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl TryFrom<String> for Role {
+    type Error = String;
+
+    fn try_from(name: String) -> Result<Self, String> {
+        let known = |c: u8| c.is_ascii_lowercase() || c.is_ascii_digit() || c == b'-';
+        match !name.is_empty() && name.len() <= 64 && name.bytes().all(known) {
+            true => Ok(Self(Cow::Owned(name))),
+            false => Err(format!("{name:?} is not a part's role; expected small letters, digits and `-`, at most 64")),
+        }
+    }
+}
+
+impl From<Role> for String {
+    fn from(role: Role) -> Self {
+        role.0.into_owned()
+    }
+}
+
+impl fmt::Display for Role {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
     }
 }
 

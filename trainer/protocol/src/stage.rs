@@ -18,6 +18,7 @@ mod neighbours;
 mod network;
 mod placement;
 mod problems;
+mod sampler;
 mod spec;
 mod training;
 
@@ -25,7 +26,7 @@ use crate::{ArtifactKind, Digest, Steps};
 
 pub use data::DataFormat;
 pub use distillation::{Distance, Distillation};
-pub use evaluation::{Mode, Sampler, Split};
+pub use evaluation::{Mode, Split};
 pub use identity::{Backend, StageIdentity};
 pub use kinds::{
     DataOpen, DataSynthetic, DistillLcm, DistillPcm, EncodeLatents, EvaluateLatentFid, EvaluateReconstruction,
@@ -36,6 +37,7 @@ pub use neighbours::Neighbours;
 pub use network::{LatentShape, Network, Positions};
 pub use placement::{CheckpointPolicy, Keep, Placement, WorkerRange};
 pub use problems::{Problem, Problems};
+pub use sampler::{Family, Sampler, measured_with};
 pub use spec::{Output, Ref, Shape, StageSpec, Target};
 pub use training::{Batch, Decay, Optimizer, Training};
 
@@ -147,6 +149,11 @@ impl StageSettings {
     pub fn evaluated_model(&self) -> Option<String> {
         let mut settings = self.clone();
         settings.refs().into_iter().find(|reference| reference.measured).map(|reference| reference.name.clone())
+    }
+
+    /// How an evaluation draws from what it measures.
+    pub fn sampler(&self) -> Option<&Sampler> {
+        self.spec().sampler()
     }
 
     /// The schema of the kind's keys.

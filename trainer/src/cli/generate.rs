@@ -7,11 +7,11 @@ use std::time::Instant;
 use clap::Args;
 use motion::{Skeleton, npy};
 use protocol::Seed;
-use protocol::stage::Sampler;
 use stages::generate::{Generated, Generator};
 
 use super::model::{self, Found};
 use super::remote::check_parent;
+use super::sampler::SamplerArgs;
 use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result};
@@ -23,15 +23,20 @@ pub(crate) struct GenerateArgs {
     #[arg(required = true)]
     prompt: Vec<String>,
     /// MODEL@ALIAS, MODEL@best or MODEL:VERSION
-    #[arg(short, long)]
-    model: String,
-    /// Sampling steps [default: the model's own]
+    #[arg(short, long, required_unless_present = "stage", conflicts_with = "stage")]
+    model: Option<String>,
+    /// What a stage of a run gave, such as the teacher
+    #[arg(long, value_name = "STAGE")]
+    stage: Option<String>,
+    /// The run of --stage: its name, a unique beginning of it, or `@last`
+    #[arg(long, default_value = "@last", requires = "stage")]
+    run: String,
+    /// Sampling steps [default: as the model was measured]
     #[arg(long, value_name = "N")]
     steps: Option<usize>,
-    /// Guidance: a teacher's scale g, a student's w = g - 1 [default: the model's own]
-    #[arg(long, value_name = "W")]
-    guidance: Option<f64>,
-    /// Length in frames [default: 120]
+    #[command(flatten)]
+    sampler: SamplerArgs,
+    /// Length in frames [default: what the model's length estimator says, 120 without one]
     #[arg(long, value_name = "N")]
     frames: Option<usize>,
     /// Other seeds give other motions
@@ -71,16 +76,18 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
     }
     let start = Instant::now();
     let reader = Reader::open(&args.target).await?;
-    let Found { manifest, blobs, label } = model::version(&reader, &args.model).await?;
+    let found = match (&args.stage, &args.model) {
+        (Some(stage), _) => model::stage(&reader, &reader.find(&args.run).await?, stage).await?,
+        (None, model) => model::version(&reader, model.as_deref().unwrap_or_default()).await?,
+    };
+    let Found { manifest, blobs, label, measured } = found;
     reader.close().await;
     let (device, _) = model::device(args.backend.as_deref())?;
     let generator = Generator::load(&manifest, &blobs, &device).map_err(Problem::failed)?;
     let loaded = start.elapsed();
 
-    let own = generator.sampler().clone();
-    let steps = args.steps.unwrap_or(own.steps);
-    let timesteps = if steps == own.steps { own.timesteps.clone() } else { Vec::new() };
-    let sampler = Sampler { steps, guidance: args.guidance.unwrap_or(own.guidance), timesteps };
+    let sampler = args.sampler.sampler(args.steps, generator.sampler(), &measured);
+    let sampler = sampler.map_err(|why| Problem::usage(format!("{label}: {why}")))?;
     let mut motions = Vec::new();
     for prompt in &args.prompt {
         let motion =
@@ -108,11 +115,10 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
             "load_ms": milliseconds(loaded),
         })),
         Output::Table => print::out(&format!(
-            "{} from {label}: {} frames, {} step(s), guidance {}\n{:.1} ms per sentence (text {:.1}, sampling {:.1}, decoding {:.1}); the model loaded in {:.0} ms",
+            "{} from {label}: {} frames, {}\n{:.1} ms per sentence (text {:.1}, sampling {:.1}, decoding {:.1}); the model loaded in {:.0} ms",
             written.join(", "),
             motion.frames,
-            sampler.steps,
-            sampler.guidance,
+            sampler,
             milliseconds(timing.total()),
             milliseconds(timing.text),
             milliseconds(timing.sampling),

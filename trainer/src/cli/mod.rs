@@ -4,6 +4,7 @@ mod config;
 mod generate;
 mod model;
 mod remote;
+mod sampler;
 mod serve;
 pub(crate) mod sweep;
 mod time;

@@ -5,10 +5,11 @@ use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use burn::tensor::Device;
-use checkpoint::bundle::{bundle, vae_of};
+use checkpoint::model::{Drawn, Model};
 use checkpoint::{BlobError, Blobs};
 use models::device::DeviceInfo;
 use protocol::message::RunView;
+use protocol::stage::Sampler;
 use protocol::{Digest, Manifest};
 use registry::cli::{Command, Data};
 use stages::context::StageError;
@@ -22,6 +23,8 @@ pub(super) struct Found {
     pub(super) manifest: Manifest,
     pub(super) blobs: Fetched,
     pub(super) label: Label,
+    /// Evaluations of it and how they drew, of what a stage gave. A version has its own sampler.
+    pub(super) measured: Vec<(String, Sampler)>,
 }
 
 /// What a name stood for.
@@ -102,40 +105,50 @@ pub(super) async fn version(reader: &Reader, name: &str) -> Result<Found> {
         }
     };
     let blobs = Fetched::files(reader, &manifest).await?;
-    Ok(Found { manifest, blobs, label: Label::Version(name.to_owned(), version.version) })
+    Ok(Found { manifest, blobs, label: Label::Version(name.to_owned(), version.version), measured: Vec::new() })
 }
 
-/// The denoiser that a stage of `run` gave, with the VAE whose latents it makes.
+/// The model that a stage of `run` gave, and how the run's evaluations drew from it.
 pub(super) async fn stage(reader: &Reader, run: &RunView, name: &str) -> Result<Found> {
-    let denoiser = run.stages.iter().find(|stage| stage.name.as_str() == name).map(|stage| stage.outputs.get(DENOISER));
-    let Some(Some(denoiser)) = denoiser else {
-        let have = run.stages.iter().filter(|stage| stage.of.is_none() && stage.outputs.contains_key(DENOISER));
+    let model = run.stages.iter().find(|stage| stage.name.as_str() == name).map(|stage| stage.outputs.get(MODEL));
+    let Some(Some(model)) = model else {
+        let have = run.stages.iter().filter(|stage| stage.of.is_none() && stage.outputs.contains_key(MODEL));
         let have: Vec<&str> = have.map(|stage| stage.name.as_str()).collect();
-        let why = if denoiser.is_none() { "has no stage" } else { "has no denoiser yet from stage" };
+        let why = if model.is_none() { "has no stage" } else { "has no model yet from stage" };
         let problem = Problem::new(exit::NOT_FOUND, anyhow::anyhow!("run `{}` {why} `{name}`", run.run));
         return Err(problem.hint(match have.as_slice() {
             [] => "no stage of it gave one yet; `trainer status --all` lists other runs, --run takes one".to_owned(),
             have => format!("stages of it that gave one: {}; --run names another run", have.join(", ")),
         }));
     };
-    let manifest = async |digest: Digest| -> Result<Manifest> {
-        let manifest: Manifest = serde_json::from_slice(&verified(reader, digest).await?)
-            .map_err(|error| Problem::failed(format!("{digest} is no manifest: {error}")))?;
-        if manifest.format != Manifest::FORMAT {
-            let (found, known) = (manifest.format, Manifest::FORMAT);
-            return Err(Problem::failed(format!("{digest} has format {found}, this program knows {known}")));
+    let manifest = manifest(reader, *model).await?;
+    let mut measured = Vec::new();
+    if Model::read(&manifest).map_err(Problem::failed)?.sampler.is_none() {
+        for stage in run.stages.iter().filter(|stage| stage.of.is_none()) {
+            let Some(report) = stage.outputs.get(REPORT) else { continue };
+            let report = self::manifest(reader, *report).await?;
+            let drawn: Option<Drawn> = serde_json::from_value(report.meta["drawn"].clone()).ok();
+            measured.extend(drawn.filter(|drawn| drawn.model == *model).map(|d| (stage.name.to_string(), d.sampler)));
         }
-        Ok(manifest)
-    };
-    let denoiser = manifest(*denoiser).await?;
-    let vae = manifest(vae_of(&denoiser).map_err(Problem::failed)?).await?;
-    let model = bundle(&denoiser, &vae).map_err(|error| Problem::failed(format!("stage `{name}`: {error}")))?;
-    let blobs = Fetched::files(reader, &model).await?;
-    Ok(Found { manifest: model, blobs, label: Label::Stage(run.run.to_string(), name.to_owned()) })
+    }
+    let blobs = Fetched::files(reader, &manifest).await?;
+    Ok(Found { manifest, blobs, label: Label::Stage(run.run.to_string(), name.to_owned()), measured })
 }
 
-/// The output of stages that give a denoiser.
-const DENOISER: &str = "denoiser";
+async fn manifest(reader: &Reader, digest: Digest) -> Result<Manifest> {
+    let manifest: Manifest = serde_json::from_slice(&verified(reader, digest).await?)
+        .map_err(|error| Problem::failed(format!("{digest} is no manifest: {error}")))?;
+    if manifest.format != Manifest::FORMAT {
+        let (found, known) = (manifest.format, Manifest::FORMAT);
+        return Err(Problem::failed(format!("{digest} has format {found}, this program knows {known}")));
+    }
+    Ok(manifest)
+}
+
+/// The output of stages that give a model.
+const MODEL: &str = "model";
+/// The output of evaluations.
+const REPORT: &str = "report";
 
 /// The first device of a backend.
 pub(super) fn device(backend: Option<&str>) -> Result<(Device, DeviceInfo)> {

@@ -9,7 +9,8 @@ use serde_json::json;
 use stages::generate::{DEFAULT_FRAMES, Generator};
 use stages::timing::{self, Times, WARM_UP};
 
-use super::model;
+use super::model::{self, Found};
+use super::sampler::SamplerArgs;
 use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result};
@@ -26,12 +27,11 @@ pub(crate) struct TimeArgs {
     /// The run of --stage: its name, a unique beginning of it, or `@last`
     #[arg(long, default_value = "@last", requires = "stage")]
     run: String,
-    /// Sampling steps, a row for each that the model has [default: the model's own]
+    /// Sampling steps, a row for each that the model has [default: as the model was measured]
     #[arg(long, value_name = "N", value_delimiter = ',')]
     steps: Vec<usize>,
-    /// Guidance: a teacher's scale g, a student's w = g - 1 [default: the model's own]
-    #[arg(long, value_name = "W")]
-    guidance: Option<f64>,
+    #[command(flatten)]
+    sampler: SamplerArgs,
     /// Sentences that are timed, after a warm-up
     #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     sentences: u32,
@@ -69,53 +69,52 @@ pub(crate) async fn time(args: TimeArgs) -> Result<u8> {
     }
     reader.close().await;
     let (device, info) = model::device(args.backend.as_deref())?;
-    let mut models: Vec<(String, Generator)> = Vec::new();
+    let mut models: Vec<(String, Generator, &Found)> = Vec::new();
     for found in &found {
         let generator = Generator::load(&found.manifest, &found.blobs, &device).map_err(Problem::failed)?;
-        models.push((found.label.to_string(), generator));
+        models.push((found.label.to_string(), generator, found));
     }
     let mut timed: Vec<(&str, &Generator, Sampler)> = Vec::new();
-    for (label, generator) in &models {
-        let samplers = samplers(label, generator, &args.steps, args.guidance).map_err(|why| {
+    for (label, generator, found) in &models {
+        let samplers = samplers(label, generator, &found.measured, &args).map_err(|why| {
             Problem::usage(format!("{label}: {why}"))
                 .hint("leave --steps out for the steps that each model has by default")
         })?;
         timed.extend(samplers.into_iter().map(|sampler| (label.as_str(), generator, sampler)));
     }
 
+    // As many for all: the time of a model must not depend on what its length estimator says.
+    let frames = args.frames.unwrap_or(DEFAULT_FRAMES);
     let sentences = timing::sentences(args.sentences as usize);
     let progress = progress((sentences.len() + WARM_UP) * timed.len());
     let pairs: Vec<(&Generator, &Sampler)> =
         timed.iter().map(|(_, generator, sampler)| (*generator, sampler)).collect();
-    let all = timing::time(&pairs, &sentences, args.frames, &mut || progress.inc(1)).map_err(model::refused)?;
+    let all = timing::time(&pairs, &sentences, Some(frames), &mut || progress.inc(1)).map_err(model::refused)?;
     progress.finish_and_clear();
     let row = |((label, _, sampler), timings): (&(&str, &Generator, Sampler), &Vec<timing::Timing>)| {
         Times::of(timings).map(|times| Row { label: (*label).to_owned(), sampler: sampler.clone(), times })
     };
     let rows: Vec<Row> = timed.iter().zip(&all).filter_map(row).collect();
-    show(&rows, args.frames.unwrap_or(DEFAULT_FRAMES), &Machine::here(&info), args.output);
+    show(&rows, frames, &Machine::here(&info), args.output);
     Ok(0)
 }
 
-/// The samplers to time a model with: its own, or one for each of `steps` that it has. Steps that only other models have are left out with a
+/// The samplers to time a model with: its own, or one for each of `--steps` that it has. Steps that only other models have are left out with a
 /// note; a model that has none of them is refused.
 fn samplers(
     label: &str,
     generator: &Generator,
-    steps: &[usize],
-    guidance: Option<f64>,
+    measured: &[(String, Sampler)],
+    args: &TimeArgs,
 ) -> std::result::Result<Vec<Sampler>, String> {
-    let own = Sampler { guidance: guidance.unwrap_or(generator.sampler().guidance), ..generator.sampler().clone() };
-    if steps.is_empty() {
-        return Ok(vec![own]);
+    let with = |steps| args.sampler.sampler(steps, generator.sampler(), measured);
+    if args.steps.is_empty() {
+        return Ok(vec![with(None)?]);
     }
-    let with = |steps: usize| match steps == own.steps {
-        true => own.clone(),
-        false => Sampler { steps, timesteps: Vec::new(), ..own.clone() },
-    };
     let mut refused = Vec::new();
     let mut fits = Vec::new();
-    for sampler in steps.iter().map(|steps| with(*steps)) {
+    for steps in &args.steps {
+        let sampler = with(Some(*steps))?;
         match generator.check_sampler(&sampler) {
             Ok(()) => fits.push(sampler),
             Err(why) => refused.push(why.to_string()),

@@ -8,10 +8,11 @@ use std::cell::RefCell;
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
+use checkpoint::model::{self, Parts};
 use checkpoint::{Blob, BlobError, Blobs};
 use motion::dataset::{Caption, Dataset, PackError, Split};
-use protocol::artifact::FileEntry;
-use protocol::stage::{DataFormat, LatentShape, Network};
+use protocol::artifact::{FileEntry, Role};
+use protocol::stage::{DataFormat, Family, LatentShape, Network};
 use protocol::{ArtifactKind, Digest, Manifest};
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
@@ -47,8 +48,8 @@ pub struct DatasetMeta {
 /// Meta of an artifact of kind `embeddings`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EmbeddingsMeta {
-    /// The encoder, as in the settings: `hashed`.
-    pub encoder: String,
+    /// The encoder, which is also its part `text`.
+    pub text: Digest,
     /// Width of an embedding.
     pub dim: usize,
     /// Captions embedded.
@@ -91,37 +92,13 @@ pub struct LatentsMeta {
     pub lengths: Vec<usize>,
 }
 
-/// What a denoiser was trained to do, and so how motions are drawn from it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "family", rename_all = "lowercase")]
-pub enum Family {
-    /// Predicts noise; DDIM with classifier-free guidance.
-    Mld,
-    /// Latent consistency model: jumps to the data, re-noises between jumps.
-    Lcm {
-        /// Solver step k; the grid has 1000/k points.
-        skip: usize,
-        /// Guidance scales w it was trained for.
-        guidance: (f64, f64),
-    },
-    /// Phased consistency model: deterministic jumps between phase edges.
-    Pcm {
-        /// Solver step k; the grid has 1000/k points.
-        skip: usize,
-        /// Guidance scales w it was trained for.
-        guidance: (f64, f64),
-        /// M: phases, and sampling steps.
-        phases: usize,
-    },
-}
-
 /// Meta of an artifact of kind `denoiser`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DenoiserMeta {
     /// What it does.
     #[serde(flatten)]
     pub family: Family,
-    /// Latent shape; that of `vae`.
+    /// Latent shape; that of its VAE.
     pub latent: LatentShape,
     /// Size.
     pub network: Network,
@@ -129,12 +106,10 @@ pub struct DenoiserMeta {
     pub text_relu: bool,
     /// Width of the guidance embedding; 0 for a teacher, which has none.
     pub guidance_dim: usize,
-    /// Text encoder, as in [`EmbeddingsMeta`].
-    pub encoder: String,
     /// Width of a caption embedding.
     pub text_dim: usize,
-    /// The VAE whose latents it makes.
-    pub vae: Digest,
+    /// The parts that it was trained with: the VAE whose latents it makes, the text encoder.
+    pub fits: Parts,
 }
 
 /// Reads a manifest's meta as `T`; `what` names the artifact in the error.
@@ -167,13 +142,16 @@ pub fn input(cx: &dyn AttemptContext, field: &str, kind: ArtifactKind) -> Result
         .get(field)
         .ok_or_else(|| StageError::Fault(format!("the stage was started without its input `{field}`")))?;
     let manifest = cx.manifest(digest)?;
-    if manifest.kind != kind {
-        return Err(StageError::Input(format!(
-            "`{field}` is an artifact of kind {:?}, expected {kind:?}",
-            manifest.kind
-        )));
-    }
+    expect(&format!("`{field}`"), &manifest, kind)?;
     Ok((digest, manifest))
+}
+
+/// Refuses an artifact of another kind; `what` names it in the error.
+pub fn expect(what: &str, manifest: &Manifest, kind: ArtifactKind) -> Result<(), StageError> {
+    if manifest.kind == kind {
+        return Ok(());
+    }
+    Err(StageError::Input(format!("{what} is an artifact of kind {:?}, expected {kind:?}", manifest.kind)))
 }
 
 fn entry<'a>(manifest: &'a Manifest, name: &str) -> Result<&'a FileEntry, StageError> {
@@ -226,6 +204,16 @@ impl Draft {
         let digest = self.blobs.put_pieces(pieces).map_err(blob_error)?;
         self.manifest.files.insert(name.to_owned(), FileEntry { digest, bytes: length });
         Ok(())
+    }
+
+    /// The manifest, without uploading it: of what becomes a part.
+    pub fn into_manifest(self) -> Manifest {
+        self.manifest
+    }
+
+    /// Adds another artifact as a part; its manifest must be uploaded.
+    pub fn part(&mut self, role: &Role, part: &Manifest) -> Digest {
+        model::add_part(&mut self.manifest, role, part)
     }
 
     /// Uploads the manifest; its digest names the artifact.
@@ -499,9 +487,8 @@ mod tests {
             network: Network::default(),
             text_relu: false,
             guidance_dim: 256,
-            encoder: "hashed".into(),
             text_dim: 768,
-            vae: Digest::of(b"vae"),
+            fits: Parts::from([(Role::VAE, Digest::of(b"vae"))]),
         };
         let json = to_meta(&meta);
         assert_eq!(json["family"], "pcm");

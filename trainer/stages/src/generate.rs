@@ -1,43 +1,35 @@
-//! From a sentence to a motion, with a registered model.
+//! From a sentence to a motion, with a model of any kind.
 //!
 //! Not a stage: nothing is kept, and the clock is read, because the time per sentence is what few-step models are about. The
 //! motion is a function of (model, sentence, frames, sampler, seed).
 
+use std::rc::Rc;
 use std::time::Instant;
 
 use burn::tensor::Device;
 use checkpoint::Blobs;
-use checkpoint::bundle::{DENOISER_FILE, VAE_FILE};
+use checkpoint::model::Model;
 use motion::features::recover_joints;
 use motion::{Skeleton, Stream};
+use protocol::artifact::Role;
 use protocol::stage::{DataFormat, Sampler};
 use protocol::{ArtifactKind, Manifest, Seed};
-use serde::Deserialize;
 
-use crate::artifacts::{self, DenoiserMeta, VaeMeta};
 use crate::context::StageError;
-use crate::kinds::text::embed;
-use crate::networks::{Autoencoder, Conditions, Denoiser};
+use crate::generator::{self, Batch, Lap, MotionGenerator};
+use crate::length::Lengths;
+use crate::parts::{self, model_error};
 use crate::timing::Timing;
 
-/// Length of a motion when nobody says: 6 seconds of HumanML3D, 9.6 of KIT-ML, near the mean length of their clips.
+/// Length of a motion when neither the user nor the model says: 6 seconds of HumanML3D, 9.6 of KIT-ML, near the mean length of their clips.
 pub const DEFAULT_FRAMES: usize = 120;
 
-/// Meta of a registered model, as [`checkpoint::bundle`] writes it.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-struct ModelMeta {
-    denoiser: DenoiserMeta,
-    vae: VaeMeta,
-    sampler: Sampler,
-}
-
-/// A model that is ready to draw motions.
+/// A model that is ready to draw motions, with all that it has of its own: a sampler, a length.
 #[derive(Debug)]
 pub struct Generator {
-    vae: Autoencoder,
-    denoiser: Denoiser,
-    sampler: Sampler,
-    null: Vec<f32>,
+    model: Box<dyn MotionGenerator>,
+    lengths: Option<Lengths>,
+    sampler: Option<Sampler>,
 }
 
 /// A motion.
@@ -58,33 +50,48 @@ pub struct Generated {
 impl Generator {
     /// Loads an artifact of kind `model`.
     pub fn load(manifest: &Manifest, blobs: &dyn Blobs, device: &Device) -> Result<Self, StageError> {
-        if manifest.kind != ArtifactKind::Model {
-            let kind = manifest.kind;
-            return Err(StageError::Input(format!("an artifact of kind {kind:?} cannot generate; expected a model")));
+        let parts = Model::read(manifest).map_err(model_error)?;
+        let model = generator::open(manifest, blobs, device)?;
+        let lengths = match parts.parts.contains_key(&Role::LENGTH) {
+            true => {
+                let part = parts::part(blobs, &parts, &Role::LENGTH, ArtifactKind::Length)?;
+                Some(Lengths::read(blobs, &part, device)?)
+            }
+            false => None,
+        };
+        if let Some(lengths) = &lengths
+            && (lengths.meta().format, lengths.meta().text_dim) != (model.format(), model.text().dim())
+        {
+            return Err(StageError::Input("the model's length estimator is for other data or another encoder".into()));
         }
-        let meta: ModelMeta = artifacts::meta(manifest, "the model")?;
-        let vae = Autoencoder::load(meta.vae, &artifacts::file(blobs, manifest, VAE_FILE)?, device)?;
-        let null = embed(&meta.denoiser.encoder, "")?;
-        let denoiser = Denoiser::load(meta.denoiser, &artifacts::file(blobs, manifest, DENOISER_FILE)?, device)?;
-        Ok(Self { vae, denoiser, sampler: meta.sampler, null })
+        Ok(Self { model, lengths, sampler: parts.sampler })
     }
 
-    /// How motions are drawn when nobody says.
-    pub fn sampler(&self) -> &Sampler {
-        &self.sampler
+    /// How motions are drawn when nobody says: as the model was measured, or as the papers draw from its kind if nobody measured it.
+    pub fn sampler(&self) -> Sampler {
+        self.sampler.clone().unwrap_or_else(|| self.model.family().published())
     }
 
     /// Refuses a sampler that the model does not have.
     pub fn check_sampler(&self, sampler: &Sampler) -> Result<(), StageError> {
-        self.denoiser.check_sampler(sampler)
+        generator::check_sampler(&*self.model, sampler)
     }
 
     /// Which skeleton its motions have.
     pub fn format(&self) -> DataFormat {
-        self.vae.meta().format
+        self.model.format()
     }
 
-    /// Draws a motion for `prompt`. Without `frames` it has [`DEFAULT_FRAMES`], without `sampler` the model's own is used.
+    /// Frames of `prompt` when nobody says: what the model's length estimator draws, [`DEFAULT_FRAMES`] without one.
+    pub fn frames(&self, prompt: &str, seed: Seed) -> Result<usize, StageError> {
+        let Some(lengths) = &self.lengths else { return Ok(DEFAULT_FRAMES) };
+        let pooled = self.model.text().pooled(&[prompt])?;
+        let drawn = lengths.draw(&pooled, &mut Stream::new(seed, "generate/length", 0, 0));
+        Ok(drawn.min(self.model.longest()))
+    }
+
+    /// Draws a motion for `prompt`. Without `frames` it is as long as [`frames`](Self::frames) says, without `sampler` the model's own is
+    /// used.
     pub fn generate(
         &self,
         prompt: &str,
@@ -92,35 +99,19 @@ impl Generator {
         sampler: Option<&Sampler>,
         seed: Seed,
     ) -> Result<Generated, StageError> {
-        let frames = frames.unwrap_or(DEFAULT_FRAMES);
-        let sampler = sampler.unwrap_or(&self.sampler);
-        let longest = self.vae.max_frames();
-        if !(1..=longest).contains(&frames) {
-            return Err(StageError::Input(format!(
-                "{frames} frames: expected 1 to {longest}, which the VAE has positions for"
-            )));
-        }
-        self.denoiser.check_sampler(sampler)?;
-
+        let sampler = sampler.cloned().unwrap_or_else(|| self.sampler());
         let start = Instant::now();
-        let text = embed(&self.denoiser.meta().encoder, prompt)?;
+        let frames = frames.map_or_else(|| self.frames(prompt, seed), Ok)?;
+        let texts: Vec<_> = self.model.embed(&[prompt])?.into_iter().map(Rc::new).collect();
         let embedded = Instant::now();
-        let latent = self.denoiser.meta().latent;
-        let normal = |index: u64| {
-            let mut noise = vec![0.0; latent.tokens * latent.dim];
-            Stream::new(seed, "generate/noise", 0, index).fill_normal(&mut noise);
-            noise
+        let seeds = |k: usize, _| Stream::new(seed, "generate/noise", 0, k as u64);
+        let batch = Batch { texts: &texts, lengths: &[frames], seeds: &seeds };
+        let (mut sampled, mut decoded) = (embedded, embedded);
+        let mut lap = |lap| match lap {
+            Lap::Sampled => (sampled, decoded) = (Instant::now(), Instant::now()),
+            Lap::Decoded => decoded = Instant::now(),
         };
-        let conditions = Conditions { text, null: self.null.clone(), noise: normal(0) };
-        let z = self.denoiser.sample(&conditions, sampler, &mut |step| normal(1 + step as u64))?;
-        let sampled = Instant::now();
-        let mut features = self.vae.decode(z, frames);
-        self.vae.denormalise(&mut features);
-        let decoded = Instant::now();
-
-        if !features.iter().all(|v| v.is_finite()) {
-            return Err(StageError::Input("the motion is not finite; the model has not been trained well".into()));
-        }
+        let features = generator::motions(&*self.model, batch, &sampler, &mut lap)?.concat();
         let joints = recover_joints(&features, Skeleton::of(self.format()));
         let timing = Timing { text: embedded - start, sampling: sampled - embedded, decoding: decoded - sampled };
         Ok(Generated { features, joints, frames, format: self.format(), timing })

@@ -6,16 +6,16 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
 use models::diffusion::{
-    Grid, LcmTimesteps, Phases, Schedule, TIMESTEPS, ddim_sample, guided, lcm_sample, lcm_timesteps, pcm_sample,
+    Grid, LcmTimesteps, Phases, Schedule, ddim_sample, guided, lcm_sample, lcm_timesteps, pcm_sample,
 };
 use models::kernels::Dropout;
 use models::names::load;
 use models::networks::{self, DenoiserConfig, Init, POSITIONS, Vae, VaeConfig, guidance_embedding};
 use motion::Stream;
-use protocol::stage::{DataFormat, Positions, Sampler};
+use protocol::stage::{DataFormat, Family, Positions, Sampler};
 use protocol::{Manifest, Seed};
 
-use crate::artifacts::{self, DenoiserMeta, Family, MODEL_FILE, VaeMeta};
+use crate::artifacts::{self, DenoiserMeta, MODEL_FILE, VaeMeta};
 use crate::context::{ContextError, StageError};
 use crate::kinds::word;
 
@@ -222,11 +222,6 @@ impl Denoiser {
         &self.meta
     }
 
-    /// Refuses a sampler that this family does not have.
-    pub fn check_sampler(&self, sampler: &Sampler) -> Result<(), StageError> {
-        check_sampler(&self.meta.family, sampler).map_err(StageError::Input)
-    }
-
     /// Draws latents `[batch, N, d]`: a teacher by DDIM with guidance g, an LCM with fresh noise between its jumps, a PCM by one jump a
     /// phase; students embed w. `step_noise(j)` is asked for noise of the same shape after jump j of an LCM.
     pub fn sample(
@@ -235,7 +230,7 @@ impl Denoiser {
         sampler: &Sampler,
         step_noise: &mut dyn FnMut(usize) -> Vec<f32>,
     ) -> Result<Vec<f32>, StageError> {
-        self.check_sampler(sampler)?;
+        self.meta.family.accepts(sampler).map_err(StageError::Input)?;
         let (latent, text_dim) = (self.meta.latent, self.meta.text_dim);
         let batch = conditions.noise.len() / (latent.tokens * latent.dim);
         let shape = [batch, latent.tokens, latent.dim];
@@ -291,79 +286,14 @@ fn lcm_path(skip: usize, sampler: &Sampler) -> Vec<usize> {
     }
 }
 
-/// Why `sampler` is not one of `family`'s.
-fn check_sampler(family: &Family, sampler: &Sampler) -> Result<(), String> {
-    let Sampler { steps, guidance, timesteps } = sampler;
-    let bound = |most: usize| match (1..=most).contains(steps) {
-        true => Ok(()),
-        false => Err(format!("sampler: `steps` is {steps}, expected 1 to {most}")),
-    };
-    if !guidance.is_finite() {
-        return Err(format!("sampler: `guidance` is {guidance}, expected a number"));
-    }
-    if !timesteps.is_empty() && !matches!(family, Family::Lcm { .. }) {
-        return Err("sampler: `timesteps` can be chosen for an LCM only; leave them out".into());
-    }
-    let grid = |skip: usize| match skip > 0 && TIMESTEPS.is_multiple_of(skip) {
-        true => Ok(TIMESTEPS / skip),
-        false => Err(format!("the model's solver step {skip} does not divide {TIMESTEPS}")),
-    };
-    match family {
-        Family::Mld => bound(TIMESTEPS - 1),
-        Family::Lcm { skip, .. } if timesteps.is_empty() => bound(grid(*skip)?),
-        Family::Lcm { .. } => {
-            if timesteps.len() != *steps {
-                return Err(format!("sampler: {} `timesteps` for {steps} `steps`", timesteps.len()));
-            }
-            match timesteps.iter().find(|t| **t >= TIMESTEPS) {
-                Some(t) => Err(format!("sampler: timestep {t}, expected 0 to {}", TIMESTEPS - 1)),
-                None => Ok(()),
-            }
-        }
-        Family::Pcm { skip, phases, .. } => {
-            let most = grid(*skip)?;
-            if !(1..=most).contains(phases) {
-                return Err(format!("the model has {phases} phases, its grid {most} points"));
-            }
-            match steps == phases {
-                true => Ok(()),
-                false => Err(format!(
-                    "sampler: `steps` is {steps}, but this PCM student has {phases} phases and takes as many steps; set {phases}, or \
-                     train another with `phases: {steps}`"
-                )),
-            }
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn sampler(steps: usize, timesteps: &[usize]) -> Sampler {
-        Sampler { steps, guidance: 2.0, timesteps: timesteps.to_vec() }
-    }
-
     #[test]
-    fn samplers_that_a_family_does_not_have_are_refused() {
-        let lcm = Family::Lcm { skip: 100, guidance: (5.0, 15.0) };
-        let pcm = Family::Pcm { skip: 100, guidance: (5.0, 15.0), phases: 2 };
-        for (family, sampler, word) in [
-            (&Family::Mld, sampler(0, &[]), "steps"),
-            (&Family::Mld, sampler(1000, &[]), "steps"),
-            (&Family::Mld, sampler(1, &[999]), "timesteps"),
-            (&lcm, sampler(11, &[]), "1 to 10"),
-            (&lcm, sampler(2, &[999]), "timesteps"),
-            (&lcm, sampler(1, &[1000]), "0 to 999"),
-            (&pcm, sampler(1, &[]), "2 phases"),
-            (&pcm, Sampler { guidance: f64::NAN, ..sampler(2, &[]) }, "guidance"),
-        ] {
-            let refused = check_sampler(family, &sampler).expect_err(word);
-            assert!(refused.contains(word), "{refused}");
-        }
-        assert_eq!(check_sampler(&Family::Mld, &sampler(50, &[])), Ok(()));
-        assert_eq!(check_sampler(&lcm, &sampler(2, &[699, 299])), Ok(()));
-        assert_eq!(check_sampler(&pcm, &sampler(2, &[])), Ok(()));
-        assert_eq!(lcm_path(100, &sampler(1, &[])), [999]);
+    fn an_lcm_starts_at_the_noisiest_timestep_or_where_it_is_told() {
+        let sampler = |timesteps: &[usize]| Sampler { steps: 1, guidance: 2.0, timesteps: timesteps.to_vec() };
+        assert_eq!(lcm_path(100, &sampler(&[])), [999]);
+        assert_eq!(lcm_path(100, &sampler(&[699])), [699]);
     }
 }

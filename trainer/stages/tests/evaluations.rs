@@ -3,17 +3,20 @@
 use std::collections::BTreeMap;
 
 use checkpoint::Blobs;
+use checkpoint::model::{self, Parts};
 use models::names::save;
 use models::networks::{Denoiser, Init, Vae};
-use protocol::artifact::FileEntry;
+use protocol::artifact::{FileEntry, Role};
 use protocol::stage::{
-    Batch, CheckpointPolicy, DataFormat, DataSynthetic, EncodeLatents, EvaluateLatentFid, EvaluateReconstruction, Keep,
-    LatentShape, Network, Positions, Sampler, Split, StageSettings, TextEmbed, TrainVae, Training,
+    Batch, CheckpointPolicy, DataFormat, DataSynthetic, EncodeLatents, EvaluateLatentFid, EvaluateReconstruction,
+    Family, Keep, LatentShape, Network, Positions, Sampler, Split, StageSettings, TextEmbed, TextEncoder, TrainLength,
+    TrainVae, Training,
 };
 use protocol::{ArtifactKind, Digest, Manifest, Seed, Steps};
-use stages::artifacts::{self, DenoiserMeta, Family, Latents, MODEL_FILE, VaeMeta, to_meta};
+use stages::artifacts::{self, DenoiserMeta, Latents, MODEL_FILE, VaeMeta, to_meta};
 use stages::generate::Generator;
 use stages::testing::Bench;
+use stages::text;
 use stages::timing::{Times, WARM_UP, sentences, time};
 
 const LATENT: LatentShape = LatentShape { tokens: 2, dim: 4 };
@@ -35,42 +38,59 @@ fn put(bench: &Bench, kind: ArtifactKind, meta: serde_json::Value, weights: Vec<
 }
 
 fn untrained_vae(bench: &Bench) -> Digest {
+    vae_of(bench, 1.0)
+}
+
+fn other_vae(bench: &Bench) -> Digest {
+    vae_of(bench, 2.0)
+}
+
+/// A VAE of features with this standard deviation.
+fn vae_of(bench: &Bench, std: f32) -> Digest {
     let meta = VaeMeta {
         format: DataFormat::Humanml3d,
         features: 263,
         latent: LATENT,
         network: network(),
         mean: vec![0.0; 263],
-        std: vec![1.0; 263],
+        std: vec![std; 263],
     };
     let device = bench.device();
     let vae = Vae::new(&meta.config(), &mut Init::new(Seed(1), "vae", Positions::Sinusoid, &device));
     put(bench, ArtifactKind::Vae, to_meta(&meta), save(&vae))
 }
 
-fn untrained_denoiser(bench: &Bench, vae: Digest, family: Family, latent: LatentShape) -> Digest {
+/// A model of latent diffusion.
+fn untrained_model(bench: &Bench, vae: Digest, family: Family, latent: LatentShape) -> Digest {
+    let text = text::manifest(TextEncoder::Hashed);
+    bench.blobs().put(text.to_bytes()).expect("stored");
     let meta = DenoiserMeta {
         guidance_dim: if family == Family::Mld { 0 } else { 32 },
         family,
         latent,
         network: network(),
         text_relu: false,
-        encoder: "hashed".into(),
         text_dim: 768,
-        vae,
+        fits: Parts::from([(Role::VAE, vae), (Role::TEXT, text.digest())]),
     };
     let device = bench.device();
     let denoiser = Denoiser::new(&meta.config(), &mut Init::new(Seed(2), "denoiser", Positions::Uniform, &device));
-    put(bench, ArtifactKind::Denoiser, to_meta(&meta), save(&denoiser))
+    let denoiser = put(bench, ArtifactKind::Denoiser, to_meta(&meta), save(&denoiser));
+    let part = |digest| bench.manifest(digest).expect("stored");
+    let parts = BTreeMap::from([(Role::DENOISER, part(denoiser)), (Role::VAE, part(vae)), (Role::TEXT, text)]);
+    let model = model::assemble("latent-diffusion", DataFormat::Humanml3d, &parts).expect("they fit");
+    bench.blobs().put(model.to_bytes()).expect("stored")
 }
 
-/// Dataset, embeddings and VAE.
-fn data(bench: &mut Bench) -> (Digest, Digest, Digest) {
+fn untrained(bench: &Bench, vae: Digest, family: Family) -> Digest {
+    untrained_model(bench, vae, family, LATENT)
+}
+
+/// Dataset and VAE.
+fn data(bench: &mut Bench) -> (Digest, Digest) {
     let settings = DataSynthetic { clips: 40, val: 0.1, test: 0.2, mirror: false };
     let dataset = bench.run("dataset", &StageSettings::DataSynthetic(settings), &[]).expect("the stage runs").output();
-    let text = StageSettings::TextEmbed(TextEmbed::default());
-    let text = bench.run("text", &text, &[("dataset", dataset)]).expect("the stage runs").output();
-    (dataset, text, untrained_vae(bench))
+    (dataset, untrained_vae(bench))
 }
 
 fn encode(bench: &mut Bench, shards: usize, dataset: Digest, vae: Digest) -> Digest {
@@ -81,7 +101,7 @@ fn encode(bench: &mut Bench, shards: usize, dataset: Digest, vae: Digest) -> Dig
 #[test]
 fn latents_are_the_same_bytes_however_the_entries_are_cut() {
     let mut bench = bench();
-    let (dataset, _, vae) = data(&mut bench);
+    let (dataset, vae) = data(&mut bench);
     let whole = encode(&mut bench, 1, dataset, vae);
     for shards in [2, 4, 7, 64] {
         assert_eq!(encode(&mut bench, shards, dataset, vae), whole, "{shards} shards");
@@ -101,7 +121,7 @@ fn latents_are_the_same_bytes_however_the_entries_are_cut() {
 #[test]
 fn reconstruction_is_the_same_however_the_clips_are_cut() {
     let mut bench = bench();
-    let (dataset, _, vae) = data(&mut bench);
+    let (dataset, vae) = data(&mut bench);
     let mut reports = Vec::new();
     for shards in [1, 3, 50] {
         let settings = EvaluateReconstruction { shards, split: Split::All, ..EvaluateReconstruction::default() };
@@ -150,14 +170,14 @@ fn latent_fid(shards: usize, sampler: Sampler, teacher: bool) -> StageSettings {
 #[test]
 fn latent_fid_is_the_same_however_the_samples_are_cut() {
     let mut bench = bench();
-    let (dataset, text, vae) = data(&mut bench);
+    let (dataset, vae) = data(&mut bench);
     let latents = encode(&mut bench, 2, dataset, vae);
     let guidance = (0.5, 5.0);
-    let teacher = untrained_denoiser(&bench, vae, Family::Mld, LATENT);
-    let lcm = untrained_denoiser(&bench, vae, Family::Lcm { skip: 100, guidance }, LATENT);
-    let pcm = untrained_denoiser(&bench, vae, Family::Pcm { skip: 100, guidance, phases: 2 }, LATENT);
+    let teacher = untrained(&bench, vae, Family::Mld);
+    let lcm = untrained(&bench, vae, Family::Lcm { skip: 100, guidance });
+    let pcm = untrained(&bench, vae, Family::Pcm { skip: 100, guidance, phases: 2 });
     for (model, steps) in [(teacher, 3), (lcm, 2), (pcm, 2)] {
-        let inputs = [("model", model), ("latents", latents), ("text", text), ("teacher", teacher)];
+        let inputs = [("model", model), ("latents", latents), ("dataset", dataset), ("teacher", teacher)];
         let sampler = Sampler { steps, guidance: 2.0, timesteps: vec![] };
         let mut reports = Vec::new();
         for shards in [1, 3, 8] {
@@ -184,7 +204,7 @@ fn latent_fid_is_the_same_however_the_samples_are_cut() {
         }
     }
     // The teacher's own 50 steps match themselves exactly.
-    let inputs = [("model", teacher), ("latents", latents), ("text", text), ("teacher", teacher)];
+    let inputs = [("model", teacher), ("latents", latents), ("dataset", dataset), ("teacher", teacher)];
     let own = Sampler { steps: 50, guidance: 2.0, timesteps: vec![] };
     let ran = bench.run("eval", &latent_fid(2, own.clone(), true), &inputs).unwrap();
     assert_eq!(ran.metrics()["match"], 0.0);
@@ -195,16 +215,16 @@ fn latent_fid_is_the_same_however_the_samples_are_cut() {
 #[test]
 fn what_does_not_fit_is_refused_with_the_reason() {
     let mut bench = bench();
-    let (dataset, text, vae) = data(&mut bench);
+    let (dataset, vae) = data(&mut bench);
     let latents = encode(&mut bench, 2, dataset, vae);
-    let other_shape = untrained_denoiser(&bench, vae, Family::Mld, LatentShape { tokens: 3, dim: 4 });
-    let other_vae = untrained_denoiser(&bench, Digest::of(b"another"), Family::Mld, LATENT);
-    let good = untrained_denoiser(&bench, vae, Family::Mld, LATENT);
+    let other_shape = untrained_model(&bench, vae, Family::Mld, LatentShape { tokens: 3, dim: 4 });
+    let other_vae = untrained(&bench, other_vae(&bench), Family::Mld);
+    let good = untrained(&bench, vae, Family::Mld);
     let sampler = Sampler { steps: 3, guidance: 2.0, timesteps: vec![] };
     for (model, kind_of, reason) in
-        [(other_shape, latents, "3x4"), (other_vae, latents, "another VAE"), (good, text, "kind Embeddings")]
+        [(other_shape, latents, "3x4"), (other_vae, latents, "another VAE"), (good, dataset, "kind Dataset")]
     {
-        let inputs = [("model", model), ("latents", kind_of), ("text", text)];
+        let inputs = [("model", model), ("latents", kind_of), ("dataset", dataset)];
         let refused = bench.run("eval", &latent_fid(1, sampler.clone(), false), &inputs).unwrap_err();
         assert!(refused.to_string().contains(reason), "{refused}");
         assert_eq!(refused.class(), protocol::message::FailureClass::Input, "{refused}");
@@ -222,16 +242,14 @@ fn an_empty_split_is_refused_by_its_name() {
     let mut bench = bench();
     let settings = DataSynthetic { clips: 12, val: 0.0, test: 0.25, mirror: false };
     let dataset = bench.run("dataset", &StageSettings::DataSynthetic(settings), &[]).expect("the stage runs").output();
-    let text = StageSettings::TextEmbed(TextEmbed::default());
-    let text = bench.run("text", &text, &[("dataset", dataset)]).expect("the stage runs").output();
     let vae = untrained_vae(&bench);
     let latents = encode(&mut bench, 1, dataset, vae);
-    let model = untrained_denoiser(&bench, vae, Family::Mld, LATENT);
+    let model = untrained(&bench, vae, Family::Mld);
     let reconstruction = EvaluateReconstruction { split: Split::Val, ..EvaluateReconstruction::default() };
     let sampler = Sampler { steps: 1, guidance: 2.0, timesteps: vec![] };
     let StageSettings::EvaluateLatentFid(fid) = latent_fid(1, sampler, false) else { unreachable!() };
     let fid = EvaluateLatentFid { split: Split::Val, ..fid };
-    let inputs = [("dataset", dataset), ("vae", vae), ("model", model), ("latents", latents), ("text", text)];
+    let inputs = [("dataset", dataset), ("vae", vae), ("model", model), ("latents", latents)];
     for settings in [StageSettings::EvaluateReconstruction(reconstruction), StageSettings::EvaluateLatentFid(fid)] {
         let refused = bench.run("eval", &settings, &inputs).unwrap_err();
         assert!(refused.to_string().contains("the split `val` has no entries; set `split`"), "{refused}");
@@ -243,7 +261,7 @@ fn an_empty_split_is_refused_by_its_name() {
 #[test]
 fn a_metric_to_keep_checkpoints_by_that_is_not_saved_is_refused_before_a_step() {
     let mut bench = bench();
-    let (dataset, ..) = data(&mut bench);
+    let (dataset, _) = data(&mut bench);
     let batch = Batch { global: 4, slices: 2 };
     let training = Training { steps: Steps(3), batch, warmup: Steps(0), ..TrainVae::default().training };
     let vae = TrainVae { latent: LATENT, network: network(), training, ..TrainVae::default() };
@@ -263,15 +281,26 @@ fn a_metric_to_keep_checkpoints_by_that_is_not_saved_is_refused_before_a_step() 
 }
 
 #[test]
-fn a_bundled_model_generates_and_repeats_itself() {
+fn a_model_generates_as_it_was_measured_and_repeats_itself() {
     let bench = bench();
     let vae = untrained_vae(&bench);
     let family = Family::Pcm { skip: 100, guidance: (0.5, 5.0), phases: 2 };
-    let pcm = untrained_denoiser(&bench, vae, family, LATENT);
+    let pcm = untrained(&bench, vae, family);
     let manifest = |digest| bench.manifest(digest).unwrap();
-    let model = checkpoint::bundle::bundle(&manifest(pcm), &manifest(vae)).expect("they fit");
-    let generator = Generator::load(&model, &*bench.blobs(), &bench.device()).expect("it loads");
-    assert_eq!(generator.sampler().steps, 2);
+    let load = |model: &Manifest| Generator::load(model, &*bench.blobs(), &bench.device());
+    let generator = load(&manifest(pcm)).expect("it loads");
+    assert_eq!(generator.sampler(), Sampler { steps: 2, guidance: 2.0, timesteps: vec![] }, "nobody measured it");
+    // Once it is measured it is drawn from in that way, and so it gives other motions.
+    let teacher = manifest(untrained(&bench, vae, Family::Mld));
+    let measured = Sampler { steps: 2, guidance: 4.5, timesteps: vec![] };
+    let registered = model::extend(&teacher, Some(&measured), &BTreeMap::new()).expect("it is a model");
+    let (teacher, registered) = (load(&teacher).expect("it loads"), load(&registered).expect("it loads"));
+    assert_eq!((teacher.sampler().steps, registered.sampler()), (50, measured.clone()));
+    let drawn = |generator: &Generator, sampler| {
+        generator.generate("a jump", Some(40), sampler, Seed(3)).expect("a motion").features
+    };
+    assert!(drawn(&registered, None) == drawn(&teacher, Some(&measured)));
+    assert!(drawn(&registered, None) != drawn(&teacher, None));
     let prompt = "a person walks in a circle";
     let first = generator.generate(prompt, None, None, Seed(1)).expect("a motion");
     assert_eq!((first.frames, first.features.len(), first.joints.len()), (120, 120 * 263, 120 * 22 * 3));
@@ -284,12 +313,12 @@ fn a_bundled_model_generates_and_repeats_itself() {
     assert!(refused.contains("5000 frames"), "{refused}");
     let sampler = Sampler { steps: 1, guidance: 2.0, timesteps: vec![] };
     let refused = generator.generate(prompt, None, Some(&sampler), Seed(1)).expect_err("other phases").to_string();
-    assert!(refused.contains("phases"), "{refused}");
+    assert!(refused.contains("2 phase(s)"), "{refused}");
     let meta: VaeMeta = artifacts::meta(&manifest(vae), "the VAE").unwrap();
     assert_eq!(generator.format(), meta.format);
 
     // Timed beside itself: a time for every sentence and model, the warm-up made but not counted.
-    let own = generator.sampler();
+    let own = &generator.sampler();
     let mut motions = 0;
     let times = time(&[(&generator, own), (&generator, own)], &sentences(4), Some(40), &mut || motions += 1).unwrap();
     assert_eq!(times.iter().map(Vec::len).collect::<Vec<_>>(), [4, 4]);
@@ -298,5 +327,37 @@ fn a_bundled_model_generates_and_repeats_itself() {
     assert!(times.sampling > 0.0 && times.decoding > 0.0 && times.median <= times.p95, "{times:?}");
     assert!((times.text + times.sampling + times.decoding - times.mean).abs() < 1e-9, "{times:?}");
     let refused = time(&[(&generator, &sampler)], &sentences(1), None, &mut || ()).expect_err("other phases");
-    assert!(refused.to_string().contains("phases"), "{refused}");
+    assert!(refused.to_string().contains("2 phase(s)"), "{refused}");
+}
+
+#[test]
+fn a_model_with_a_length_estimator_says_how_long_a_motion_is() {
+    let mut bench = bench();
+    let (dataset, vae) = data(&mut bench);
+    let text = StageSettings::TextEmbed(TextEmbed::default());
+    let text = bench.run("text", &text, &[("dataset", dataset)]).expect("the stage runs").output();
+    let batch = Batch { global: 4, slices: 2 };
+    let training = Training { steps: Steps(3), batch, ..TrainLength::default().training };
+    let settings = StageSettings::TrainLength(TrainLength { training, ..TrainLength::default() });
+    let length = bench.run("length", &settings, &[("dataset", dataset), ("text", text)]).expect("the stage runs");
+    let part = bench.manifest(length.output()).expect("stored");
+    let model = bench.manifest(untrained(&bench, vae, Family::Mld)).expect("stored");
+    let load = |model: &Manifest| Generator::load(model, &*bench.blobs(), &bench.device()).expect("it loads");
+    let with = |part: &Manifest| model::extend(&model, None, &BTreeMap::from([(Role::LENGTH, part.clone())]));
+    let (without, with_it) = (load(&model), load(&with(&part).expect("they fit")));
+    let frames = |generator: &Generator, seed| generator.frames("a person walks", Seed(seed)).expect("a length");
+    assert_eq!((0..8).map(|seed| frames(&without, seed)).collect::<Vec<_>>(), [120; 8]);
+    let drawn: Vec<usize> = (0..8).map(|seed| frames(&with_it, seed)).collect();
+    assert!(drawn.iter().all(|frames| (4..=196).contains(frames) && frames % 4 == 0), "{drawn:?}");
+    assert!(drawn.iter().any(|frames| *frames != drawn[0]), "one seed is like another: {drawn:?}");
+    let sampler = Sampler { steps: 1, guidance: 2.0, timesteps: vec![] };
+    let motion = with_it.generate("a person walks", None, Some(&sampler), Seed(1)).expect("a motion");
+    assert_eq!(motion.frames, drawn[1]);
+    let motion = with_it.generate("a person walks", Some(40), Some(&sampler), Seed(1)).expect("a motion");
+    assert_eq!(motion.frames, 40, "a length that is asked for counts");
+
+    let mut other = part;
+    other.meta["fits"]["text"] = serde_json::to_value(Digest::of(b"another encoder")).expect("a digest");
+    let refused = with(&other).expect_err("another encoder").to_string();
+    assert!(refused.contains("`length` was made for the `text`"), "{refused}");
 }

@@ -4,22 +4,25 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use checkpoint::Blobs;
+use checkpoint::model::{self, Parts};
 use models::names::save;
 use models::networks::{Denoiser, Init, Vae};
 use motion::Dataset;
 use motion::dataset::PackError;
-use protocol::artifact::FileEntry;
+use protocol::artifact::{FileEntry, Role};
 use protocol::message::FailureClass;
 use protocol::stage::{
-    Batch, DataFormat, DataSynthetic, EvaluateT2m, EvaluatorNetwork, ImportEvaluator, LatentShape, MovementPhase,
-    MultiModality, Network, Positions, Sampler, Split, StageSettings, TextEmbed, TrainEvaluator, Training,
+    Batch, DataFormat, DataSynthetic, EvaluateT2m, EvaluatorNetwork, Family, ImportEvaluator, LatentShape,
+    MovementPhase, MultiModality, Network, Positions, Sampler, Split, StageSettings, TextEncoder, TrainEvaluator,
+    Training,
 };
 use protocol::{ArtifactKind, Digest, Manifest, Seed, Steps};
-use stages::artifacts::{self, DenoiserMeta, Family, MODEL_FILE, VaeMeta, to_meta};
+use stages::artifacts::{self, DenoiserMeta, MODEL_FILE, VaeMeta, to_meta};
 use stages::context::Outcome;
 use stages::evaluator::{EvaluatorMeta, TrainedEvaluator};
 use stages::kinds::REPORT_FILE;
 use stages::testing::{Bench, Script};
+use stages::text;
 use stages::words::WordsMeta;
 
 const LATENT: LatentShape = LatentShape { tokens: 2, dim: 4 };
@@ -88,8 +91,10 @@ fn network() -> Network {
     Network { width: 16, layers: 3, heads: 2, feed_forward: 32, ..Network::default() }
 }
 
-/// An untrained VAE and denoiser of a family.
-fn untrained(bench: &Bench, family: Family) -> (Digest, Digest) {
+/// An untrained model of a family.
+fn untrained(bench: &Bench, family: Family) -> Digest {
+    let text = text::manifest(TextEncoder::Hashed);
+    bench.blobs().put(text.to_bytes()).expect("stored");
     let device = bench.device();
     let meta = VaeMeta {
         format: DataFormat::Humanml3d,
@@ -107,17 +112,15 @@ fn untrained(bench: &Bench, family: Family) -> (Digest, Digest) {
         latent: LATENT,
         network: network(),
         text_relu: false,
-        encoder: "hashed".into(),
         text_dim: 768,
-        vae,
+        fits: Parts::from([(Role::VAE, vae), (Role::TEXT, text.digest())]),
     };
     let net = Denoiser::new(&meta.config(), &mut Init::new(Seed(2), "denoiser", Positions::Uniform, &device));
-    (vae, put(bench, ArtifactKind::Denoiser, to_meta(&meta), save(&net)))
-}
-
-fn text(bench: &mut Bench, dataset: Digest) -> Digest {
-    let settings = StageSettings::TextEmbed(TextEmbed::default());
-    bench.run("text", &settings, &[("dataset", dataset)]).expect("the stage runs").output()
+    let denoiser = put(bench, ArtifactKind::Denoiser, to_meta(&meta), save(&net));
+    let part = |digest| bench.manifest(digest).expect("stored");
+    let parts = BTreeMap::from([(Role::DENOISER, part(denoiser)), (Role::VAE, part(vae)), (Role::TEXT, text)]);
+    let model = model::assemble("latent-diffusion", DataFormat::Humanml3d, &parts).expect("they fit");
+    bench.blobs().put(model.to_bytes()).expect("stored")
 }
 
 fn evaluate(shards: usize, of: EvaluateT2m) -> StageSettings {
@@ -129,9 +132,8 @@ fn t2m_is_the_same_however_the_motions_are_cut() {
     let mut bench = bench(1);
     let data = dataset(&mut bench, 100);
     let evaluator = bench.run("evaluator", &small(), &[("dataset", data)]).expect("the stage runs").output();
-    let (vae, model) = untrained(&bench, Family::Lcm { skip: 100, guidance: (0.5, 5.0) });
-    let text = text(&mut bench, data);
-    let inputs = [("dataset", data), ("evaluator", evaluator), ("model", model), ("vae", vae), ("text", text)];
+    let model = untrained(&bench, Family::Lcm { skip: 100, guidance: (0.5, 5.0) });
+    let inputs = [("dataset", data), ("evaluator", evaluator), ("model", model)];
     let settings = EvaluateT2m {
         sampler: Sampler { steps: 2, guidance: 2.0, timesteps: vec![] },
         repeats: 3,

@@ -3,7 +3,8 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use checkpoint::bundle::bundle;
+use checkpoint::model;
+use protocol::artifact::Role;
 use protocol::{Digest, RunId, StageName, TaskId};
 use registry::blob::{IDLE, Protected};
 use registry::{BlobStore, QueryError};
@@ -123,9 +124,11 @@ fn bundles(blobs: &BlobStore, candidates: &[Candidate]) -> Result<(Vec<Digest>, 
         .map(|candidate| {
             let at =
                 |e: &dyn std::fmt::Display| format!("the model of stage `{}` cannot be made: {e}", candidate.stage);
-            let denoiser = blobs.manifest(candidate.denoiser).map_err(|e| at(&e))?;
-            let vae = blobs.manifest(candidate.vae).map_err(|e| at(&e))?;
-            let model = bundle(&denoiser, &vae).map_err(|e| at(&e))?.to_bytes();
+            let given = blobs.manifest(candidate.model).map_err(|e| at(&e))?;
+            let part =
+                |(role, digest): (&Role, &Digest)| Ok((role.clone(), blobs.manifest(*digest).map_err(|e| at(&e))?));
+            let parts = candidate.parts.iter().map(part).collect::<Result<_, String>>()?;
+            let model = model::extend(&given, candidate.sampler.as_ref(), &parts).map_err(|e| at(&e))?.to_bytes();
             let protected = blobs.protect(Digest::of(&model));
             Ok((blobs.put(&model).map_err(|e| at(&e))?, protected))
         })

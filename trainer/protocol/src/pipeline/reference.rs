@@ -128,13 +128,17 @@ fn close(schema: &mut Value, example: &Value) {
     for key in ["title", "format", "required"] {
         schema.remove(key);
     }
-    if let (Some(properties), Some(example)) =
-        (schema.get_mut("properties").and_then(Value::as_object_mut), example.as_object())
+    // A mapping that may be left out has no example of its keys.
+    if let Some(properties) = schema.get_mut("properties").and_then(Value::as_object_mut)
+        && (example.is_object() || example.is_null())
     {
-        properties.retain(|key, _| example.contains_key(key));
+        properties.retain(|key, _| example.is_null() || example.get(key).is_some());
         properties.iter_mut().for_each(|(key, property)| close(property, &example[key]));
         schema.insert("additionalProperties".into(), false.into());
         schema.remove("default");
+        if example.is_null() {
+            schema.insert("default".into(), Value::Null);
+        }
         return;
     }
     for word in schema.get_mut("oneOf").and_then(Value::as_array_mut).into_iter().flatten() {
@@ -203,6 +207,13 @@ fn rows(text: &mut String, schema: &Value, path: &str) {
     for (key, property) in schema["properties"].as_object().into_iter().flatten() {
         let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
         if property.get("properties").is_some() {
+            if property.get("default").is_some() {
+                let _ = writeln!(
+                    text,
+                    "| `{path}` |  | mapping, or left out | {} |",
+                    sentence(property).replace('|', "\\|")
+                );
+            }
             rows(text, property, &path);
             continue;
         }

@@ -138,6 +138,7 @@ fn expectation(example: &Value, node: &Node, reason: &str) -> (String, Option<St
             "a list of two numbers, such as `[5, 15]`".into()
         }
         Value::Array(_) => "a list".into(),
+        Value::Null => "a mapping".into(),
         _ => "another value".into(),
     };
     let help = match (&node.value, example) {
@@ -153,7 +154,7 @@ fn expectation(example: &Value, node: &Node, reason: &str) -> (String, Option<St
             Some("write it as in 0.0002 or 2e-4".into())
         }
         (Content::Scalar { value: Value::Null, .. }, _) => Some("give a value, or leave the key out".into()),
-        (Content::List(_), Value::Array(_)) => Some(reason_in_short(reason)),
+        (Content::List(_), Value::Array(_)) | (_, Value::Null) => Some(reason_in_short(reason)),
         _ => None,
     };
     (expected, help)

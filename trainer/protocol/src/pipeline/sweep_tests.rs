@@ -83,7 +83,7 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
         "{kind: evaluate.latent_fid, teacher: mld, sampler: {steps: 1, guidance: 2}}",
         "{kind: evaluate.reconstruction}",
         "20:24",
-        &["`evaluate.reconstruction` does not measure a denoiser", "`evaluate.latent_fid`"],
+        &["`evaluate.reconstruction` does not measure a model", "`evaluate.latent_fid`"],
     ),
     ("teacher: mld", "model: mld", "20:52", &["a sweep judges its own trials", "leave it out"]),
     ("teacher: mld", "teacher: mdl", "20:54", &["the stage `mdl`, which does not exist; did you mean `mld`?"]),
@@ -130,7 +130,7 @@ fn a_sweep_is_read() {
     let own = ["teacher", "latents", "text"];
     assert_eq!(
         fields,
-        [&own[..], &["sweep.evaluate.latents", "sweep.evaluate.text", "sweep.evaluate.teacher"]].concat()
+        [&own[..], &["sweep.evaluate.latents", "sweep.evaluate.dataset", "sweep.evaluate.teacher"]].concat()
     );
     let from = &pipeline.stage(&"out".into()).unwrap().inputs;
     assert!(from.iter().any(|input| input.field == "from[0]" && input.stage.as_str() == "pcm"), "{from:?}");

@@ -14,6 +14,14 @@ pub enum DataFormat {
 }
 
 impl DataFormat {
+    /// Its word in settings.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Humanml3d => "humanml3d",
+            Self::Kit => "kit",
+        }
+    }
+
     /// Its skeleton in words.
     pub(crate) fn skeleton(self) -> &'static str {
         match self {

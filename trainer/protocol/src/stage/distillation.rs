@@ -68,7 +68,7 @@ impl Distillation {
 
     pub(super) fn refs(&mut self) -> Vec<Ref<'_>> {
         vec![
-            Ref::stage("teacher", &mut self.teacher, ArtifactKind::Denoiser),
+            Ref::stage("teacher", &mut self.teacher, ArtifactKind::Model),
             Ref::stage("latents", &mut self.latents, ArtifactKind::Latents),
             Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
         ]
@@ -104,7 +104,7 @@ impl Distillation {
 
     pub(super) fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
         stages.is_teacher(p, &self.teacher);
-        stages.same_vae(p, ("teacher", stages.vae_of_denoiser(&self.teacher)), &self.latents);
+        stages.same_vae(p, ("teacher", stages.vae_of_model(&self.teacher)), &self.latents);
         stages.same_data(p, &self.latents, &self.text);
     }
 }

@@ -1,8 +1,8 @@
 //! The other stages of a pipeline, as a kind's checks see them: found by following references, not by kind.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
-use super::{DataFormat, LatentShape, Problems, Sampler, StageSettings};
+use super::{DataFormat, Family, LatentShape, Problems, Sampler, StageSettings};
 use crate::{ArtifactKind, StageName};
 
 /// The stages of a pipeline by name. References are sound: they lead to stages that give the right kind, and nowhere in a circle.
@@ -11,7 +11,8 @@ pub struct Neighbours<'a> {
     stages: BTreeMap<&'a str, &'a StageSettings>,
     /// For each stage, the stages that it reads by what they give.
     reads: BTreeMap<&'a str, Vec<(ArtifactKind, String)>>,
-    measured: BTreeSet<String>,
+    /// For each measured stage, the evaluations of it and how they draw.
+    measured: BTreeMap<String, Vec<(&'a str, Option<&'a Sampler>)>>,
 }
 
 impl<'a> Neighbours<'a> {
@@ -21,7 +22,12 @@ impl<'a> Neighbours<'a> {
             settings.inputs().into_iter().map(|(_, stage, kind)| (kind, stage)).collect()
         };
         let reads = stages.iter().map(|(name, settings)| (*name, read(settings))).collect();
-        let measured = stages.values().filter_map(|settings| settings.evaluated_model()).collect();
+        let mut measured: BTreeMap<String, Vec<_>> = BTreeMap::new();
+        for (name, settings) in &stages {
+            if let Some(model) = settings.evaluated_model() {
+                measured.entry(model).or_default().push((*name, settings.sampler()));
+            }
+        }
         Self { stages, reads, measured }
     }
 
@@ -40,9 +46,26 @@ impl<'a> Neighbours<'a> {
         self.read_by(latents, ArtifactKind::Vae)
     }
 
-    /// Which VAE made the latents that a denoiser was trained on.
-    pub fn vae_of_denoiser(&self, denoiser: &str) -> Option<&str> {
-        self.vae_of_latents(self.read_by(denoiser, ArtifactKind::Latents)?)
+    /// Which VAE made the latents that a model was trained on.
+    pub fn vae_of_model(&self, model: &str) -> Option<&str> {
+        self.of_model(model, &|name| self.vae_of_latents(self.read_by(name, ArtifactKind::Latents)?))
+    }
+
+    /// What a model can do.
+    pub fn family(&self, model: &str) -> Option<Family> {
+        self.of_model(model, &|name| self.stage(name)?.spec().family())
+    }
+
+    /// What `own` says of the stage that trained `model`. A stage that only passes models on, such as `register`, is asked for what all of
+    /// those have in common.
+    fn of_model<T: PartialEq>(&self, model: &str, own: &dyn Fn(&str) -> Option<T>) -> Option<T> {
+        if let Some(found) = own(model) {
+            return Some(found);
+        }
+        let models = self.reads.get(model)?.iter().filter(|(kind, _)| *kind == ArtifactKind::Model);
+        let mut all = models.map(|(_, stage)| self.of_model(stage, own));
+        let first = all.next()??;
+        all.all(|other| other.as_ref() == Some(&first)).then_some(first)
     }
 
     /// The clips behind latents or caption embeddings.
@@ -50,11 +73,11 @@ impl<'a> Neighbours<'a> {
         self.read_by(name, ArtifactKind::Dataset)
     }
 
-    /// The skeleton of a dataset, or the one that an evaluator is for.
+    /// The skeleton of a dataset, of a model's motions, or the one that an evaluator is for.
     pub fn format(&self, name: &str) -> Option<DataFormat> {
         self.stage(name)?.spec().format().or_else(|| {
-            let dataset = self.dataset_of(name)?;
-            if dataset == name { None } else { self.format(dataset) }
+            let from = self.dataset_of(name).or_else(|| self.vae_of_model(name))?;
+            if from == name { None } else { self.format(from) }
         })
     }
 
@@ -65,7 +88,14 @@ impl<'a> Neighbours<'a> {
 
     /// Whether an evaluation measures stage `name`.
     pub fn measures(&self, name: &str) -> bool {
-        self.measured.contains(name)
+        self.measured.contains_key(name)
+    }
+
+    /// The evaluations of the pipeline that draw from stage `name`, and how. What judges a sweep's trials is none of them: a judge has a dot
+    /// in its name, which no name of a user's has.
+    pub fn samplers_of(&self, name: &str) -> impl Iterator<Item = (&'a str, &'a Sampler)> {
+        let all = self.measured.get(name).into_iter().flatten().filter(|(evaluation, _)| !evaluation.contains('.'));
+        all.filter_map(|(evaluation, sampler)| Some((*evaluation, (*sampler)?)))
     }
 
     /// Refuses latents of another VAE than `vae`, which `field` stands for.
@@ -96,6 +126,16 @@ impl<'a> Neighbours<'a> {
         }
     }
 
+    /// Refuses clips other than those that `latents` were encoded from.
+    pub(crate) fn same_clips(&self, p: &mut Problems, dataset: &str, latents: &str) {
+        if let Some(data) = self.dataset_of(latents)
+            && data != dataset
+        {
+            let message = format!("`{latents}` are of the clips of `{data}`, but `dataset` is `{dataset}`");
+            p.add("dataset", message, &format!("write `dataset: {data}`"));
+        }
+    }
+
     /// Refuses captions of other clips than those of `dataset`.
     pub(crate) fn same_captions(&self, p: &mut Problems, text: &str, dataset: &str) {
         if let Some(data) = self.dataset_of(text)
@@ -108,7 +148,9 @@ impl<'a> Neighbours<'a> {
 
     /// Refuses a student where a teacher is needed.
     pub(crate) fn is_teacher(&self, p: &mut Problems, teacher: &str) {
-        if let Some(settings) = self.stage(teacher).filter(|settings| settings.spec().is_student()) {
+        if let Some(settings) = self.stage(teacher)
+            && self.family(teacher).is_some_and(|family| family.is_student())
+        {
             let kind = settings.kind();
             let message = format!("`{teacher}` is a student ({kind}), but `teacher` needs a `train.mld` stage");
             p.add("teacher", message, "a student has guidance built in, and cannot be asked without it");
@@ -117,8 +159,8 @@ impl<'a> Neighbours<'a> {
 
     /// Refuses steps and timesteps that the model does not have.
     pub(crate) fn check_sampler(&self, p: &mut Problems, model: &str, sampler: &Sampler) {
-        if let Some(settings) = self.stage(model) {
-            settings.spec().check_sampler(model, sampler, p);
+        if let Some(family) = self.family(model) {
+            family.check(&format!("`{model}`"), sampler, p);
         }
     }
 }

@@ -10,7 +10,7 @@ use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use super::{DataFormat, LatentShape, Neighbours, Problems, Sampler, Training};
+use super::{DataFormat, Family, LatentShape, Neighbours, Problems, Sampler, Training};
 use crate::ArtifactKind;
 
 /// How a stage's work is laid over workers.
@@ -77,13 +77,15 @@ pub trait StageSpec:
         None
     }
 
-    /// Whether it gives a model with guidance built in, which cannot be asked without it and so teaches nobody.
-    fn is_student(&self) -> bool {
-        false
+    /// What the model that it trains can do, and so which samplers it has.
+    fn family(&self) -> Option<Family> {
+        None
     }
 
-    /// What must hold of a sampler that draws from what it gives; `model` is the stage's name.
-    fn check_sampler(&self, _model: &str, _sampler: &Sampler, _problems: &mut Problems) {}
+    /// How it draws from the model that it measures.
+    fn sampler(&self) -> Option<&Sampler> {
+        None
+    }
 }
 
 /// What a reference leads to.
@@ -164,8 +166,8 @@ pub(super) trait AnySpec: Any {
     fn training(&mut self) -> Option<&mut Training>;
     fn latent(&self) -> Option<LatentShape>;
     fn format(&self) -> Option<DataFormat>;
-    fn is_student(&self) -> bool;
-    fn check_sampler(&self, model: &str, sampler: &Sampler, problems: &mut Problems);
+    fn family(&self) -> Option<Family>;
+    fn sampler(&self) -> Option<&Sampler>;
 }
 
 impl<S: StageSpec> AnySpec for S {
@@ -217,12 +219,12 @@ impl<S: StageSpec> AnySpec for S {
         StageSpec::format(self)
     }
 
-    fn is_student(&self) -> bool {
-        StageSpec::is_student(self)
+    fn family(&self) -> Option<Family> {
+        StageSpec::family(self)
     }
 
-    fn check_sampler(&self, model: &str, sampler: &Sampler, problems: &mut Problems) {
-        StageSpec::check_sampler(self, model, sampler, problems);
+    fn sampler(&self) -> Option<&Sampler> {
+        StageSpec::sampler(self)
     }
 }
 

@@ -144,13 +144,13 @@ pub fn top(ranks: impl Iterator<Item = usize>, k: usize) -> f64 {
     hits as f64 / count as f64
 }
 
-/// Numbers captions so that equal embeddings have equal numbers; `rows` are rows of `dim` values.
-pub fn same_captions(rows: &[f32], dim: usize) -> Vec<usize> {
-    let mut known: HashMap<Vec<u32>, usize> = HashMap::new();
-    rows.chunks_exact(dim)
-        .map(|row| {
+/// Numbers captions so that those of the same words have equal numbers.
+pub fn same_captions(captions: impl Iterator<Item = Vec<String>>) -> Vec<usize> {
+    let mut known: HashMap<Vec<String>, usize> = HashMap::new();
+    captions
+        .map(|words| {
             let next = known.len();
-            *known.entry(row.iter().map(|v| v.to_bits()).collect()).or_insert(next)
+            *known.entry(words).or_insert(next)
         })
         .collect()
 }
@@ -250,7 +250,8 @@ mod tests {
         assert_eq!(relative_distance(&others, &others, 2), 0.0);
         // Everything at the mean.
         assert_eq!(relative_distance(&[1.0, 2.0, 1.0, 2.0], &others, 2), 1.0);
-        assert_eq!(same_captions(&[1.0, 0.0, 0.5, 0.5, 1.0, 0.0], 2), [0, 1, 0]);
+        let captions = ["A man walks.", "a man", "a man walks"];
+        assert_eq!(same_captions(captions.into_iter().map(motion::text::words)), [0, 1, 0]);
         assert_eq!(mean_and_spread(&[1.0, 3.0]), (2.0, Some(2.0f64.sqrt())));
         assert_eq!(mean_and_spread(&[1.0]), (1.0, None));
     }

@@ -4,20 +4,25 @@
 //! The student starts as the teacher plus a zero guidance projection; the target is the moving average of the student. Frozen networks
 //! run without dropout unless `upstream_dropout` asks for the original script's accident.
 
+use std::collections::BTreeMap;
+
 use burn::tensor::{Device, Tensor};
+use checkpoint::model::Model;
 use models::diffusion::{Grid, Schedule, affine, guided_by, unzip};
 use models::flat::{self, Entry};
 use models::kernels::Dropout;
 use models::losses;
 use models::names;
 use models::networks::{Denoiser, Init, guidance_embedding};
-use protocol::stage::{Distance, Distillation, Positions};
-use protocol::{ArtifactKind, Seed};
+use protocol::artifact::Role;
+use protocol::stage::{Distance, Distillation, Family, Positions};
+use protocol::{ArtifactKind, Digest, Manifest, Seed};
 
 use super::group;
-use super::latent_data::{LatentData, LatentSlice};
-use crate::artifacts::{self, DenoiserMeta, Family, MODEL_FILE};
-use crate::context::{ContextError, GangContext, StageError};
+use super::latent_data::{self, LatentData, LatentSlice};
+use crate::artifacts::{self, DenoiserMeta, MODEL_FILE};
+use crate::context::{AttemptContext, ContextError, GangContext, StageError};
+use crate::parts::{self, model_error};
 use crate::train::{GroupPlan, TrainState};
 
 /// Networks and data of a distillation.
@@ -26,6 +31,8 @@ pub(super) struct Distiller {
     pub(super) data: LatentData,
     pub(super) teacher: Denoiser,
     pub(super) teacher_meta: DenoiserMeta,
+    /// What the teacher draws with, which its student draws with too.
+    base: Model,
     pub(super) student: Denoiser,
     target: Denoiser,
     pub(super) noise: Schedule,
@@ -56,14 +63,22 @@ impl Distiller {
     pub(super) fn read(cx: &dyn GangContext, settings: &Distillation) -> Result<Self, StageError> {
         let data = LatentData::read(cx, &settings.training)?;
         let blobs = cx.blobs();
-        let (_, manifest) = artifacts::input(cx, "teacher", ArtifactKind::Denoiser)?;
+        let (_, manifest) = artifacts::input(cx, "teacher", ArtifactKind::Model)?;
+        let base = Model::read(&manifest).map_err(model_error)?;
+        let manifest = parts::part(&*blobs, &base, &Role::DENOISER, ArtifactKind::Denoiser)?;
         let teacher_meta: DenoiserMeta = artifacts::meta(&manifest, "the teacher")?;
         if teacher_meta.family != Family::Mld {
             return Err(StageError::Input("`teacher` is a student; name a `train.mld` stage".into()));
         }
-        if teacher_meta.vae != data.vae() {
+        if teacher_meta.fits.get(&Role::VAE) != Some(&data.vae()) {
             return Err(StageError::Input(
                 "`latents` were made by another VAE than the teacher was trained on; name the teacher's latents".into(),
+            ));
+        }
+        if teacher_meta.fits.get(&Role::TEXT) != Some(&data.text_meta().text) {
+            return Err(StageError::Input(
+                "`text` was embedded with another encoder than the teacher was trained with; name the teacher's `text`"
+                    .into(),
             ));
         }
         let device = cx.device();
@@ -82,6 +97,7 @@ impl Distiller {
             data,
             teacher,
             teacher_meta,
+            base,
             student,
             target,
             noise: Schedule::published(),
@@ -183,9 +199,21 @@ impl Distiller {
         }
     }
 
-    /// The student's manifest.
-    pub(super) fn meta(&self, family: Family) -> DenoiserMeta {
-        DenoiserMeta { family, guidance_dim: self.settings.guidance_dim, ..self.teacher_meta.clone() }
+    /// Uploads the student: the teacher's model with another denoiser.
+    pub(super) fn publish(
+        &self,
+        cx: &mut dyn AttemptContext,
+        family: Family,
+        weights: Vec<u8>,
+    ) -> Result<Digest, StageError> {
+        let meta = DenoiserMeta { family, guidance_dim: self.settings.guidance_dim, ..self.teacher_meta.clone() };
+        let blobs = cx.blobs();
+        let others = self.base.parts.iter().filter(|(role, _)| **role != Role::DENOISER);
+        let part = |(role, digest): (&Role, &Digest)| {
+            Ok((role.clone(), parts::manifest(&*blobs, *digest, &format!("the part `{role}`"))?))
+        };
+        let parts: BTreeMap<Role, Manifest> = others.map(part).collect::<Result<_, StageError>>()?;
+        latent_data::publish(cx, self.base.format, &meta, weights, parts)
     }
 }
 

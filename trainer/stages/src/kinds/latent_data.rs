@@ -1,14 +1,19 @@
 //! Examples of the stages that train in the latent space: a latent drawn from its posterior, its caption, and keyed draws about it.
 
+use std::collections::BTreeMap;
+
 use burn::tensor::{Device, Tensor, TensorData};
 use motion::Stream;
 use motion::dataset::Split;
-use protocol::stage::Training;
-use protocol::{ArtifactKind, Digest, Seed, StageName};
+use protocol::artifact::Role;
+use protocol::stage::{DataFormat, Training};
+use protocol::{ArtifactKind, Digest, Manifest, Seed, StageName};
 
 use super::no_clips;
-use crate::artifacts::{self, Embeddings, Latents};
+use crate::artifacts::{self, DenoiserMeta, Draft, Embeddings, Latents, MODEL_FILE, to_meta};
 use crate::context::{AttemptContext, StageError};
+use crate::generator::LATENT_DIFFUSION;
+use crate::parts;
 use crate::train::{Order, Pick};
 
 /// Latents and captions of the training split, in the order of a stage.
@@ -77,6 +82,11 @@ impl LatentData {
         &self.embeddings.meta
     }
 
+    /// The encoder that embedded the captions.
+    pub(super) fn text_encoder(&self, cx: &dyn AttemptContext) -> Result<Manifest, StageError> {
+        parts::manifest(&*cx.blobs(), self.embeddings.meta.text, "the text encoder")
+    }
+
     /// The generator of one kind of draw about one example.
     pub(super) fn stream(&self, what: &str, pick: Pick) -> Stream {
         Stream::new(self.seed, &format!("{}/{what}", self.stage), pick.place, 0)
@@ -123,4 +133,18 @@ impl LatentData {
             null_blc: tensor(null, [batch, 1, width]),
         }
     }
+}
+
+/// Uploads a model of latent diffusion: the denoiser, made of its meta and weights, and the parts that it was trained with.
+pub(super) fn publish(
+    cx: &mut dyn AttemptContext,
+    format: DataFormat,
+    meta: &DenoiserMeta,
+    weights: Vec<u8>,
+    mut parts: BTreeMap<Role, Manifest>,
+) -> Result<Digest, StageError> {
+    let mut denoiser = Draft::new(cx, ArtifactKind::Denoiser, to_meta(meta));
+    denoiser.add(MODEL_FILE, weights)?;
+    parts.insert(Role::DENOISER, denoiser.into_manifest());
+    parts::publish_model(cx, LATENT_DIFFUSION, format, &parts)
 }

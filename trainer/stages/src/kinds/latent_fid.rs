@@ -1,4 +1,4 @@
-//! `evaluate.latent_fid`: how close a denoiser's samples come to real latents, to their captions, and to its teacher's.
+//! `evaluate.latent_fid`: how close a model's latents come to real latents, to their captions, and to its teacher's.
 //!
 //! Sample `i` of a repeat is of entry `i mod n`; its caption and noise are keyed by (seed, repeat, i) and not by the stage's name, so
 //! that two models of a run are compared on the same noise. Samples are made in blocks that are cut from the sample's number alone, and
@@ -11,19 +11,20 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use motion::Stream;
-use motion::dataset::Split;
+use motion::dataset::{Caption, Split};
+use motion::text::words;
 use protocol::stage::{EvaluateLatentFid, Sampler, Split as Wanted};
-use protocol::{ArtifactKind, Digest, Manifest, Seed};
+use protocol::{ArtifactKind, Digest, Seed};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::{Map, no_entries, publish_report};
-use crate::artifacts::{self, DenoiserMeta, Embeddings, Family, Latents, Tensors, to_meta};
+use crate::artifacts::{self, Latents, Tensors, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::latent_fid::{
     Real, Reference, mean_and_spread, relative_distance, same_captions, standard_deviation, top,
 };
-use crate::networks::{Conditions, Denoiser};
+use crate::generator::{self, LatentGenerator, MotionGenerator, Texts};
 
 /// Samples computed together. Measured with 5 blocks of width 128 on one core: 32 take a tenth less time each than 64, which with
 /// guidance are 128 sequences and leave the cache.
@@ -54,25 +55,26 @@ struct Plan<'a> {
     settings: &'a EvaluateLatentFid,
     seed: Seed,
     latents: Latents,
-    embeddings: Embeddings,
-    model: DenoiserMeta,
+    captions: Vec<Caption>,
+    model: Box<dyn MotionGenerator>,
     /// Entries that are sampled.
     entries: Vec<usize>,
-    /// Whether a teacher's samples are needed besides the model's.
-    teacher: bool,
+    /// The teacher, where its samples are needed besides the model's.
+    teacher: Option<Box<dyn MotionGenerator>>,
     /// Whether `match` is measured.
     matched: bool,
 }
 
 impl<'a> Plan<'a> {
-    fn read(cx: &dyn AttemptContext, settings: &'a EvaluateLatentFid) -> Result<(Self, Manifest), StageError> {
+    fn read(cx: &dyn AttemptContext, settings: &'a EvaluateLatentFid) -> Result<Self, StageError> {
         let blobs = cx.blobs();
         let refuse = |text: String| Err(StageError::Input(text));
-        let (model_digest, manifest) = artifacts::input(cx, "model", ArtifactKind::Denoiser)?;
-        let model: DenoiserMeta = artifacts::meta(&manifest, "the denoiser")?;
         let latents = Latents::read(&*blobs, &artifacts::input(cx, "latents", ArtifactKind::Latents)?.1)?;
-        let embeddings = Embeddings::read(&*blobs, &artifacts::input(cx, "text", ArtifactKind::Embeddings)?.1)?;
-        fits("model", &model, &latents, &embeddings)?;
+        let captions = artifacts::captions(&*blobs, &artifacts::input(cx, "dataset", ArtifactKind::Dataset)?.1)?;
+        let (model_digest, manifest) = artifacts::input(cx, "model", ArtifactKind::Model)?;
+        let model = generator::open(&manifest, &*blobs, &cx.device())?;
+        generator::check_sampler(&*model, &settings.sampler)?;
+        fits("model", &*model, &latents)?;
         let wanted = |split: Split| match settings.split {
             Wanted::All => true,
             Wanted::Train => split == Split::Train,
@@ -89,27 +91,27 @@ impl<'a> Plan<'a> {
         if settings.repeats == 0 || settings.components == 0 {
             return refuse("`repeats` and `components` must be at least 1".into());
         }
-        let captions = embeddings.meta.captions;
-        if let Some(c) = latents.meta.captions.iter().flatten().find(|c| **c >= captions) {
+        if let Some(c) = latents.meta.captions.iter().flatten().find(|c| **c >= captions.len()) {
+            let have = captions.len();
             return refuse(format!(
-                "`latents` speaks of caption {c}, `text` has {captions}; they are of different datasets"
+                "`latents` speaks of caption {c}, `dataset` has {have}; they are of different clips"
             ));
         }
         let matched = cx.task().inputs.contains_key("teacher");
         let teacher = if matched {
-            let (digest, manifest) = artifacts::input(cx, "teacher", ArtifactKind::Denoiser)?;
-            let meta: DenoiserMeta = artifacts::meta(&manifest, "the teacher")?;
-            if meta.family != Family::Mld {
+            let (digest, manifest) = artifacts::input(cx, "teacher", ArtifactKind::Model)?;
+            let teacher = generator::open(&manifest, &*blobs, &cx.device())?;
+            if teacher.family().is_student() {
                 return refuse("`teacher` is a student itself; expected the output of a train.mld stage".into());
             }
-            fits("teacher", &meta, &latents, &embeddings)?;
+            fits("teacher", &*teacher, &latents)?;
             // A teacher that is compared with itself is not sampled twice.
-            digest != model_digest || settings.sampler.steps != TEACHER_STEPS
+            (digest != model_digest || settings.sampler.steps != TEACHER_STEPS).then_some(teacher)
         } else {
-            false
+            None
         };
         let seed = cx.task().seed;
-        Ok((Self { settings, seed, latents, embeddings, model, entries, teacher, matched }, manifest))
+        Ok(Self { settings, seed, latents, captions, model, entries, teacher, matched })
     }
 
     /// Samples of one repeat.
@@ -134,81 +136,79 @@ impl<'a> Plan<'a> {
         let blocks = self.samples().div_ceil(BLOCK);
         let of = |maker, repeat| (0..blocks).map(move |block| Unit { maker, repeat, block });
         let model = (0..self.settings.repeats).flat_map(|repeat| of(Maker::Model, repeat));
-        let teacher = self.teacher.then(|| of(Maker::Teacher, 0));
+        let teacher = self.teacher.as_ref().map(|_| of(Maker::Teacher, 0));
         model.chain(teacher.into_iter().flatten()).collect()
     }
 
-    /// The conditions and noise of a block.
-    fn conditions(&self, unit: Unit) -> Conditions {
-        let mut conditions = Conditions { text: Vec::new(), null: self.embeddings.null.clone(), noise: Vec::new() };
-        for sample in self.block(unit.block) {
-            let captions = &self.latents.meta.captions[self.entry(sample)];
-            let stream = |what: &str| {
-                Stream::new(self.seed, &format!("evaluate.latent_fid/{what}"), unit.repeat as u64, sample as u64)
-            };
-            let caption = captions[stream("caption").below(captions.len())];
-            conditions.text.extend_from_slice(self.embeddings.captions.row(caption));
-            let mut noise = vec![0.0; self.width()];
-            stream("noise").fill_normal(&mut noise);
-            conditions.noise.extend(noise);
-        }
-        conditions
+    fn stream(&self, what: &str, unit: Unit, sample: usize) -> Stream {
+        Stream::new(self.seed, &format!("evaluate.latent_fid/{what}"), unit.repeat as u64, sample as u64)
     }
 
-    /// Fresh noise of a block for the `step`-th jump of an LCM.
-    fn step_noise(&self, unit: Unit, step: usize) -> Vec<f32> {
-        let mut noise = vec![0.0; self.block(unit.block).len() * self.width()];
-        for (row, sample) in noise.chunks_exact_mut(self.width()).zip(self.block(unit.block)) {
-            let purpose = format!("evaluate.latent_fid/noise {step}");
-            Stream::new(self.seed, &purpose, unit.repeat as u64, sample as u64).fill_normal(row);
-        }
-        noise
+    /// The caption of each sample of a block, by number.
+    fn block_captions(&self, unit: Unit) -> Vec<usize> {
+        let caption = |sample| {
+            let captions = &self.latents.meta.captions[self.entry(sample)];
+            captions[self.stream("caption", unit, sample).below(captions.len())]
+        };
+        self.block(unit.block).map(caption).collect()
+    }
+
+    /// The samples of a block.
+    fn sample(
+        &self,
+        unit: Unit,
+        generator: &dyn MotionGenerator,
+        texts: &Texts<'_>,
+        sampler: &Sampler,
+    ) -> Result<Vec<f32>, StageError> {
+        let texts = texts.get(&self.block_captions(unit), |caption| self.captions[caption].text.as_str())?;
+        let first = self.block(unit.block).start;
+        let seeds = |k: usize, b: usize| match k.checked_sub(1) {
+            None => self.stream("noise", unit, first + b),
+            Some(step) => self.stream(&format!("noise {step}"), unit, first + b),
+        };
+        latents_of("model", generator)?.sample(&texts, &seeds, sampler)
     }
 
     /// The sampler of the teacher that `match` compares with.
     fn teacher_sampler(&self) -> Sampler {
-        let shift = if self.model.family == Family::Mld { 0.0 } else { 1.0 };
+        let shift = if self.model.family().is_student() { 1.0 } else { 0.0 };
         Sampler { steps: TEACHER_STEPS, guidance: self.settings.sampler.guidance + shift, timesteps: Vec::new() }
     }
 }
 
-/// Whether a denoiser makes these latents and reads these embeddings.
-fn fits(field: &str, model: &DenoiserMeta, latents: &Latents, embeddings: &Embeddings) -> Result<(), StageError> {
+/// The way to a model's latents.
+fn latents_of<'g>(field: &str, generator: &'g dyn MotionGenerator) -> Result<&'g dyn LatentGenerator, StageError> {
+    generator.latents().ok_or_else(|| {
+        let text = format!("`{field}` draws motion from no latents, which is what this measures; use `evaluate.t2m`");
+        StageError::Input(text)
+    })
+}
+
+/// Whether a model makes these latents.
+fn fits(field: &str, generator: &dyn MotionGenerator, latents: &Latents) -> Result<(), StageError> {
     let refuse = |text: String| Err(StageError::Input(format!("`{field}` does not fit: {text}")));
-    if model.latent != latents.meta.latent {
-        let (a, b) = (model.latent, latents.meta.latent);
+    let model = latents_of(field, generator)?;
+    let (a, b) = (model.shape(), latents.meta.latent);
+    if a != b {
         return refuse(format!("its latent is {}x{}, that of `latents` {}x{}", a.tokens, a.dim, b.tokens, b.dim));
     }
-    if model.vae != latents.meta.vae {
+    if model.vae() != latents.meta.vae {
         return refuse("it was trained on latents of another VAE than `latents`".into());
-    }
-    if model.encoder != embeddings.meta.encoder || model.text_dim != embeddings.meta.dim {
-        return refuse(format!(
-            "it was trained on `{}` embeddings of width {}, `text` has `{}` of width {}",
-            model.encoder, model.text_dim, embeddings.meta.encoder, embeddings.meta.dim
-        ));
     }
     Ok(())
 }
 
 impl Map for EvaluateLatentFid {
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
-        let blobs = cx.blobs();
-        let (plan, manifest) = Plan::read(cx, self)?;
+        let plan = Plan::read(cx, self)?;
         let mine = |maker: Maker| -> Vec<Unit> {
             let all = plan.units().into_iter().filter(|u| u.maker == maker);
             all.enumerate().filter(|(i, _)| i % of == index).map(|(_, unit)| unit).collect()
         };
         let units: Vec<Unit> = mine(Maker::Model).into_iter().chain(mine(Maker::Teacher)).collect();
-        let model = Denoiser::read(&*blobs, &manifest, &cx.device())?;
-        let teacher = match plan.teacher {
-            true => {
-                let (_, manifest) = artifacts::input(cx, "teacher", ArtifactKind::Denoiser)?;
-                Some((Denoiser::read(&*blobs, &manifest, &cx.device())?, plan.teacher_sampler()))
-            }
-            false => None,
-        };
-        model.check_sampler(&self.sampler)?;
+        let (texts, teacher_sampler) = (Texts::new(&*plan.model), plan.teacher_sampler());
+        let teacher = plan.teacher.as_deref().map(|teacher| (teacher, Texts::new(teacher)));
 
         // Network evaluations, so that the progress is even.
         let cost = |unit: &Unit| match unit.maker {
@@ -221,12 +221,9 @@ impl Map for EvaluateLatentFid {
             if cx.interrupted() {
                 return Ok(Outcome::Yielded { at: 0 });
             }
-            let conditions = plan.conditions(*unit);
             let z = match (&teacher, unit.maker) {
-                (Some((teacher, sampler)), Maker::Teacher) => {
-                    teacher.sample(&conditions, sampler, &mut |_| Vec::new())?
-                }
-                _ => model.sample(&conditions, &self.sampler, &mut |step| plan.step_noise(*unit, step))?,
+                (Some((teacher, texts)), Maker::Teacher) => plan.sample(*unit, *teacher, texts, &teacher_sampler)?,
+                _ => plan.sample(*unit, &*plan.model, &texts, &self.sampler)?,
             };
             values.extend(z);
             done += cost(unit);
@@ -243,7 +240,7 @@ impl Map for EvaluateLatentFid {
         struct ShardMeta {
             units: Vec<Unit>,
         }
-        let (plan, _) = Plan::read(cx, self)?;
+        let plan = Plan::read(cx, self)?;
         let blobs = cx.blobs();
         let mut blocks: BTreeMap<Unit, Vec<f32>> = BTreeMap::new();
         for digest in shards {
@@ -288,7 +285,7 @@ impl Map for EvaluateLatentFid {
                 put("latent_r_precision_top3_test", top(test.iter().copied(), 3));
             }
             if repeat == 0 && plan.matched {
-                let teacher = if plan.teacher { of(Maker::Teacher, 0) } else { samples.clone() };
+                let teacher = if plan.teacher.is_some() { of(Maker::Teacher, 0) } else { samples.clone() };
                 put("match", relative_distance(&samples, &teacher, plan.width()));
                 if self.samples > 1 {
                     // One entry's samples are a whole number of entries apart.
@@ -323,7 +320,7 @@ fn details(
 ) -> Value {
     json!({
         "sampler": plan.settings.sampler,
-        "model": to_meta(&plan.model.family),
+        "model": to_meta(plan.model.family()),
         "samples_per_repeat": plan.samples(),
         "explained_variance": reference.explained(),
         "real_variance": reference.total_variance(),
@@ -351,7 +348,7 @@ fn reference(plan: &Plan<'_>, z: &[f32]) -> Reference {
     let train: Vec<usize> =
         (0..plan.latents.entries()).filter(|&e| plan.latents.meta.splits[e] == Split::Train).collect();
     let real = Real { z, mu: &plan.latents.mu.values, crops, width: plan.width() };
-    let numbers = same_captions(&plan.embeddings.captions.values, plan.embeddings.meta.dim);
+    let numbers = same_captions(plan.captions.iter().map(|caption| words(&caption.text)));
     let captions =
         plan.latents.meta.captions.iter().map(|captions| captions.iter().map(|c| numbers[*c]).collect()).collect();
     Reference::new(real, &train, &plan.entries, captions, plan.settings.components)

@@ -4,12 +4,10 @@
 
 use models::diffusion::{affine, consistency, unzip};
 use models::names::to_bytes;
-use protocol::ArtifactKind;
-use protocol::stage::DistillLcm;
+use protocol::stage::{DistillLcm, StageSpec};
 
 use super::consistency::Distiller;
 use super::{Gang, slice_gradient};
-use crate::artifacts::{self, Family, MODEL_FILE, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, train};
 
@@ -47,11 +45,10 @@ impl Gang for DistillLcm {
         match train(&mut objective, &self.distillation.training, cx)? {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {
-                let family = Family::Lcm { skip: self.distillation.skip, guidance: self.distillation.guidance };
                 // The online network is what is kept, as upstream; its average only was the target.
                 let bytes = to_bytes(&state.groups[0].entries, &state.groups[0].params);
-                let meta = to_meta(&objective.0.meta(family));
-                let output = artifacts::publish(cx, ArtifactKind::Denoiser, meta, MODEL_FILE, bytes)?;
+                let family = self.family().expect("a distillation gives a student");
+                let output = objective.0.publish(cx, family, bytes)?;
                 Ok(Outcome::Finished { output, metrics })
             }
         }

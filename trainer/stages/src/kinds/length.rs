@@ -7,35 +7,22 @@
 
 use burn::tensor::activation::softmax;
 use burn::tensor::{Device, Tensor, TensorData};
+use checkpoint::model::Parts;
 use models::flat;
 use models::kernels::Dropout;
 use models::names::to_bytes;
 use models::networks::{Init, LengthEstimator};
 use motion::Stream;
 use motion::dataset::Dataset;
-use protocol::stage::{DataFormat, Positions, Split, TrainLength};
+use protocol::artifact::Role;
+use protocol::stage::{Positions, Split, TrainLength};
 use protocol::{ArtifactKind, Seed};
-use serde::{Deserialize, Serialize};
 
 use super::{Gang, dropout_seed, group, no_clips, slice_gradient};
 use crate::artifacts::{self, Embeddings, MODEL_FILE, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
+use crate::length::LengthMeta;
 use crate::train::{GroupPlan, Objective, Order, SliceResult, TrainState, Trained, train};
-
-/// Meta of an artifact of kind `length`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct LengthMeta {
-    /// The data it was trained on.
-    format: DataFormat,
-    /// Text encoder, as in the embeddings' meta.
-    encoder: String,
-    /// Width of a caption embedding.
-    text_dim: usize,
-    /// Lengths told apart: class c is a motion of `c * unit` frames.
-    classes: usize,
-    /// Frames of one class.
-    unit: usize,
-}
 
 struct Lengths {
     settings: TrainLength,
@@ -115,7 +102,7 @@ impl Gang for TrainLength {
         }
         let meta = LengthMeta {
             format: dataset.format,
-            encoder: embeddings.meta.encoder.clone(),
+            fits: Parts::from([(Role::TEXT, embeddings.meta.text)]),
             text_dim: embeddings.meta.dim,
             classes: LengthEstimator::CLASSES,
             unit: LengthEstimator::UNIT,

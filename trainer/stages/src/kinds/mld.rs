@@ -3,6 +3,9 @@
 //! `t ~ U{0..999}`, `z_t = alpha_t z_0 + sigma_t eps`, loss `mean (eps_hat(z_t, t, c) - eps)^2`, the caption replaced by the empty one with
 //! probability `guidance_dropout`. Latents are samples of their posteriors, unscaled.
 
+use std::collections::BTreeMap;
+
+use checkpoint::model::Parts;
 use models::diffusion::{Schedule, TIMESTEPS, affine, unzip};
 use models::flat;
 use models::kernels::Dropout;
@@ -10,11 +13,12 @@ use models::losses;
 use models::names::to_bytes;
 use models::networks::{Denoiser, Init};
 use protocol::ArtifactKind;
-use protocol::stage::TrainMld;
+use protocol::artifact::Role;
+use protocol::stage::{Family, TrainMld};
 
-use super::latent_data::LatentData;
+use super::latent_data::{self, LatentData};
 use super::{Gang, group, slice_gradient};
-use crate::artifacts::{self, DenoiserMeta, Family, MODEL_FILE, VaeMeta, to_meta};
+use crate::artifacts::{self, DenoiserMeta, VaeMeta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, train};
 
@@ -57,8 +61,9 @@ impl Objective for Mld {
 impl Gang for TrainMld {
     fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
         let data = LatentData::read(cx, &self.training)?;
-        let (vae_digest, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
-        let vae: VaeMeta = artifacts::meta(&vae, "the VAE")?;
+        let (vae_digest, vae_part) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
+        let vae: VaeMeta = artifacts::meta(&vae_part, "the VAE")?;
+        let text_part = data.text_encoder(cx)?;
         if data.vae() != vae_digest || data.meta().latent != vae.latent {
             return Err(StageError::Input(format!(
                 "`latents` were made by another VAE ({} x {} latents) than `vae` ({} x {}); name the VAE that encoded them",
@@ -74,9 +79,8 @@ impl Gang for TrainMld {
             network: self.network.clone(),
             text_relu: self.text_relu,
             guidance_dim: 0,
-            encoder: data.text_meta().encoder.clone(),
             text_dim: data.text_meta().dim,
-            vae: vae_digest,
+            fits: Parts::from([(Role::VAE, vae_digest), (Role::TEXT, text_part.digest())]),
         };
         let device = cx.device().autodiff();
         let purpose = format!("{}/init", cx.task().name);
@@ -88,7 +92,8 @@ impl Gang for TrainMld {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {
                 let bytes = to_bytes(&state.groups[0].entries, state.result(0));
-                let output = artifacts::publish(cx, ArtifactKind::Denoiser, to_meta(&meta), MODEL_FILE, bytes)?;
+                let parts = BTreeMap::from([(Role::VAE, vae_part), (Role::TEXT, text_part)]);
+                let output = latent_data::publish(cx, vae.format, &meta, bytes, parts)?;
                 Ok(Outcome::Finished { output, metrics })
             }
         }

@@ -14,13 +14,14 @@ mod mld;
 mod pcm;
 mod reconstruction;
 mod t2m;
-pub mod text;
+mod text;
 mod vae;
 
 use std::collections::BTreeMap;
 
 use burn::module::Module;
 use burn::tensor::Tensor;
+use checkpoint::model::Drawn;
 use models::flat::{self, add_gradients};
 use motion::Stream;
 use protocol::stage::{Split, StageSettings, Training};
@@ -156,6 +157,15 @@ fn misplaced(settings: &StageSettings, how: &str) -> StageError {
     StageError::Fault(format!("stage kind `{}` does not run {how}", settings.kind()))
 }
 
+/// Which model an evaluation measured, and how it drew from it; nothing of real motion. A report says this, so that whoever has the
+/// report of a model knows how to draw from the model.
+fn drawn(cx: &dyn AttemptContext) -> Result<Value, StageError> {
+    let task = cx.task();
+    let Some(sampler) = task.settings.sampler() else { return Ok(Value::Null) };
+    let drawn = Drawn { model: artifacts::input(cx, "model", ArtifactKind::Model)?.0, sampler: sampler.clone() };
+    Ok(artifacts::to_meta(&drawn))
+}
+
 /// Uploads a report and ends the stage with its metrics.
 fn publish_report(
     cx: &mut dyn AttemptContext,
@@ -163,7 +173,7 @@ fn publish_report(
     details: Value,
 ) -> Result<Outcome, StageError> {
     let report = json!({"metrics": metrics, "details": details});
-    let meta = json!({"kind": cx.task().settings.kind(), "metrics": metrics});
+    let meta = json!({"kind": cx.task().settings.kind(), "metrics": metrics, "drawn": drawn(cx)?});
     let bytes = protocol::canonical::to_bytes(&report);
     let output = artifacts::publish(cx, ArtifactKind::Report, meta, REPORT_FILE, bytes)?;
     Ok(Outcome::Finished { output, metrics })

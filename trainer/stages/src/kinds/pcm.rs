@@ -16,12 +16,10 @@ use models::kernels::Dropout;
 use models::losses;
 use models::names::to_bytes;
 use models::networks::{Discriminator, Init};
-use protocol::ArtifactKind;
-use protocol::stage::{DistillPcm, Training};
+use protocol::stage::{DistillPcm, StageSpec, Training};
 
 use super::consistency::{Distiller, SolverStep};
 use super::{Gang, group, slice_gradient};
-use crate::artifacts::{self, Family, MODEL_FILE, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, train};
 use burn::module::Module;
@@ -139,12 +137,9 @@ impl Gang for DistillPcm {
         match train(&mut objective, &self.distillation.training, cx)? {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {
-                let distillation = &self.distillation;
-                let family =
-                    Family::Pcm { skip: distillation.skip, guidance: distillation.guidance, phases: self.phases };
                 let bytes = to_bytes(&state.groups[0].entries, &state.groups[0].params);
-                let meta = to_meta(&objective.it.meta(family));
-                let output = artifacts::publish(cx, ArtifactKind::Denoiser, meta, MODEL_FILE, bytes)?;
+                let family = self.family().expect("a distillation gives a student");
+                let output = objective.it.publish(cx, family, bytes)?;
                 Ok(Outcome::Finished { output, metrics })
             }
         }

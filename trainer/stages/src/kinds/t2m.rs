@@ -22,14 +22,14 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use super::{Map, REPORT_FILE, no_entries, word};
-use crate::artifacts::{self, DenoiserMeta, Embeddings, Tensors};
+use crate::artifacts::{self, Tensors};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::frechet::{Gaussian, to_f64};
 use crate::evaluation::interval::Interval;
 use crate::evaluation::retrieval::in_groups;
 use crate::evaluation::{skating, spread};
 use crate::evaluator::TrainedEvaluator;
-use crate::networks::{Autoencoder, Conditions, Denoiser};
+use crate::generator::{self, Batch, MotionGenerator, Texts};
 
 /// Motions computed together.
 const BLOCK: usize = 32;
@@ -155,68 +155,40 @@ impl<'a> Plan<'a> {
 }
 
 /// What makes motions.
-struct Maker {
-    denoiser: Denoiser,
-    vae: Autoencoder,
-    embeddings: Embeddings,
+struct Maker<'a> {
+    generator: &'a dyn MotionGenerator,
+    texts: Texts<'a>,
 }
 
-impl Maker {
-    fn read(cx: &dyn AttemptContext, plan: &Plan<'_>) -> Result<Self, StageError> {
-        let blobs = cx.blobs();
-        let refuse = |text: String| Err(StageError::Input(text));
-        let (_, manifest) = artifacts::input(cx, "model", ArtifactKind::Denoiser)?;
-        let meta: DenoiserMeta = artifacts::meta(&manifest, "the denoiser")?;
-        let (vae_digest, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
-        if meta.vae != vae_digest {
-            return refuse("`model` was trained on latents of another VAE than `vae`".into());
-        }
-        let (_, text) = artifacts::input(cx, "text", ArtifactKind::Embeddings)?;
-        let embeddings = Embeddings::read(&*blobs, &text)?;
-        if (&meta.encoder, meta.text_dim) != (&embeddings.meta.encoder, embeddings.meta.dim) {
-            return refuse(format!(
-                "`model` was trained on `{}` embeddings of width {}, `text` has `{}` of width {}",
-                meta.encoder, meta.text_dim, embeddings.meta.encoder, embeddings.meta.dim
-            ));
-        }
-        if embeddings.meta.captions != plan.dataset.captions.len() {
-            return refuse(format!(
-                "`text` embeds {} captions, `dataset` has {}; they are of different datasets",
-                embeddings.meta.captions,
-                plan.dataset.captions.len()
-            ));
-        }
-        let denoiser = Denoiser::read(&*blobs, &manifest, &cx.device())?;
-        denoiser.check_sampler(&plan.settings.sampler)?;
-        let vae = Autoencoder::read(&*blobs, &vae, &cx.device())?;
-        vae.check_format(plan.dataset.format)?;
-        Ok(Self { denoiser, vae, embeddings })
+/// The model that is measured.
+fn open(cx: &dyn AttemptContext, plan: &Plan<'_>) -> Result<Box<dyn MotionGenerator>, StageError> {
+    let (_, manifest) = artifacts::input(cx, "model", ArtifactKind::Model)?;
+    let generator = generator::open(&manifest, &*cx.blobs(), &cx.device())?;
+    let (ours, theirs) = (generator.format(), plan.dataset.format);
+    if ours != theirs {
+        return Err(StageError::Input(format!(
+            "`model` draws motions of `{}`, the dataset has `{}`; measure it on the format that it was trained on",
+            ours.name(),
+            theirs.name()
+        )));
     }
+    generator::check_sampler(&*generator, &plan.settings.sampler)?;
+    Ok(generator)
+}
 
-    /// A motion for each draw, in the data's own scale; `noise(k, b)` fills the k-th noise of motion b, 0 for the sampler's start.
+impl Maker<'_> {
+    /// A motion for each draw, in the data's own scale; `seeds(k, b)` is the k-th stream of motion b, 0 for the sampler's start.
     fn motions(
         &self,
         plan: &Plan<'_>,
         draws: &[Draw],
-        noise: &dyn Fn(usize, usize, &mut [f32]),
+        seeds: &dyn Fn(usize, usize) -> Stream,
     ) -> Result<Vec<Vec<f32>>, StageError> {
-        let latent = self.denoiser.meta().latent;
-        let size = latent.tokens * latent.dim;
-        let fill = |k: usize| {
-            let mut values = vec![0.0; draws.len() * size];
-            values.chunks_exact_mut(size).enumerate().for_each(|(b, row)| noise(k, b, row));
-            values
-        };
-        let text = draws.iter().flat_map(|d| self.embeddings.captions.row(d.caption).iter().copied()).collect();
-        let conditions = Conditions { text, null: self.embeddings.null.clone(), noise: fill(0) };
-        let z = self.denoiser.sample(&conditions, &plan.settings.sampler, &mut |step| fill(1 + step))?;
+        let captions: Vec<usize> = draws.iter().map(|d| d.caption).collect();
+        let texts = self.texts.get(&captions, |caption| plan.dataset.captions[caption].text.as_str())?;
         let lengths: Vec<usize> = draws.iter().map(|d| d.len).collect();
-        let mut motions = self.vae.decode_ragged(z, &lengths);
-        motions.iter_mut().for_each(|motion| self.vae.denormalise(motion));
-        if !motions.iter().flatten().all(|v| v.is_finite()) {
-            return Err(StageError::Input("motions are not finite; the model has not been trained well".into()));
-        }
-        Ok(motions)
+        let batch = Batch { texts: &texts, lengths: &lengths, seeds };
+        generator::motions(self.generator, batch, &plan.settings.sampler, &mut |_| {})
     }
 }
 
@@ -230,7 +202,8 @@ fn skates(features: &[f32], skeleton: &Skeleton) -> f32 {
 impl Map for EvaluateT2m {
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
         let plan = Plan::read(cx, self)?;
-        let maker = if self.real { None } else { Some(Maker::read(cx, &plan)?) };
+        let generator = if self.real { None } else { Some(open(cx, &plan)?) };
+        let maker = generator.as_deref().map(|generator| Maker { generator, texts: Texts::new(generator) });
         // Of either part every `of`-th, since they cost differently.
         let mine = |part: Part| -> Vec<Unit> {
             let all = plan.units().into_iter().filter(|u| u.part == part).enumerate();
@@ -252,8 +225,8 @@ impl Map for EvaluateT2m {
                     let motions = match &maker {
                         Some(maker) => {
                             real.extend(plan.trained.motions(&crops));
-                            maker.motions(&plan, &draws, &|k, b, row| {
-                                plan.stream(&format!("noise {k}"), unit.repeat, block.start + b).fill_normal(row);
+                            maker.motions(&plan, &draws, &|k, b| {
+                                plan.stream(&format!("noise {k}"), unit.repeat, block.start + b)
                             })?
                         }
                         None => {
@@ -272,9 +245,8 @@ impl Map for EvaluateT2m {
                     let samples = self.multimodality.samples;
                     for first in (0..samples).step_by(BLOCK) {
                         let count = BLOCK.min(samples - first);
-                        let motions = maker.motions(&plan, &vec![draw; count], &|k, b, row| {
-                            let index = entry * samples + first + b;
-                            plan.stream(&format!("many {k}"), unit.repeat, index).fill_normal(row);
+                        let motions = maker.motions(&plan, &vec![draw; count], &|k, b| {
+                            plan.stream(&format!("many {k}"), unit.repeat, entry * samples + first + b)
                         })?;
                         many.extend(plan.trained.motions(&motions));
                     }
@@ -334,9 +306,11 @@ impl Map for EvaluateT2m {
             ));
         }
         metrics.insert("samples".to_owned(), samples as f64);
+        let drawn = super::drawn(cx)?;
         let meta = json!({
             "kind": cx.task().settings.kind(),
             "metrics": metrics,
+            "drawn": drawn,
             "split": plan.split,
             "evaluator": plan.evaluator,
             "words": plan.trained.meta().words,

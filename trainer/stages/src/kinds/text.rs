@@ -1,45 +1,38 @@
-//! `text.embed`: captions as vectors, once and for all stages.
+//! `text.embed`: captions as vectors, once and for all stages, with the encoder that made them.
 
 use std::collections::BTreeMap;
 
-use motion::text::hashed_embedding;
 use protocol::ArtifactKind;
-use protocol::stage::{TextEmbed, TextEncoder};
+use protocol::artifact::Role;
+use protocol::stage::TextEmbed;
 
 use super::Plain;
-use crate::artifacts::{self, EMBEDDINGS_FILE, EmbeddingsMeta, Tensors, to_meta};
+use crate::artifacts::{self, Draft, EMBEDDINGS_FILE, EmbeddingsMeta, Tensors, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
+use crate::text;
 
-/// The encoder's name in metas.
-pub fn encoder_name(encoder: TextEncoder) -> &'static str {
-    match encoder {
-        TextEncoder::Hashed => "hashed",
-    }
-}
-
-/// The embedding of `caption` by the encoder called `name` in a meta.
-pub fn embed(name: &str, caption: &str) -> Result<Vec<f32>, StageError> {
-    match name {
-        "hashed" => Ok(hashed_embedding(caption).to_vec()),
-        other => Err(StageError::Input(format!("text encoder `{other}` is not in this build, which has `hashed`"))),
-    }
-}
+/// Captions embedded at once.
+const BLOCK: usize = 64;
 
 impl Plain for TextEmbed {
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
         let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
         let captions = artifacts::captions(&*cx.blobs(), &manifest)?;
-        let encoder = encoder_name(self.encoder);
-        let null = embed(encoder, "")?;
-        let dim = null.len();
+        let part = text::manifest(self.encoder);
+        let digest = cx.put_manifest(&part)?;
+        let encoder = text::open(&part, &*cx.blobs(), &cx.device())?;
+        let (null, dim) = (encoder.pooled(&[""])?, encoder.dim());
         let mut rows = Vec::with_capacity(captions.len() * dim);
-        for caption in &captions {
-            rows.extend(embed(encoder, &caption.text)?);
+        for block in captions.chunks(BLOCK) {
+            let texts: Vec<&str> = block.iter().map(|caption| caption.text.as_str()).collect();
+            rows.extend(encoder.pooled(&texts)?);
         }
-        let meta = EmbeddingsMeta { encoder: encoder.to_owned(), dim, captions: captions.len() };
+        let meta = EmbeddingsMeta { text: digest, dim, captions: captions.len() };
         let tensors = Tensors::default().with("captions", [captions.len(), dim], rows).with("null", [dim], null);
-        let output =
-            artifacts::publish(cx, ArtifactKind::Embeddings, to_meta(&meta), EMBEDDINGS_FILE, tensors.to_bytes()?)?;
+        let mut draft = Draft::new(cx, ArtifactKind::Embeddings, to_meta(&meta));
+        draft.part(&Role::TEXT, &part);
+        draft.add(EMBEDDINGS_FILE, tensors.to_bytes()?)?;
+        let output = draft.finish(cx)?;
         let metrics = BTreeMap::from([("captions".to_owned(), captions.len() as f64)]);
         Ok(Outcome::Finished { output, metrics })
     }

@@ -63,7 +63,7 @@ pub(crate) fn chain(shards: usize, steps: Steps4) -> Vec<Link> {
             ..EvaluateLatentFid::default()
         })
     };
-    let latent = |model| vec![("model", model), ("latents", "latents"), ("text", "text"), ("teacher", "mld")];
+    let latent = |model| vec![("model", model), ("latents", "latents"), ("dataset", "dataset"), ("teacher", "mld")];
     let teacher = || vec![("teacher", "mld"), ("latents", "latents"), ("text", "text")];
     vec![
         ("dataset", StageSettings::DataSynthetic(data), vec![]),

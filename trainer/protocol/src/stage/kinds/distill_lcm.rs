@@ -4,7 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
-use crate::stage::{Distillation, Neighbours, Output, Problems, Ref, Sampler, Shape, StageSpec, Training};
+use crate::stage::{Distillation, Family, Neighbours, Output, Problems, Ref, Shape, StageSpec, Training};
 
 /// `distill.lcm`. Source: MotionLCM.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -23,8 +23,10 @@ impl Default for DistillLcm {
 
 impl StageSpec for DistillLcm {
     const KIND: &'static str = "distill.lcm";
+    // 2: a whole model, with its VAE and text encoder.
+    const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Gang;
-    const OUTPUT: Output = Output { name: "denoiser", kind: ArtifactKind::Denoiser };
+    const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
 
     fn refs(&mut self) -> Vec<Ref<'_>> {
         self.distillation.refs()
@@ -42,16 +44,8 @@ impl StageSpec for DistillLcm {
         Some(&mut self.distillation.training)
     }
 
-    fn is_student(&self) -> bool {
-        true
-    }
-
-    fn check_sampler(&self, model: &str, sampler: &Sampler, p: &mut Problems) {
-        let points = 1000 / self.distillation.skip.max(1);
-        if sampler.steps > points {
-            let message =
-                format!("`sampler.steps` is {}, but the grid of `{model}` has {points} points", sampler.steps);
-            p.add("sampler.steps", message, "");
-        }
+    fn family(&self) -> Option<Family> {
+        let Distillation { skip, guidance, .. } = self.distillation;
+        Some(Family::Lcm { skip, guidance })
     }
 }

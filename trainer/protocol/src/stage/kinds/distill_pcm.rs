@@ -4,7 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
-use crate::stage::{Distillation, Neighbours, Optimizer, Output, Problems, Ref, Sampler, Shape, StageSpec, Training};
+use crate::stage::{Distillation, Family, Neighbours, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training};
 
 /// `distill.pcm`. Source: MotionPCM, Algorithm 1.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -37,8 +37,10 @@ impl Default for DistillPcm {
 
 impl StageSpec for DistillPcm {
     const KIND: &'static str = "distill.pcm";
+    // 2: a whole model, with its VAE and text encoder.
+    const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Gang;
-    const OUTPUT: Output = Output { name: "denoiser", kind: ArtifactKind::Denoiser };
+    const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
 
     fn refs(&mut self) -> Vec<Ref<'_>> {
         self.distillation.refs()
@@ -67,19 +69,8 @@ impl StageSpec for DistillPcm {
         Some(&mut self.distillation.training)
     }
 
-    fn is_student(&self) -> bool {
-        true
-    }
-
-    fn check_sampler(&self, model: &str, sampler: &Sampler, p: &mut Problems) {
-        if self.phases == sampler.steps {
-            sampler.refuse_timesteps(model, p);
-        } else {
-            let message = format!(
-                "`sampler.steps` is {}, but `{model}` has {} phase(s); a PCM student makes one step a phase",
-                sampler.steps, self.phases
-            );
-            p.add("sampler.steps", message, &format!("write `steps: {}`", self.phases));
-        }
+    fn family(&self) -> Option<Family> {
+        let Distillation { skip, guidance, .. } = self.distillation;
+        Some(Family::Pcm { skip, guidance, phases: self.phases })
     }
 }

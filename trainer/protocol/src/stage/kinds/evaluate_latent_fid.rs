@@ -1,4 +1,4 @@
-//! `evaluate.latent_fid`: a denoiser measured in its own latent space, without an evaluator. Source: ours.
+//! `evaluate.latent_fid`: a model measured in its own latent space, without an evaluator. Source: ours.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -10,12 +10,12 @@ use crate::stage::{Neighbours, Output, Problems, Ref, Sampler, Shape, Split, Sta
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluateLatentFid {
-    /// Stage that gives the denoiser.
+    /// Stage that gives the model, which makes latents.
     pub model: String,
     /// Stage that gives the latents.
     pub latents: String,
-    /// Stage that gives the caption embeddings.
-    pub text: String,
+    /// Stage that gives the clips of the latents, whose captions are drawn.
+    pub dataset: String,
     /// Stage that gives the teacher whose 50-step samples `match` compares with; empty leaves `match` out.
     pub teacher: String,
     /// Sampler.
@@ -37,7 +37,7 @@ impl Default for EvaluateLatentFid {
         Self {
             model: "mld".into(),
             latents: "latents".into(),
-            text: "text".into(),
+            dataset: "dataset".into(),
             teacher: String::new(),
             sampler: Sampler::default(),
             repeats: 5,
@@ -51,17 +51,17 @@ impl Default for EvaluateLatentFid {
 
 impl StageSpec for EvaluateLatentFid {
     const KIND: &'static str = "evaluate.latent_fid";
-    // 2: retrieval among latents has names of its own.
-    const VERSION: u32 = 2;
+    // 2: retrieval among latents has names of its own. 3: captions are the same by their words, not by their vectors.
+    const VERSION: u32 = 3;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 
     fn refs(&mut self) -> Vec<Ref<'_>> {
         vec![
-            Ref::stage("model", &mut self.model, ArtifactKind::Denoiser).measured_if(true),
+            Ref::stage("model", &mut self.model, ArtifactKind::Model).measured_if(true),
             Ref::stage("latents", &mut self.latents, ArtifactKind::Latents),
-            Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
-            Ref::stage("teacher", &mut self.teacher, ArtifactKind::Denoiser).optional(),
+            Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
+            Ref::stage("teacher", &mut self.teacher, ArtifactKind::Model).optional(),
         ]
     }
 
@@ -75,10 +75,10 @@ impl StageSpec for EvaluateLatentFid {
     }
 
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
-        stages.same_vae(p, ("model", stages.vae_of_denoiser(&self.model)), &self.latents);
-        stages.same_data(p, &self.latents, &self.text);
+        stages.same_vae(p, ("model", stages.vae_of_model(&self.model)), &self.latents);
+        stages.same_clips(p, &self.dataset, &self.latents);
         if !self.teacher.is_empty() {
-            stages.same_vae(p, ("teacher", stages.vae_of_denoiser(&self.teacher)), &self.latents);
+            stages.same_vae(p, ("teacher", stages.vae_of_model(&self.teacher)), &self.latents);
             stages.is_teacher(p, &self.teacher);
         }
         if let Some(latent) = stages.vae_of_latents(&self.latents).and_then(|vae| stages.latent(vae)) {
@@ -89,6 +89,10 @@ impl StageSpec for EvaluateLatentFid {
             }
         }
         stages.check_sampler(p, &self.model, &self.sampler);
+    }
+
+    fn sampler(&self) -> Option<&Sampler> {
+        Some(&self.sampler)
     }
 
     fn shards(&self) -> usize {

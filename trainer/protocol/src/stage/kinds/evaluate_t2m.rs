@@ -28,14 +28,10 @@ impl Default for MultiModality {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluateT2m {
-    /// Stage that gives the denoiser.
+    /// Stage that gives the model.
     pub model: String,
-    /// Stage that gives its VAE.
-    pub vae: String,
     /// Stage that gives the clips.
     pub dataset: String,
-    /// Stage that gives the caption embeddings.
-    pub text: String,
     /// Stage that gives the evaluator.
     pub evaluator: String,
     /// Measures real motion, against itself with other crops; no model is read.
@@ -60,9 +56,7 @@ impl Default for EvaluateT2m {
     fn default() -> Self {
         Self {
             model: "mld".into(),
-            vae: "vae".into(),
             dataset: "dataset".into(),
-            text: "text".into(),
             evaluator: "evaluator".into(),
             real: false,
             shuffled: false,
@@ -78,6 +72,8 @@ impl Default for EvaluateT2m {
 
 impl StageSpec for EvaluateT2m {
     const KIND: &'static str = "evaluate.t2m";
+    // 2: says which model it measured, and how that was drawn.
+    const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 
@@ -86,12 +82,10 @@ impl StageSpec for EvaluateT2m {
         vec![
             Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
             Ref::stage("evaluator", &mut self.evaluator, ArtifactKind::Evaluator),
-            Ref::stage("model", &mut self.model, ArtifactKind::Denoiser)
+            Ref::stage("model", &mut self.model, ArtifactKind::Model)
                 .only_if(generated)
                 // Shuffled captions say nothing of the model.
                 .measured_if(generated && !self.shuffled),
-            Ref::stage("vae", &mut self.vae, ArtifactKind::Vae).only_if(generated),
-            Ref::stage("text", &mut self.text, ArtifactKind::Embeddings).only_if(generated),
         ]
     }
 
@@ -128,15 +122,22 @@ impl StageSpec for EvaluateT2m {
         if self.real {
             return;
         }
-        let (model, text) = (&self.model, &self.text);
-        if let Some(vae) = stages.vae_of_denoiser(model)
-            && vae != self.vae
+        let model = &self.model;
+        if let (Some(ours), Some(theirs)) = (stages.format(dataset), stages.format(model))
+            && ours != theirs
         {
-            let message = format!("`{model}` makes latents of `{vae}`, but `vae` is `{}`", self.vae);
-            p.add("vae", message, "another VAE makes other motions of them; name the same one");
+            let message = format!(
+                "`{model}` makes motions of {}, but the clips of `{dataset}` have {}",
+                theirs.skeleton(),
+                ours.skeleton()
+            );
+            p.add("model", message, "measure a model on the format that it was trained on");
         }
-        stages.same_captions(p, text, dataset);
         stages.check_sampler(p, model, &self.sampler);
+    }
+
+    fn sampler(&self) -> Option<&Sampler> {
+        (!self.real).then_some(&self.sampler)
     }
 
     fn shards(&self) -> usize {

@@ -4,8 +4,9 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
+use crate::artifact::Role;
 use crate::id::is_name;
-use crate::stage::{Mode, Neighbours, Output, Problems, Ref, Shape, StageSpec};
+use crate::stage::{Mode, Neighbours, Output, Problems, Ref, Sampler, Shape, StageSpec, measured_with};
 
 /// `register`: model versions, and the best of them promoted.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -13,13 +14,18 @@ use crate::stage::{Mode, Neighbours, Output, Problems, Ref, Shape, StageSpec};
 pub struct Register {
     /// Model name.
     pub model: String,
-    /// Training stages whose denoisers become versions. The metrics of every `evaluate.*` stage of the pipeline that
+    /// Stages whose models become versions. The metrics of every `evaluate.*` stage of the pipeline that
     /// looks at one of them go with it.
     pub from: Vec<String>,
     /// Metric that decides which is best.
     pub metric: String,
     /// Its direction.
     pub mode: Mode,
+    /// How the versions are drawn from when nobody says otherwise. Without it, as their evaluations drew; it is needed where those differ.
+    #[schemars(with = "Sampler")]
+    pub sampler: Option<Sampler>,
+    /// Stage that gives a length estimator, which becomes a part of every version; empty adds none.
+    pub length: String,
     /// What is promoted; without it nothing is.
     pub promote: Promote,
 }
@@ -31,6 +37,8 @@ impl Default for Register {
             from: Vec::new(),
             metric: "latent_fid".into(),
             mode: Mode::Min,
+            sampler: None,
+            length: String::new(),
             promote: Promote::default(),
         }
     }
@@ -48,6 +56,8 @@ pub struct Promote {
 
 impl StageSpec for Register {
     const KIND: &'static str = "register";
+    // 2: versions are drawn as they were measured.
+    const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Registry;
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
 
@@ -55,7 +65,8 @@ impl StageSpec for Register {
     fn refs(&mut self) -> Vec<Ref<'_>> {
         let field = |i| format!("from[{i}]");
         let stages = self.from.iter_mut().enumerate();
-        stages.map(|(i, stage)| Ref::stage(field(i), stage, ArtifactKind::Denoiser)).collect()
+        let models = stages.map(|(i, stage)| Ref::stage(field(i), stage, ArtifactKind::Model));
+        models.chain([Ref::stage("length", &mut self.length, ArtifactKind::Length).optional()]).collect()
     }
 
     fn check(&self, p: &mut Problems) {
@@ -69,7 +80,7 @@ impl StageSpec for Register {
         if self.from.is_empty() {
             p.add(
                 "from",
-                "`from` is missing: the training stages whose denoisers become versions",
+                "`from` is missing: the training stages whose models become versions",
                 "such as `from: [lcm, pcm]`",
             );
         }
@@ -81,6 +92,9 @@ impl StageSpec for Register {
         if self.metric.trim().is_empty() {
             p.add("metric", "`metric` is empty; expected the metric that decides which version is best", "");
         }
+        if let Some(sampler) = &self.sampler {
+            sampler.check(p);
+        }
         self.promote.check(p);
     }
 
@@ -91,6 +105,45 @@ impl StageSpec for Register {
                 let help = format!("add a stage such as `{{kind: evaluate.latent_fid, model: {from}}}`");
                 p.add(&format!("from[{i}]"), message, &help);
             }
+            match &self.sampler {
+                Some(sampler) => stages.check_sampler(p, from, sampler),
+                None => {
+                    if let Err(differ) = measured_with(stages.samplers_of(from)) {
+                        p.add(&format!("from[{i}]"), undecided(from, &differ), SAY_WHICH);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// What to do about evaluations that differ.
+const SAY_WHICH: &str = "say which one the model is drawn with, such as `sampler: {steps: 1, guidance: 2}`";
+
+/// Evaluations of `from` that draw in different ways, when nobody said which way is the model's own.
+fn undecided(from: &str, differ: &str) -> String {
+    format!("the evaluations of `{from}` draw from it in different ways ({differ}), and a version has one")
+}
+
+impl Register {
+    /// Parts that are added to every version: role, and the stage that gives it.
+    pub fn parts(&self) -> impl Iterator<Item = (Role, &str)> {
+        [(Role::LENGTH, self.length.as_str())].into_iter().filter(|(_, stage)| !stage.is_empty())
+    }
+
+    /// How a version of `from` is drawn from when nobody says otherwise: as these settings name it, or as its evaluations drew. `None` if
+    /// nobody measured it.
+    ///
+    /// # Errors
+    /// Which evaluations differ, and what to write.
+    pub fn sampler_of<'a>(
+        &'a self,
+        from: &str,
+        evaluations: impl IntoIterator<Item = (&'a str, &'a Sampler)>,
+    ) -> Result<Option<&'a Sampler>, String> {
+        match &self.sampler {
+            Some(sampler) => Ok(Some(sampler)),
+            None => measured_with(evaluations).map_err(|differ| format!("{}; {SAY_WHICH}", undecided(from, &differ))),
         }
     }
 }

@@ -30,8 +30,27 @@ pub enum TextEncoder {
     Hashed,
 }
 
+impl TextEncoder {
+    /// The word in YAML, and in what the encoder made.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Hashed => "hashed",
+        }
+    }
+
+    /// Whether enough of its vectors is left by a ReLU. A hashed word is one coordinate, as often -1 as +1, so that half of the words
+    /// would mean nothing, and so would the empty caption.
+    pub fn survives_relu(self) -> bool {
+        match self {
+            Self::Hashed => false,
+        }
+    }
+}
+
 impl StageSpec for TextEmbed {
     const KIND: &'static str = "text.embed";
+    // 2: with the encoder.
+    const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Plain;
     const OUTPUT: Output = Output { name: "embeddings", kind: ArtifactKind::Embeddings };
 

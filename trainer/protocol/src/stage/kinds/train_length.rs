@@ -43,6 +43,8 @@ impl Default for TrainLength {
 
 impl StageSpec for TrainLength {
     const KIND: &'static str = "train.length";
+    // 2: says which encoder it reads.
+    const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "length", kind: ArtifactKind::Length };
 

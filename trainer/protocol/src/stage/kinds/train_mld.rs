@@ -4,7 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
-use crate::stage::{Neighbours, Network, Output, Problems, Ref, Sampler, Shape, StageSpec, Training};
+use crate::stage::{Family, Neighbours, Network, Output, Problems, Ref, Shape, StageSpec, TextEmbed, Training};
 
 /// `train.mld`: the latent-diffusion teacher. Source: MLD, MotionLCM v1/v2.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -46,8 +46,10 @@ impl Default for TrainMld {
 
 impl StageSpec for TrainMld {
     const KIND: &'static str = "train.mld";
+    // 2: a whole model, with its VAE and text encoder.
+    const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Gang;
-    const OUTPUT: Output = Output { name: "denoiser", kind: ArtifactKind::Denoiser };
+    const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
 
     fn refs(&mut self) -> Vec<Ref<'_>> {
         vec![
@@ -67,13 +69,24 @@ impl StageSpec for TrainMld {
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
         stages.same_vae(p, ("vae", Some(&self.vae)), &self.latents);
         stages.same_data(p, &self.latents, &self.text);
+        let embed = stages.stage(&self.text).and_then(|settings| settings.get::<TextEmbed>());
+        if let Some(encoder) = embed.map(|embed| embed.encoder)
+            && self.text_relu
+            && !encoder.survives_relu()
+        {
+            let message = format!(
+                "`text_relu` deletes every negative coordinate, and with `{}` half of the words are just one such coordinate",
+                encoder.name()
+            );
+            p.add("text_relu", message, "leave it out, as MotionLCM v2 does, or embed with another encoder");
+        }
     }
 
     fn training(&mut self) -> Option<&mut Training> {
         Some(&mut self.training)
     }
 
-    fn check_sampler(&self, model: &str, sampler: &Sampler, p: &mut Problems) {
-        sampler.refuse_timesteps(model, p);
+    fn family(&self) -> Option<Family> {
+        Some(Family::Mld)
     }
 }

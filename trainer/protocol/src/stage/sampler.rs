@@ -1,0 +1,212 @@
+//! How motions are drawn from a model, which samplers a model has, and which of them is its own.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::Problems;
+
+/// Timesteps of every published noise schedule.
+const TIMESTEPS: usize = 1000;
+
+/// How motions are drawn from a model.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Sampler {
+    /// Network evaluations. A PCM student has as many as phases.
+    pub steps: usize,
+    /// Teacher: g in `uncond + g (cond - uncond)`. Student: the embedded w, which is g - 1.
+    pub guidance: f64,
+    /// LCM only: timesteps, first to last; empty takes evenly spaced points of the training grid from 999 down.
+    pub timesteps: Vec<usize>,
+}
+
+impl Default for Sampler {
+    fn default() -> Self {
+        Self { steps: 1, guidance: 7.5, timesteps: Vec::new() }
+    }
+}
+
+impl std::fmt::Display for Sampler {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{} step(s), guidance {}", self.steps, self.guidance)?;
+        match self.timesteps.is_empty() {
+            true => Ok(()),
+            false => write!(f, ", timesteps {:?}", self.timesteps),
+        }
+    }
+}
+
+impl Sampler {
+    /// What must hold whatever model is drawn from.
+    pub(super) fn check(&self, p: &mut Problems) {
+        if !(1..=TIMESTEPS).contains(&self.steps) {
+            p.add("sampler.steps", format!("`sampler.steps` is {}; expected 1 to {TIMESTEPS}", self.steps), "");
+        }
+        p.not_negative("sampler.guidance", self.guidance);
+        if let Some(t) = self.timesteps.iter().find(|t| **t >= TIMESTEPS) {
+            let last = TIMESTEPS - 1;
+            p.add("sampler.timesteps", format!("timestep {t} is out of range; expected 0 to {last}"), "");
+        }
+        if self.timesteps.windows(2).any(|pair| pair[0] < pair[1]) {
+            p.add("sampler.timesteps", "`sampler.timesteps` rise; expected the noisiest first", "");
+        }
+        if !self.timesteps.is_empty() && self.timesteps.len() != self.steps {
+            let entries = self.timesteps.len();
+            let message = format!("`sampler.timesteps` has {entries} entries, but `sampler.steps` is {}", self.steps);
+            p.add("sampler.timesteps", message, "");
+        }
+    }
+}
+
+/// What a model was trained to do, and so which samplers it has.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "family", rename_all = "lowercase")]
+pub enum Family {
+    /// Predicts noise; DDIM with classifier-free guidance.
+    Mld,
+    /// Latent consistency model: jumps to the data, re-noises between jumps.
+    Lcm {
+        /// Solver step k; the grid has 1000/k points.
+        skip: usize,
+        /// Guidance scales w it was trained for.
+        guidance: (f64, f64),
+    },
+    /// Phased consistency model: deterministic jumps between phase edges.
+    Pcm {
+        /// Solver step k; the grid has 1000/k points.
+        skip: usize,
+        /// Guidance scales w it was trained for.
+        guidance: (f64, f64),
+        /// M: phases, and sampling steps.
+        phases: usize,
+    },
+}
+
+impl Family {
+    /// Whether guidance is built in, so that it cannot be asked without it and teaches nobody.
+    pub fn is_student(&self) -> bool {
+        !matches!(self, Self::Mld)
+    }
+
+    /// What must hold of a sampler for a model of this family; `model` is what messages call it.
+    pub(super) fn check(&self, model: &str, sampler: &Sampler, p: &mut Problems) {
+        let steps = sampler.steps;
+        if !sampler.timesteps.is_empty() && !matches!(self, Self::Lcm { .. }) {
+            let message = format!("`sampler.timesteps` are for LCM students, and {model} is none");
+            p.add("sampler.timesteps", message, "leave them out");
+        }
+        let mut at_most = |most: usize, what: &str| {
+            if steps > most {
+                p.add("sampler.steps", format!("`sampler.steps` is {steps}, but {what}; expected 1 to {most}"), "");
+            }
+        };
+        match self {
+            Self::Mld => at_most(TIMESTEPS - 1, "there are no more timesteps between noise and data"),
+            Self::Lcm { skip, .. } if sampler.timesteps.is_empty() => {
+                let points = TIMESTEPS / (*skip).max(1);
+                at_most(points, &format!("the grid of {model} has {points} points"));
+            }
+            Self::Lcm { .. } => {}
+            Self::Pcm { phases, .. } if *phases == steps => {}
+            Self::Pcm { phases, .. } => {
+                let message = format!(
+                    "`sampler.steps` is {steps}, but {model} has {phases} phase(s); a PCM student makes one step a phase"
+                );
+                p.add("sampler.steps", message, &format!("write `steps: {phases}`"));
+            }
+        }
+    }
+
+    /// Why `sampler` is not one of this family's: all that a pipeline's check finds, in one line.
+    ///
+    /// # Errors
+    /// The reasons.
+    pub fn accepts(&self, sampler: &Sampler) -> Result<(), String> {
+        let mut problems = Problems::default();
+        sampler.check(&mut problems);
+        self.check("the model", sampler, &mut problems);
+        let reasons: Vec<String> = problems.0.into_iter().map(|problem| problem.message).collect();
+        if reasons.is_empty() { Ok(()) } else { Err(reasons.join("; ")) }
+    }
+
+    /// How the papers draw: a teacher with 50 steps at its published guidance, a student with as many steps as it has phases (an LCM with
+    /// one), at a third of the range of guidance scales that it was trained for. The published range 5 to 15 gives w = 8.3, near
+    /// MotionLCM's 7 to 12.5. For models that nobody has measured; a measured one has its own.
+    pub fn published(&self) -> Sampler {
+        let student = |steps: usize, (low, high): (f64, f64)| Sampler {
+            steps,
+            guidance: low + (high - low) / 3.0,
+            timesteps: Vec::new(),
+        };
+        match self {
+            Self::Mld => Sampler { steps: 50, guidance: 7.5, timesteps: Vec::new() },
+            Self::Lcm { guidance, .. } => student(1, *guidance),
+            Self::Pcm { guidance, phases, .. } => student(*phases, *guidance),
+        }
+    }
+}
+
+/// The one sampler that a model was measured with, given the evaluations of it by name; `None` if there are none.
+///
+/// # Errors
+/// Which evaluations differ, and in what.
+pub fn measured_with<'a>(
+    evaluations: impl IntoIterator<Item = (&'a str, &'a Sampler)>,
+) -> Result<Option<&'a Sampler>, String> {
+    let mut groups: Vec<(&Sampler, Vec<&str>)> = Vec::new();
+    for (name, sampler) in evaluations {
+        match groups.iter_mut().find(|(known, _)| *known == sampler) {
+            Some((_, names)) => names.push(name),
+            None => groups.push((sampler, vec![name])),
+        }
+    }
+    if groups.len() < 2 {
+        return Ok(groups.first().map(|(sampler, _)| *sampler));
+    }
+    let each = groups.iter().map(|(sampler, names)| format!("{sampler} in `{}`", names.join("`, `")));
+    Err(each.collect::<Vec<_>>().join("; "))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sampler(steps: usize, timesteps: &[usize]) -> Sampler {
+        Sampler { steps, guidance: 2.0, timesteps: timesteps.to_vec() }
+    }
+
+    #[test]
+    fn samplers_that_a_family_does_not_have_are_refused() {
+        let lcm = Family::Lcm { skip: 100, guidance: (5.0, 15.0) };
+        let pcm = Family::Pcm { skip: 100, guidance: (5.0, 15.0), phases: 2 };
+        for (family, sampler, word) in [
+            (&Family::Mld, sampler(0, &[]), "steps"),
+            (&Family::Mld, sampler(1000, &[]), "1 to 999"),
+            (&Family::Mld, sampler(1, &[999]), "timesteps"),
+            (&lcm, sampler(11, &[]), "1 to 10"),
+            (&lcm, sampler(2, &[999]), "timesteps"),
+            (&lcm, sampler(1, &[1000]), "0 to 999"),
+            (&pcm, sampler(1, &[]), "2 phase"),
+            (&pcm, sampler(2, &[999, 499]), "timesteps"),
+            (&pcm, Sampler { guidance: f64::NAN, ..sampler(2, &[]) }, "guidance"),
+        ] {
+            let refused = family.accepts(&sampler).unwrap_err();
+            assert!(refused.contains(word), "{refused}");
+        }
+        assert_eq!(Family::Mld.accepts(&sampler(50, &[])), Ok(()));
+        assert_eq!(lcm.accepts(&sampler(2, &[699, 299])), Ok(()));
+        assert_eq!(pcm.accepts(&sampler(2, &[])), Ok(()));
+        for family in [Family::Mld, lcm, pcm] {
+            assert_eq!(family.accepts(&family.published()), Ok(()), "{family:?}");
+        }
+    }
+
+    #[test]
+    fn what_a_model_was_measured_with_is_one_sampler_or_a_question() {
+        let (one, four) = (sampler(1, &[]), sampler(4, &[]));
+        assert_eq!(measured_with([]), Ok(None));
+        assert_eq!(measured_with([("fid", &one), ("t2m", &one.clone())]), Ok(Some(&one)));
+        let refused = measured_with([("fid", &one), ("t2m_1", &one), ("t2m_4", &four)]).unwrap_err();
+        assert_eq!(refused, "1 step(s), guidance 2 in `fid`, `t2m_1`; 4 step(s), guidance 2 in `t2m_4`");
+    }
+}

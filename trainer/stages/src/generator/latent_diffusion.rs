@@ -1,0 +1,122 @@
+//! Latent diffusion and its students: a denoiser draws a latent, a VAE turns it into motion. Source: MLD, MotionLCM, MotionPCM.
+//!
+//! Parts: `denoiser`, `vae`, `text`. The denoiser reads a caption's one vector.
+
+use std::rc::Rc;
+
+use burn::tensor::Device;
+use checkpoint::Blobs;
+use checkpoint::model::Model;
+use protocol::artifact::Role;
+use protocol::stage::{DataFormat, Family, LatentShape, Sampler};
+use protocol::{ArtifactKind, Digest};
+
+use super::{Batch, Lap, LatentGenerator, MotionGenerator, Seeds, Text};
+use crate::context::StageError;
+use crate::networks::{Autoencoder, Conditions, Denoiser};
+use crate::parts::{self, model_error};
+use crate::text::{self, TextEncoder};
+
+/// Its name in manifests.
+pub(crate) const NAME: &str = "latent-diffusion";
+
+#[derive(Debug)]
+struct LatentDiffusion {
+    denoiser: Denoiser,
+    vae: Autoencoder,
+    /// The VAE's manifest.
+    vae_digest: Digest,
+    text: Box<dyn TextEncoder>,
+    /// The empty caption.
+    null: Vec<f32>,
+}
+
+/// Opens its parts, which must fit each other.
+pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<Box<dyn MotionGenerator>, StageError> {
+    let part = |role: &Role, kind| parts::part(blobs, model, role, kind);
+    let denoiser = Denoiser::read(blobs, &part(&Role::DENOISER, ArtifactKind::Denoiser)?, device)?;
+    let vae = Autoencoder::read(blobs, &part(&Role::VAE, ArtifactKind::Vae)?, device)?;
+    let text = text::open(&part(&Role::TEXT, ArtifactKind::TextEncoder)?, blobs, device)?;
+    let meta = denoiser.meta();
+    for role in [Role::VAE, Role::TEXT] {
+        if meta.fits.get(&role) != model.parts.get(&role) {
+            return Err(StageError::Input(format!(
+                "the denoiser was trained with another `{role}` than the model has"
+            )));
+        }
+    }
+    let (ours, theirs) = (meta.latent, vae.meta().latent);
+    if ours != theirs {
+        return Err(StageError::Input(format!(
+            "the denoiser's latent is {}x{}, the VAE's {}x{}",
+            ours.tokens, ours.dim, theirs.tokens, theirs.dim
+        )));
+    }
+    if meta.text_dim != text.dim() {
+        let (wanted, found) = (meta.text_dim, text.dim());
+        return Err(StageError::Input(format!(
+            "the denoiser reads {wanted} numbers a caption, the encoder gives {found}"
+        )));
+    }
+    let null = text.pooled(&[""])?;
+    let vae_digest = model.part(&Role::VAE).map_err(model_error)?;
+    Ok(Box::new(LatentDiffusion { denoiser, vae, vae_digest, text, null }))
+}
+
+impl MotionGenerator for LatentDiffusion {
+    fn format(&self) -> DataFormat {
+        self.vae.meta().format
+    }
+
+    fn longest(&self) -> usize {
+        self.vae.max_frames()
+    }
+
+    fn family(&self) -> &Family {
+        &self.denoiser.meta().family
+    }
+
+    fn text(&self) -> &dyn TextEncoder {
+        &*self.text
+    }
+
+    fn embed(&self, captions: &[&str]) -> Result<Vec<Text>, StageError> {
+        let pooled = self.text.pooled(captions)?;
+        Ok(pooled.chunks_exact(self.text.dim()).map(|row| Text { values: row.to_vec() }).collect())
+    }
+
+    fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError> {
+        let z = self.sample(batch.texts, batch.seeds, sampler)?;
+        lap(Lap::Sampled);
+        let mut motions = self.vae.decode_ragged(z, batch.lengths);
+        motions.iter_mut().for_each(|motion| self.vae.denormalise(motion));
+        lap(Lap::Decoded);
+        Ok(motions)
+    }
+
+    fn latents(&self) -> Option<&dyn LatentGenerator> {
+        Some(self)
+    }
+}
+
+impl LatentGenerator for LatentDiffusion {
+    fn shape(&self) -> LatentShape {
+        self.denoiser.meta().latent
+    }
+
+    fn vae(&self) -> Digest {
+        self.vae_digest
+    }
+
+    fn sample(&self, texts: &[Rc<Text>], seeds: &Seeds<'_>, sampler: &Sampler) -> Result<Vec<f32>, StageError> {
+        let size = self.shape().tokens * self.shape().dim;
+        let fill = |k: usize| {
+            let mut values = vec![0.0; texts.len() * size];
+            values.chunks_exact_mut(size).enumerate().for_each(|(b, row)| seeds(k, b).fill_normal(row));
+            values
+        };
+        let text = texts.iter().flat_map(|text| text.values.iter().copied()).collect();
+        let conditions = Conditions { text, null: self.null.clone(), noise: fill(0) };
+        self.denoiser.sample(&conditions, sampler, &mut |step| fill(1 + step))
+    }
+}
