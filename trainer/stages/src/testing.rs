@@ -245,14 +245,7 @@ impl Bench {
     ///
     /// Shards of a map stage run last to first: their order must not matter.
     pub fn run(&mut self, name: &str, settings: &StageSettings, inputs: &[(&str, Digest)]) -> Result<Ran, StageError> {
-        let task = StageTask {
-            run: RunId::new("test-1"),
-            name: StageName::new(name),
-            settings: settings.clone(),
-            inputs: inputs.iter().map(|(field, digest)| ((*field).to_owned(), *digest)).collect(),
-            seed: self.seed,
-            checkpoint: self.checkpoint.clone(),
-        };
+        let task = self.task(name, settings, inputs);
         let attempt = || MemoryAttempt::new(task.clone(), self.device.clone(), Arc::clone(&self.blobs));
         match settings.shape() {
             Shape::Plain => {
@@ -272,11 +265,33 @@ impl Bench {
                 let outcome = kinds::run_part(&mut cx, Part::Merge { shards })?;
                 Ok(Ran { outcome, told: cx.told })
             }
-            Shape::Gang => {
-                let saved = self.checkpoints.entry(name.to_owned()).or_default();
-                gang::run(attempt, self.members, &self.script, saved, &kinds::run_gang)
-            }
+            Shape::Gang => self.run_gang(name, settings, inputs, &kinds::run_gang),
             Shape::Registry => Err(StageError::Fault(format!("`{}` runs in the coordinator", settings.kind()))),
+        }
+    }
+
+    /// Runs `body` as the gang stage `name`, whatever kind its settings are of.
+    pub(crate) fn run_gang(
+        &mut self,
+        name: &str,
+        settings: &StageSettings,
+        inputs: &[(&str, Digest)],
+        body: &gang::Body<'_>,
+    ) -> Result<Ran, StageError> {
+        let task = self.task(name, settings, inputs);
+        let attempt = || MemoryAttempt::new(task.clone(), self.device.clone(), Arc::clone(&self.blobs));
+        let saved = self.checkpoints.entry(name.to_owned()).or_default();
+        gang::run(attempt, self.members, &self.script, saved, body)
+    }
+
+    fn task(&self, name: &str, settings: &StageSettings, inputs: &[(&str, Digest)]) -> StageTask {
+        StageTask {
+            run: RunId::new("test-1"),
+            name: StageName::new(name),
+            settings: settings.clone(),
+            inputs: inputs.iter().map(|(field, digest)| ((*field).to_owned(), *digest)).collect(),
+            seed: self.seed,
+            checkpoint: self.checkpoint.clone(),
         }
     }
 }

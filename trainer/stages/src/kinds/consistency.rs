@@ -23,7 +23,7 @@ use super::latent_data::{self, LatentData, LatentSlice};
 use crate::artifacts::{self, DenoiserMeta, MODEL_FILE};
 use crate::context::{AttemptContext, ContextError, GangContext, StageError};
 use crate::parts::{self, model_error};
-use crate::train::{GroupPlan, TrainState};
+use crate::train::{Average, GroupPlan, TrainState};
 
 /// Networks and data of a distillation.
 pub(super) struct Distiller {
@@ -110,7 +110,10 @@ impl Distiller {
     /// The student as a group of parameters.
     pub(super) fn group(&self) -> GroupPlan {
         // The target network is the average, whatever its decay.
-        GroupPlan { ema: Some(self.settings.ema), ..group("model", &self.student, &self.settings.training, 0.0) }
+        GroupPlan {
+            average: Some(Average::of(self.settings.ema)),
+            ..group("model", &self.student, &self.settings.training, 0.0)
+        }
     }
 
     /// Takes over student and target.

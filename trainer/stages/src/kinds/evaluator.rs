@@ -15,7 +15,6 @@ use models::flat;
 use models::kernels::Dropout;
 use models::names::to_bytes;
 use models::networks::{Evaluator, Init, MotionEncoder, MovementDecoder, MovementEncoder, TextEncoder};
-use models::optim::LrSchedule;
 use motion::Stream;
 use motion::dataset::{Dataset, crop, window};
 use protocol::stage::{Positions, Split, TrainEvaluator};
@@ -25,7 +24,7 @@ use super::{Gang, dropout_seed, group, no_clips};
 use crate::artifacts;
 use crate::context::{GangContext, Outcome, StageError};
 use crate::evaluator::{self, EvaluatorMeta, UNIT, normalise};
-use crate::train::{GroupPlan, Objective, Order, Pick, SliceResult, TrainState, Trained, train};
+use crate::train::{GroupPlan, Objective, Order, Pick, SliceResult, TrainState, Trained, Turns, train};
 use crate::words::{CLASSES, CaptionBatch, WORD_WIDTH, WORDS, Words};
 
 /// Keeps the slope of a distance finite at 0, as in the original.
@@ -153,10 +152,10 @@ impl EvaluatorObjective {
         let mut gradients = loss.backward();
         let mut flat = vec![0.0; self.movements.num_params()];
         flat::add_gradients(&self.movements, &mut gradients, &mut flat);
-        let idle = |module_params: usize| vec![0.0; module_params];
         Ok(SliceResult {
-            gradients: vec![idle(self.text.num_params()), idle(self.motion.num_params()), flat],
+            gradients: vec![Vec::new(), Vec::new(), flat],
             terms: vec![value, reconstruction, 0.0, 0.0],
+            ..SliceResult::default()
         })
     }
 
@@ -202,8 +201,9 @@ impl EvaluatorObjective {
         let mut motion_flat = vec![0.0; self.motion.num_params()];
         flat::add_gradients(&self.motion, &mut gradients, &mut motion_flat);
         Ok(SliceResult {
-            gradients: vec![text_flat, motion_flat, vec![0.0; self.movements.num_params()]],
+            gradients: vec![text_flat, motion_flat, Vec::new()],
             terms: vec![value, 0.0, close, far],
+            ..SliceResult::default()
         })
     }
 }
@@ -224,22 +224,18 @@ fn apart(sentences: &[&str]) -> Vec<f32> {
 
 impl Objective for EvaluatorObjective {
     fn groups(&mut self) -> Vec<GroupPlan> {
-        let (turn, training) = (self.turning_point(), &self.settings.training);
-        let during = |steps: std::ops::Range<u64>, group: GroupPlan| GroupPlan {
-            lr: LrSchedule { steps: steps.end - steps.start, ..group.lr },
-            active: Some(steps),
-            ..group
-        };
-        let (matching, ema) = (turn..training.steps.0, self.settings.ema);
+        let (turn, training, ema) = (self.turning_point(), &self.settings.training, self.settings.ema);
+        let steps = training.steps.0;
+        let (movements, matching) = (Turns::during(0..turn), Turns::during(turn..steps));
         vec![
-            during(matching.clone(), group("text", &self.text, training, ema)),
-            during(matching, group("motion", &self.motion, training, ema)),
-            during(0..turn, group("movements", &self.movements, training, ema)),
+            group("text", &self.text, training, ema).taking(matching.clone(), steps),
+            group("motion", &self.motion, training, ema).taking(matching, steps),
+            group("movements", &self.movements, training, ema).taking(movements, steps),
         ]
     }
 
-    fn terms(&self) -> &'static [&'static str] {
-        &["loss", "reconstruction", "positive", "negative"]
+    fn terms(&self) -> Vec<&'static str> {
+        vec!["loss", "reconstruction", "positive", "negative"]
     }
 
     fn load(&mut self, state: &TrainState) {

@@ -18,8 +18,8 @@ impl Objective for Lcm {
         vec![self.0.group()]
     }
 
-    fn terms(&self) -> &'static [&'static str] {
-        &["loss"]
+    fn terms(&self) -> Vec<&'static str> {
+        vec!["loss"]
     }
 
     fn load(&mut self, state: &TrainState) {
@@ -35,7 +35,7 @@ impl Objective for Lcm {
         let student = affine(solved.noisy_bnd.clone(), it.student_eps(&solved, step, slice), &a, &e);
         let loss = it.distance(student, target) / it.settings.training.batch.global as f32;
         let (gradient, loss) = slice_gradient(&it.student, loss);
-        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss] })
+        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss], ..SliceResult::default() })
     }
 }
 

@@ -43,8 +43,8 @@ impl Objective for Lengths {
     }
 
     /// The second: frames between the mean of the predicted lengths and the true one.
-    fn terms(&self) -> &'static [&'static str] {
-        &["loss", "frames_off"]
+    fn terms(&self) -> Vec<&'static str> {
+        vec!["loss", "frames_off"]
     }
 
     fn load(&mut self, state: &TrainState) {
@@ -78,7 +78,7 @@ impl Objective for Lengths {
             frames.iter().map(|frames| LengthEstimator::class(*frames, LengthEstimator::CLASSES)).collect();
         let loss = LengthEstimator::loss(logits, &classes) / batch.global as f32;
         let (gradient, loss) = slice_gradient(&self.network, loss);
-        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss, off] })
+        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss, off], ..SliceResult::default() })
     }
 }
 

@@ -35,8 +35,8 @@ impl Objective for Mld {
         vec![group("model", &self.network, &self.settings.training, self.settings.ema)]
     }
 
-    fn terms(&self) -> &'static [&'static str] {
-        &["loss"]
+    fn terms(&self) -> Vec<&'static str> {
+        vec!["loss"]
     }
 
     fn load(&mut self, state: &TrainState) {
@@ -54,7 +54,7 @@ impl Objective for Mld {
         let predicted = self.network.forward(noisy, &timesteps, batch.text_blc, None, &mut dropout);
         let loss = losses::mse(predicted, noise) / self.settings.training.batch.global as f32;
         let (gradient, loss) = slice_gradient(&self.network, loss);
-        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss] })
+        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss], ..SliceResult::default() })
     }
 }
 

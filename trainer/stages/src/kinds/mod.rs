@@ -30,7 +30,7 @@ use serde_json::{Value, json};
 
 use crate::artifacts;
 use crate::context::{AttemptContext, GangContext, Outcome, Part, StageError};
-use crate::train::GroupPlan;
+use crate::train::{Average, Clip, GroupPlan, Turns};
 
 /// Where a report's details are.
 pub const REPORT_FILE: &str = "report.json";
@@ -110,8 +110,8 @@ pub fn run_gang(cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
     }
 }
 
-/// All parameters of `module` as one group that every step trains as `training` says, with a moving average of decay `ema` beside them
-/// unless that is 0.
+/// All parameters of `module` as one group that every step trains as `training` says and that is clipped by its own norm, with a moving
+/// average of decay `ema` beside them unless that is 0.
 fn group<M: Module>(name: &'static str, module: &M, training: &Training, ema: f64) -> GroupPlan {
     GroupPlan {
         name,
@@ -119,8 +119,9 @@ fn group<M: Module>(name: &'static str, module: &M, training: &Training, ema: f6
         params: flat::read(module),
         optimizer: (&training.optimizer).into(),
         lr: training.into(),
-        ema: (ema > 0.0).then_some(ema),
-        active: None,
+        clip: (training.max_grad_norm > 0.0).then_some(Clip { norm: training.max_grad_norm, together: name }),
+        average: (ema > 0.0).then(|| Average::of(ema)),
+        turns: Turns::ALWAYS,
     }
 }
 

@@ -6,8 +6,8 @@
 //! noised on from `s_m`, real the data latent noised to `s`, with independent noise.
 //!
 //! Readings and departures: the student's input is the noised latent (the paper's line 10 is a slip); hinge signs as in Algorithm 1, not
-//! Eq. 13; levels end at the true next edge. Both networks are updated in every step from gradients of the same step, so one exchange carries
-//! both; the discriminator therefore sees the student before its update.
+//! Eq. 13; levels end at the true next edge. Unless `alternate` says otherwise, both networks are updated in every step from gradients of the
+//! same step, so one exchange carries both; the discriminator therefore sees the student before its update.
 
 use burn::tensor::Tensor;
 use models::diffusion::{Phases, affine, unzip};
@@ -21,7 +21,7 @@ use protocol::stage::{DistillPcm, StageSpec, Training};
 use super::consistency::{Distiller, SolverStep};
 use super::{Gang, group, slice_gradient};
 use crate::context::{GangContext, Outcome, StageError};
-use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, train};
+use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, Turns, train};
 use burn::module::Module;
 
 struct Pcm {
@@ -33,20 +33,20 @@ struct Pcm {
 
 impl Objective for Pcm {
     fn groups(&mut self) -> Vec<GroupPlan> {
-        let mut groups = vec![self.it.group()];
-        if let Some(heads) = &self.heads {
-            let training = &self.settings.distillation.training;
-            let lr = if self.settings.discriminator_lr > 0.0 { self.settings.discriminator_lr } else { training.lr };
-            groups.push(GroupPlan {
-                optimizer: (&self.settings.discriminator_optimizer).into(),
-                ..group("heads", heads, &Training { lr, ..training.clone() }, 0.0)
-            });
-        }
-        groups
+        let Some(heads) = &self.heads else { return vec![self.it.group()] };
+        let training = &self.settings.distillation.training;
+        let lr = if self.settings.discriminator_lr > 0.0 { self.settings.discriminator_lr } else { training.lr };
+        let heads = GroupPlan {
+            optimizer: (&self.settings.discriminator_optimizer).into(),
+            ..group("heads", heads, &Training { lr, ..training.clone() }, 0.0)
+        };
+        let [student, critic] = self.turns();
+        vec![self.it.group().taking(student, training.steps.0), heads.taking(critic, training.steps.0)]
     }
 
-    fn terms(&self) -> &'static [&'static str] {
-        if self.heads.is_some() { &["loss", "consistency", "adversarial", "discriminator"] } else { &["loss"] }
+    fn terms(&self) -> Vec<&'static str> {
+        let all = ["loss", "consistency", "adversarial", "discriminator"];
+        all[..if self.heads.is_some() { 4 } else { 1 }].to_vec()
     }
 
     fn load(&mut self, state: &TrainState) {
@@ -71,7 +71,7 @@ impl Objective for Pcm {
         let consistency = self.it.distance(student.clone(), target) / global;
         let Some(heads) = &self.heads else {
             let (gradient, loss) = slice_gradient(&self.it.student, consistency);
-            return Ok(SliceResult { gradients: vec![gradient], terms: vec![loss] });
+            return Ok(SliceResult { gradients: vec![gradient], terms: vec![loss], ..SliceResult::default() });
         };
 
         let levels: Vec<usize> = solved
@@ -92,19 +92,28 @@ impl Objective for Pcm {
         let detached: Vec<Tensor<3>> = fake_features.iter().map(|f| f.clone().inner()).collect();
         let adversarial = losses::hinge_generator(heads.valid().forward(fake_features)) / global;
         let total = consistency.clone() + adversarial.clone() * self.settings.adversarial as f32;
-        let (gradient, loss) = slice_gradient(&self.it.student, total);
-
         let critic = losses::hinge_discriminator(heads.forward(features(real)), heads.forward(detached)) / global;
-        let (head_gradient, discriminator) = slice_gradient(heads, critic);
-        let value = |x: Tensor<1>| x.inner().into_scalar::<f32>();
-        Ok(SliceResult {
-            gradients: vec![gradient, head_gradient],
-            terms: vec![loss, value(consistency), value(adversarial), discriminator],
-        })
+        let value = |x: &Tensor<1>| x.clone().inner().into_scalar::<f32>();
+        let terms = vec![value(&total), value(&consistency), value(&adversarial), value(&critic)];
+        let [student_turns, critic_turns] = self.turns().map(|turns| turns.turn(step).is_some());
+        let gradients = vec![
+            if student_turns { slice_gradient(&self.it.student, total).0 } else { Vec::new() },
+            if critic_turns { slice_gradient(heads, critic).0 } else { Vec::new() },
+        ];
+        Ok(SliceResult { gradients, terms, ..SliceResult::default() })
     }
 }
 
 impl Pcm {
+    /// The steps that train the student, and those that train the discriminator.
+    fn turns(&self) -> [Turns; 2] {
+        if self.settings.alternate {
+            [Turns::ALWAYS.one_in(2, 0), Turns::ALWAYS.one_in(2, 1)]
+        } else {
+            [Turns::ALWAYS, Turns::ALWAYS]
+        }
+    }
+
     /// The student's jump noised from `s_m` to the level (on the tape), and the data latent noised to it.
     fn levels(
         &self,

@@ -80,8 +80,8 @@ impl Objective for VaeObjective {
         vec![group("model", &self.network, &self.settings.training, self.settings.ema)]
     }
 
-    fn terms(&self) -> &'static [&'static str] {
-        &["loss", "feature", "joint", "kl"]
+    fn terms(&self) -> Vec<&'static str> {
+        vec!["loss", "feature", "joint", "kl"]
     }
 
     fn load(&mut self, state: &TrainState) {
@@ -126,7 +126,7 @@ impl Objective for VaeObjective {
             return Err(StageError::Input("every weight in `loss` is 0, so there is nothing to learn; set one".into()));
         };
         let (gradient, loss) = slice_gradient(&self.network, loss / global as f32);
-        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss, feature, joint, kl] })
+        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss, feature, joint, kl], ..SliceResult::default() })
     }
 }
 

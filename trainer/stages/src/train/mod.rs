@@ -5,15 +5,21 @@
 //! The non-obvious idea: everything that training changes is a few flat f32 buffers and a step number ([`TrainState`]). A step reads
 //! them, and applies one sum over all slices of the step; nothing else survives from step to step, so a checkpoint, a peer's copy and
 //! a fresh start are the same thing at different steps.
+//!
+//! A [`Group`] is parameters with an optimizer; [`Turns`] say which steps train it, so phases, alternating updates and frozen parts are
+//! plans, not loops. [`Buffers`] are what no optimizer changes: [`Objective::after`] does, from sums over the slices.
 
+mod buffers;
+mod group;
 mod order;
 mod state;
+#[cfg(test)]
+mod tests;
 mod tree;
 
 use std::collections::BTreeMap;
-use std::collections::btree_map::Entry;
 
-use models::optim::{clip_factor, global_norm};
+use protocol::message::StageTask;
 use protocol::stage::Training;
 
 use crate::artifacts::Draft;
@@ -21,8 +27,12 @@ use crate::context::{ContextError, Exchange, GangContext, Rendezvous, StageError
 use protocol::ArtifactKind;
 use serde_json::json;
 
+use group::Gradients;
+
+pub use buffers::{AfterStep, BufferPlan, Buffers, SumPlan};
+pub use group::{Average, Clip, Group, GroupPlan, Turns};
 pub use order::{Order, Pick};
-pub use state::{Group, GroupPlan, RestoreError, TrainState};
+pub use state::{RestoreError, TrainState};
 pub use tree::tree_sum;
 
 /// The input that a rung of a sweep goes on from: the checkpoint that the rung before left.
@@ -34,24 +44,53 @@ const LEARNING_RATE: &str = "lr";
 pub(crate) const STATE_FILE: &str = "state.safetensors";
 
 /// What one slice of a step gave.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct SliceResult {
-    /// For each group the gradient of `sum over the slice's examples of the example's loss, divided by the global batch`.
+    /// For each group the gradient of `sum over the slice's examples of the example's loss, divided by the global batch`. Empty for a group
+    /// that the step does not train.
     pub gradients: Vec<Vec<f32>>,
     /// For each term its sum over the slice's examples, divided by the global batch.
     pub terms: Vec<f32>,
+    /// For each planned sum the slice's share of it.
+    pub sums: Vec<Vec<f32>>,
 }
 
 /// The mathematics of one stage: parameters and examples to gradients.
 pub trait Objective {
     /// What is trained, with its first values.
     fn groups(&mut self) -> Vec<GroupPlan>;
+
+    /// What is kept besides, and changed by [`after`](Self::after) alone.
+    fn buffers(&mut self) -> Vec<BufferPlan> {
+        Vec::new()
+    }
+
     /// Names of the values that every slice gives besides gradients; the first is the loss that is watched.
-    fn terms(&self) -> &'static [&'static str];
-    /// Takes over the parameters of `state` before the slices of a step.
+    fn terms(&self) -> Vec<&'static str>;
+
+    /// What every slice gives for [`after`](Self::after).
+    fn sums(&self) -> Vec<SumPlan> {
+        Vec::new()
+    }
+
+    /// Takes over the parameters and buffers of `state` before the slices of a step.
     fn load(&mut self, state: &TrainState);
+
     /// Computes slice `slice` of step `step`.
     fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError>;
+
+    /// Computes the slices of step `step` that are this member's, in the order of `slices`. Rows of a batch do not depend on each other, so
+    /// one pass may serve several slices, as long as each one's result has the bits that [`slice`](Self::slice) gives it: who computes
+    /// which slices together differs from gang to gang.
+    fn slices(&mut self, step: u64, slices: &[usize]) -> Result<Vec<SliceResult>, StageError> {
+        slices.iter().map(|slice| self.slice(step, *slice)).collect()
+    }
+
+    /// Changes the buffers once the groups have been updated. Every member does so for itself, and must come to the same bits: what is not
+    /// in `step` must not matter.
+    fn after(&mut self, _step: &mut AfterStep<'_>) -> Result<(), StageError> {
+        Ok(())
+    }
 }
 
 /// How training ended, short of an error.
@@ -86,11 +125,15 @@ pub fn train(
 ) -> Result<Trained, StageError> {
     let (steps, slices) = (training.end().0, training.batch.slices);
     // Before anything is computed: what is saved is known from the start.
-    let saved = objective.terms().iter().copied().chain([GRADIENT_NORM, LEARNING_RATE]);
-    cx.task().checkpoint.keep.check(saved).map_err(StageError::Input)?;
+    let (terms, sums) = (objective.terms(), objective.sums());
+    cx.task()
+        .checkpoint
+        .keep
+        .check(terms.iter().copied().chain([GRADIENT_NORM, LEARNING_RATE]))
+        .map_err(StageError::Input)?;
     // Names of other stages say nothing about a state, which the key of the next rung rests on.
     let config = cx.task().settings.digest();
-    let mut state = TrainState::new(&objective.groups());
+    let mut state = TrainState::new(&objective.groups(), objective.buffers());
     let mut saved_at = begin(&mut state, cx)?;
     let mut save_is_due = false;
     let mut stop = false;
@@ -120,13 +163,14 @@ pub fn train(
             continue;
         }
         // A regroup may hand us other slices of the same step; what was computed is not computed again.
+        let layout = Layout::of(&state, terms.len(), &sums);
         let share = cx.share(slices);
-        for slice in share.clone() {
-            if let Entry::Vacant(place) = done.entry(slice) {
-                place.insert(flatten(objective.slice(state.step, slice)?));
-            }
+        let missing: Vec<usize> = share.clone().filter(|slice| !done.contains_key(slice)).collect();
+        let results = objective.slices(state.step, &missing)?;
+        for (slice, result) in missing.iter().zip(results) {
+            done.insert(*slice, layout.pack(result)?);
         }
-        let parts: Vec<_> = share.map(|slice| (slice, done.remove(&slice).expect("just computed"))).collect();
+        let parts: Vec<_> = share.map(|slice| (slice, done.remove(&slice).expect("a result for each slice"))).collect();
         let (sum, drain) = match cx.exchange(state.step, slices, &parts)? {
             Exchange::Sum { sum, drain } => (sum, drain),
             Exchange::Regroup => {
@@ -142,12 +186,12 @@ pub fn train(
             }
         };
         done.clear();
-        let (gradients, terms) = split(&sum, &state, objective.terms().len());
-        let report = apply(&mut state, gradients, terms[0], training)?;
+        let report = apply(&mut state, &layout, &sum)?;
+        hook(objective, &mut state, layout.sums(&sum, &sums), cx.task())?;
         objective.load(&state);
 
-        let mut values: Vec<(&str, f64)> =
-            objective.terms().iter().copied().zip(terms.iter().map(|t| f64::from(*t))).collect();
+        let values = terms.iter().copied().zip(layout.terms(&sum).iter().map(|t| f64::from(*t)));
+        let mut values: Vec<(&str, f64)> = values.collect();
         recent.push(&values);
         values.push((GRADIENT_NORM, report.norm));
         values.push((LEARNING_RATE, report.lr));
@@ -215,24 +259,68 @@ fn due(step: u64, steps: u64) -> bool {
     step <= 2000 || step.is_multiple_of(10) || step == steps
 }
 
-fn flatten(result: SliceResult) -> Vec<f32> {
-    let mut flat = Vec::with_capacity(result.gradients.iter().map(Vec::len).sum::<usize>() + result.terms.len());
-    for gradient in result.gradients {
-        flat.extend(gradient);
-    }
-    flat.extend(result.terms);
-    flat
+/// Where in a slice's vector each of its values is: the gradients of the groups that the step trains, the terms, the sums.
+struct Layout {
+    /// For each group its gradient's length, if the step trains it.
+    gradients: Vec<Option<usize>>,
+    terms: usize,
+    sums: Vec<usize>,
 }
 
-fn split<'a>(sum: &'a [f32], state: &TrainState, terms: usize) -> (Vec<&'a [f32]>, &'a [f32]) {
-    let (mut rest, mut gradients) = (sum, Vec::new());
-    for group in &state.groups {
-        let (head, tail) = rest.split_at(group.params.len());
-        gradients.push(head);
-        rest = tail;
+impl Layout {
+    fn of(state: &TrainState, terms: usize, sums: &[SumPlan]) -> Self {
+        let trained = |group: &Group| group.turn(state.step).map(|_| group.params.len());
+        Self {
+            gradients: state.groups.iter().map(trained).collect(),
+            terms,
+            sums: sums.iter().map(|sum| sum.len).collect(),
+        }
     }
-    assert_eq!(rest.len(), terms, "an exchange carries gradients and terms");
-    (gradients, rest)
+
+    /// A slice's result as one vector.
+    fn pack(&self, result: SliceResult) -> Result<Vec<f32>, StageError> {
+        let wanted: Vec<usize> = self.gradients.iter().map(|len| len.unwrap_or(0)).collect();
+        let lengths = |parts: &[Vec<f32>]| parts.iter().map(Vec::len).collect::<Vec<_>>();
+        let found = (lengths(&result.gradients), result.terms.len(), lengths(&result.sums));
+        if found != (wanted, self.terms, self.sums.clone()) {
+            let (gradients, terms, sums) = found;
+            return Err(StageError::Fault(format!(
+                "a slice gave gradients of {gradients:?} values, {terms} terms and sums of {sums:?}; the plan has {:?}, {} and {:?}",
+                self.gradients, self.terms, self.sums
+            )));
+        }
+        let mut flat =
+            Vec::with_capacity(self.gradients.iter().flatten().chain(&self.sums).sum::<usize>() + self.terms);
+        result.gradients.into_iter().for_each(|gradient| flat.extend(gradient));
+        flat.extend(result.terms);
+        result.sums.into_iter().for_each(|sum| flat.extend(sum));
+        Ok(flat)
+    }
+
+    fn gradients<'a>(&self, mut packed: &'a [f32]) -> Vec<Option<&'a [f32]>> {
+        let cut = |len: &Option<usize>| {
+            let (head, tail) = packed.split_at((*len)?);
+            packed = tail;
+            Some(head)
+        };
+        self.gradients.iter().map(cut).collect()
+    }
+
+    fn terms<'a>(&self, packed: &'a [f32]) -> &'a [f32] {
+        let start: usize = self.gradients.iter().flatten().sum();
+        &packed[start..start + self.terms]
+    }
+
+    fn sums<'a>(&self, packed: &'a [f32], plans: &'a [SumPlan]) -> Vec<(&'a str, &'a [f32])> {
+        let start = self.gradients.iter().flatten().sum::<usize>() + self.terms;
+        let mut rest = &packed[start..];
+        let cut = |plan: &'a SumPlan| {
+            let (head, tail) = rest.split_at(plan.len);
+            rest = tail;
+            (plan.name.as_str(), head)
+        };
+        plans.iter().map(cut).collect()
+    }
 }
 
 struct Applied {
@@ -240,28 +328,28 @@ struct Applied {
     lr: f64,
 }
 
-/// One optimizer update of every group: clip by the group's global norm, AdamW, EMA.
-fn apply(
-    state: &mut TrainState,
-    gradients: Vec<&[f32]>,
-    loss: f32,
-    training: &Training,
-) -> Result<Applied, StageError> {
-    let norms: Vec<f64> = gradients.iter().map(|g| global_norm(g)).collect();
-    if !loss.is_finite() || norms.iter().any(|n| !n.is_finite()) {
-        let norm = norms.iter().copied().find(|n| !n.is_finite()).unwrap_or(norms[0]);
+/// One optimizer update of every group that the step trains. A step that trains none, because it only gathers sums, has norm and rate 0.
+fn apply(state: &mut TrainState, layout: &Layout, sum: &[f32]) -> Result<Applied, StageError> {
+    let gradients = Gradients::of(&state.groups, state.step, layout.gradients(sum));
+    let (norm, lr) = gradients.watched(&state.groups).unwrap_or_default();
+    let loss = layout.terms(sum)[0];
+    if let Some(norm) = gradients.unbounded().or((!loss.is_finite()).then_some(norm)) {
         return Err(StageError::Diverged { step: state.step, loss: f64::from(loss), norm });
     }
-    let step = state.step;
-    for ((group, gradient), norm) in state.groups.iter_mut().zip(gradients).zip(&norms) {
-        let factor = if training.max_grad_norm > 0.0 { clip_factor(*norm, training.max_grad_norm) } else { 1.0 };
-        group.update(step, gradient, factor);
-    }
+    gradients.apply(&mut state.groups);
     state.step += 1;
-    // The first group that the step trains stands for the step.
-    let watched = state.groups.iter().zip(&norms).find_map(|(group, norm)| Some((group.turn(step)?, group, *norm)));
-    let (turn, group, norm) = watched.unwrap_or((step, &state.groups[0], norms[0]));
-    Ok(Applied { norm, lr: group.lr.at(turn) })
+    Ok(Applied { norm, lr })
+}
+
+/// Lets the objective change the buffers, after the step before `state.step`.
+fn hook(
+    objective: &mut dyn Objective,
+    state: &mut TrainState,
+    sums: Vec<(&str, &[f32])>,
+    task: &StageTask,
+) -> Result<(), StageError> {
+    let (step, buffers) = (state.step - 1, &mut state.buffers);
+    objective.after(&mut AfterStep { step, buffers, sums, seed: task.seed, stage: &task.name })
 }
 
 fn save(
@@ -275,6 +363,7 @@ fn save(
         "settings": config,
         "seed": cx.task().seed,
         "groups": state.groups.iter().map(|g| json!({"name": g.name, "parameters": g.params.len()})).collect::<Vec<_>>(),
+        "buffers": state.buffers.iter().map(|(name, v)| json!({"name": name, "values": v.len()})).collect::<Vec<_>>(),
         "build": env!("CARGO_PKG_VERSION"),
     });
     let mut draft = Draft::new(cx, ArtifactKind::Checkpoint, meta);

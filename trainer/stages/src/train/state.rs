@@ -1,14 +1,14 @@
 //! What training changes, and its bytes.
 
 use std::collections::BTreeMap;
-use std::ops::Range;
 
 use bytemuck::{cast_slice, cast_slice_mut};
 use checkpoint::{Blob, BlobError};
-use models::flat::Entry;
-use models::optim::{AdamW, LrSchedule, ema};
 use safetensors::Dtype;
 use safetensors::tensor::{Metadata, TensorInfo};
+
+use super::buffers::{BufferPlan, Buffers};
+use super::group::{Group, GroupPlan};
 
 /// The largest header of a saved state that is read; ours have some hundred bytes.
 const HEADER_BYTES: u64 = 1 << 20;
@@ -24,68 +24,6 @@ pub enum RestoreError {
     Blob(#[from] BlobError),
 }
 
-/// One set of parameters with an optimizer of its own.
-#[derive(Debug, Clone)]
-pub struct GroupPlan {
-    /// Short name: `model`, `heads`.
-    pub name: &'static str,
-    /// Tensors in the buffer.
-    pub entries: Vec<Entry>,
-    /// First values.
-    pub params: Vec<f32>,
-    /// Optimizer.
-    pub optimizer: AdamW,
-    /// Learning rate by step.
-    pub lr: LrSchedule,
-    /// Decay of a moving average that is kept beside the parameters.
-    pub ema: Option<f64>,
-    /// Steps that train it, where that is not all; its optimizer and its schedule count from the first of them.
-    pub active: Option<Range<u64>>,
-}
-
-/// A group in training: flat buffers of one length.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Group {
-    /// Short name.
-    pub name: &'static str,
-    /// Tensors in the buffer.
-    pub entries: Vec<Entry>,
-    /// Parameters.
-    pub params: Vec<f32>,
-    /// AdamW's first moments.
-    pub m: Vec<f32>,
-    /// AdamW's second moments.
-    pub v: Vec<f32>,
-    /// Moving average of the parameters, if the plan asks for one.
-    pub average: Option<Vec<f32>>,
-    /// Learning rate by step.
-    pub lr: LrSchedule,
-    optimizer: AdamW,
-    ema: f64,
-    active: Option<Range<u64>>,
-}
-
-impl Group {
-    /// The number of the update that step `step` is to this group, from 0; `None` outside the steps that train it.
-    pub(super) fn turn(&self, step: u64) -> Option<u64> {
-        match &self.active {
-            None => Some(step),
-            Some(active) => active.contains(&step).then(|| step - active.start),
-        }
-    }
-
-    /// Applies update number `step` (from 0) with `factor` times the gradient, then moves the average.
-    pub(super) fn update(&mut self, step: u64, gradient: &[f32], factor: f64) {
-        let Some(step) = self.turn(step) else { return };
-        #[expect(clippy::cast_possible_truncation, reason = "a factor in (0, 1]")]
-        let scaled: Vec<f32> = gradient.iter().map(|g| g * factor as f32).collect();
-        self.optimizer.step(step + 1, self.lr.at(step), &mut self.params, &scaled, &mut self.m, &mut self.v);
-        if let Some(average) = &mut self.average {
-            ema(average, &self.params, self.ema);
-        }
-    }
-}
-
 /// All that a training stage carries from step to step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainState {
@@ -93,46 +31,43 @@ pub struct TrainState {
     pub step: u64,
     /// Groups in the objective's order.
     pub groups: Vec<Group>,
+    /// What no optimizer changes.
+    pub buffers: Buffers,
 }
 
 impl TrainState {
     /// The state before the first step.
-    pub fn new(plans: &[GroupPlan]) -> Self {
-        let group = |plan: &GroupPlan| Group {
-            name: plan.name,
-            entries: plan.entries.clone(),
-            params: plan.params.clone(),
-            m: vec![0.0; plan.params.len()],
-            v: vec![0.0; plan.params.len()],
-            average: plan.ema.map(|_| plan.params.clone()),
-            lr: plan.lr,
-            optimizer: plan.optimizer,
-            ema: plan.ema.unwrap_or(0.0),
-            active: plan.active.clone(),
-        };
-        Self { step: 0, groups: plans.iter().map(group).collect() }
+    ///
+    /// # Panics
+    /// If two groups or two buffers have one name.
+    pub fn new(groups: &[GroupPlan], buffers: Vec<BufferPlan>) -> Self {
+        let state = Self { step: 0, groups: groups.iter().map(Group::new).collect(), buffers: Buffers::new(buffers) };
+        let names: usize = state.groups.iter().map(|group| 3 + usize::from(group.average.is_some())).sum();
+        assert_eq!(state.values().len(), names + state.buffers.iter().count(), "every name stands for one buffer");
+        state
     }
 
-    /// The buffers of all groups by their names in a saved state.
-    fn buffers(&self) -> BTreeMap<String, &Vec<f32>> {
+    /// All that is saved besides the step, by its name there.
+    fn values(&self) -> BTreeMap<String, &Vec<f32>> {
         fn of(group: &Group) -> Vec<(String, &Vec<f32>)> {
             let all = [("params", Some(&group.params)), ("m", Some(&group.m)), ("v", Some(&group.v))];
             let all = all.into_iter().chain([("average", group.average.as_ref())]);
             all.filter_map(|(what, values)| Some((format!("{}.{what}", group.name), values?))).collect()
         }
-        self.groups.iter().flat_map(of).collect()
+        self.groups.iter().flat_map(of).chain(self.buffers.values()).collect()
     }
 
-    fn buffers_mut(&mut self) -> impl Iterator<Item = (String, &mut Vec<f32>)> {
-        self.groups.iter_mut().flat_map(|group| {
+    fn values_mut(&mut self) -> impl Iterator<Item = (String, &mut Vec<f32>)> {
+        let groups = self.groups.iter_mut().flat_map(|group| {
             let Group { name, params, m, v, average, .. } = group;
             let all = [("params", Some(params)), ("m", Some(m)), ("v", Some(v)), ("average", average.as_mut())];
             all.into_iter().filter_map(move |(what, values)| Some((format!("{name}.{what}"), values?)))
-        })
+        });
+        groups.chain(self.buffers.values_mut())
     }
 
     /// Begins the bytes of a saved state: safetensors with `step`, and per group `NAME.params`, `NAME.m`, `NAME.v`,
-    /// `NAME.average`, in the order and with the alignment of the `safetensors` crate. What follows it is [`Self::saved`]'s.
+    /// `NAME.average`, and `buffer.NAME`, in the order and with the alignment of the `safetensors` crate. What follows it is [`Self::saved`]'s.
     fn header(&self) -> Vec<u8> {
         let mut end = 0;
         let mut info = |dtype, shape: usize, bytes: usize| {
@@ -141,10 +76,9 @@ impl TrainState {
             TensorInfo { dtype, shape: vec![shape], data_offsets: (begin, end) }
         };
         let mut tensors = vec![("step".to_owned(), info(Dtype::I64, 1, 8))];
-        let buffers = self.buffers();
+        let all = self.values();
         tensors.extend(
-            buffers
-                .iter()
+            all.iter()
                 .map(|(name, values)| (name.clone(), info(Dtype::F32, values.len(), size_of_val(values.as_slice())))),
         );
         let metadata = Metadata::new(None, tensors).expect("flat buffers one after the other");
@@ -157,9 +91,9 @@ impl TrainState {
     /// state is made.
     pub fn saved<T>(&self, save: impl FnOnce(&[&[u8]]) -> T) -> T {
         let (header, step) = (self.header(), self.step.to_le_bytes());
-        let buffers = self.buffers();
+        let all = self.values();
         let mut pieces: Vec<&[u8]> = vec![&header, &step];
-        pieces.extend(buffers.values().map(|values| cast_slice::<f32, u8>(values)));
+        pieces.extend(all.values().map(|values| cast_slice::<f32, u8>(values)));
         save(&pieces)
     }
 
@@ -204,13 +138,19 @@ impl TrainState {
         let mut step = [0; 8];
         saved.read_at(place("step", Dtype::I64, 1)?, &mut step)?;
         let step = u64::try_from(i64::from_le_bytes(step)).map_err(|_| wrong("a step below 0".to_owned()))?;
-        let buffers = self.buffers();
-        let places: BTreeMap<&String, u64> = buffers
-            .iter()
-            .map(|(name, values)| Ok((name, place(name, Dtype::F32, values.len())?)))
-            .collect::<Result<_, RestoreError>>()?;
-        let places: BTreeMap<String, u64> = places.into_iter().map(|(name, at)| (name.clone(), at)).collect();
-        for (name, values) in self.buffers_mut() {
+        let mut places: BTreeMap<String, u64> = BTreeMap::new();
+        for (name, values) in self.values() {
+            let at = place(&name, Dtype::F32, values.len())?;
+            places.insert(name, at);
+        }
+        // A state of a plan that has more would go on without what it lost here.
+        if metadata.tensors().len() != places.len() + 1 {
+            let strange = |name: &String| name != "step" && !places.contains_key(name);
+            let mut strange: Vec<String> = metadata.tensors().into_keys().filter(strange).collect();
+            strange.sort();
+            return Err(wrong(format!("tensors that this plan has no place for: {strange:?}")));
+        }
+        for (name, values) in self.values_mut() {
             saved.read_at(places[&name], cast_slice_mut(values))?;
         }
         self.step = step;
@@ -220,10 +160,11 @@ impl TrainState {
     /// The state as it travels between members of a gang, who have the same plan: `step` (as little-endian bytes), then the buffers as they
     /// lie in memory. Nothing is copied: with large models that is what takes the time.
     pub fn pieces<'a>(&'a self, step: &'a [u8; 8]) -> Vec<&'a [u8]> {
-        let buffers = self.groups.iter().flat_map(|group| {
+        let groups = self.groups.iter().flat_map(|group| {
             [&group.params, &group.m, &group.v].into_iter().chain(&group.average).map(|values| cast_slice(values))
         });
-        std::iter::once(step.as_slice()).chain(buffers).collect()
+        let buffers = self.buffers.iter().map(|(_, values)| cast_slice(values));
+        std::iter::once(step.as_slice()).chain(groups).chain(buffers).collect()
     }
 
     /// Takes over what [`Self::pieces`] of another member gave, however it was cut on the way.
@@ -257,6 +198,9 @@ impl TrainState {
                 fill(cast_slice_mut(values));
             }
         }
+        for (_, values) in self.buffers.values_mut() {
+            fill(cast_slice_mut(values));
+        }
         Ok(())
     }
 
@@ -271,34 +215,47 @@ impl TrainState {
 mod tests {
     use std::sync::Arc;
 
+    use models::optim::{AdamW, LrSchedule};
     use protocol::stage::Decay;
 
     use super::*;
     use crate::artifacts::Tensors;
+    use crate::train::{Average, Turns};
 
     #[test]
     fn a_member_takes_over_a_peers_state_bit_for_bit_or_not_at_all() {
-        let plan = |name, ema| GroupPlan {
+        let plan = |name, average, turns| GroupPlan {
             name,
             entries: Vec::new(),
             params: vec![1.0, -2.0, 0.5],
             optimizer: AdamW { beta1: 0.9, beta2: 0.999, eps: 1e-8, weight_decay: 0.0 },
             lr: LrSchedule { peak: 1e-2, warmup: 0, steps: 10, decay: Decay::Constant },
-            ema,
-            active: None,
+            clip: None,
+            average,
+            turns,
         };
-        let plans = [plan("model", Some(0.9)), plan("heads", None)];
-        let mut donor = TrainState::new(&plans);
+        let plans = [
+            plan("model", Some(Average::of(0.9)), Turns::ALWAYS),
+            plan("heads", None, Turns::ALWAYS),
+            plan("frozen", None, Turns::NEVER),
+        ];
+        let buffers = || {
+            let buffer = |name: &str, values| BufferPlan { name: name.into(), values };
+            vec![buffer("codebook", vec![0.25; 4]), buffer("count", vec![0.0])]
+        };
+        let mut donor = TrainState::new(&plans, buffers());
         for step in 0..3 {
-            donor.groups.iter_mut().for_each(|group| group.update(step, &[0.1, 0.2, -0.3], 1.0));
+            donor.groups[..2].iter_mut().for_each(|group| group.update(step, &[0.1, 0.2, -0.3], 1.0));
+            donor.buffers.get_mut("codebook")[1] += 0.5;
+            donor.buffers.get_mut("count")[0] += 1.0;
             donor.step = step + 1;
         }
         let step = donor.step.to_le_bytes();
-        let mut joiner = TrainState::new(&plans);
+        let mut joiner = TrainState::new(&plans, buffers());
         let before = joiner.clone();
         let bytes = donor.pieces(&step).concat();
         for wrong in [&bytes[..bytes.len() - 4], &[bytes.clone(), vec![0; 4]].concat(), &[]] {
-            assert!(joiner.adopt(&[wrong.to_vec()]).unwrap_err().contains("expected 92"), "{}", wrong.len());
+            assert!(joiner.adopt(&[wrong.to_vec()]).unwrap_err().contains("expected 124"), "{}", wrong.len());
             assert_eq!(joiner, before);
         }
         for cut in [3, 8, 50, bytes.len()] {
@@ -314,7 +271,7 @@ mod tests {
 
         // It is what the crate would have written, and less than all of it is refused.
         let mut tensors = Tensors::default().with_integers("step", [1], vec![3]);
-        for (name, values) in donor.buffers() {
+        for (name, values) in donor.values() {
             tensors = tensors.with(&name, [values.len()], values.clone());
         }
         assert_eq!(*bytes, tensors.to_bytes().unwrap());
@@ -324,8 +281,10 @@ mod tests {
             assert!(matches!(error, RestoreError::Wrong(_)), "{end}: {error}");
             assert_eq!(cut, before);
         }
-        let mut other = TrainState::new(&plans[..1]);
+        let mut other = TrainState::new(&plans, buffers());
         other.groups[0].params.push(0.0);
         assert!(matches!(other.restore(&bytes), Err(RestoreError::Wrong(_))));
+        let error = TrainState::new(&plans, Vec::new()).restore(&bytes).unwrap_err();
+        assert!(error.to_string().contains("buffer.codebook"), "{error}");
     }
 }

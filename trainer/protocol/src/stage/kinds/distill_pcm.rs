@@ -18,6 +18,9 @@ pub struct DistillPcm {
     pub discriminator_lr: f64,
     /// The discriminator's AdamW.
     pub discriminator_optimizer: Optimizer,
+    /// Student and discriminator are updated in turns, one a step, as the image repository has it; otherwise both in every step. Each one's
+    /// learning rate counts its own updates.
+    pub alternate: bool,
     /// Everything else.
     #[serde(flatten)]
     pub distillation: Distillation,
@@ -30,6 +33,7 @@ impl Default for DistillPcm {
             adversarial: 0.1,
             discriminator_lr: 0.0,
             discriminator_optimizer: Optimizer::default(),
+            alternate: false,
             distillation: Distillation::published(384_000, 128),
         }
     }
@@ -59,6 +63,10 @@ impl StageSpec for DistillPcm {
         p.not_negative("adversarial", self.adversarial);
         p.not_negative("discriminator_lr", self.discriminator_lr);
         self.discriminator_optimizer.check(p, "discriminator_optimizer");
+        if self.alternate && self.adversarial == 0.0 {
+            let message = "`alternate` is true, but without `adversarial` there is no discriminator to take turns with";
+            p.add("alternate", message, "leave it out, or set `adversarial`");
+        }
     }
 
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {

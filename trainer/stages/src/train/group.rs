@@ -1,0 +1,290 @@
+//! A group: parameters that share an optimizer, and the steps that train it.
+
+use std::ops::Range;
+
+use models::flat::Entry;
+use models::optim::{AdamW, LrSchedule, clip_factor, ema, global_norm};
+
+/// Which steps train a group.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Turns {
+    during: Range<u64>,
+    every: u64,
+    at: u64,
+}
+
+impl Turns {
+    /// All of them.
+    pub const ALWAYS: Self = Self { during: 0..u64::MAX, every: 1, at: 0 };
+    /// None: the parameters are a frozen part of what is trained, without moments.
+    pub const NEVER: Self = Self { during: 0..0, every: 1, at: 0 };
+
+    /// A phase.
+    pub fn during(steps: Range<u64>) -> Self {
+        Self { during: steps, ..Self::ALWAYS }
+    }
+
+    /// Of these steps only one in `every`: that which comes `at` steps after the first. Groups with the same `every` and other `at` take
+    /// turns.
+    ///
+    /// # Panics
+    /// If `at` is not below `every`.
+    #[must_use]
+    pub fn one_in(self, every: u64, at: u64) -> Self {
+        assert!(at < every, "turn {at} of {every}");
+        Self { every, at, ..self }
+    }
+
+    /// The number of the update that step `step` is to the group, from 0; `None` if the step does not train it.
+    pub fn turn(&self, step: u64) -> Option<u64> {
+        let local = step.checked_sub(self.during.start).filter(|_| step < self.during.end)?;
+        (local % self.every == self.at).then_some(local / self.every)
+    }
+
+    /// Updates among the first `steps` steps.
+    pub fn count(&self, steps: u64) -> u64 {
+        let local = steps.min(self.during.end).saturating_sub(self.during.start);
+        (local + self.every - 1 - self.at) / self.every
+    }
+}
+
+/// Gradients are scaled down to a norm.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Clip {
+    /// The largest norm that is left alone.
+    pub norm: f64,
+    /// Groups of one name here are clipped together, by the norm of all of them that the step trains.
+    pub together: &'static str,
+}
+
+/// A moving average of a group's parameters.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Average {
+    /// What is kept of the average in each of its updates.
+    pub decay: f64,
+    /// Updates of the parameters between two of the average.
+    pub every: u64,
+    /// The first update takes the parameters as they are.
+    pub starts_as_copy: bool,
+}
+
+impl Average {
+    /// After every update, beginning with the parameters' first values.
+    pub fn of(decay: f64) -> Self {
+        Self { decay, every: 1, starts_as_copy: false }
+    }
+
+    /// Moves `average` after update number `turn` (from 0) gave `params`.
+    fn follow(&self, turn: u64, average: &mut [f32], params: &[f32]) {
+        let done = turn + 1;
+        if self.starts_as_copy && done == self.every {
+            average.copy_from_slice(params);
+        } else if done.is_multiple_of(self.every) {
+            ema(average, params, self.decay);
+        }
+    }
+}
+
+/// One set of parameters with an optimizer of its own.
+#[derive(Debug, Clone)]
+pub struct GroupPlan {
+    /// Short name: `model`, `heads`.
+    pub name: &'static str,
+    /// Tensors in the buffer.
+    pub entries: Vec<Entry>,
+    /// First values.
+    pub params: Vec<f32>,
+    /// Optimizer.
+    pub optimizer: AdamW,
+    /// Learning rate by the group's own updates.
+    pub lr: LrSchedule,
+    /// Clipping, if any.
+    pub clip: Option<Clip>,
+    /// A moving average that is kept beside the parameters.
+    pub average: Option<Average>,
+    /// Steps that train it.
+    pub turns: Turns,
+}
+
+impl GroupPlan {
+    /// The group trained by `turns` alone; its schedule spans those among the first `steps` steps.
+    #[must_use]
+    pub fn taking(self, turns: Turns, steps: u64) -> Self {
+        Self { lr: LrSchedule { steps: turns.count(steps), ..self.lr }, turns, ..self }
+    }
+}
+
+/// A group in training: flat buffers.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Group {
+    /// Short name.
+    pub name: &'static str,
+    /// Tensors in the buffer.
+    pub entries: Vec<Entry>,
+    /// Parameters.
+    pub params: Vec<f32>,
+    /// AdamW's first moments; none of a frozen group.
+    pub m: Vec<f32>,
+    /// AdamW's second moments; none of a frozen group.
+    pub v: Vec<f32>,
+    /// Moving average of the parameters, if the plan asks for one.
+    pub average: Option<Vec<f32>>,
+    /// Learning rate by update.
+    pub lr: LrSchedule,
+    optimizer: AdamW,
+    clip: Option<Clip>,
+    averaging: Option<Average>,
+    turns: Turns,
+}
+
+impl Group {
+    pub(super) fn new(plan: &GroupPlan) -> Self {
+        let moments = if plan.turns == Turns::NEVER { 0 } else { plan.params.len() };
+        Self {
+            name: plan.name,
+            entries: plan.entries.clone(),
+            params: plan.params.clone(),
+            m: vec![0.0; moments],
+            v: vec![0.0; moments],
+            average: plan.average.map(|_| plan.params.clone()),
+            lr: plan.lr,
+            optimizer: plan.optimizer,
+            clip: plan.clip,
+            averaging: plan.average,
+            turns: plan.turns.clone(),
+        }
+    }
+
+    /// The number of the update that step `step` is to this group, from 0; `None` if the step does not train it.
+    pub fn turn(&self, step: u64) -> Option<u64> {
+        self.turns.turn(step)
+    }
+
+    /// Applies update number `turn` (from 0) with `factor` times the gradient, then moves the average.
+    pub(super) fn update(&mut self, turn: u64, gradient: &[f32], factor: f64) {
+        #[expect(clippy::cast_possible_truncation, reason = "a factor in (0, 1]")]
+        let scaled: Vec<f32> = gradient.iter().map(|g| g * factor as f32).collect();
+        self.optimizer.step(turn + 1, self.lr.at(turn), &mut self.params, &scaled, &mut self.m, &mut self.v);
+        if let (Some(averaging), Some(average)) = (self.averaging, &mut self.average) {
+            averaging.follow(turn, average, &self.params);
+        }
+    }
+}
+
+/// What a step does to the groups that it trains.
+pub(super) struct Gradients<'a> {
+    /// For each group its update's number, its gradient and the gradient's norm, or `None`.
+    parts: Vec<Option<(u64, &'a [f32], f64)>>,
+}
+
+impl<'a> Gradients<'a> {
+    /// `gradients` has one for each group that step `step` trains, and none for the others.
+    pub(super) fn of(groups: &[Group], step: u64, gradients: Vec<Option<&'a [f32]>>) -> Self {
+        let part = |(group, gradient): (&Group, Option<&'a [f32]>)| {
+            let gradient = gradient?;
+            Some((group.turn(step)?, gradient, global_norm(gradient)))
+        };
+        Self { parts: groups.iter().zip(gradients).map(part).collect() }
+    }
+
+    /// A norm that is not finite, if there is one.
+    pub(super) fn unbounded(&self) -> Option<f64> {
+        self.parts.iter().flatten().map(|(_, _, norm)| *norm).find(|norm| !norm.is_finite())
+    }
+
+    /// Norm and learning rate of the first group that the step trains: what stands for the step.
+    pub(super) fn watched(&self, groups: &[Group]) -> Option<(f64, f64)> {
+        groups.iter().zip(&self.parts).find_map(|(group, part)| part.map(|(turn, _, norm)| (norm, group.lr.at(turn))))
+    }
+
+    /// The factor of each group, 1 where nothing is clipped.
+    fn factors(&self, groups: &[Group]) -> Vec<f64> {
+        let norm_of = |name: &str| {
+            let same = groups.iter().zip(&self.parts).filter(|(g, _)| g.clip.is_some_and(|c| c.together == name));
+            let norms: Vec<f64> = same.filter_map(|(_, part)| part.map(|(_, _, norm)| norm)).collect();
+            // Of one group the norm itself: a root of its square may differ from it.
+            if let [only] = norms[..] { only } else { norms.iter().map(|n| n * n).sum::<f64>().sqrt() }
+        };
+        groups.iter().map(|g| g.clip.map_or(1.0, |clip| clip_factor(norm_of(clip.together), clip.norm))).collect()
+    }
+
+    /// Updates the groups.
+    pub(super) fn apply(self, groups: &mut [Group]) {
+        let factors = self.factors(groups);
+        for ((group, part), factor) in groups.iter_mut().zip(self.parts).zip(factors) {
+            if let Some((turn, gradient, _)) = part {
+                group.update(turn, gradient, factor);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::stage::Decay;
+
+    use super::*;
+
+    #[test]
+    fn turns_count_their_own_updates() {
+        let taken = |turns: &Turns| (0..10).map(|step| turns.turn(step)).collect::<Vec<_>>();
+        let first = Turns::ALWAYS.one_in(2, 0);
+        assert_eq!(taken(&first)[..4], [Some(0), None, Some(1), None]);
+        let second = Turns::during(3..9).one_in(3, 1);
+        assert_eq!(taken(&second), [None, None, None, None, Some(0), None, None, Some(1), None, None]);
+        for turns in [Turns::ALWAYS, Turns::NEVER, first, second, Turns::during(4..7), Turns::ALWAYS.one_in(3, 2)] {
+            for steps in 0..10 {
+                let counted = taken(&turns)[..steps].iter().flatten().count() as u64;
+                assert_eq!(turns.count(steps as u64), counted, "{turns:?} of {steps}");
+            }
+        }
+    }
+
+    fn plan(name: &'static str, turns: Turns) -> GroupPlan {
+        GroupPlan {
+            name,
+            entries: Vec::new(),
+            params: vec![1.0, -2.0],
+            optimizer: AdamW { beta1: 0.9, beta2: 0.999, eps: 1e-8, weight_decay: 0.0 },
+            lr: LrSchedule { peak: 1e-2, warmup: 0, steps: 10, decay: Decay::Constant },
+            clip: None,
+            average: None,
+            turns,
+        }
+    }
+
+    #[test]
+    fn groups_are_clipped_alone_or_together() {
+        let clip = |norm, together| Some(Clip { norm, together });
+        let plans = [
+            GroupPlan { clip: clip(1.0, "net"), ..plan("a", Turns::ALWAYS) },
+            GroupPlan { clip: clip(1.0, "net"), ..plan("b", Turns::ALWAYS.one_in(2, 0)) },
+            GroupPlan { clip: clip(2.0, "c"), ..plan("c", Turns::ALWAYS) },
+            plan("d", Turns::ALWAYS),
+        ];
+        let groups: Vec<Group> = plans.iter().map(Group::new).collect();
+        let (a, b): (&[f32], &[f32]) = (&[3.0, 0.0], &[0.0, 4.0]);
+        let factors = |step, b| Gradients::of(&groups, step, vec![Some(a), b, Some(a), Some(a)]).factors(&groups);
+        let near = |found: Vec<f64>, expected: [f64; 4]| {
+            assert!(found.iter().zip(expected).all(|(f, e)| (f - e).abs() < 1e-6), "{found:?}");
+        };
+        near(factors(0, Some(b)), [0.2, 0.2, 2.0 / 3.0, 1.0]);
+        // The second does not take part in step 1.
+        near(factors(1, None), [1.0 / 3.0, 1.0 / 3.0, 2.0 / 3.0, 1.0]);
+    }
+
+    #[test]
+    fn a_frozen_group_has_no_moments_and_an_average_its_own_pace() {
+        let frozen = Group::new(&plan("frozen", Turns::NEVER));
+        assert!(frozen.m.is_empty() && frozen.v.is_empty() && frozen.turn(0).is_none());
+        let average = Average { decay: 0.5, every: 2, starts_as_copy: true };
+        let mut group = Group::new(&GroupPlan { average: Some(average), ..plan("model", Turns::ALWAYS) });
+        let mut seen = Vec::new();
+        for turn in 0..4 {
+            group.update(turn, &[1.0, -1.0], 1.0);
+            seen.push((group.params[0], group.average.as_ref().unwrap()[0]));
+        }
+        assert_eq!((seen[0].1, seen[1].1, seen[2].1), (1.0, seen[1].0, seen[1].0));
+        assert_eq!(seen[3].1, 0.5 * seen[1].0 + 0.5 * seen[3].0);
+    }
+}
