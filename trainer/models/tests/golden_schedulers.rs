@@ -3,7 +3,8 @@
 mod common;
 
 use common::{Arrays, Gates, json, shared};
-use models::diffusion::{Schedule, affine, affine_one, boundary, consistency, ddim_timesteps, unzip};
+use models::diffusion::{Schedule, TIMESTEPS, affine, affine_one, boundary, consistency, ddim_timesteps, unzip};
+use protocol::stage::{Diffusion, Prediction};
 
 const GATE: f64 = 1e-5;
 
@@ -51,26 +52,39 @@ fn golden_schedulers() {
     let (x, noise) = (steps.get("addnoise_x").tensor(&device), steps.get("addnoise_noise").tensor(&device));
     gates.tensor("add_noise", "all", affine(x, noise, &a, &e), steps.get("addnoise_out"), GATE);
 
-    ddim(&info, &steps, &mut gates);
+    let (x, noise) = (steps.get("addnoise_x").tensor(&device), steps.get("addnoise_noise").tensor(&device));
+    let velocity = predicting(Prediction::Velocity).target(x, noise, &times);
+    gates.tensor("velocity", "all", velocity, steps.get("velocity_out"), GATE);
+
+    for (word, prediction) in
+        [("epsilon", Prediction::Noise), ("sample", Prediction::Sample), ("v_prediction", Prediction::Velocity)]
+    {
+        ddim(word, &predicting(prediction), &info, &steps, &mut gates);
+    }
     lcm(&info, &steps, &mut gates);
     gates.close("golden/schedulers");
 }
 
-/// Chained steps of the 50-step sampler, each from the stored latent before it.
-fn ddim(info: &serde_json::Value, steps: &Arrays, gates: &mut Gates) {
-    let (device, schedule) = (common::device(), Schedule::published());
-    let out = steps.get("ddim_epsilon_model_out");
-    let (clean, prev) = (steps.get("ddim_epsilon_pred_x0"), steps.get("ddim_epsilon_prev"));
-    let mut z = steps.get("ddim_epsilon_x0").clone();
+/// The published schedule of a network that predicts this.
+fn predicting(prediction: Prediction) -> Schedule {
+    Schedule::new(&Diffusion { prediction, ..Diffusion::default() }, TIMESTEPS)
+}
+
+/// Chained steps of the 50-step sampler with one kind of prediction, each from the stored latent before it.
+fn ddim(word: &str, schedule: &Schedule, info: &serde_json::Value, steps: &Arrays, gates: &mut Gates) {
+    let device = common::device();
+    let stored = |part: &str| steps.get(&format!("ddim_{word}_{part}"));
+    let (out, clean, prev) = (stored("model_out"), stored("pred_x0"), stored("prev"));
+    let mut z = stored("x0").clone();
     for (j, t) in info["ddim_steps_t"].as_array().expect("as the README says").iter().enumerate() {
         let t = t.as_u64().expect("as the README says") as usize;
         let eps = common::row(out, j);
         let (zt, eps) = (z.tensor::<3>(&device), eps.tensor::<3>(&device));
         let x0 = affine_one(zt.clone(), eps.clone(), schedule.clean(t));
-        gates.tensor("ddim x0", format!("t {t}"), x0, &common::row(clean, j), GATE);
+        gates.tensor("ddim x0", format!("{word} t {t}"), x0, &common::row(clean, j), GATE);
         let s = models::diffusion::ddim::ddim_previous(50, t);
         let next = affine_one(zt, eps, schedule.jump(t, s));
-        gates.tensor("ddim step", format!("t {t}"), next, &common::row(prev, j), GATE);
+        gates.tensor("ddim step", format!("{word} t {t}"), next, &common::row(prev, j), GATE);
         z = common::row(prev, j);
     }
 }

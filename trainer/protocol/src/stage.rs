@@ -10,6 +10,7 @@
 //! joins one that has none ([`Training`], [`Batch`]) brings `#[serde(default)]` along.
 
 mod data;
+mod diffusion;
 mod distillation;
 mod evaluation;
 mod identity;
@@ -25,6 +26,7 @@ mod training;
 use crate::{ArtifactKind, Digest, Steps};
 
 pub use data::DataFormat;
+pub use diffusion::{Diffusion, NoiseSchedule, Prediction};
 pub use distillation::{Distance, Distillation};
 pub use evaluation::{Mode, Split};
 pub use identity::{Backend, StageIdentity};

@@ -12,7 +12,7 @@ use checkpoint::model::{self, Parts};
 use checkpoint::{Blob, BlobError, Blobs};
 use motion::dataset::{Caption, Dataset, PackError, Split};
 use protocol::artifact::{FileEntry, Role};
-use protocol::stage::{DataFormat, Family, LatentShape, Network};
+use protocol::stage::{DataFormat, Diffusion, Family, LatentShape, Network};
 use protocol::{ArtifactKind, Digest, Manifest};
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
@@ -102,6 +102,8 @@ pub struct DenoiserMeta {
     pub latent: LatentShape,
     /// Size.
     pub network: Network,
+    /// Noise schedule and prediction.
+    pub diffusion: Diffusion,
     /// A ReLU on the text embedding (v1).
     pub text_relu: bool,
     /// Width of the guidance embedding; 0 for a teacher, which has none.
@@ -485,6 +487,7 @@ mod tests {
             family: Family::Pcm { skip: 100, guidance: (0.5, 5.0), phases: 4 },
             latent: LatentShape::default(),
             network: Network::default(),
+            diffusion: Diffusion::default(),
             text_relu: false,
             guidance_dim: 256,
             text_dim: 768,

@@ -6,7 +6,7 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
 use models::diffusion::{
-    Grid, LcmTimesteps, Phases, Schedule, ddim_sample, guided, lcm_sample, lcm_timesteps, pcm_sample,
+    Grid, LcmTimesteps, Phases, Schedule, TIMESTEPS, ddim_sample, guided, lcm_sample, lcm_timesteps, pcm_sample,
 };
 use models::kernels::Dropout;
 use models::names::load;
@@ -214,7 +214,8 @@ impl Denoiser {
         let device = device.clone().inner();
         let fresh = networks::Denoiser::new(&meta.config(), &mut blank(&device));
         let network = load(fresh, weights, "").map_err(|e| misfit("the denoiser's weights", &e))?;
-        Ok(Self { network, meta, schedule: Schedule::published(), device })
+        let schedule = Schedule::new(&meta.diffusion, TIMESTEPS);
+        Ok(Self { network, meta, schedule, device })
     }
 
     /// What it is.

@@ -19,7 +19,7 @@ use crate::context::{AttemptContext, ContextError, Outcome, Part, StageError};
 use crate::kinds;
 
 pub use crate::train::tree_sum;
-pub use gang::Script;
+pub use gang::{Body, Script};
 
 /// Locks, whether or not another thread panicked while it held the lock: the panic is reported where it happened.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -270,13 +270,16 @@ impl Bench {
         }
     }
 
-    /// Runs `body` as the gang stage `name`, whatever kind its settings are of.
-    pub(crate) fn run_gang(
+    /// Runs `body` as the gang stage `name`, whatever kind its settings are of: a stage that no kind is yet.
+    ///
+    /// # Errors
+    /// What the last member said no with.
+    pub fn run_gang(
         &mut self,
         name: &str,
         settings: &StageSettings,
         inputs: &[(&str, Digest)],
-        body: &gang::Body<'_>,
+        body: &Body<'_>,
     ) -> Result<Ran, StageError> {
         let task = self.task(name, settings, inputs);
         let attempt = || MemoryAttempt::new(task.clone(), self.device.clone(), Arc::clone(&self.blobs));

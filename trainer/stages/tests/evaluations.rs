@@ -7,6 +7,7 @@ use checkpoint::model::{self, Parts};
 use models::names::save;
 use models::networks::{Denoiser, Init, Vae};
 use protocol::artifact::{FileEntry, Role};
+use protocol::stage::Diffusion;
 use protocol::stage::{
     Batch, CheckpointPolicy, DataFormat, DataSynthetic, EncodeLatents, EvaluateLatentFid, EvaluateReconstruction,
     Family, Keep, LatentShape, Network, Positions, Sampler, Split, StageSettings, TextEmbed, TextEncoder, TrainLength,
@@ -69,6 +70,7 @@ fn untrained_model(bench: &Bench, vae: Digest, family: Family, latent: LatentSha
         family,
         latent,
         network: network(),
+        diffusion: Diffusion::default(),
         text_relu: false,
         text_dim: 768,
         fits: Parts::from([(Role::VAE, vae), (Role::TEXT, text.digest())]),

@@ -11,6 +11,7 @@ use motion::Dataset;
 use motion::dataset::PackError;
 use protocol::artifact::{FileEntry, Role};
 use protocol::message::FailureClass;
+use protocol::stage::Diffusion;
 use protocol::stage::{
     Batch, DataFormat, DataSynthetic, EvaluateT2m, EvaluatorNetwork, Family, ImportEvaluator, LatentShape,
     MovementPhase, MultiModality, Network, Positions, Sampler, Split, StageSettings, TextEncoder, TrainEvaluator,
@@ -111,6 +112,7 @@ fn untrained(bench: &Bench, family: Family) -> Digest {
         family,
         latent: LATENT,
         network: network(),
+        diffusion: Diffusion::default(),
         text_relu: false,
         text_dim: 768,
         fits: Parts::from([(Role::VAE, vae), (Role::TEXT, text.digest())]),

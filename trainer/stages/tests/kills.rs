@@ -133,3 +133,21 @@ fn p4_a_leader_that_is_lost_in_its_last_save_costs_nothing() {
         assert_eq!(steps, (1..=20).collect::<Vec<_>>(), "{members} members: no step is applied twice");
     }
 }
+
+/// A student and a discriminator that take turns, with members lost and gained.
+#[test]
+fn p6_alternating_updates_change_no_byte() {
+    let mut case = case("pcm", [24; 4]);
+    let both = case.expected;
+    let StageSettings::DistillPcm(pcm) = &mut case.settings else { panic!("distill.pcm") };
+    pcm.alternate = true;
+    case.bench.forget("pcm");
+    case.expected = case.bench.run("pcm", &case.settings, &case.inputs).expect("it runs").output();
+    assert_ne!(case.expected, both);
+    case.run("pcm", "alternating pcm killed at two steps", &[8, 13]);
+    case.bench.forget("pcm");
+    case.bench.members = 1;
+    case.bench.script = Script { joins: vec![(1, 5), (2, 5)], lost: vec![(2, 13), (0, 19)], ..Script::default() };
+    let ran = case.bench.run("pcm", &case.settings, &case.inputs).expect("it runs");
+    assert_eq!(ran.output(), case.expected);
+}

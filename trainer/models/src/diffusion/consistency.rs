@@ -49,7 +49,7 @@ pub fn boundary(t: usize) -> (f64, f64) {
     (square / (s * s + square), s / (s * s + square).sqrt())
 }
 
-/// The consistency function as `A z + E eps`: `c_skip z + c_out z_0(z, eps)`.
+/// The consistency function as `A z + E out`: `c_skip z + c_out z_0(z, out)`.
 pub fn consistency(schedule: &Schedule, t: usize) -> (f64, f64) {
     let (skip, out) = boundary(t);
     let (a, e) = schedule.clean(t);
@@ -83,7 +83,7 @@ pub fn lcm_timesteps(rule: LcmTimesteps, steps: usize) -> Vec<usize> {
     }
 }
 
-/// Denoises `z` [B, N, d] in `timesteps.len()` calls of `eps`, adding `step_noise[j]` after every call but the last.
+/// Denoises `z` [B, N, d] in `timesteps.len()` calls of `out`, the network's output, adding `step_noise[j]` after every call but the last.
 ///
 /// # Panics
 /// If there is not one noise tensor for each step but the last.
@@ -92,12 +92,12 @@ pub fn lcm_sample(
     timesteps: &[usize],
     mut z: Tensor<3>,
     step_noise: &[Tensor<3>],
-    mut eps: impl FnMut(Tensor<3>, usize) -> Tensor<3>,
+    mut out: impl FnMut(Tensor<3>, usize) -> Tensor<3>,
 ) -> Tensor<3> {
     assert_eq!(step_noise.len() + 1, timesteps.len(), "one noise tensor for each step but the last");
     for (j, &t) in timesteps.iter().enumerate() {
-        let noise = eps(z.clone(), t);
-        z = affine_one(z, noise, consistency(schedule, t));
+        let predicted = out(z.clone(), t);
+        z = affine_one(z, predicted, consistency(schedule, t));
         if let Some(fresh) = step_noise.get(j) {
             z = affine_one(z, fresh.clone(), schedule.add_noise(timesteps[j + 1]));
         }

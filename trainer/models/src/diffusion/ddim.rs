@@ -22,18 +22,18 @@ pub fn ddim_previous(steps: usize, t: usize) -> usize {
     t.saturating_sub(TIMESTEPS / steps)
 }
 
-/// Moves `z` [B, N, d] from pure noise to a clean latent in `steps` calls of `eps`.
+/// Moves `z` [B, N, d] from pure noise to a clean latent in `steps` calls of `out`. Along a flow these are Euler's steps.
 ///
-/// `eps(z, t)` predicts the noise, already guided.
+/// `out(z, t)` is the network's output, already guided.
 pub fn ddim_sample(
     schedule: &Schedule,
     steps: usize,
     mut z: Tensor<3>,
-    mut eps: impl FnMut(Tensor<3>, usize) -> Tensor<3>,
+    mut out: impl FnMut(Tensor<3>, usize) -> Tensor<3>,
 ) -> Tensor<3> {
-    for t in ddim_timesteps(steps) {
-        let noise = eps(z.clone(), t);
-        z = affine_one(z, noise, schedule.jump(t, ddim_previous(steps, t)));
+    for (t, s) in schedule.path(steps) {
+        let predicted = out(z.clone(), t);
+        z = affine_one(z, predicted, schedule.jump(t, s));
     }
     z
 }

@@ -1,11 +1,10 @@
 //! The noise schedule, what moves a latent along it, and the three samplers.
 //!
-//! Every rule here is affine in the latent and the predicted noise, so each module gives plain coefficients, one pair
-//! per sample, and [`affine`] applies them. Coefficients are computed in f64 from the f32 table that the published
-//! models were trained with (see [`Schedule`]).
+//! Every rule here is affine in the latent and the network's output, whatever it predicts, so each module gives plain coefficients, one
+//! pair per sample, and [`affine`] applies them. Coefficients are computed in f64 (see [`Schedule`]).
 //!
-//! Notation: `ab_t` cumulative alpha, `alpha_t = sqrt(ab_t)`, `sigma_t = sqrt(1 - ab_t)`; timesteps are integers
-//! 0..=999. Latents are [B, N, d]. Nothing here draws random numbers: noise is an argument.
+//! Notation: `alpha_t` and `sigma_t` are the factors of signal and noise; of a diffusion `alpha_t = sqrt(ab_t)`, `sigma_t = sqrt(1 - ab_t)` with
+//! `ab_t` the cumulative alpha. Timesteps are integers 0..=999. Latents are [B, N, d]. Nothing here draws random numbers: noise is an argument.
 //!
 //! Not its job: networks, losses, what the timestep and the guidance scale of a training example are.
 
@@ -17,7 +16,7 @@ mod schedule;
 pub use consistency::{Grid, LcmTimesteps, boundary, consistency, lcm_sample, lcm_timesteps};
 pub use ddim::{ddim_sample, ddim_timesteps};
 pub use pcm::{Phases, pcm_sample};
-pub use schedule::{Schedule, TIMESTEPS};
+pub use schedule::{Schedule, TIMESTEPS, flow};
 
 use burn::tensor::{Tensor, TensorData};
 

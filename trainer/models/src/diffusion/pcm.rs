@@ -56,16 +56,16 @@ impl Phases {
     }
 }
 
-/// Jumps `z` [B, N, d] through all phases, one call of `eps` each; no noise is added on the way.
+/// Jumps `z` [B, N, d] through all phases, one call of `out`, the network's output, each; no noise is added on the way.
 pub fn pcm_sample(
     schedule: &Schedule,
     phases: &Phases,
     mut z: Tensor<3>,
-    mut eps: impl FnMut(Tensor<3>, usize) -> Tensor<3>,
+    mut out: impl FnMut(Tensor<3>, usize) -> Tensor<3>,
 ) -> Tensor<3> {
     for (t, s) in phases.path() {
-        let noise = eps(z.clone(), t);
-        z = affine_one(z, noise, schedule.jump(t, s));
+        let predicted = out(z.clone(), t);
+        z = affine_one(z, predicted, schedule.jump(t, s));
     }
     z
 }

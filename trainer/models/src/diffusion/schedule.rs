@@ -1,20 +1,61 @@
-//! The schedule `scaled_linear` .00085 -> .012 over 1000 timesteps.
+//! How a sample becomes noise, and how a network's output is read along the way.
 //!
-//! Source: Rombach et al., arXiv:2112.10752 (the square roots of the betas are equidistant), as MLD and MotionLCM use it.
-//! Every published weight was trained with the table rounded to f32, and near t = 0 that rounding is visible in
-//! `1 - ab_t`; so the table is rounded likewise and only then widened.
+//! At timestep t a noised sample is `z_t = alpha_t z_0 + sigma_t eps`. Schedules differ in the two factors, predictions in what of this the
+//! network gives; both come down to plain coefficients, so that samplers and losses know neither. Wherever a function here speaks of
+//! `out`, it is the network's output, guided or not: every reading is affine in it.
+//!
+//! Sources: Rombach et al., arXiv:2112.10752 (`scaled_linear`, as MLD and MotionLCM use it); Ho et al., arXiv:2006.11239 (`linear`); Nichol
+//! and Dhariwal, arXiv:2102.09672 (`cosine`); Salimans and Ho, arXiv:2202.00512 (velocity); Liu et al., arXiv:2209.03003 (`flow`). The
+//! weights that are published for the first two were trained with tables in f32, and near t = 0 that rounding is visible in
+//! `1 - ab_t`; so those tables are rounded likewise and only then widened. The cosine's are f64, as its authors have them.
 
-/// Timesteps of the published schedule.
+use burn::tensor::Tensor;
+use protocol::stage::{Diffusion, NoiseSchedule, Prediction};
+
+use super::{affine, unzip};
+
+/// Timesteps of the published latent models.
 pub const TIMESTEPS: usize = 1000;
 
-const BETA_FIRST: f64 = 0.000_85;
-const BETA_LAST: f64 = 0.012;
-
-/// `beta_t` and `ab_t` for t in 0..1000. Terminal signal is not zero: `ab_999` = .00466.
+/// A noise schedule, and what the network predicts along it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Schedule {
-    betas: Vec<f32>,
-    alpha_bar: Vec<f32>,
+    /// `beta_t`; a flow has none.
+    betas: Vec<f64>,
+    /// `ab_t`; a flow has none.
+    alpha_bar: Vec<f64>,
+    /// (alpha_t, sigma_t).
+    factors: Vec<(f64, f64)>,
+    prediction: Prediction,
+}
+
+/// (alpha, sigma) of a rectified flow at the share `s` of noise: a straight line.
+pub fn flow(s: f64) -> (f64, f64) {
+    (1.0 - s, s)
+}
+
+/// `steps` equidistant numbers in f32, rounded as PyTorch does it: from the nearer end.
+fn line(first: f32, last: f32, steps: usize) -> impl Iterator<Item = f32> {
+    let step = (last - first) / (steps - 1).max(1) as f32;
+    (0..steps).map(move |t| {
+        if t < steps / 2 { step.mul_add(t as f32, first) } else { (-step).mul_add((steps - 1 - t) as f32, last) }
+    })
+}
+
+fn betas(settings: &Diffusion, steps: usize) -> Vec<f64> {
+    let (first, last) = (settings.beta_first, settings.beta_last);
+    match settings.schedule {
+        NoiseSchedule::ScaledLinear => {
+            line(first.sqrt() as f32, last.sqrt() as f32, steps).map(|root| f64::from(root * root)).collect()
+        }
+        NoiseSchedule::Linear => line(first as f32, last as f32, steps).map(f64::from).collect(),
+        NoiseSchedule::Cosine => {
+            let bar = |share: f64| ((share + 0.008) / 1.008 * std::f64::consts::FRAC_PI_2).cos().powi(2);
+            let at = |t: usize| bar(t as f64 / steps as f64);
+            (0..steps).map(|t| (1.0 - at(t + 1) / at(t)).min(0.999)).collect()
+        }
+        NoiseSchedule::Flow => Vec::new(),
+    }
 }
 
 impl Default for Schedule {
@@ -24,80 +65,149 @@ impl Default for Schedule {
 }
 
 impl Schedule {
-    /// The schedule of MLD, MotionLCM and MotionPCM.
+    /// The schedule of MLD, MotionLCM and MotionPCM: `scaled_linear` .00085 -> .012, noise predicted. Terminal signal is not zero:
+    /// `ab_999` = .00466.
     pub fn published() -> Self {
-        let (first, last) = (BETA_FIRST.sqrt() as f32, BETA_LAST.sqrt() as f32);
-        let step = (last - first) / (TIMESTEPS - 1) as f32;
-        // Equidistant from the nearer end, which is how the published table was rounded.
-        let betas: Vec<f32> = (0..TIMESTEPS)
-            .map(|t| {
-                let root = if t < TIMESTEPS / 2 {
-                    step.mul_add(t as f32, first)
-                } else {
-                    (-step).mul_add((TIMESTEPS - 1 - t) as f32, last)
-                };
-                root * root
-            })
-            .collect();
-        let mut product = 1.0_f64;
-        let alpha_bar = betas
-            .iter()
-            .map(|beta| {
-                product *= f64::from(1.0 - beta);
-                product as f32
-            })
-            .collect();
-        Self { betas, alpha_bar }
+        Self::new(&Diffusion::default(), TIMESTEPS)
     }
 
-    /// `beta_t`.
+    /// A schedule over timesteps `0..steps`.
+    pub fn new(settings: &Diffusion, steps: usize) -> Self {
+        let betas = betas(settings, steps);
+        let rounded = settings.schedule != NoiseSchedule::Cosine;
+        let mut product = 1.0_f64;
+        let bar = |beta: &f64| {
+            if rounded {
+                product *= f64::from(1.0 - *beta as f32);
+                f64::from(product as f32)
+            } else {
+                product *= 1.0 - beta;
+                product
+            }
+        };
+        let alpha_bar: Vec<f64> = betas.iter().map(bar).collect();
+        let factors = if settings.schedule == NoiseSchedule::Flow {
+            (0..steps).map(|t| flow(t as f64 / (steps - 1).max(1) as f64)).collect()
+        } else {
+            alpha_bar.iter().map(|bar| (bar.sqrt(), (1.0 - bar).sqrt())).collect()
+        };
+        Self { betas, alpha_bar, factors, prediction: settings.prediction }
+    }
+
+    /// Timesteps.
+    pub fn steps(&self) -> usize {
+        self.factors.len()
+    }
+
+    fn is_flow(&self) -> bool {
+        self.alpha_bar.is_empty()
+    }
+
+    /// `beta_t`, the share of the variance that becomes noise at t.
     ///
     /// # Panics
-    /// If `t` is not a timestep; so do all functions of a timestep.
+    /// If `t` is not a timestep; so do all functions of a timestep. And for a flow, which has none.
     pub fn beta(&self, t: usize) -> f64 {
-        f64::from(self.betas[t])
+        self.betas[t]
     }
 
     /// `ab_t`, the share of signal in the variance.
     pub fn alpha_bar(&self, t: usize) -> f64 {
-        f64::from(self.alpha_bar[t])
+        let (alpha, sigma) = self.factors[t];
+        self.alpha_bar.get(t).copied().unwrap_or_else(|| alpha * alpha / (alpha * alpha + sigma * sigma))
     }
 
-    /// `alpha_t = sqrt(ab_t)`.
+    /// The factor of the signal.
     pub fn alpha(&self, t: usize) -> f64 {
-        self.alpha_bar(t).sqrt()
+        self.factors[t].0
     }
 
-    /// `sigma_t = sqrt(1 - ab_t)`.
+    /// The factor of the noise.
     pub fn sigma(&self, t: usize) -> f64 {
-        (1.0 - self.alpha_bar(t)).sqrt()
+        self.factors[t].1
     }
 
     /// `z_t = A z_0 + E noise`: (alpha_t, sigma_t).
     pub fn add_noise(&self, t: usize) -> (f64, f64) {
-        (self.alpha(t), self.sigma(t))
+        self.factors[t]
     }
 
-    /// `z_0 = A z_t + E eps`: the clean latent that a noise prediction implies.
+    /// What the network should give for samples `clean` and their `noise` at `timesteps`: the noise, the sample, or the velocity. That of a
+    /// flow is `noise - clean`, its slope towards noise; otherwise it is `alpha noise - sigma clean`.
+    pub fn target(&self, clean: Tensor<3>, noise: Tensor<3>, timesteps: &[usize]) -> Tensor<3> {
+        match self.prediction {
+            Prediction::Noise => noise,
+            Prediction::Sample => clean,
+            Prediction::Velocity if self.is_flow() => noise - clean,
+            Prediction::Velocity => {
+                let (a, e) = unzip(timesteps.iter().map(|t| (-self.sigma(*t), self.alpha(*t))));
+                affine(clean, noise, &a, &e)
+            }
+        }
+    }
+
+    /// `z_0 = A z_t + E out`: the clean sample that an output implies.
     pub fn clean(&self, t: usize) -> (f64, f64) {
-        (1.0 / self.alpha(t), -self.sigma(t) / self.alpha(t))
+        let (alpha, sigma) = self.factors[t];
+        match self.prediction {
+            Prediction::Noise => (1.0 / alpha, -sigma / alpha),
+            Prediction::Sample => (0.0, 1.0),
+            Prediction::Velocity if self.is_flow() => (1.0, -sigma),
+            Prediction::Velocity => (alpha, -sigma),
+        }
     }
 
-    /// `z_s = A z_t + E eps`, the deterministic DDIM move from `t` to `s`. `jump(t, t)` is exactly the identity.
+    /// `eps = A z_t + E out`: the noise that an output implies.
+    pub fn noise(&self, t: usize) -> (f64, f64) {
+        let (alpha, sigma) = self.factors[t];
+        match self.prediction {
+            Prediction::Noise => (0.0, 1.0),
+            Prediction::Sample => (1.0 / sigma, -alpha / sigma),
+            Prediction::Velocity if self.is_flow() => (1.0, alpha),
+            Prediction::Velocity => (sigma, alpha),
+        }
+    }
+
+    /// `z_s = A z_t + E out`, the deterministic move from `t` to `s`: the clean sample that the output implies, with its noise at level s. Along
+    /// a flow it is Euler's step. `jump(t, t)` is exactly the identity.
     ///
     /// Source: Song, Meng, Ermon, arXiv:2010.02502, eq. 12 with eta = 0.
     pub fn jump(&self, t: usize, s: usize) -> (f64, f64) {
         if t == s {
             return (1.0, 0.0);
         }
-        let a = self.alpha(s) / self.alpha(t);
-        (a, self.sigma(s) - a * self.sigma(t))
+        let (alpha, sigma) = self.factors[s];
+        if self.prediction == Prediction::Noise {
+            let a = alpha / self.alpha(t);
+            return (a, sigma - a * self.sigma(t));
+        }
+        let (clean, noise) = (self.clean(t), self.noise(t));
+        (alpha * clean.0 + sigma * noise.0, alpha * clean.1 + sigma * noise.1)
     }
 
     /// `z_s = A z_m + E noise`, the noising from level `m` to a noisier level `s >= m`.
     pub fn transition(&self, m: usize, s: usize) -> (f64, f64) {
+        if self.is_flow() {
+            let a = self.alpha(s) / self.alpha(m);
+            return (a, (self.sigma(s).powi(2) - (a * self.sigma(m)).powi(2)).max(0.0).sqrt());
+        }
         let ratio = self.alpha_bar(s) / self.alpha_bar(m);
         (ratio.sqrt(), (1.0 - ratio).max(0.0).sqrt())
+    }
+
+    /// The moves (from, to) of a sampler of `steps` steps, noisiest first. A diffusion is spaced as MLD has it (see [`super::ddim`]); a flow begins
+    /// at pure noise and ends at the sample, in steps of one length.
+    ///
+    /// # Panics
+    /// If `steps` is not in `1..self.steps()`.
+    pub fn path(&self, steps: usize) -> Vec<(usize, usize)> {
+        if self.is_flow() {
+            let last = self.steps() - 1;
+            assert!((1..=last).contains(&steps), "a flow's sampler takes 1 to {last} steps, not {steps}");
+            let at = |j: usize| (last * (steps - j) + steps / 2) / steps;
+            return (0..steps).map(|j| (at(j), at(j + 1))).collect();
+        }
+        super::ddim_timesteps(steps).into_iter().map(|t| (t, super::ddim::ddim_previous(steps, t))).collect()
     }
 }
 
@@ -156,5 +266,74 @@ mod tests {
             assert!((a2 * a1 - a).abs() < 1e-12 && (a2 * e1 + e2 - e).abs() < 1e-12);
             assert_eq!(s.jump(t, t), (1.0, 0.0));
         }
+    }
+
+    /// Every schedule with every prediction that it allows.
+    fn all(steps: usize) -> Vec<(Diffusion, Schedule)> {
+        let mut all = Vec::new();
+        for schedule in [NoiseSchedule::ScaledLinear, NoiseSchedule::Linear, NoiseSchedule::Cosine, NoiseSchedule::Flow]
+        {
+            for prediction in [Prediction::Noise, Prediction::Sample, Prediction::Velocity] {
+                let settings = Diffusion { schedule, prediction, ..Diffusion::default() };
+                if !(schedule == NoiseSchedule::Flow && prediction == Prediction::Noise) {
+                    all.push((settings.clone(), Schedule::new(&settings, steps)));
+                }
+            }
+        }
+        all
+    }
+
+    /// One example in numbers: what is read from the true output is the truth, at every timestep.
+    #[test]
+    fn the_true_output_gives_back_sample_noise_and_every_level() {
+        let device = burn::tensor::Device::flex();
+        let tensor = |value: f64| Tensor::<3>::full([1, 1, 1], value as f32, &device);
+        for (settings, schedule) in all(50) {
+            let (clean, noise) = (0.75_f64, -1.25_f64);
+            for t in 0..50 {
+                let (a, e) = schedule.add_noise(t);
+                let z = a * clean + e * noise;
+                let out = schedule.target(tensor(clean), tensor(noise), &[t]).into_scalar::<f32>();
+                let read = |(a, e): (f64, f64)| a * z + e * f64::from(out);
+                let close = |found: f64, expected: f64, what: &str| {
+                    // Near one end the coefficients of a reading are large.
+                    let bound = 1e-5 * (1.0 + schedule.clean(t).0.abs() + schedule.noise(t).0.abs());
+                    assert!((found - expected).abs() < bound, "{settings:?}, t {t}, {what}: {found}, not {expected}");
+                };
+                close(read(schedule.clean(t)), clean, "sample");
+                if schedule.sigma(t) > 0.0 {
+                    close(read(schedule.noise(t)), noise, "noise");
+                    for s in [0, 10, 49] {
+                        let (a, e) = schedule.add_noise(s);
+                        close(read(schedule.jump(t, s)), a * clean + e * noise, "jump");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn noising_in_two_moves_has_the_variance_of_one() {
+        for (settings, schedule) in all(100) {
+            let (first, second) = (schedule.add_noise(20), schedule.transition(20, 70));
+            let whole = schedule.add_noise(70);
+            let variance = (second.0 * first.1).powi(2) + second.1.powi(2);
+            assert!((second.0 * first.0 - whole.0).abs() < 1e-6, "{settings:?}");
+            assert!((variance.sqrt() - whole.1).abs() < 1e-6, "{settings:?}");
+        }
+    }
+
+    #[test]
+    fn a_flow_goes_from_pure_noise_to_the_sample() {
+        let settings =
+            Diffusion { schedule: NoiseSchedule::Flow, prediction: Prediction::Velocity, ..Diffusion::default() };
+        let schedule = Schedule::new(&settings, TIMESTEPS);
+        assert_eq!((schedule.add_noise(0), schedule.add_noise(999)), ((1.0, 0.0), (0.0, 1.0)));
+        assert_eq!(schedule.path(1), [(999, 0)]);
+        assert_eq!(schedule.path(4), [(999, 749), (749, 500), (500, 250), (250, 0)]);
+        assert_eq!(schedule.path(999).len(), 999);
+        // Euler's step.
+        near(schedule.jump(750, 250), (1.0, (250.0 - 750.0) / 999.0));
+        assert_eq!(Schedule::published().path(50)[..2], [(981, 961), (961, 941)]);
     }
 }

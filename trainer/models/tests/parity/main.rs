@@ -1,7 +1,8 @@
 //! Networks, losses, one distillation step and the samplers against the published PyTorch modules.
 //!
 //! Driven by what is there: every folder of the fixtures whose name starts with a known prefix, every case its arrays
-//! name, sizes out of its `config.json`. `02_control*`, most of 05, and 06 and 07 hold networks that this crate does not have.
+//! name, sizes out of its `config.json`. `02_control*`, most of 05, and 06 and 07 hold networks that this crate does not have; their schedules
+//! it has.
 //! Gates are those of the fixtures' README, for CPU.
 
 #[path = "../common/mod.rs"]
@@ -13,6 +14,7 @@ mod length;
 mod networks;
 mod pcm_step;
 mod samplers;
+mod schedules;
 mod vae;
 
 /// One forward pass.

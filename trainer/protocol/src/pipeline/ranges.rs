@@ -60,6 +60,8 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("ema", Real(0.0, 1.0), ""),
     ("dropout", Real(0.0, 1.0), ""),
     ("guidance_dropout", Real(0.0, 1.0), "of the captions"),
+    ("diffusion.beta_first", Real(0.0, 1.0), "of the variance"),
+    ("diffusion.beta_last", Real(0.0, 1.0), "of the variance"),
     ("loss.feature", Real(0.0, 1e6), ""),
     ("loss.joint", Real(0.0, 1e6), ""),
     ("loss.velocity", Real(0.0, 1e6), ""),

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 
 use burn::tensor::{Device, Tensor};
 use checkpoint::model::Model;
-use models::diffusion::{Grid, Schedule, affine, guided_by, unzip};
+use models::diffusion::{Grid, Schedule, TIMESTEPS, affine, guided_by, unzip};
 use models::flat::{self, Entry};
 use models::kernels::Dropout;
 use models::losses;
@@ -96,11 +96,11 @@ impl Distiller {
             settings: settings.clone(),
             data,
             teacher,
+            noise: Schedule::new(&teacher_meta.diffusion, TIMESTEPS),
             teacher_meta,
             base,
             student,
             target,
-            noise: Schedule::published(),
             grid: Grid::new(settings.skip),
             device,
             seed: super::dropout_seed(cx),
@@ -159,19 +159,19 @@ impl Distiller {
         let both: Vec<usize> = from.iter().chain(&from).copied().collect();
         let texts = twice(&batch.text_blc, &batch.null_blc);
         let mut dropout = self.frozen(step, slice, 1);
-        let eps = self.teacher.forward(twice(&noisy, &noisy), &both, texts, None, &mut dropout);
+        let out = self.teacher.forward(twice(&noisy, &noisy), &both, texts, None, &mut dropout);
         let [count, tokens, dim] = noisy.dims();
-        let conditional = eps.clone().slice([0..count, 0..tokens, 0..dim]);
-        let unconditional = eps.slice([count..2 * count, 0..tokens, 0..dim]);
-        let eps = guided_by(conditional, unconditional, &w);
+        let conditional = out.clone().slice([0..count, 0..tokens, 0..dim]);
+        let unconditional = out.slice([count..2 * count, 0..tokens, 0..dim]);
+        let out = guided_by(conditional, unconditional, &w);
         let (a, e) = unzip(from.iter().zip(&to).map(|(t, s)| self.noise.jump(*t, *s)));
-        let solved = affine(noisy.clone(), eps, &a, &e);
+        let solved = affine(noisy.clone(), out, &a, &e);
         let guidance = guidance_embedding(&w, self.settings.guidance_dim, &self.device);
         SolverStep { batch, index, from, to, noisy_bnd: noisy, solved_bnd: solved, guidance_bg: guidance }
     }
 
-    /// The student's predicted noise at the start of the step, on the tape.
-    pub(super) fn student_eps(&self, solved: &SolverStep, step: u64, slice: usize) -> Tensor<3> {
+    /// The student's output at the start of the step, on the tape.
+    pub(super) fn student_out(&self, solved: &SolverStep, step: u64, slice: usize) -> Tensor<3> {
         let mut dropout = self.dropout(step, slice);
         self.student.forward(
             solved.noisy_bnd.clone(),
@@ -182,8 +182,8 @@ impl Distiller {
         )
     }
 
-    /// The target's predicted noise at the end of the step.
-    pub(super) fn target_eps(&self, solved: &SolverStep, step: u64, slice: usize) -> Tensor<3> {
+    /// The target's output at the end of the step.
+    pub(super) fn target_out(&self, solved: &SolverStep, step: u64, slice: usize) -> Tensor<3> {
         let mut dropout = self.frozen(step, slice, 2);
         self.target.forward(
             solved.solved_bnd.clone(),

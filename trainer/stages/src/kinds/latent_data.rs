@@ -34,6 +34,12 @@ pub(super) struct LatentData {
 pub(super) struct LatentSlice {
     /// Keys of all draws.
     pub(super) picks: Vec<Pick>,
+    /// Frames of the motion behind each latent: a condition, as the caption is.
+    #[expect(
+        dead_code,
+        reason = "denoisers that take the length are to come; those here leave it to the VAE's decoder"
+    )]
+    pub(super) lengths: Vec<usize>,
     /// Latents [B, N, d], drawn from their posteriors.
     pub(super) clean_bnd: Tensor<3>,
     /// Caption embeddings [B, 1, text].
@@ -109,11 +115,12 @@ impl LatentData {
         let picks: Vec<Pick> = self.order.batch(step, |_| 0)[range].to_vec();
         let latent = self.latents.meta.latent;
         let (size, crops) = (latent.tokens * latent.dim, self.latents.meta.crops);
-        let (mut clean, mut text) = (Vec::new(), Vec::new());
+        let (mut clean, mut text, mut lengths) = (Vec::new(), Vec::new(), Vec::new());
         for pick in &picks {
             let entry = self.train[pick.example];
             let mut draw = self.stream("example", *pick);
             let row = entry * crops + draw.below(crops);
+            lengths.push(self.latents.meta.lengths[row]);
             let captions = &self.latents.meta.captions[entry];
             let caption = captions[draw.below(captions.len())];
             let empty = draw.uniform() < drop;
@@ -128,6 +135,7 @@ impl LatentData {
         let null = self.embeddings.null.iter().copied().cycle().take(batch * width).collect();
         LatentSlice {
             picks,
+            lengths,
             clean_bnd: tensor(clean, [batch, latent.tokens, latent.dim]),
             text_blc: tensor(text, [batch, 1, width]),
             null_blc: tensor(null, [batch, 1, width]),

@@ -7,9 +7,9 @@ use models::names::to_bytes;
 use protocol::stage::{DistillLcm, StageSpec};
 
 use super::consistency::Distiller;
-use super::{Gang, slice_gradient};
+use super::{Gang, slice_result};
 use crate::context::{GangContext, Outcome, StageError};
-use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, train};
+use crate::train::{GroupPlan, Losses, Objective, SliceResult, TrainState, Trained, train};
 
 struct Lcm(Distiller);
 
@@ -19,7 +19,7 @@ impl Objective for Lcm {
     }
 
     fn terms(&self) -> Vec<&'static str> {
-        vec!["loss"]
+        vec![Losses::TOTAL]
     }
 
     fn load(&mut self, state: &TrainState) {
@@ -30,12 +30,12 @@ impl Objective for Lcm {
         let it = &mut self.0;
         let solved = it.solve(step, slice);
         let (a, e) = unzip(solved.to.iter().map(|t| consistency(&it.noise, *t)));
-        let target = affine(solved.solved_bnd.clone(), it.target_eps(&solved, step, slice), &a, &e);
+        let target = affine(solved.solved_bnd.clone(), it.target_out(&solved, step, slice), &a, &e);
         let (a, e) = unzip(solved.from.iter().map(|t| consistency(&it.noise, *t)));
-        let student = affine(solved.noisy_bnd.clone(), it.student_eps(&solved, step, slice), &a, &e);
-        let loss = it.distance(student, target) / it.settings.training.batch.global as f32;
-        let (gradient, loss) = slice_gradient(&it.student, loss);
-        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss], ..SliceResult::default() })
+        let student = affine(solved.noisy_bnd.clone(), it.student_out(&solved, step, slice), &a, &e);
+        let mut losses = Losses::new(it.settings.training.batch.global);
+        losses.add("consistency", it.distance(student, target), 1.0);
+        slice_result(&self.0.student, &losses, &self.terms())
     }
 }
 

@@ -18,11 +18,14 @@ use protocol::artifact::Role;
 use protocol::stage::{Positions, Split, TrainLength};
 use protocol::{ArtifactKind, Seed};
 
-use super::{Gang, dropout_seed, group, no_clips, slice_gradient};
+use super::{Gang, dropout_seed, group, no_clips, slice_result};
 use crate::artifacts::{self, Embeddings, MODEL_FILE, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::length::LengthMeta;
-use crate::train::{GroupPlan, Objective, Order, SliceResult, TrainState, Trained, train};
+use crate::train::{GroupPlan, Losses, Objective, Order, SliceResult, TrainState, Trained, train};
+
+/// Frames between the mean of the predicted lengths and the true one.
+const OFF: &str = "frames_off";
 
 struct Lengths {
     settings: TrainLength,
@@ -42,9 +45,8 @@ impl Objective for Lengths {
         vec![group("model", &self.network, &self.settings.training, 0.0)]
     }
 
-    /// The second: frames between the mean of the predicted lengths and the true one.
     fn terms(&self) -> Vec<&'static str> {
-        vec!["loss", "frames_off"]
+        vec![Losses::TOTAL, OFF]
     }
 
     fn load(&mut self, state: &TrainState) {
@@ -76,9 +78,10 @@ impl Objective for Lengths {
         let off = off.sum::<f32>() / batch.global as f32;
         let classes: Vec<usize> =
             frames.iter().map(|frames| LengthEstimator::class(*frames, LengthEstimator::CLASSES)).collect();
-        let loss = LengthEstimator::loss(logits, &classes) / batch.global as f32;
-        let (gradient, loss) = slice_gradient(&self.network, loss);
-        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss, off], ..SliceResult::default() })
+        let mut losses = Losses::new(batch.global);
+        losses.add("cross-entropy", LengthEstimator::loss(logits, &classes), 1.0);
+        losses.note(OFF, off);
+        slice_result(&self.network, &losses, &self.terms())
     }
 }
 

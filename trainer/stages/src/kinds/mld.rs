@@ -1,7 +1,7 @@
 //! `train.mld`: the latent-diffusion teacher. Source: MLD (arXiv:2212.04048), MotionLCM v2's recipe.
 //!
-//! `t ~ U{0..999}`, `z_t = alpha_t z_0 + sigma_t eps`, loss `mean (eps_hat(z_t, t, c) - eps)^2`, the caption replaced by the empty one with
-//! probability `guidance_dropout`. Latents are samples of their posteriors, unscaled.
+//! `t ~ U{0..999}`, `z_t = alpha_t z_0 + sigma_t eps`, loss `mean (eps_hat(z_t, t, c) - eps)^2` (of the sample or the velocity where `diffusion`
+//! says so), the caption replaced by the empty one with probability `guidance_dropout`. Latents are samples of their posteriors, unscaled.
 
 use std::collections::BTreeMap;
 
@@ -17,10 +17,13 @@ use protocol::artifact::Role;
 use protocol::stage::{Family, TrainMld};
 
 use super::latent_data::{self, LatentData};
-use super::{Gang, group, slice_gradient};
+use super::{Gang, group, slice_result};
 use crate::artifacts::{self, DenoiserMeta, VaeMeta};
 use crate::context::{GangContext, Outcome, StageError};
-use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, train};
+use crate::train::{GroupPlan, Losses, Objective, SliceResult, TrainState, Trained, train};
+
+/// The term of the loss that every latent diffusion has.
+const DENOISING: &str = "denoising";
 
 struct Mld {
     settings: TrainMld,
@@ -36,7 +39,7 @@ impl Objective for Mld {
     }
 
     fn terms(&self) -> Vec<&'static str> {
-        vec!["loss"]
+        vec![Losses::TOTAL]
     }
 
     fn load(&mut self, state: &TrainState) {
@@ -49,12 +52,13 @@ impl Objective for Mld {
             batch.picks.iter().map(|pick| self.data.stream("timestep", *pick).below(TIMESTEPS)).collect();
         let noise = self.data.noise("noise", &batch.picks);
         let (a, e) = unzip(timesteps.iter().map(|t| self.noise.add_noise(*t)));
-        let noisy = affine(batch.clean_bnd, noise.clone(), &a, &e);
+        let noisy = affine(batch.clean_bnd.clone(), noise.clone(), &a, &e);
+        let target = self.noise.target(batch.clean_bnd, noise, &timesteps);
         let mut dropout = Dropout::new(self.settings.network.dropout, self.seed, step, slice as u64);
         let predicted = self.network.forward(noisy, &timesteps, batch.text_blc, None, &mut dropout);
-        let loss = losses::mse(predicted, noise) / self.settings.training.batch.global as f32;
-        let (gradient, loss) = slice_gradient(&self.network, loss);
-        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss], ..SliceResult::default() })
+        let mut all = Losses::new(self.settings.training.batch.global);
+        all.add(DENOISING, losses::mse(predicted, target), 1.0);
+        slice_result(&self.network, &all, &self.terms())
     }
 }
 
@@ -77,6 +81,7 @@ impl Gang for TrainMld {
             family: Family::Mld,
             latent: vae.latent,
             network: self.network.clone(),
+            diffusion: self.diffusion.clone(),
             text_relu: self.text_relu,
             guidance_dim: 0,
             text_dim: data.text_meta().dim,
@@ -87,7 +92,8 @@ impl Gang for TrainMld {
         let mut init = Init::new(cx.task().seed, &purpose, self.network.positions, &device);
         let network = Denoiser::new(&meta.config(), &mut init);
         let seed = super::dropout_seed(cx);
-        let mut objective = Mld { settings: self.clone(), data, network, noise: Schedule::published(), seed };
+        let noise = Schedule::new(&self.diffusion, TIMESTEPS);
+        let mut objective = Mld { settings: self.clone(), data, network, noise, seed };
         match train(&mut objective, &self.training, cx)? {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {

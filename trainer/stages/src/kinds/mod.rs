@@ -30,7 +30,7 @@ use serde_json::{Value, json};
 
 use crate::artifacts;
 use crate::context::{AttemptContext, GangContext, Outcome, Part, StageError};
-use crate::train::{Average, Clip, GroupPlan, Turns};
+use crate::train::{Average, Clip, GroupPlan, Losses, SliceResult, Turns};
 
 /// Where a report's details are.
 pub const REPORT_FILE: &str = "report.json";
@@ -125,13 +125,21 @@ fn group<M: Module>(name: &'static str, module: &M, training: &Training, ema: f6
     }
 }
 
-/// The gradient of a slice's loss for all parameters of `module`, and the loss.
-fn slice_gradient<M: Module>(module: &M, loss: Tensor<1>) -> (Vec<f32>, f32) {
-    let value = loss.clone().inner().into_scalar::<f32>();
+/// The gradient of a slice's loss for all parameters of `module`.
+fn slice_gradient<M: Module>(module: &M, loss: Tensor<1>) -> Vec<f32> {
     let mut gradients = loss.backward();
     let mut flat = vec![0.0; module.num_params()];
     add_gradients(module, &mut gradients, &mut flat);
-    (flat, value)
+    flat
+}
+
+/// What a slice gives that trains `module` alone, on all of `losses`.
+fn slice_result<M: Module>(module: &M, losses: &Losses, terms: &[&'static str]) -> Result<SliceResult, StageError> {
+    let total = losses.total().ok_or_else(|| {
+        StageError::Input("every weight of the loss is 0, so there is nothing to learn; set one".into())
+    })?;
+    let gradients = vec![slice_gradient(module, total)];
+    Ok(SliceResult { gradients, terms: losses.values(terms), ..SliceResult::default() })
 }
 
 /// What a stage's dropout is keyed by: the run's seed and the stage's name.

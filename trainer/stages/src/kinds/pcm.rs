@@ -19,9 +19,9 @@ use models::networks::{Discriminator, Init};
 use protocol::stage::{DistillPcm, StageSpec, Training};
 
 use super::consistency::{Distiller, SolverStep};
-use super::{Gang, group, slice_gradient};
+use super::{Gang, group, slice_gradient, slice_result};
 use crate::context::{GangContext, Outcome, StageError};
-use crate::train::{GroupPlan, Objective, SliceResult, TrainState, Trained, Turns, train};
+use crate::train::{GroupPlan, Losses, Objective, SliceResult, TrainState, Trained, Turns, train};
 use burn::module::Module;
 
 struct Pcm {
@@ -45,7 +45,7 @@ impl Objective for Pcm {
     }
 
     fn terms(&self) -> Vec<&'static str> {
-        let all = ["loss", "consistency", "adversarial", "discriminator"];
+        let all = [Losses::TOTAL, "consistency", "adversarial", "discriminator"];
         all[..if self.heads.is_some() { 4 } else { 1 }].to_vec()
     }
 
@@ -63,16 +63,14 @@ impl Objective for Pcm {
 
         // The jump from a point to itself is the identity, which is what the target is next to an edge (t' = s_m).
         let (a, e) = unzip(solved.to.iter().zip(&edges).map(|(t, s)| self.it.noise.jump(*t, *s)));
-        let target = affine(solved.solved_bnd.clone(), self.it.target_eps(&solved, step, slice), &a, &e);
+        let target = affine(solved.solved_bnd.clone(), self.it.target_out(&solved, step, slice), &a, &e);
         let (a, e) = unzip(solved.from.iter().zip(&edges).map(|(t, s)| self.it.noise.jump(*t, *s)));
-        let student = affine(solved.noisy_bnd.clone(), self.it.student_eps(&solved, step, slice), &a, &e);
+        let student = affine(solved.noisy_bnd.clone(), self.it.student_out(&solved, step, slice), &a, &e);
 
-        let global = self.settings.distillation.training.batch.global as f32;
-        let consistency = self.it.distance(student.clone(), target) / global;
-        let Some(heads) = &self.heads else {
-            let (gradient, loss) = slice_gradient(&self.it.student, consistency);
-            return Ok(SliceResult { gradients: vec![gradient], terms: vec![loss], ..SliceResult::default() });
-        };
+        let global = self.settings.distillation.training.batch.global;
+        let mut all = Losses::new(global);
+        all.add("consistency", self.it.distance(student.clone(), target), 1.0);
+        let Some(heads) = &self.heads else { return slice_result(&self.it.student, &all, &self.terms()) };
 
         let levels: Vec<usize> = solved
             .batch
@@ -90,17 +88,18 @@ impl Objective for Pcm {
 
         let fake_features = features(fake);
         let detached: Vec<Tensor<3>> = fake_features.iter().map(|f| f.clone().inner()).collect();
-        let adversarial = losses::hinge_generator(heads.valid().forward(fake_features)) / global;
-        let total = consistency.clone() + adversarial.clone() * self.settings.adversarial as f32;
-        let critic = losses::hinge_discriminator(heads.forward(features(real)), heads.forward(detached)) / global;
-        let value = |x: &Tensor<1>| x.clone().inner().into_scalar::<f32>();
-        let terms = vec![value(&total), value(&consistency), value(&adversarial), value(&critic)];
+        let adversarial = losses::hinge_generator(heads.valid().forward(fake_features));
+        all.add("adversarial", adversarial, self.settings.adversarial);
+        let critic =
+            losses::hinge_discriminator(heads.forward(features(real)), heads.forward(detached)) / global as f32;
+        all.note("discriminator", critic.clone().inner().into_scalar::<f32>());
+        let total = all.total().expect("the consistency is part of it");
         let [student_turns, critic_turns] = self.turns().map(|turns| turns.turn(step).is_some());
         let gradients = vec![
-            if student_turns { slice_gradient(&self.it.student, total).0 } else { Vec::new() },
-            if critic_turns { slice_gradient(heads, critic).0 } else { Vec::new() },
+            if student_turns { slice_gradient(&self.it.student, total) } else { Vec::new() },
+            if critic_turns { slice_gradient(heads, critic) } else { Vec::new() },
         ];
-        Ok(SliceResult { gradients, terms, ..SliceResult::default() })
+        Ok(SliceResult { gradients, terms: all.values(&self.terms()), ..SliceResult::default() })
     }
 }
 

@@ -15,10 +15,10 @@ use motion::dataset::{Dataset, crop, window};
 use protocol::stage::{Split, TrainVae};
 use protocol::{ArtifactKind, Seed};
 
-use super::{Gang, group, no_clips, slice_gradient};
+use super::{Gang, group, no_clips, slice_result};
 use crate::artifacts::{self, MODEL_FILE, VaeMeta, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
-use crate::train::{GroupPlan, Objective, Order, Pick, SliceResult, TrainState, Trained, train};
+use crate::train::{GroupPlan, Losses, Objective, Order, Pick, SliceResult, TrainState, Trained, train};
 
 /// Batches that are sorted by length together.
 const POOL: usize = 4;
@@ -81,7 +81,7 @@ impl Objective for VaeObjective {
     }
 
     fn terms(&self) -> Vec<&'static str> {
-        vec!["loss", "feature", "joint", "kl"]
+        vec![Losses::TOTAL, "feature", "joint", "kl"]
     }
 
     fn load(&mut self, state: &TrainState) {
@@ -120,13 +120,16 @@ impl Objective for VaeObjective {
             recipe.weights.joint = 0.0;
         }
         let terms = losses::vae(&recipe, &self.body, decoded, rows, &posterior, &lengths);
-        let part = |x: &Option<Tensor<1>>| x.clone().map_or(0.0, |x| x.inner().into_scalar::<f32>() / global as f32);
-        let (feature, joint, kl) = (part(&terms.feature), part(&terms.joint), part(&terms.kl));
-        let Some(loss) = terms.total() else {
-            return Err(StageError::Input("every weight in `loss` is 0, so there is nothing to learn; set one".into()));
-        };
-        let (gradient, loss) = slice_gradient(&self.network, loss / global as f32);
-        Ok(SliceResult { gradients: vec![gradient], terms: vec![loss, feature, joint, kl], ..SliceResult::default() })
+        let mut losses = Losses::new(global);
+        let named =
+            [("feature", terms.feature), ("joint", terms.joint), ("velocity", terms.velocity), ("kl", terms.kl)];
+        for (name, term) in named {
+            if let Some(term) = term {
+                // Its weight is in it.
+                losses.add(name, term, 1.0);
+            }
+        }
+        slice_result(&self.network, &losses, &self.terms())
     }
 }
 

@@ -79,7 +79,7 @@ impl Member {
 }
 
 /// What a member runs.
-pub(super) type Body<'a> = dyn Fn(&mut dyn GangContext) -> Result<Outcome, StageError> + Sync + 'a;
+pub type Body<'a> = dyn Fn(&mut dyn GangContext) -> Result<Outcome, StageError> + Sync + 'a;
 
 /// How a member's thread ended: who, with what (`None` if it never became a member), and what it told.
 type Ended = (usize, Option<Result<Outcome, StageError>>, Told);

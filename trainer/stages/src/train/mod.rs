@@ -11,10 +11,9 @@
 
 mod buffers;
 mod group;
+mod losses;
 mod order;
 mod state;
-#[cfg(test)]
-mod tests;
 mod tree;
 
 use std::collections::BTreeMap;
@@ -31,6 +30,7 @@ use group::Gradients;
 
 pub use buffers::{AfterStep, BufferPlan, Buffers, SumPlan};
 pub use group::{Average, Clip, Group, GroupPlan, Turns};
+pub use losses::Losses;
 pub use order::{Order, Pick};
 pub use state::{RestoreError, TrainState};
 pub use tree::tree_sum;

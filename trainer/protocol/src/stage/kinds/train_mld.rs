@@ -4,7 +4,9 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
-use crate::stage::{Family, Neighbours, Network, Output, Problems, Ref, Shape, StageSpec, TextEmbed, Training};
+use crate::stage::{
+    Diffusion, Family, Neighbours, Network, Output, Problems, Ref, Shape, StageSpec, TextEmbed, Training,
+};
 
 /// `train.mld`: the latent-diffusion teacher. Source: MLD, MotionLCM v1/v2.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -18,6 +20,8 @@ pub struct TrainMld {
     pub text: String,
     /// Size.
     pub network: Network,
+    /// Noise schedule and prediction; students take over the teacher's.
+    pub diffusion: Diffusion,
     /// A ReLU on the text embedding (v1); v2 removed it.
     pub text_relu: bool,
     /// Probability that a caption is replaced by the empty one.
@@ -36,6 +40,7 @@ impl Default for TrainMld {
             latents: "latents".into(),
             text: "text".into(),
             network: Network::default(),
+            diffusion: Diffusion::default(),
             text_relu: false,
             guidance_dropout: 0.1,
             ema: 0.0,
@@ -61,6 +66,7 @@ impl StageSpec for TrainMld {
 
     fn check(&self, p: &mut Problems) {
         self.network.check(p);
+        self.diffusion.check(p);
         p.fraction("guidance_dropout", self.guidance_dropout, false);
         p.fraction("ema", self.ema, true);
         self.training.check(p);

@@ -1,0 +1,79 @@
+//! How a sample is noised, and what a network predicts of it.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::Problems;
+
+/// How noise grows over the timesteps.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum NoiseSchedule {
+    /// Square roots of the betas are equidistant. MLD, MotionLCM, MotionPCM.
+    #[default]
+    ScaledLinear,
+    /// Betas are equidistant. DDPM; StableMoFusion with .0001 to .02.
+    Linear,
+    /// The signal's share of the variance is a squared cosine; no betas are given. Improved DDPM, MDM.
+    Cosine,
+    /// A straight line from sample to noise (rectified flow). DisCoRD.
+    Flow,
+}
+
+/// What a network predicts of a noised sample.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Prediction {
+    /// The noise, called epsilon. MLD, MotionLCM.
+    #[default]
+    Noise,
+    /// The clean sample, called x0. MDM, StableMoFusion.
+    Sample,
+    /// Of a diffusion `alpha noise - sigma sample` (Salimans and Ho), of a flow `noise - sample`.
+    Velocity,
+}
+
+/// Noise schedule and prediction. Defaults are MLD's.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct Diffusion {
+    /// How noise grows over the 1000 timesteps.
+    pub schedule: NoiseSchedule,
+    /// Share of the variance that becomes noise at the first timestep; for `scaled_linear` and `linear`.
+    pub beta_first: f64,
+    /// The same at the last timestep.
+    pub beta_last: f64,
+    /// What the network gives.
+    pub prediction: Prediction,
+}
+
+impl Default for Diffusion {
+    fn default() -> Self {
+        Self {
+            schedule: NoiseSchedule::ScaledLinear,
+            beta_first: 0.000_85,
+            beta_last: 0.012,
+            prediction: Prediction::Noise,
+        }
+    }
+}
+
+impl Diffusion {
+    pub(super) fn check(&self, p: &mut Problems) {
+        let (first, last) = (self.beta_first, self.beta_last);
+        if !(first > 0.0 && first <= last && last < 1.0) {
+            let message = format!("`diffusion` has betas from {first} to {last}; expected 0 < first <= last < 1");
+            p.add("diffusion.beta_first", message, "published: .00085 to .012 (MLD), .0001 to .02 (StableMoFusion)");
+        }
+        if self.schedule == NoiseSchedule::Flow && self.prediction == Prediction::Noise {
+            let message = "a flow ends in pure noise, of which a predicted noise says nothing about the sample";
+            p.add("diffusion.prediction", message, "write `prediction: velocity`, or `sample`");
+        }
+        let uses_betas = matches!(self.schedule, NoiseSchedule::ScaledLinear | NoiseSchedule::Linear);
+        let given = Self::default();
+        if !uses_betas && (first, last) != (given.beta_first, given.beta_last) {
+            let message = "betas are given, but `cosine` and `flow` have none of their own";
+            p.add("diffusion.beta_first", message, "leave `beta_first` and `beta_last` out, or take a linear schedule");
+        }
+    }
+}
