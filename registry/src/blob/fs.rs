@@ -318,7 +318,7 @@ impl Staged for StagedFile {
             folder.put_aside(shard)?;
             made = folder.disk.create_dir(shard);
         }
-        // Always synced, not only by whoever made the shard: that one may not have come to it yet.
+        // Always synced: the thread that made the shard may not have synced it yet.
         let made = made.and_then(|()| folder.disk.sync_dir(&folder.blobs));
         made.map_err(|e| error("make", shard, &e))?;
         {

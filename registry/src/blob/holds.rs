@@ -28,7 +28,7 @@ impl Holds {
         Self { tasks: read(path), path: Some(path.to_owned()), is_others: false }
     }
 
-    /// Those of whoever holds the store.
+    /// Those that the process which holds the store has written down.
     pub(super) fn of_others(path: &Path) -> Self {
         Self { path: Some(path.to_owned()), is_others: true, ..Self::default() }
     }

@@ -213,7 +213,7 @@ impl BlobStore {
         Ok(Self::remembering(Arc::new(folder), &dir.join("blobs/verified")))
     }
 
-    /// The blobs of the store in a folder, for reading only, whoever holds its lock.
+    /// The blobs of the store in a folder, for reading only; another process may hold its lock.
     pub fn folder_to_read(dir: &Path) -> Self {
         Self::beside(Arc::new(fs::Folder::to_read(dir)), &dir.join("blobs/verified"))
     }

@@ -1,5 +1,5 @@
 //! What waits while the disk is busy, what is decided together, and who is answered when: all of the actor but its queue, its
-//! clock and its disk, which whoever drives it brings along.
+//! clock and its disk, which its driver brings along.
 //!
 //! What has gathered is decided together: one event after the other on one copy of the state, and all that they write in one
 //! transaction. Nobody is answered before it is stored. If the store refuses it, none of it has happened, and each is tried

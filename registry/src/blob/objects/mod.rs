@@ -380,7 +380,7 @@ impl Staged for StagedObject {
     }
 }
 
-/// Reads an object in ranges, each with a request of its own: whoever reads slowly keeps no connection waiting.
+/// Reads an object in ranges, each with a request of its own: a slow reader keeps no connection waiting.
 struct Ranges {
     remote: Arc<Remote>,
     path: Path,

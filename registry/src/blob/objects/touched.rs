@@ -24,7 +24,7 @@ const SPARE_LINES: usize = 10_000;
 pub(super) struct Touched {
     times: HashMap<Digest, i64>,
     path: PathBuf,
-    /// `None` for whoever only reads.
+    /// `None` where the store is only read.
     file: Option<File>,
     lines: usize,
 }
