@@ -23,7 +23,6 @@ use checkpoint::BlobError;
 use protocol::Digest;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
-use sqlx::{Connection, Row};
 
 use crate::blob::Backend;
 use crate::blob::fs::Folder;
@@ -31,7 +30,7 @@ use crate::blob::place::Place;
 use crate::identity::Marker;
 use crate::lock::CollectionLock;
 use crate::retention::{self, Rows};
-use crate::{BlobStore, QueryError, ReadStore, StoreId, clock, db, identity};
+use crate::{BlobStore, QueryError, ReadStore, StoreId, clock, folder, identity, sqlite};
 
 const MANIFEST: &str = "backup.json";
 const FORMAT: u32 = 1;
@@ -71,12 +70,6 @@ pub enum BackupError {
     /// The database.
     #[error(transparent)]
     Query(#[from] QueryError),
-}
-
-impl From<sqlx::Error> for BackupError {
-    fn from(e: sqlx::Error) -> Self {
-        Self::Query(e.into())
-    }
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -189,19 +182,9 @@ impl ReadStore {
         let at_ms = clock::now_ms();
         let database = format!("stride-{at_ms}.db");
         let copy = to.join(&database);
-        let mut conn = self.readers().acquire().await?;
-        sqlx::query("VACUUM INTO ?").bind(copy.to_string_lossy().into_owned()).execute(&mut *conn).await?;
-        drop(conn);
+        let rows = Rows::from(self.copy_to(&copy).await?);
         sync(&copy)?;
-
-        let mut conn = db::open_copy(&copy).await?;
-        let rows = Rows::of(&mut conn).await;
-        let checked: String = sqlx::query("PRAGMA integrity_check").fetch_one(&mut conn).await?.try_get(0)?;
-        conn.close().await?;
-        if checked != "ok" {
-            return Err(BackupError::Damaged(format!("the database is damaged: {checked}")));
-        }
-        let (rows, blobs, from, store) = (rows?, self.blobs().clone(), self.dir().to_owned(), self.id().clone());
+        let (blobs, from, store) = (self.blobs().clone(), self.dir().to_owned(), self.id().clone());
         let ended = |e: tokio::task::JoinError| BackupError::Damaged(format!("the copying ended early: {e}"));
         let work = move || {
             let needed = retention::needed(&blobs, &rows)?;
@@ -224,7 +207,7 @@ fn prepare(store: &ReadStore, to: &Path) -> Result<(), BackupError> {
     let folder = Folder::to_read(to);
     let marker = Marker::read(&folder).map_err(|e| BackupError::Damaged(e.to_string()))?;
     let is_ours = marker.as_ref().is_some_and(|marker| marker.store == *store.id());
-    let is_store = names.iter().any(|name| name == db::FILE || name == "lock");
+    let is_store = names.iter().any(|name| name == folder::DATABASE || name == "lock");
     if !names.is_empty() && (!is_ours || is_store) {
         return Err(BackupError::Folder(format!(
             "`{}` is neither empty nor an older backup of this store",
@@ -354,7 +337,7 @@ async fn verified(backup: &Path, fresh: &Path, manifest: &Manifest, place: Optio
     let ended = |e: tokio::task::JoinError| BackupError::Damaged(format!("the copying ended early: {e}"));
     let copied = tokio::task::spawn_blocking(move || copy_back(&from, &to, &parts, place)).await.map_err(ended)?;
     // Every other copy of the database is refused from here on.
-    db::reach_epoch(fresh, copied?).await?;
+    sqlite::reach_epoch(fresh, copied?).await.map_err(QueryError::from)?;
     let unsound = |problem: String| {
         BackupError::Damaged(format!("the backup is not whole, and no store was made of it: {problem}"))
     };
@@ -370,7 +353,7 @@ async fn verified(backup: &Path, fresh: &Path, manifest: &Manifest, place: Optio
 /// Copies a backup to `fresh`, and its blobs to `place`; returns the epoch that is known there.
 fn copy_back(backup: &Path, fresh: &Path, manifest: &Manifest, place: Option<Place>) -> Result<u64, BackupError> {
     make_dir(&fresh.join("blobs"))?;
-    let (from, to) = (backup.join(&manifest.database), fresh.join(db::FILE));
+    let (from, to) = (backup.join(&manifest.database), fresh.join(folder::DATABASE));
     // Not linked: a store must not share its files with what is to bring it back.
     fs::copy(&from, &to).map_err(disk("cannot copy", &from))?;
     expect(&to, manifest.database_digest)?;

@@ -1,11 +1,10 @@
 //! Whether what is kept is whole: the database's own check, every blob hashed again, every reference resolved.
 
-use protocol::Digest;
 use serde::{Deserialize, Serialize};
-use sqlx::Row;
 
 use crate::blob::BlobStore;
-use crate::{QueryError, ReadStore, retention};
+use crate::catalog::Root;
+use crate::{QueryError, ReadStore};
 
 /// What a check found.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -30,18 +29,8 @@ impl ReadStore {
         if let Err(problem) = self.check_identity().await {
             problems.push(problem);
         }
-        let mut conn = self.readers().acquire().await?;
-        for row in sqlx::query("PRAGMA integrity_check").fetch_all(&mut *conn).await? {
-            let line: String = row.try_get(0)?;
-            if line != "ok" {
-                problems.push(format!("database: {line}"));
-            }
-        }
-        for row in sqlx::query("PRAGMA foreign_key_check").fetch_all(&mut *conn).await? {
-            problems.push(format!("database: a row of `{}` points at nothing", row.try_get::<String, _>(0)?));
-        }
-        let roots = retention::roots(&mut conn).await?;
-        drop(conn);
+        problems.extend(self.problems().await?);
+        let roots = self.needs().await?.roots;
         let blobs = self.blobs().clone();
         let ended = |e: tokio::task::JoinError| QueryError::Blob(format!("the check ended early: {e}"));
         let mut report = tokio::task::spawn_blocking(move || check(&blobs, &roots)).await.map_err(ended)?;
@@ -50,7 +39,7 @@ impl ReadStore {
     }
 }
 
-fn check(blobs: &BlobStore, roots: &[(Digest, String)]) -> Report {
+fn check(blobs: &BlobStore, roots: &[Root]) -> Report {
     let mut report = Report::default();
     match blobs.list() {
         Ok(all) => {
@@ -73,10 +62,10 @@ fn check(blobs: &BlobStore, roots: &[(Digest, String)]) -> Report {
         }
         (Err(e), _) | (_, Err(e)) => report.problems.push(e.to_string()),
     }
-    for (digest, why) in roots {
+    for root in roots {
         report.references += 1;
-        if let Err(e) = blobs.complete_manifest(*digest) {
-            report.problems.push(format!("{why}: {e}"));
+        if let Err(e) = blobs.complete_manifest(root.digest) {
+            report.problems.push(format!("{}: {e}", root.what));
         }
     }
     report

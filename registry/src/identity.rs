@@ -25,10 +25,9 @@
 
 use std::fmt;
 use std::fs::{self, File};
-use std::io::{self, ErrorKind, Read as _, Write as _};
+use std::io::{self, ErrorKind, Write as _};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -36,58 +35,9 @@ use checkpoint::BlobError;
 use serde::{Deserialize, Serialize};
 
 use crate::blob::Backend;
-use crate::db;
-
-/// The random name of a store: 32 hexadecimal digits.
-#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
-pub struct StoreId(String);
-
-impl StoreId {
-    /// Another one each time.
-    pub(crate) fn random() -> io::Result<Self> {
-        let mut bytes = [0_u8; 16];
-        File::open("/dev/urandom")?.read_exact(&mut bytes)?;
-        Ok(Self(bytes.iter().map(|byte| format!("{byte:02x}")).collect()))
-    }
-
-    /// The digits.
-    pub fn as_str(&self) -> &str {
-        &self.0
-    }
-}
-
-impl fmt::Display for StoreId {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.0)
-    }
-}
-
-impl FromStr for StoreId {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let hex = |c: char| c.is_ascii_digit() || ('a'..='f').contains(&c);
-        if text.len() == 32 && text.chars().all(hex) {
-            return Ok(Self(text.to_owned()));
-        }
-        Err(format!("`{text}` does not name a store: expected 32 hexadecimal digits"))
-    }
-}
-
-impl TryFrom<String> for StoreId {
-    type Error = String;
-
-    fn try_from(text: String) -> Result<Self, String> {
-        text.parse()
-    }
-}
-
-impl From<StoreId> for String {
-    fn from(id: StoreId) -> Self {
-        id.0
-    }
-}
+use crate::catalog::Records;
+use crate::folder;
+use crate::store_id::{StoreId, Stored};
 
 /// Why the parts of a store are not opened together.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -193,14 +143,6 @@ impl Mismatch {
     }
 }
 
-/// The store's row in its database.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Stored {
-    pub(crate) id: StoreId,
-    pub(crate) epoch: u64,
-    pub(crate) commits: u64,
-}
-
 /// What stands beside the blobs.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Marker {
@@ -302,7 +244,7 @@ impl Found {
             any_blob: !blobs.is_empty()?,
             witness: Testimony::read(dir)?,
             // Beside a database that is there the log is a part of it.
-            log: !db::is_there(dir) && db::log_bytes(dir) > 0,
+            log: !folder::has_database(dir) && folder::log_bytes(dir) > 0,
         })
     }
 
@@ -337,7 +279,7 @@ impl Found {
 
     /// Whether the parts belong together. `stored` is what the database says, `None` if it is absent.
     pub(crate) fn judge(&self, stored: Option<&Stored>) -> Result<Verdict, Mismatch> {
-        let database = db::path(&self.dir);
+        let database = folder::database(&self.dir);
         let Some(stored) = stored else {
             return match self.evidence() {
                 None => Ok(Verdict::New),
@@ -380,10 +322,10 @@ pub(crate) async fn check(
     id: &StoreId,
     dir: &Path,
     blobs: Arc<dyn Backend>,
-    readers: &sqlx::SqlitePool,
+    records: &dyn Records,
 ) -> Result<(), String> {
-    if !db::is_there(dir) {
-        return Err(format!("the database `{}` is missing or empty", db::path(dir).display()));
+    if !folder::has_database(dir) {
+        return Err(format!("the database `{}` is missing or empty", folder::database(dir).display()));
     }
     let place = blobs.marker_place();
     // Before the database: its epoch is raised first.
@@ -393,12 +335,11 @@ pub(crate) async fn check(
         Some(marker) => return Err(format!("`{place}` is of store {}, not {id}", marker.store)),
         None => return Err(format!("`{place}`, which says whose the blobs are, is missing")),
     };
-    let mut conn = readers.acquire().await.map_err(|e| format!("the database does not open: {e}"))?;
-    match db::stored_now(&mut conn).await.map_err(|e| format!("the database does not read: {e}"))? {
+    match records.stored().await.map_err(|e| format!("the database does not read: {e}"))? {
         Some(stored) if stored.id != *id => Err(format!("the database is of store {}, not {id}", stored.id)),
         Some(stored) if marker.epoch > stored.epoch => {
             let (found, known) = (stored.epoch, marker.epoch);
-            Err(Mismatch::Copied { database: db::path(dir), found, marker: place, known }.to_string())
+            Err(Mismatch::Copied { database: folder::database(dir), found, marker: place, known }.to_string())
         }
         Some(_) => Ok(()),
         None => Err("the database names no store".into()),
@@ -485,7 +426,7 @@ impl Witness {
 fn log_cycle(dir: &Path) -> Option<[u8; 12]> {
     let mut cycle = [0; 12];
     // There is no log before the first write.
-    let log = File::open(db::log_path(dir)).ok()?;
+    let log = File::open(folder::log(dir)).ok()?;
     log.read_exact_at(&mut cycle, 12).ok()?;
     Some(cycle)
 }
@@ -532,13 +473,5 @@ mod tests {
         assert!(matches!(whole.judge(Some(&stored(2))), Err(Mismatch::WentBack { found: 2, known: 3, .. })));
         let copied = found(Some('a'), true, None);
         assert!(matches!(copied.judge(Some(&stored(1))), Err(Mismatch::Copied { found: 1, known: 2, .. })));
-    }
-
-    #[test]
-    fn names_of_stores_differ_and_read_back() {
-        let (one, other) = (StoreId::random().unwrap(), StoreId::random().unwrap());
-        assert_ne!(one, other);
-        assert_eq!(one.to_string().parse(), Ok(one));
-        assert!("../../a".parse::<StoreId>().is_err());
     }
 }

@@ -23,172 +23,21 @@ use std::sync::Arc;
 use checkpoint::BlobError;
 use protocol::stage::Keep;
 use protocol::{Alias, Digest, ModelName, RunId, TaskId};
-use sqlx::SqlitePool;
 
-use crate::blob::fs::{free_bytes, is_full, is_read_only};
+use crate::blob::fs::free_bytes;
 use crate::blob::place::{Looked, Place};
 use crate::blob::{Backend, BlobStore};
-use crate::catalog::{Expect, Pick, PromoteOrder, Promotion, Which};
-use crate::db::writer::{Done, Order, Session, Writer};
-use crate::db::{self, Opened};
+use crate::catalog::{Catalog, Done, Order, PromoteOrder, Records, RollbackOrder, Which};
 use crate::forget::Forgotten;
-use crate::identity::{self, Found, Marker, MarkerError, Mismatch, StoreId, Stored, Verdict, Witness};
+use crate::identity::{self, Found, Marker, MarkerError, Verdict, Witness};
 use crate::lock::{self, Holder, SharedLock, StoreLock, Taken, network_filesystem};
+use crate::open_error::OpenError;
 use crate::reserve::{self, OPEN_NEEDS_BYTES};
-use crate::retention::{Named, Vouched};
-use crate::{Write, WriteError, clock};
-
-/// Why a store could not be opened. Nothing in it was changed.
-#[derive(Debug, thiserror::Error)]
-pub enum OpenError {
-    /// Another process holds it.
-    #[error("store `{}` is in use by {holder}", dir.display())]
-    Busy {
-        /// The store.
-        dir: PathBuf,
-        /// Who.
-        holder: Holder,
-    },
-    /// Its database, its blobs and its folder do not belong together, or one of them is missing or has gone back.
-    #[error("store `{}` is not whole: {mismatch}", dir.display())]
-    Mismatch {
-        /// The store.
-        dir: PathBuf,
-        /// What does not fit.
-        mismatch: Mismatch,
-    },
-    /// Its blobs lie elsewhere than where it was said.
-    #[error("the blobs of store `{}` are at `{place}`, not at `{asked}`", dir.display())]
-    Elsewhere {
-        /// The store.
-        dir: PathBuf,
-        /// Where they are.
-        place: Place,
-        /// Where they were said to be.
-        asked: Place,
-    },
-    /// The place of its blobs cannot be used; the message says why and what to do.
-    #[error("store `{}`: {message}", dir.display())]
-    Blobs {
-        /// The store.
-        dir: PathBuf,
-        /// What is wrong.
-        message: String,
-    },
-    /// No store, and the folder is somebody else's.
-    #[error("there is no store in `{}`, and none is made among other files: it holds {found}", dir.display())]
-    NotEmpty {
-        /// The folder.
-        dir: PathBuf,
-        /// Some of what lies in it.
-        found: String,
-    },
-    /// There is none, and none was to be made.
-    #[error("there is no store in `{}`", .0.display())]
-    NotAStore(PathBuf),
-    /// It cannot be written to.
-    #[error("store is not writable: `{}`: {message}", path.display())]
-    ReadOnly {
-        /// What was tried.
-        path: PathBuf,
-        /// What the system said.
-        message: String,
-    },
-    /// No space.
-    #[error("no space for the store: `{}`: {message}", path.display())]
-    Full {
-        /// What was tried.
-        path: PathBuf,
-        /// What the system said.
-        message: String,
-    },
-    /// SQLite's locks do not hold there.
-    #[error("store `{}` lies on {kind}, where a database can lose committed data", dir.display())]
-    NetworkFilesystem {
-        /// The store.
-        dir: PathBuf,
-        /// Which file system.
-        kind: &'static str,
-    },
-    /// A newer build has changed the schema.
-    #[error("database `{}` has schema {found}, this build knows {known}", path.display())]
-    NewerSchema {
-        /// The database.
-        path: PathBuf,
-        /// Its schema.
-        found: i64,
-        /// The newest that this build knows.
-        known: i64,
-    },
-    /// An older build made it, and whoever only reads does not change it.
-    #[error("database `{}` has schema {found}, this build reads {known}", path.display())]
-    OlderSchema {
-        /// The database.
-        path: PathBuf,
-        /// Its schema.
-        found: i64,
-        /// The one that this build reads.
-        known: i64,
-    },
-    /// It is not a database, or not one of ours.
-    #[error("database `{}` is damaged: {message}", path.display())]
-    Damaged {
-        /// The database.
-        path: PathBuf,
-        /// What the database said.
-        message: String,
-    },
-    /// Anything else.
-    #[error("store: `{}`: {message}", path.display())]
-    Other {
-        /// What was tried.
-        path: PathBuf,
-        /// What the system said.
-        message: String,
-    },
-}
-
-impl OpenError {
-    /// What the user can do.
-    pub fn hint(&self) -> String {
-        match self {
-            Self::Busy { holder: Holder { address: Some(address), .. }, .. } => {
-                format!("send work to {address}, wait for it to end, or choose another folder with `--store`")
-            }
-            Self::Busy { holder, .. } => {
-                format!("wait for process {} to end, or choose another folder with `--store`", holder.pid)
-            }
-            Self::Mismatch { mismatch, .. } => mismatch.hint().into(),
-            Self::Elsewhere { asked, .. } => format!(
-                "leave `--blobs` out, or choose another folder with `--store`; if the blobs were moved, `registry adopt --blobs \
-                 {asked}` goes on with them there"
-            ),
-            Self::Blobs { .. } => "nothing was changed; see to it and run the same command again".into(),
-            Self::NotEmpty { .. } => "choose a folder that is empty or does not exist with `--store`".into(),
-            Self::NotAStore(_) => "`trainer run PIPELINE` makes one; name its folder with `--store`".into(),
-            Self::ReadOnly { .. } => "make the folder writable for this user, or choose another with `--store`".into(),
-            Self::Full { .. } => "`registry gc` removes what nothing needs, on a full disk too; or free some space otherwise".into(),
-            Self::NetworkFilesystem { .. } => {
-                "choose a folder on a local disk with `--store`; workers on other machines need none, they talk to the server".into()
-            }
-            Self::NewerSchema { .. } => "use the newer build that wrote it, or choose another folder with `--store`".into(),
-            Self::OlderSchema { .. } => "a command that writes, such as `registry gc`, brings it up to date".into(),
-            Self::Damaged { .. } => "restore it from a backup, or choose another folder with `--store`".into(),
-            Self::Other { .. } => "look at the folder's permissions and disk, or choose another with `--store`".into(),
-        }
-    }
-
-    fn io(path: &Path, e: &io::Error) -> Self {
-        let (path, message) = (path.to_owned(), e.to_string());
-        if is_full(e) {
-            Self::Full { path, message }
-        } else if is_read_only(e) {
-            Self::ReadOnly { path, message }
-        } else {
-            Self::Other { path, message }
-        }
-    }
-}
+use crate::sqlite::{Opened, Session, SqliteCatalog, SqliteRecords, Writer};
+use crate::store_id::{StoreId, Stored};
+use crate::versions::{Expect, Pick, Promotion};
+use crate::vouched::{Named, Vouched};
+use crate::{Write, WriteError, clock, folder, sqlite};
 
 /// What a store can be asked, from what is committed. A [`Store`] is one; a process that only reads opens one by itself, whether
 /// or not somebody holds the store. It starts nothing and writes nothing. Clones share it.
@@ -201,7 +50,7 @@ struct Reading {
     id: StoreId,
     opened_ms: i64,
     blobs: BlobStore,
-    readers: SqlitePool,
+    records: Arc<dyn Records>,
     /// Keeps writers out of a database that is read without its log.
     _closed: Option<SharedLock>,
 }
@@ -214,7 +63,7 @@ pub struct Store(Arc<Inner>);
 struct Inner {
     read: ReadStore,
     /// Before `lock`: the writer ends first.
-    writer: Writer,
+    catalog: Box<dyn Catalog>,
     lock: Arc<StoreLock>,
     named: Arc<Named>,
 }
@@ -224,6 +73,14 @@ impl std::ops::Deref for Store {
 
     fn deref(&self) -> &ReadStore {
         &self.0.read
+    }
+}
+
+impl std::ops::Deref for ReadStore {
+    type Target = dyn Records;
+
+    fn deref(&self) -> &Self::Target {
+        &*self.0.records
     }
 }
 
@@ -239,14 +96,14 @@ impl ReadStore {
         // Without a log the database file is all there is. As long as writers are kept out it does not change, and is read
         // as a file: reading through a log would have to make one. With a log, SQLite keeps readers and the writer apart.
         let shared = SharedLock::try_take(&dir.join("lock")).map_err(|e| io(&dir.join("lock"), e))?;
-        let closed = shared.filter(|_| db::log_bytes(&dir) == 0);
+        let closed = shared.filter(|_| folder::log_bytes(&dir) == 0);
         // Before the database: the witness and the marker never know of more than what is committed.
         let seen = Seen::of(&dir, None, false).await?;
-        let id = db::check_to_read(&dir, &seen.found, closed.is_some()).await?;
+        let id = sqlite::check_to_read(&dir, &seen.found, closed.is_some()).await?;
         let blobs = BlobStore::beside(seen.blobs, &seen.looked.verified());
-        let readers = db::open_readers(&dir, closed.is_some());
+        let records = Arc::new(SqliteRecords::new(sqlite::open_readers(&dir, closed.is_some())));
         let opened_ms = clock::now_ms();
-        Ok(Self(Arc::new(Reading { dir, id, opened_ms, blobs, readers, _closed: closed })))
+        Ok(Self(Arc::new(Reading { dir, id, opened_ms, blobs, records, _closed: closed })))
     }
 
     /// Who holds the store in `dir` now, if somebody does. There need be no store.
@@ -257,7 +114,7 @@ impl ReadStore {
 
     /// Ends its connections to the database, which would otherwise end some time after the last clone is gone.
     pub async fn close(self) {
-        self.0.readers.close().await;
+        self.0.records.close().await;
     }
 
     /// The store's name, which no other store has.
@@ -280,14 +137,10 @@ impl ReadStore {
         self.0.opened_ms
     }
 
-    pub(crate) fn readers(&self) -> &SqlitePool {
-        &self.0.readers
-    }
-
     /// Says what is wrong if the database or the blobs are not those that were opened: somebody has removed, emptied or replaced
     /// them since.
     pub(crate) async fn check_identity(&self) -> Result<(), String> {
-        identity::check(self.id(), self.dir(), self.blobs().place(), self.readers()).await
+        identity::check(self.id(), self.dir(), self.blobs().place(), &**self).await
     }
 }
 
@@ -300,7 +153,7 @@ impl Store {
     /// The same; `blobs` is where the blobs of a new store are to lie, and where those of one that is there must be.
     pub async fn open_with(dir: &Path, blobs: Option<&Place>, holder: Holder) -> Result<Self, OpenError> {
         let io = |path: &Path, e: io::Error| OpenError::io(path, &e);
-        if !db::is_there(dir) && Seen::of(dir, None, false).await?.found.evidence().is_none() {
+        if !folder::has_database(dir) && Seen::of(dir, None, false).await?.found.evidence().is_none() {
             refuse_other_files(dir)?;
         }
         DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(|e| io(dir, e))?;
@@ -348,11 +201,11 @@ impl Store {
         // Under the lock: nobody is making the store at the same time.
         let adopt = purpose == Purpose::Adopt;
         let seen = Seen::of(&dir, place, adopt).await?;
-        if seen.to_remember && !db::is_there(&dir) && seen.found.evidence().is_none() {
+        if seen.to_remember && !folder::has_database(&dir) && seen.found.evidence().is_none() {
             // Before the database is there: one that is there knows where its blobs are.
             seen.place.remember(&dir).map_err(|e| io(&dir, e))?;
         }
-        let Opened { mut conn, store: id, verdict } = db::open_writer(&dir, &seen.found, adopt).await?;
+        let Opened { mut conn, store: id, verdict } = sqlite::open_writer(&dir, &seen.found, adopt).await?;
         if seen.to_remember && adopt {
             seen.place.remember(&dir).map_err(|e| io(&dir, e))?;
         }
@@ -363,7 +216,7 @@ impl Store {
         if let Verdict::New | Verdict::Unfinished(_) = verdict {
             marker = Some(mark(&dir, &blobs, marker, &Stored { id: id.clone(), epoch: 0, commits: 0 }).await?);
         }
-        let stored = db::raise_epoch(&dir, &mut conn).await?;
+        let stored = sqlite::raise_epoch(&dir, &mut conn).await?;
         mark(&dir, &blobs, marker, &stored).await?;
         let witness = Witness::begin(&dir, &stored).map_err(|e| io(&dir, e))?;
         reserve::keep(&dir);
@@ -371,10 +224,16 @@ impl Store {
         let named = Arc::new(Named::default());
         let vouched = Vouched { blobs: blobs.clone(), named: Arc::clone(&named) };
         let writer = Writer::start(session, vouched, Arc::clone(&lock)).map_err(|e| io(&dir, e))?;
-        let readers = db::open_readers(&dir, false);
+        let records = Arc::new(SqliteRecords::new(sqlite::open_readers(&dir, false)));
+        let catalog = Box::new(SqliteCatalog { writer, records: Arc::clone(&records) });
         let opened_ms = clock::now_ms();
-        let read = ReadStore(Arc::new(Reading { dir, id, opened_ms, blobs, readers, _closed: None }));
-        Ok(Self(Arc::new(Inner { read, writer, lock, named })))
+        let read = ReadStore(Arc::new(Reading { dir, id, opened_ms, blobs, records, _closed: None }));
+        Ok(Self(Arc::new(Inner { read, catalog, lock, named })))
+    }
+
+    /// What is kept besides the blobs.
+    pub fn catalog(&self) -> &dyn Catalog {
+        &*self.0.catalog
     }
 
     /// Tells other processes where this one answers requests.
@@ -427,7 +286,7 @@ impl Store {
         actor: &str,
     ) -> Result<Promotion, WriteError> {
         let (model, alias, reason, actor) = (model.clone(), alias.clone(), reason.to_owned(), actor.to_owned());
-        promoted(self.order(Order::Rollback { model, alias, to, expect, reason, actor }).await?)
+        promoted(self.order(Order::Rollback(RollbackOrder { model, alias, to, expect, reason, actor })).await?)
     }
 
     /// Forgets a task's checkpoints but those that `keep` names; returns the manifests that were forgotten. Their blobs go
@@ -480,7 +339,7 @@ impl Store {
     }
 
     async fn order(&self, order: Order) -> Result<Done, WriteError> {
-        self.0.writer.order(order).await
+        self.0.catalog.commit(order).await
     }
 }
 
@@ -527,7 +386,7 @@ impl Seen {
         let io = |e: io::Error| OpenError::io(&dir.join("blobs/PLACE"), &e);
         let here = Place::Folder(std::path::absolute(dir).map_err(io)?);
         let remembered = Place::remembered(dir).map_err(io)?;
-        let is_new = remembered.is_none() && !db::is_there(dir);
+        let is_new = remembered.is_none() && !folder::has_database(dir);
         let current = remembered.unwrap_or(here);
         let asked = asked.unwrap_or_else(|| current.clone());
         let to_remember = asked != current;
@@ -554,7 +413,7 @@ impl Seen {
 
 /// Refuses a folder that is not, and never was, a store.
 async fn there(dir: &Path) -> Result<(), OpenError> {
-    if db::is_there(dir) {
+    if folder::has_database(dir) {
         return Ok(());
     }
     match Seen::of(dir, None, false).await?.found.evidence() {
@@ -593,7 +452,7 @@ fn refuse_other_files(dir: &Path) -> Result<(), OpenError> {
         let name = entry.map_err(|e| OpenError::io(dir, &e))?.file_name();
         let name = name.to_string_lossy();
         // Beside the database lie its log and, while it is made, a journal.
-        if !OF_A_STORE.contains(&&*name) && !name.starts_with(db::FILE) {
+        if !OF_A_STORE.contains(&&*name) && !name.starts_with(folder::DATABASE) {
             other.push(format!("`{name}`"));
         }
     }

@@ -1,7 +1,7 @@
 //! What may be written, as data. One call of [`Store::write`](crate::Store::write) is one transaction: all of it or none.
 //!
 //! A write that carries a [`Grant`] is checked against the task's fence inside that transaction, so that no code path can
-//! forget it; an older fence refuses the whole transaction with [`WriteError::StaleFence`].
+//! forget it; an older fence refuses the whole transaction with [`WriteError::StaleFence`](crate::WriteError::StaleFence).
 
 use std::collections::BTreeMap;
 
@@ -183,40 +183,10 @@ impl Write {
     }
 }
 
-/// Why nothing of a transaction was stored.
-#[derive(Debug, thiserror::Error)]
-pub enum WriteError {
-    /// Somebody else holds the task now.
-    #[error("stale fence: task `{task}` is at fence {current}, the write carries {carried}")]
-    StaleFence {
-        /// The task.
-        task: TaskId,
-        /// The fence in the store.
-        current: Fence,
-        /// The fence of the write.
-        carried: Fence,
-    },
-    /// Another process has opened the store since this one did, so this one may not write to it any more.
-    #[error(
-        "the store was opened by another process: this one held it under epoch {epoch}, which is over; nothing was written"
-    )]
-    Superseded {
-        /// This process's epoch.
-        epoch: u64,
-    },
-    /// What is stored contradicts it.
-    #[error("{0}")]
-    Conflict(String),
-    /// A promotion gate does not hold; the message says by how much.
-    #[error("{0}")]
-    Gate(String),
-    /// No such thing.
-    #[error("{0}")]
-    NotFound(String),
-    /// Full or not writable.
-    #[error("{0}")]
-    Storage(String),
-    /// A fault of ours or of the database.
-    #[error("{0}")]
-    Internal(String),
+/// What is said of two checkpoints of one step that differ.
+pub fn two_states(task: &TaskId, step: u64, stored: &str, now: &str) -> String {
+    format!(
+        "task `{task}` has checkpoint {stored} at step {step}; now it is {now}: the same step was computed twice with \
+         different results, which should be impossible"
+    )
 }

@@ -1,218 +1,250 @@
-//! Models, their versions, and the aliases that point at them.
+//! What the catalog of a store is: all that is kept besides the blobs, behind two traits.
 //!
-//! A version is numbered in the transaction that registers it: 1, 2, 3, without gaps. An alias moves by `promote` or
-//! `rollback`, each one transaction that compares, judges the gates on stored metrics, moves and logs. `@best` is a
-//! query over stored metrics, never state.
+//! [`Records`] answers questions from what is committed; [`Catalog`] commits. SQLite implements them (`sqlite`), and whatever
+//! else does passes the same suite, `registry/tests/catalog_conformance.rs`. What an implementation owes:
+//!
+//! - **One order is all or nothing.** [`Catalog::commit`] returns once the order would survive a loss of power, or has changed
+//!   nothing. Orders that are committed together do not see each other's failures.
+//! - **Fences are checked where the write is stored**, in the same transaction ([`Write::grant`]).
+//! - **One epoch writes.** Opening for writing raises the epoch; a commit under an older one is refused with
+//!   [`WriteError::Superseded`], whichever process or machine it comes from. So exclusivity needs no lock that both can see.
+//! - **Committed transactions are counted** ([`Stored::commits`]), so that a catalog that has gone back is told from the newest.
+//! - **A row names only what is whole**: manifests are checked, and noted for a collection under way, before the row is stored.
+//! - **An answer is of one moment**, and of every commit that was acknowledged before the question.
+//!
+//! Rules that no database has a say in are functions beside the types ([`crate::versions`], [`crate::curve`]): which version is
+//! the best, whether a gate holds, where a rollback goes, which attempt's values count.
 
-mod gate;
-mod moves;
-mod read;
+mod rows;
 
 use std::collections::BTreeMap;
-use std::fmt;
-use std::str::FromStr;
+use std::fmt::Debug;
+use std::path::Path;
+use std::sync::Arc;
 
-use protocol::stage::Mode;
-use protocol::{Alias, Digest, ModelName};
-use serde::{Deserialize, Serialize};
-use serde_json::Value;
+use async_trait::async_trait;
+use protocol::stage::Keep;
+use protocol::{Alias, Digest, ModelName, RunId, StageName, TaskId};
 
-pub use gate::{Gate, GateResult, ParseGateError};
-pub(crate) use moves::{PromoteOrder, Which, promote, register, rollback};
-pub(crate) use read::{history, model, models, numbers, resolve, version_of, versions};
+pub use rows::{CheckpointRow, EndedRow, LineageNode, LogRow, Needs, Recovery, Root, RunRow, StageResultRow};
 
-/// Aliases that are queries; nothing is promoted to them.
-pub const BEST: &str = "best";
-/// The newest version, by number.
-pub const LATEST: &str = "latest";
+use crate::curve::Curve;
+use crate::forget::Forgotten;
+use crate::store_id::Stored;
+use crate::versions::{self, Expect, Model, ModelRef, Pick, Promotion, Version};
+use crate::{QueryError, Write, WriteError};
 
-/// A model as a list shows it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Model {
-    /// Its name.
-    pub model: ModelName,
-    /// The metric that decides `@best`.
-    pub metric: Option<String>,
-    /// Its direction.
-    pub mode: Option<Mode>,
-    /// How many versions there are; the newest has this number.
-    pub versions: u64,
-    /// The best version, if one has a finite value of the metric.
-    pub best: Option<u64>,
-    /// Where the aliases point.
-    pub aliases: BTreeMap<String, u64>,
+type Result<T> = std::result::Result<T, QueryError>;
+
+/// What can be asked, from what is committed.
+#[async_trait]
+pub trait Records: Debug + Send + Sync {
+    /// What the catalog says of itself; `None` if it is not one of a store.
+    async fn stored(&self) -> Result<Option<Stored>>;
+
+    /// What a coordinator recovers from.
+    async fn recovery(&self) -> Result<Recovery>;
+
+    /// What is kept of a run that ended; `None` while it has never ended.
+    async fn ended(&self, run: &RunId) -> Result<Option<EndedRow>>;
+
+    /// The views of runs that ended, as JSON, with their runs; oldest first. Of more than `limit` the newest.
+    async fn ended_views(&self, limit: u32) -> Result<Vec<(RunId, String)>>;
+
+    /// Runs that ended before a time, in milliseconds since 1970; oldest first.
+    async fn ended_before(&self, before_ms: i64) -> Result<Vec<RunId>>;
+
+    /// Under whose names the logs and values behind stage keys are stored: those of the value, or of what there is of it.
+    async fn sources(&self, keys: &[Digest]) -> Result<BTreeMap<Digest, (RunId, StageName)>>;
+
+    /// What a coordinator left of a stage's value when nobody waited for it any more, as JSON.
+    async fn archived_execution(&self, key: Digest) -> Result<Option<String>>;
+
+    /// The values whose keys are among `keys`.
+    async fn stage_results(&self, keys: &[Digest]) -> Result<BTreeMap<Digest, StageResultRow>>;
+
+    /// The value stored under a stage key.
+    async fn stage_result(&self, key: Digest) -> Result<Option<StageResultRow>> {
+        Ok(self.stage_results(&[key]).await?.remove(&key))
+    }
+
+    /// All runs, newest first.
+    async fn runs(&self) -> Result<Vec<RunRow>>;
+
+    /// One run.
+    async fn run(&self, run: &RunId) -> Result<Option<RunRow>>;
+
+    /// The run that was submitted with an idempotency key.
+    async fn run_by_key(&self, key: &str) -> Result<Option<RunRow>>;
+
+    /// A task's committed checkpoints, newest first.
+    async fn checkpoints(&self, task: &TaskId) -> Result<Vec<CheckpointRow>>;
+
+    /// A task's newest committed checkpoint: where the next attempt goes on.
+    async fn latest_checkpoint(&self, task: &TaskId) -> Result<Option<CheckpointRow>> {
+        Ok(self.checkpoints(task).await?.into_iter().next())
+    }
+
+    /// The shards of a run's map stages that are stored, by task.
+    async fn shards(&self, run: &RunId) -> Result<BTreeMap<TaskId, Digest>>;
+
+    /// Log lines of a run, or of one stage of it, that were stored after line `after`; at most `limit`.
+    async fn logs(&self, run: &RunId, stage: Option<&StageName>, after: i64, limit: u32) -> Result<Vec<LogRow>>;
+
+    /// The current values of a stage by key; of all keys, or of `keys`; at most about `points` of each, 0 for all.
+    async fn metrics(
+        &self,
+        run: &RunId,
+        stage: &StageName,
+        keys: Option<&[String]>,
+        points: usize,
+    ) -> Result<BTreeMap<String, Curve>>;
+
+    /// All models by name.
+    async fn models(&self) -> Result<Vec<Model>>;
+
+    /// One model.
+    async fn model(&self, model: &ModelName) -> Result<Option<Model>>;
+
+    /// A model's versions, oldest first.
+    async fn versions(&self, model: &ModelName) -> Result<Vec<Version>>;
+
+    /// The version that an artifact was registered as.
+    async fn version_of(&self, model: &ModelName, artifact: Digest) -> Result<Option<Version>> {
+        Ok(self.versions(model).await?.into_iter().find(|version| version.artifact == artifact))
+    }
+
+    /// The moves of a model's aliases, or of one of them, oldest first.
+    async fn history(&self, model: &ModelName, alias: Option<&Alias>) -> Result<Vec<Promotion>>;
+
+    /// The version behind `quickstart@staging`, `quickstart@best` or `quickstart:3`.
+    async fn resolve(&self, reference: &str) -> Result<Version> {
+        let reference: ModelRef = reference.parse().map_err(QueryError::Invalid)?;
+        match self.model(&reference.model).await? {
+            None => Err(versions::unknown(&reference.model, &self.models().await?)),
+            Some(model) => versions::pick(&reference, &model, &self.versions(&reference.model).await?),
+        }
+    }
+
+    /// An artifact and all that it was made of, nearest first.
+    async fn lineage(&self, digest: Digest) -> Result<Vec<LineageNode>>;
+
+    /// What the rows need of the blobs.
+    async fn needs(&self) -> Result<Needs>;
+
+    /// What the database finds wrong with itself, in words. Takes as long as reading all of it.
+    async fn problems(&self) -> Result<Vec<String>>;
+
+    /// Writes a copy of all of it, as of one moment, to a new file; returns what that copy needs of the blobs. Writes go on
+    /// meanwhile.
+    async fn copy_to(&self, path: &Path) -> Result<Needs>;
+
+    /// Ends its connections.
+    async fn close(&self);
 }
 
-/// A registered artifact. Never edited, except that metrics are added.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Version {
+/// What commits.
+#[async_trait]
+pub trait Catalog: Debug + Send + Sync {
+    /// What can be asked of it.
+    fn records(&self) -> Arc<dyn Records>;
+
+    /// Commits an order; returns once it would survive a loss of power, or has changed nothing.
+    async fn commit(&self, order: Order) -> std::result::Result<Done, WriteError>;
+}
+
+/// One thing to commit.
+#[derive(Debug, Clone)]
+pub enum Order {
+    /// All of them or none.
+    Write(Vec<Write>),
+    /// Moves an alias forward: compares, judges the gates, moves, logs.
+    Promote(PromoteOrder),
+    /// Moves an alias back. This is a log entry itself.
+    Rollback(RollbackOrder),
+    /// Forgets a task's checkpoints but those that the policy names.
+    PruneCheckpoints {
+        /// Whose.
+        task: TaskId,
+        /// Which stay.
+        keep: Keep,
+    },
+    /// Keeps an artifact whatever else points at it.
+    Pin {
+        /// The artifact.
+        digest: Digest,
+        /// Why; `None` ends the pin.
+        reason: Option<String>,
+    },
+    /// Forgets a run that has ended.
+    Forget(RunId),
+    /// Forgets what a run that ended before a time has left behind and nobody needs.
+    ForgetLeftovers {
+        /// The run, which stays itself.
+        run: RunId,
+        /// In milliseconds since 1970.
+        before_ms: i64,
+    },
+    /// Forgets the rows that a collection takes. From here on what rows come to name is noted.
+    BeginCollection,
+}
+
+/// A promotion to be made.
+#[derive(Debug, Clone)]
+pub struct PromoteOrder {
     /// The model.
     pub model: ModelName,
-    /// Its number, from 1.
-    pub version: u64,
-    /// A manifest of kind `model`.
-    pub artifact: Digest,
-    /// Metrics by name.
-    pub metrics: BTreeMap<String, f64>,
-    /// Run, stage, stage key.
-    pub source: Value,
-    /// When it was registered, in milliseconds since 1970.
-    pub created_ms: i64,
-    /// Aliases that point at it now.
-    pub aliases: Vec<String>,
-}
-
-/// Whether an alias moved forward or back.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Action {
-    /// By `promote`.
-    Promote,
-    /// By `rollback`.
-    Rollback,
-}
-
-/// One move of an alias.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Promotion {
-    /// Its place in the log.
-    pub id: i64,
-    /// When, in milliseconds since 1970.
-    pub at_ms: i64,
-    /// The model.
-    pub model: ModelName,
-    /// The alias.
+    /// The alias that moves.
     pub alias: Alias,
-    /// Which way.
-    pub action: Action,
-    /// Where the alias pointed before.
-    pub from: Option<u64>,
-    /// Where it points since.
-    pub to: u64,
-    /// Who.
-    pub actor: String,
+    /// Where to.
+    pub to: Which,
+    /// Where the alias must be now, if the caller minds.
+    pub expect: Option<Expect>,
+    /// Gates as written.
+    pub require: Vec<String>,
     /// Why.
     pub reason: String,
-    /// The gates, and the numbers that they were judged by.
-    pub gates: Vec<GateResult>,
+    /// Who.
+    pub actor: String,
 }
 
-/// What a caller believes an alias to point at.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(into = "String", try_from = "String")]
-pub enum Expect {
-    /// The alias does not exist yet.
-    None,
-    /// It points at this version.
-    Version(u64),
-}
-
-impl FromStr for Expect {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
-        if text == "none" {
-            return Ok(Self::None);
-        }
-        text.parse().map(Self::Version).map_err(|_| format!("`{text}` is not a version: expected a number or `none`"))
-    }
-}
-
-impl TryFrom<String> for Expect {
-    type Error = String;
-
-    fn try_from(text: String) -> Result<Self, Self::Error> {
-        text.parse()
-    }
-}
-
-impl From<Expect> for String {
-    fn from(expect: Expect) -> Self {
-        expect.to_string()
-    }
-}
-
-impl fmt::Display for Expect {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::None => f.write_str("none"),
-            Self::Version(version) => write!(f, "{version}"),
-        }
-    }
-}
-
-/// How users point at a model version: `quickstart@staging`, `quickstart@best`, `quickstart:3`.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct ModelRef {
+/// A rollback to be made.
+#[derive(Debug, Clone)]
+pub struct RollbackOrder {
     /// The model.
     pub model: ModelName,
-    /// Which of its versions; `None` means the model as a whole.
-    pub pick: Option<Pick>,
+    /// The alias that moves.
+    pub alias: Alias,
+    /// Where to; `None` is the version before its last promotion.
+    pub to: Option<u64>,
+    /// Where the alias must be now, if the caller minds.
+    pub expect: Option<Expect>,
+    /// Why.
+    pub reason: String,
+    /// Who.
+    pub actor: String,
 }
 
-/// Which version of a model.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Pick {
-    /// The best by the model's metric.
-    Best,
-    /// The newest.
-    Latest,
-    /// Where an alias points.
-    Alias(Alias),
-    /// By number.
-    Number(u64),
+/// Which version is to be promoted.
+#[derive(Debug, Clone)]
+pub enum Which {
+    /// The one that an artifact was registered as.
+    Artifact(Digest),
+    /// By its name.
+    Pick(Pick),
 }
 
-impl FromStr for ModelRef {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let bad = |why: String| {
-            format!("`{text}` names no model version: {why}; expected `MODEL@ALIAS`, `MODEL@best` or `MODEL:VERSION`")
-        };
-        let name = |model: &str| model.parse::<ModelName>().map_err(|e| bad(e.to_string()));
-        if let Some((model, alias)) = text.split_once('@') {
-            let pick = match alias {
-                BEST => Pick::Best,
-                LATEST => Pick::Latest,
-                alias => Pick::Alias(alias.parse().map_err(|e: protocol::id::ParseNameError| bad(e.to_string()))?),
-            };
-            Ok(Self { model: name(model)?, pick: Some(pick) })
-        } else if let Some((model, number)) = text.split_once(':') {
-            let number = number.trim_start_matches('v').parse().map_err(|_| bad(format!("`{number}` is no number")))?;
-            Ok(Self { model: name(model)?, pick: Some(Pick::Number(number)) })
-        } else {
-            Ok(Self { model: name(text)?, pick: None })
-        }
-    }
-}
-
-impl fmt::Display for ModelRef {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let model = &self.model;
-        match &self.pick {
-            None => write!(f, "{model}"),
-            Some(Pick::Best) => write!(f, "{model}@{BEST}"),
-            Some(Pick::Latest) => write!(f, "{model}@{LATEST}"),
-            Some(Pick::Alias(alias)) => write!(f, "{model}@{alias}"),
-            Some(Pick::Number(number)) => write!(f, "{model}:{number}"),
-        }
-    }
-}
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used, reason = "a test may panic")]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn references_read_as_they_are_written() {
-        for text in ["m@staging", "m@best", "m@latest", "m:3", "m"] {
-            assert_eq!(text.parse::<ModelRef>().unwrap().to_string(), text);
-        }
-        for text in ["", "@x", "m@", "m:", "m:x", "a/b@x"] {
-            let error = text.parse::<ModelRef>().unwrap_err();
-            assert!(error.contains("expected"), "{error}");
-        }
-    }
+/// What an order gives.
+#[derive(Debug)]
+pub enum Done {
+    /// It is stored.
+    Nothing,
+    /// Of a promotion or a rollback: the log entry.
+    Promoted(Box<Promotion>),
+    /// Of pruning: the manifests that were forgotten.
+    Pruned(Vec<Digest>),
+    /// Of a collection's beginning: the tasks whose shards were forgotten.
+    Begun(Vec<TaskId>),
+    /// Of forgetting: what went.
+    Forgotten(Forgotten),
 }

@@ -6,8 +6,8 @@ use clap::{Subcommand, ValueEnum};
 
 use super::Command;
 use crate::Place;
-use crate::catalog::Expect;
 use crate::leaderboard::Style;
+use crate::versions::Expect;
 
 /// How answers are printed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum)]

@@ -22,10 +22,10 @@ pub use client::{ask, execute};
 pub use print::{render, show_error};
 
 use crate::backup::{BackupError, Summary};
-use crate::catalog::{BEST, Expect, Gate, LATEST, Model, ModelRef, Promotion, Version};
 use crate::forget::Forgotten;
 use crate::leaderboard::{self, Comparison, Leaderboard, Style};
 use crate::retention::{GRACE_MS, Plan};
+use crate::versions::{BEST, Expect, Gate, LATEST, Model, ModelRef, Promotion, Version};
 use crate::{LineageNode, OpenError, QueryError, ReadStore, Store, StoreId, WriteError, fsck};
 
 /// What may be asked of a registry.

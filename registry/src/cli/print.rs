@@ -11,10 +11,10 @@ use serde_json::json;
 
 use super::{Answer, Data, Output};
 use crate::backup::Summary;
-use crate::catalog::{Action, Promotion, Version};
 use crate::clock::format_ms;
 use crate::forget::Forgotten;
 use crate::leaderboard;
+use crate::versions::{Action, Promotion, Version};
 
 /// Prints an answer.
 pub(super) fn show(answer: &Answer, output: Output) -> io::Result<()> {

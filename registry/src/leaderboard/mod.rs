@@ -16,7 +16,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::catalog::Version;
+use crate::versions::Version;
 
 pub use print::Style;
 

@@ -7,14 +7,15 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::message::{Grant, MetricRow};
-use protocol::{Digest, Fence, Manifest, TaskId};
+use protocol::{Digest, Fence, TaskId};
 use sqlx::query_builder::Separated;
 use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 
-use super::write_error;
-use crate::blob::ManifestError;
-use crate::retention::{self, Vouched};
-use crate::{Write, WriteError, catalog, clock};
+use super::{moves, write_error};
+use crate::catalog::{PromoteOrder, Which};
+use crate::vouched::{Vouched, complete};
+use crate::write::two_states;
+use crate::{Write, WriteError, clock};
 
 type Result<T> = std::result::Result<T, WriteError>;
 
@@ -22,7 +23,7 @@ type Result<T> = std::result::Result<T, WriteError>;
 const ROWS: usize = 250;
 
 /// Does all of `writes`, or says why one of them is refused; then the caller rolls back.
-pub(crate) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: &[Write]) -> Result<()> {
+pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: &[Write]) -> Result<()> {
     let mut fences = Fences::read(conn, writes).await?;
     let (mut decisions, mut shards) = (Vec::new(), BTreeMap::new());
     for write in writes {
@@ -79,19 +80,19 @@ pub(crate) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
             }
             Write::Version { model, artifact, metrics, source } => {
                 let manifest = complete(blobs, *artifact)?;
-                catalog::register(conn, model, *artifact, manifest.kind, metrics, source).await?;
+                moves::register(conn, model, *artifact, manifest.kind, metrics, source).await?;
             }
             Write::Promote { model, alias, artifact, require, reason, actor } => {
-                let order = catalog::PromoteOrder {
+                let order = PromoteOrder {
                     model: model.clone(),
                     alias: alias.clone(),
-                    to: catalog::Which::Artifact(*artifact),
+                    to: Which::Artifact(*artifact),
                     expect: None,
                     require: require.clone(),
                     reason: reason.clone(),
                     actor: actor.clone(),
                 };
-                catalog::promote(conn, &order).await?;
+                moves::promote(conn, &order).await?;
             }
         }
     }
@@ -100,23 +101,23 @@ pub(crate) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
     fences.write(conn).await
 }
 
-pub(crate) type Query<'q> = sqlx::query::Query<'q, sqlx::Sqlite, sqlx::sqlite::SqliteArguments>;
+pub(super) type Query<'q> = sqlx::query::Query<'q, sqlx::Sqlite, sqlx::sqlite::SqliteArguments>;
 
 /// Runs a statement and returns how many rows it changed.
-pub(crate) async fn run(conn: &mut SqliteConnection, query: Query<'_>) -> Result<u64> {
+pub(super) async fn run(conn: &mut SqliteConnection, query: Query<'_>) -> Result<u64> {
     query.execute(conn).await.map(|done| done.rows_affected()).map_err(write_error)
 }
 
-pub(crate) async fn one(conn: &mut SqliteConnection, query: Query<'_>) -> Result<Option<sqlx::sqlite::SqliteRow>> {
+pub(super) async fn one(conn: &mut SqliteConnection, query: Query<'_>) -> Result<Option<sqlx::sqlite::SqliteRow>> {
     query.fetch_optional(conn).await.map_err(write_error)
 }
 
 /// SQLite's integers are signed; none of our counters comes near the sign.
-pub(crate) fn int(number: u64) -> i64 {
+pub(super) fn int(number: u64) -> i64 {
     i64::try_from(number).unwrap_or(i64::MAX)
 }
 
-pub(crate) fn json<T: serde::Serialize>(value: &T) -> String {
+pub(super) fn json<T: serde::Serialize>(value: &T) -> String {
     // Maps of names to numbers or digests always serialise.
     serde_json::to_string(value).unwrap_or_else(|e| panic!("a row that is no JSON: {e}"))
 }
@@ -267,14 +268,6 @@ async fn one_checkpoint_a_step(conn: &mut SqliteConnection, task: &TaskId, step:
     }
 }
 
-/// What is said of two checkpoints of one step that differ.
-pub fn two_states(task: &TaskId, step: u64, stored: &str, now: &str) -> String {
-    format!(
-        "task `{task}` has checkpoint {stored} at step {step}; now it is {now}: the same step was computed twice with \
-         different results, which should be impossible"
-    )
-}
-
 async fn set_run(
     conn: &mut SqliteConnection,
     run_id: &str,
@@ -300,7 +293,7 @@ async fn set_run(
 }
 
 /// A task's run and stage, out of its name.
-pub(crate) fn run_and_stage(task: &TaskId) -> (&str, &str) {
+pub(super) fn run_and_stage(task: &TaskId) -> (&str, &str) {
     let mut parts = task.as_str().split('/');
     (parts.next().unwrap_or_default(), parts.next().unwrap_or_default())
 }
@@ -348,29 +341,6 @@ async fn add_logs(conn: &mut SqliteConnection, grant: &Grant, first: u64, lines:
     };
     let begin = "INSERT INTO logs (run, stage, task, attempt, worker, line, at_ms, text) ";
     insert(conn, begin, &rows, values, " ON CONFLICT DO NOTHING").await
-}
-
-/// The manifest, once all that it lists is there: before that, no row may name it.
-pub(crate) fn complete(blobs: &Vouched, digest: Digest) -> Result<Manifest> {
-    if blobs.named.is_noting() {
-        blobs.named.note([digest]);
-        if let Ok(manifest) = blobs.manifest(digest) {
-            let mut needs = manifest.files.values().map(|file| file.digest).collect();
-            retention::named(&manifest.meta, &mut needs);
-            blobs.named.note(needs);
-        }
-    }
-    blobs.complete_manifest(digest).map_err(|e| match e {
-        ManifestError::Blob(checkpoint::BlobError::NotFound(digest)) => WriteError::NotFound(format!(
-            "blob {digest} is not in the store; upload a manifest and all that it lists before naming it"
-        )),
-        ManifestError::Blob(checkpoint::BlobError::Storage(message)) => WriteError::Storage(message),
-        ManifestError::Blob(e) => WriteError::Internal(e.to_string()),
-        ManifestError::Incomplete { .. } => {
-            WriteError::NotFound(format!("{e}; upload every blob before the manifest is named"))
-        }
-        ManifestError::NotAManifest { .. } | ManifestError::Format { .. } => WriteError::Conflict(e.to_string()),
-    })
 }
 
 /// Adds a shard to those that an order stores.

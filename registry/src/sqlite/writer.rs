@@ -9,63 +9,20 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 
 use fail::fail_point;
-use protocol::stage::Keep;
-use protocol::{Alias, Digest, ModelName, RunId, TaskId};
 use sqlx::{Connection, Row, SqliteConnection};
 use tokio::sync::{mpsc, oneshot};
 
-use super::{apply, write_error};
-use crate::catalog::{Expect, Promotion};
-use crate::forget::{self, Forgotten};
+use super::{apply, forget, moves, retention, write_error};
+use crate::WriteError;
+use crate::catalog::{Done, Order};
 use crate::identity::Witness;
 use crate::lock::StoreLock;
-use crate::retention::{self, Vouched};
-use crate::{Write, WriteError, catalog};
+use crate::vouched::Vouched;
 
 /// Orders of one transaction at most. Beyond it the latency of the first grows and the share of the sync is small.
 const GROUP: usize = 256;
 /// Orders that may wait; more callers than this wait themselves.
 const QUEUE: usize = 4096;
-
-/// One thing to do in a transaction.
-#[derive(Debug)]
-pub(crate) enum Order {
-    Write(Vec<Write>),
-    Promote(catalog::PromoteOrder),
-    Rollback {
-        model: ModelName,
-        alias: Alias,
-        to: Option<u64>,
-        expect: Option<Expect>,
-        reason: String,
-        actor: String,
-    },
-    PruneCheckpoints {
-        task: TaskId,
-        keep: Keep,
-    },
-    Pin {
-        digest: Digest,
-        reason: Option<String>,
-    },
-    Forget(RunId),
-    ForgetLeftovers {
-        run: RunId,
-        before_ms: i64,
-    },
-    /// Forgets what a collection may take. From here on what rows come to name is noted.
-    BeginCollection,
-}
-
-/// What an order gives.
-#[derive(Debug)]
-pub(crate) enum Done {
-    Nothing,
-    Promoted(Box<Promotion>),
-    Pruned(Vec<Digest>),
-    Begun(Vec<TaskId>),
-    Forgotten(Forgotten),
-}
 
 type Answer = oneshot::Sender<Result<Done, WriteError>>;
 
@@ -207,12 +164,8 @@ async fn run_all(
 async fn run(conn: &mut SqliteConnection, blobs: &Vouched, order: &Order) -> Result<Done, WriteError> {
     match order {
         Order::Write(writes) => apply::apply(conn, blobs, writes).await.map(|()| Done::Nothing),
-        Order::Promote(order) => catalog::promote(conn, order).await.map(|p| Done::Promoted(Box::new(p))),
-        Order::Rollback { model, alias, to, expect, reason, actor } => {
-            catalog::rollback(conn, model, alias, *to, *expect, reason, actor)
-                .await
-                .map(|p| Done::Promoted(Box::new(p)))
-        }
+        Order::Promote(order) => moves::promote(conn, order).await.map(|p| Done::Promoted(Box::new(p))),
+        Order::Rollback(order) => moves::rollback(conn, order).await.map(|p| Done::Promoted(Box::new(p))),
         Order::PruneCheckpoints { task, keep } => retention::prune(conn, task, keep).await.map(Done::Pruned),
         Order::Pin { digest, reason } => {
             retention::pin(conn, blobs, *digest, reason.as_deref()).await.map(|()| Done::Nothing)

@@ -6,11 +6,7 @@
 
 use std::collections::BTreeMap;
 
-use protocol::{RunId, StageName};
 use serde::{Deserialize, Serialize};
-use sqlx::Row;
-
-use crate::{QueryError, ReadStore};
 
 /// A value after a step. What was no number is NaN, and `null` in JSON.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -35,53 +31,48 @@ pub struct Curve {
     pub points: Vec<Point>,
 }
 
-impl ReadStore {
-    /// The current values of a stage by key; of all keys, or of `keys`; at most about `points` of each, 0 for all.
-    pub async fn metrics(
-        &self,
-        run: &RunId,
-        stage: &StageName,
-        keys: Option<&[String]>,
-        points: usize,
-    ) -> Result<BTreeMap<String, Curve>, QueryError> {
-        let mut conn = self.readers().acquire().await?;
-        let find = sqlx::query(
-            "SELECT s.key, s.task, s.attempt, m.step, m.value FROM series s JOIN metrics m ON m.series = s.id \
-             WHERE s.run = ?1 AND s.stage = ?2 AND (?3 IS NULL OR s.key IN (SELECT value FROM json_each(?3))) \
-             ORDER BY s.key, s.task, s.attempt DESC, m.step",
-        );
-        let keys = keys.map(|keys| crate::db::apply::json(&keys));
-        let rows = find.bind(run.as_str()).bind(stage.as_str()).bind(keys).fetch_all(&mut *conn).await?;
+/// Makes curves of stored values.
+#[derive(Debug, Default)]
+pub(crate) struct Curves {
+    all: BTreeMap<String, Vec<Point>>,
+    /// The series being read: key, task, attempt.
+    reading: Option<(String, String, i64)>,
+    /// The first step of the newer attempts, and of the one being read.
+    superseded_from: u64,
+    first: u64,
+}
 
-        let mut curves: BTreeMap<String, Vec<Point>> = BTreeMap::new();
-        // Of the series being read: its task and attempt, the first step of the newer attempts, and its own first step.
-        let mut reading: Option<(&str, &str, i64)> = None;
-        let (mut superseded_from, mut first) = (u64::MAX, u64::MAX);
-        for row in &rows {
-            let (key, task, attempt): (&str, &str, i64) = (row.try_get(0)?, row.try_get(1)?, row.try_get(2)?);
-            let step = row.try_get::<i64, _>(3)?.unsigned_abs();
-            match reading {
-                Some(series) if series == (key, task, attempt) => {}
-                Some((k, t, _)) if (k, t) == (key, task) => {
-                    superseded_from = superseded_from.min(first);
-                    first = step;
-                }
-                _ => {
-                    superseded_from = u64::MAX;
-                    first = step;
-                }
+impl Curves {
+    /// Adds a value. They come by key, by task, by attempt with the newest first, and by step.
+    pub(crate) fn push(&mut self, key: &str, task: &str, attempt: i64, step: u64, value: Option<f64>) {
+        match &self.reading {
+            Some((k, t, a)) if (k.as_str(), t.as_str(), *a) == (key, task, attempt) => {}
+            Some((k, t, _)) if (k.as_str(), t.as_str()) == (key, task) => {
+                self.superseded_from = self.superseded_from.min(self.first);
+                self.first = step;
+                self.reading = Some((key.to_owned(), task.to_owned(), attempt));
             }
-            reading = Some((key, task, attempt));
-            if step < superseded_from {
-                let value = row.try_get::<Option<f64>, _>(4)?.unwrap_or(f64::NAN);
-                curves.entry(key.to_owned()).or_default().push(Point { step, value });
+            _ => {
+                (self.superseded_from, self.first) = (u64::MAX, step);
+                self.reading = Some((key.to_owned(), task.to_owned(), attempt));
             }
         }
+        if step < self.superseded_from {
+            let point = Point { step, value: value.unwrap_or(f64::NAN) };
+            match self.all.get_mut(key) {
+                Some(points) => points.push(point),
+                None => drop(self.all.insert(key.to_owned(), vec![point])),
+            }
+        }
+    }
+
+    /// The curves by key, of at most about `points` each; 0 for all.
+    pub(crate) fn finish(self, points: usize) -> BTreeMap<String, Curve> {
         let curve = |mut all: Vec<Point>| {
             all.sort_by_key(|point| point.step);
             Curve { total: all.len() as u64, points: downsample(all, points) }
         };
-        Ok(curves.into_iter().map(|(key, all)| (key, curve(all))).collect())
+        self.all.into_iter().map(|(key, all)| (key, curve(all))).collect()
     }
 }
 

@@ -1,57 +1,64 @@
-//! The database: its connections, its migrations, and the one writer.
+//! The catalog in SQLite: its connections, its migrations, and the one writer.
 //!
 //! One connection writes, from a thread of its own ([`writer`]); queries use read-only connections and see what was
 //! committed. `database is locked` cannot happen: nobody else writes, and readers of a WAL database wait for nobody.
 
-pub(crate) mod apply;
-pub(crate) mod writer;
+mod apply;
+mod forget;
+mod models;
+mod moves;
+mod query;
+mod retention;
+mod writer;
 
 use std::cmp::Ordering;
-use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 
+use async_trait::async_trait;
 use sqlx::migrate::{MigrateError, Migrator};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{Connection, Row, SqliteConnection, SqlitePool};
 
-use crate::identity::{Found, StoreId, Stored, Verdict};
-use crate::store::OpenError;
-use crate::{WriteError, clock};
+pub(crate) use query::SqliteRecords;
+pub(crate) use writer::{Session, Writer};
+
+use crate::catalog::{Catalog, Done, Order, Records};
+use crate::folder::{self, DATABASE};
+use crate::identity::{Found, Verdict};
+use crate::open_error::OpenError;
+use crate::store_id::{StoreId, Stored};
+use crate::{QueryError, WriteError, clock};
 
 pub(crate) static MIGRATOR: Migrator = sqlx::migrate!("../migrations");
 
-/// The database's name in its folder.
-pub(crate) const FILE: &str = "stride.db";
-
-/// Where a folder's database lies.
-pub(crate) fn path(dir: &Path) -> PathBuf {
-    dir.join(FILE)
-}
-
-/// Where its write-ahead log lies.
-pub(crate) fn log_path(dir: &Path) -> PathBuf {
-    dir.join(format!("{FILE}-wal"))
-}
-
-/// Bytes of the write-ahead log; 0 if there is none.
-pub(crate) fn log_bytes(dir: &Path) -> u64 {
-    fs::metadata(log_path(dir)).map_or(0, |metadata| metadata.len())
-}
-
-/// Whether a folder holds a database. An empty file is none: SQLite would take it for a new one, and drop its log.
-pub(crate) fn is_there(dir: &Path) -> bool {
-    fs::metadata(path(dir)).is_ok_and(|metadata| metadata.len() > 0)
-}
-
 fn options(dir: &Path) -> SqliteConnectOptions {
     SqliteConnectOptions::new()
-        .filename(dir.join(FILE))
+        .filename(folder::database(dir))
         .journal_mode(SqliteJournalMode::Wal)
         .synchronous(SqliteSynchronous::Full)
         .foreign_keys(true)
         .busy_timeout(Duration::from_secs(10))
         .statement_cache_capacity(200)
+}
+
+/// A database that this process writes to.
+#[derive(Debug)]
+pub(crate) struct SqliteCatalog {
+    pub(crate) writer: Writer,
+    pub(crate) records: Arc<SqliteRecords>,
+}
+
+#[async_trait]
+impl Catalog for SqliteCatalog {
+    fn records(&self) -> Arc<dyn Records> {
+        Arc::<SqliteRecords>::clone(&self.records)
+    }
+
+    async fn commit(&self, order: Order) -> Result<Done, WriteError> {
+        self.writer.order(order).await
+    }
 }
 
 /// A database opened for writing.
@@ -66,8 +73,8 @@ pub(crate) struct Opened {
 /// Opens the writing connection and brings the schema up to date, once the database belongs to what was `found` beside it. Only
 /// for the holder of the store's lock.
 pub(crate) async fn open_writer(dir: &Path, found: &Found, adopt: bool) -> Result<Opened, OpenError> {
-    let path = path(dir);
-    let existed = is_there(dir);
+    let path = folder::database(dir);
+    let existed = folder::has_database(dir);
     let mismatch = |mismatch| OpenError::Mismatch { dir: dir.to_owned(), mismatch };
     if !existed {
         found.judge(None).map_err(mismatch)?;
@@ -110,7 +117,7 @@ async fn belongs(
     if !existed {
         return Ok(Verdict::New);
     }
-    let failed = |e: &sqlx::Error| open_error(&path(dir), e);
+    let failed = |e: &sqlx::Error| open_error(&folder::database(dir), e);
     let stored = stored(conn).await.map_err(|e| failed(&e))?;
     match (found.judge(stored.as_ref()), stored) {
         (Ok(verdict), _) => Ok(verdict),
@@ -141,11 +148,6 @@ async fn stored(conn: &mut SqliteConnection) -> Result<Option<Stored>, sqlx::Err
     .transpose()
 }
 
-/// What the database that a connection is open on says of its store, now.
-pub(crate) async fn stored_now(conn: &mut SqliteConnection) -> Result<Option<Stored>, sqlx::Error> {
-    stored(conn).await
-}
-
 /// Gives a new database the name of a new store.
 async fn name(path: &Path, conn: &mut SqliteConnection) -> Result<StoreId, OpenError> {
     let io = |e: std::io::Error| OpenError::Other { path: path.to_owned(), message: e.to_string() };
@@ -158,16 +160,19 @@ async fn name(path: &Path, conn: &mut SqliteConnection) -> Result<StoreId, OpenE
 
 /// Raises the database's epoch: from here on whoever opened it before cannot write to it.
 pub(crate) async fn raise_epoch(dir: &Path, conn: &mut SqliteConnection) -> Result<Stored, OpenError> {
-    let failed = |e: &sqlx::Error| open_error(&path(dir), e);
+    let failed = |e: &sqlx::Error| open_error(&folder::database(dir), e);
     let raise = "UPDATE store SET epoch = epoch + 1, commits = commits + 1";
     sqlx::query(raise).execute(&mut *conn).await.map_err(|e| failed(&e))?;
     let stored = stored(conn).await.map_err(|e| failed(&e))?;
-    stored.ok_or_else(|| OpenError::Damaged { path: path(dir), message: "the row of the store is gone".into() })
+    stored.ok_or_else(|| OpenError::Damaged {
+        path: folder::database(dir),
+        message: "the row of the store is gone".into(),
+    })
 }
 
 /// Makes the epoch of a database that nobody has opened at least `epoch`.
 pub(crate) async fn reach_epoch(dir: &Path, epoch: u64) -> Result<(), sqlx::Error> {
-    let options = SqliteConnectOptions::new().filename(path(dir)).synchronous(SqliteSynchronous::Full);
+    let options = SqliteConnectOptions::new().filename(folder::database(dir)).synchronous(SqliteSynchronous::Full);
     let mut conn = SqliteConnection::connect_with(&options).await?;
     let reach = sqlx::query("UPDATE store SET epoch = max(epoch, ?)").bind(apply::int(epoch));
     reach.execute(&mut conn).await?;
@@ -187,7 +192,7 @@ pub(crate) async fn open_copy(path: &Path) -> Result<SqliteConnection, sqlx::Err
 
 fn reading(dir: &Path, closed: bool) -> SqliteConnectOptions {
     SqliteConnectOptions::new()
-        .filename(path(dir))
+        .filename(folder::database(dir))
         .read_only(true)
         .immutable(closed)
         .busy_timeout(Duration::from_secs(10))
@@ -197,10 +202,10 @@ fn reading(dir: &Path, closed: bool) -> SqliteConnectOptions {
 /// Whether a database that is only read belongs to what was `found` beside it and has the schema that this build reads; gives the
 /// store's name.
 pub(crate) async fn check_to_read(dir: &Path, found: &Found, closed: bool) -> Result<StoreId, OpenError> {
-    let path = path(dir);
+    let path = folder::database(dir);
     let mismatch = |mismatch| OpenError::Mismatch { dir: dir.to_owned(), mismatch };
     let failed = |e: &sqlx::Error| open_error(&path, e);
-    if !is_there(dir) {
+    if !folder::has_database(dir) {
         found.judge(None).map_err(mismatch)?;
         return Err(OpenError::NotAStore(dir.to_owned()));
     }
@@ -226,7 +231,7 @@ fn newest() -> i64 {
 
 /// Keeps a copy beside the database when this build is about to change its schema.
 async fn back_up_before_migrating(dir: &Path, conn: &mut SqliteConnection) -> Result<(), OpenError> {
-    let path = path(dir);
+    let path = folder::database(dir);
     let has_table = sqlx::query("SELECT count(*) FROM sqlite_master WHERE name = '_sqlx_migrations'");
     let has_table: i64 = has_table.fetch_one(&mut *conn).await.map_err(|e| open_error(&path, &e))?.get(0);
     if has_table == 0 {
@@ -237,7 +242,7 @@ async fn back_up_before_migrating(dir: &Path, conn: &mut SqliteConnection) -> Re
     if applied == 0 || applied >= newest() {
         return Ok(());
     }
-    let copy = dir.join(format!("{FILE}.before-{:04}", newest()));
+    let copy = dir.join(format!("{DATABASE}.before-{:04}", newest()));
     if copy.exists() {
         // A migration that was cut short has been here; its copy is the older and so the better one.
         return Ok(());
@@ -268,6 +273,15 @@ fn open_error(path: &Path, e: &sqlx::Error) -> OpenError {
         Some(SQLITE_FULL) => OpenError::Full { path, message },
         Some(SQLITE_CORRUPT | SQLITE_NOTADB) => OpenError::Damaged { path, message },
         _ => OpenError::Other { path, message },
+    }
+}
+
+impl From<sqlx::Error> for QueryError {
+    fn from(e: sqlx::Error) -> Self {
+        match code(&e) {
+            Some(SQLITE_IOERR | SQLITE_FULL) => Self::Storage(format!("the disk refused to serve the database ({e})")),
+            _ => Self::Database(e.to_string()),
+        }
     }
 }
 
@@ -325,7 +339,7 @@ mod tests {
             conn.close().await.unwrap();
             let mut conn = opened(dir.path()).await;
             assert_eq!(schema(&mut conn).await, newest_schema, "from {count} migrations");
-            assert!(dir.path().join(format!("{FILE}.before-{:04}", newest())).exists());
+            assert!(dir.path().join(format!("{DATABASE}.before-{:04}", newest())).exists());
         }
     }
 

@@ -1,0 +1,103 @@
+//! Models, versions and moves as rows, from any connection.
+
+use std::collections::BTreeMap;
+
+use protocol::stage::Mode;
+use protocol::{Alias, Digest, ModelName};
+use sqlx::sqlite::SqliteRow;
+use sqlx::{Row, SqliteConnection};
+
+use crate::versions::{self, Action, Model, Promotion, Version};
+
+/// Metrics as stored; what was no number is NaN again.
+pub(super) fn numbers(text: &str) -> BTreeMap<String, f64> {
+    let stored: BTreeMap<String, Option<f64>> = serde_json::from_str(text).unwrap_or_default();
+    stored.into_iter().map(|(key, value)| (key, value.unwrap_or(f64::NAN))).collect()
+}
+
+pub(super) fn digest(row: &SqliteRow, column: &str) -> Result<Digest, sqlx::Error> {
+    let text: String = row.try_get(column)?;
+    text.parse().map_err(|e| sqlx::Error::ColumnDecode { index: column.to_owned(), source: Box::new(e) })
+}
+
+fn number(row: &SqliteRow, column: &str) -> Result<u64, sqlx::Error> {
+    Ok(row.try_get::<i64, _>(column)?.unsigned_abs())
+}
+
+fn version(row: &SqliteRow) -> Result<Version, sqlx::Error> {
+    let aliases: Option<String> = row.try_get("aliases")?;
+    Ok(Version {
+        model: ModelName::new(row.try_get::<String, _>("model")?),
+        version: number(row, "version")?,
+        artifact: digest(row, "artifact")?,
+        metrics: numbers(row.try_get("metrics")?),
+        source: serde_json::from_str(row.try_get("source")?).unwrap_or_default(),
+        created_ms: row.try_get("at_ms")?,
+        aliases: aliases.map(|names| names.split(',').map(str::to_owned).collect()).unwrap_or_default(),
+    })
+}
+
+const VERSIONS: &str = "SELECT v.*, (SELECT group_concat(alias, ',') FROM (SELECT alias FROM aliases a \
+    WHERE a.model = v.model AND a.version = v.version ORDER BY alias)) AS aliases \
+    FROM versions v WHERE v.model = ? ORDER BY v.version";
+
+/// All versions of a model, oldest first.
+pub(super) async fn versions(conn: &mut SqliteConnection, model: &ModelName) -> Result<Vec<Version>, sqlx::Error> {
+    let rows = sqlx::query(VERSIONS).bind(model.as_str()).fetch_all(&mut *conn).await?;
+    rows.iter().map(version).collect()
+}
+
+async fn declared(
+    conn: &mut SqliteConnection,
+    model: &ModelName,
+) -> Result<Option<(Option<String>, Option<Mode>)>, sqlx::Error> {
+    let row = sqlx::query("SELECT metric, mode FROM models WHERE model = ?")
+        .bind(model.as_str())
+        .fetch_optional(&mut *conn)
+        .await?;
+    let Some(row) = row else { return Ok(None) };
+    let mode = row.try_get::<Option<String>, _>("mode")?.map(|mode| if mode == "max" { Mode::Max } else { Mode::Min });
+    Ok(Some((row.try_get("metric")?, mode)))
+}
+
+/// One model.
+pub(super) async fn model(conn: &mut SqliteConnection, name: &ModelName) -> Result<Option<Model>, sqlx::Error> {
+    let Some((metric, mode)) = declared(conn, name).await? else { return Ok(None) };
+    let versions = versions(conn, name).await?;
+    Ok(Some(versions::summary(name.clone(), metric, mode, &versions)))
+}
+
+/// All models by name.
+pub(super) async fn models(conn: &mut SqliteConnection) -> Result<Vec<Model>, sqlx::Error> {
+    let rows = sqlx::query("SELECT model FROM models ORDER BY model").fetch_all(&mut *conn).await?;
+    let mut models = Vec::with_capacity(rows.len());
+    for row in rows {
+        models.extend(model(conn, &ModelName::new(row.try_get::<String, _>(0)?)).await?);
+    }
+    Ok(models)
+}
+
+/// The moves of a model's aliases, or of one of them, oldest first.
+pub(super) async fn history(
+    conn: &mut SqliteConnection,
+    model: &ModelName,
+    alias: Option<&Alias>,
+) -> Result<Vec<Promotion>, sqlx::Error> {
+    let find = sqlx::query("SELECT * FROM promotions WHERE model = ?1 AND (?2 IS NULL OR alias = ?2) ORDER BY id");
+    let rows = find.bind(model.as_str()).bind(alias.map(Alias::as_str)).fetch_all(&mut *conn).await?;
+    let entry = |row: &SqliteRow| -> Result<Promotion, sqlx::Error> {
+        Ok(Promotion {
+            id: row.try_get("id")?,
+            at_ms: row.try_get("at_ms")?,
+            model: model.clone(),
+            alias: Alias::new(row.try_get::<String, _>("alias")?),
+            action: if row.try_get::<String, _>("action")? == "rollback" { Action::Rollback } else { Action::Promote },
+            from: row.try_get::<Option<i64>, _>("from_version")?.map(i64::unsigned_abs),
+            to: number(row, "to_version")?,
+            actor: row.try_get("actor")?,
+            reason: row.try_get("reason")?,
+            gates: serde_json::from_str(row.try_get("gates")?).unwrap_or_default(),
+        })
+    };
+    rows.iter().map(entry).collect()
+}

@@ -1,0 +1,347 @@
+//! What is asked, as SQL over connections that only read.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use async_trait::async_trait;
+use protocol::{Alias, Attempt, Digest, ModelName, RunId, StageName, TaskId, WorkerId};
+use sqlx::pool::PoolConnection;
+use sqlx::sqlite::SqliteRow;
+use sqlx::{Connection, Row, Sqlite, SqliteConnection, SqlitePool};
+
+use super::apply::json;
+use super::models::{self, numbers};
+use super::retention;
+use crate::QueryError;
+use crate::catalog::{CheckpointRow, EndedRow, LineageNode, LogRow, Needs, Records, Recovery, RunRow, StageResultRow};
+use crate::curve::{Curve, Curves};
+use crate::store_id::Stored;
+use crate::versions::{Model, Promotion, Version};
+
+type Result<T> = std::result::Result<T, QueryError>;
+
+/// Connections that read.
+#[derive(Debug)]
+pub(crate) struct SqliteRecords(SqlitePool);
+
+impl SqliteRecords {
+    /// Over connections that [`super::open_readers`] has made.
+    pub(crate) fn new(readers: SqlitePool) -> Self {
+        Self(readers)
+    }
+
+    async fn connection(&self) -> Result<PoolConnection<Sqlite>> {
+        Ok(self.0.acquire().await?)
+    }
+}
+
+#[async_trait]
+impl Records for SqliteRecords {
+    async fn stored(&self) -> Result<Option<Stored>> {
+        Ok(super::stored(&mut *self.connection().await?).await?)
+    }
+
+    async fn recovery(&self) -> Result<Recovery> {
+        let mut conn = self.connection().await?;
+        // One statement is one moment of the database; two might see a snapshot and no longer the facts before it.
+        let all = "SELECT 0 AS kind, seq, state AS text FROM (SELECT * FROM snapshots ORDER BY seq DESC LIMIT 1) \
+                   UNION ALL SELECT 1, seq, facts FROM facts ORDER BY kind, seq";
+        let mut recovery = Recovery::default();
+        for row in sqlx::query(all).fetch_all(&mut *conn).await? {
+            let (kind, seq, text): (i64, i64, String) = (row.try_get(0)?, row.try_get(1)?, row.try_get(2)?);
+            match kind {
+                0 => recovery.snapshot = Some((seq.unsigned_abs(), text)),
+                _ => recovery.facts.push((seq.unsigned_abs(), text)),
+            }
+        }
+        Ok(recovery)
+    }
+
+    async fn ended(&self, run: &RunId) -> Result<Option<EndedRow>> {
+        let mut conn = self.connection().await?;
+        let find = sqlx::query("SELECT view, archive FROM runs WHERE run = ? AND view IS NOT NULL");
+        let row = find.bind(run.as_str()).fetch_optional(&mut *conn).await?;
+        let ended = |row: SqliteRow| Ok(EndedRow { view: row.try_get(0)?, archive: row.try_get(1)? });
+        row.map(ended).transpose()
+    }
+
+    async fn ended_views(&self, limit: u32) -> Result<Vec<(RunId, String)>> {
+        let mut conn = self.connection().await?;
+        let find = "SELECT run, view FROM (SELECT rowid AS number, run, view FROM runs WHERE view IS NOT NULL \
+                    ORDER BY rowid DESC LIMIT ?) ORDER BY number";
+        let rows = sqlx::query(find).bind(limit).fetch_all(&mut *conn).await?;
+        rows.iter().map(|row| Ok((RunId::new(row.try_get::<String, _>(0)?), row.try_get(1)?))).collect()
+    }
+
+    async fn sources(&self, keys: &[Digest]) -> Result<BTreeMap<Digest, (RunId, StageName)>> {
+        let mut conn = self.connection().await?;
+        let find = "SELECT key, run, stage FROM executions WHERE key IN (SELECT value FROM json_each(?1)) \
+                    UNION ALL SELECT key, run, stage FROM stage_results WHERE key IN (SELECT value FROM json_each(?1))";
+        let rows = sqlx::query(find).bind(json(&keys)).fetch_all(&mut *conn).await?;
+        let source = |row: &SqliteRow| -> Result<_> {
+            let (run, stage): (String, String) = (row.try_get("run")?, row.try_get("stage")?);
+            Ok((digest(row, "key")?, (RunId::new(run), StageName::new(stage))))
+        };
+        // A value that is there stands behind what was left on the way to it.
+        rows.iter().map(source).collect()
+    }
+
+    async fn archived_execution(&self, key: Digest) -> Result<Option<String>> {
+        let mut conn = self.connection().await?;
+        let find = sqlx::query("SELECT execution FROM executions WHERE key = ?").bind(key.to_string());
+        Ok(find.fetch_optional(&mut *conn).await?.map(|row| row.try_get(0)).transpose()?)
+    }
+
+    async fn stage_results(&self, keys: &[Digest]) -> Result<BTreeMap<Digest, StageResultRow>> {
+        let mut conn = self.connection().await?;
+        let find = "SELECT * FROM stage_results WHERE key IN (SELECT value FROM json_each(?))";
+        let rows = sqlx::query(find).bind(json(&keys)).fetch_all(&mut *conn).await?;
+        rows.iter().map(|row| stage_result(row).map(|result| (result.key, result))).collect()
+    }
+
+    async fn runs(&self) -> Result<Vec<RunRow>> {
+        let mut conn = self.connection().await?;
+        let rows = sqlx::query("SELECT * FROM runs ORDER BY created_ms DESC, rowid DESC").fetch_all(&mut *conn).await?;
+        rows.iter().map(run_row).collect()
+    }
+
+    async fn run(&self, run: &RunId) -> Result<Option<RunRow>> {
+        let mut conn = self.connection().await?;
+        let find = sqlx::query("SELECT * FROM runs WHERE run = ?").bind(run.as_str());
+        find.fetch_optional(&mut *conn).await?.as_ref().map(run_row).transpose()
+    }
+
+    async fn run_by_key(&self, key: &str) -> Result<Option<RunRow>> {
+        let mut conn = self.connection().await?;
+        let find = sqlx::query("SELECT * FROM runs WHERE idempotency_key = ?").bind(key);
+        find.fetch_optional(&mut *conn).await?.as_ref().map(run_row).transpose()
+    }
+
+    async fn checkpoints(&self, task: &TaskId) -> Result<Vec<CheckpointRow>> {
+        let mut conn = self.connection().await?;
+        checkpoints(&mut conn, task).await
+    }
+
+    async fn shards(&self, run: &RunId) -> Result<BTreeMap<TaskId, Digest>> {
+        let mut conn = self.connection().await?;
+        let rows = sqlx::query("SELECT task, output FROM shards WHERE run = ?")
+            .bind(run.as_str())
+            .fetch_all(&mut *conn)
+            .await?;
+        rows.iter().map(|row| Ok((TaskId::new(row.try_get::<String, _>(0)?), digest(row, "output")?))).collect()
+    }
+
+    async fn logs(&self, run: &RunId, stage: Option<&StageName>, after: i64, limit: u32) -> Result<Vec<LogRow>> {
+        let mut conn = self.connection().await?;
+        let find = sqlx::query(
+            "SELECT * FROM logs WHERE run = ?1 AND (?2 IS NULL OR stage = ?2) AND id > ?3 ORDER BY id LIMIT ?4",
+        );
+        let find = find.bind(run.as_str()).bind(stage.map(StageName::as_str)).bind(after).bind(limit);
+        let line = |row: &SqliteRow| -> Result<LogRow> {
+            Ok(LogRow {
+                id: row.try_get("id")?,
+                task: TaskId::new(row.try_get::<String, _>("task")?),
+                attempt: Attempt(row.try_get::<i64, _>("attempt")?.unsigned_abs()),
+                worker: WorkerId::new(row.try_get::<String, _>("worker")?),
+                line: row.try_get::<i64, _>("line")?.unsigned_abs(),
+                at_ms: row.try_get("at_ms")?,
+                text: row.try_get("text")?,
+            })
+        };
+        find.fetch_all(&mut *conn).await?.iter().map(line).collect()
+    }
+
+    async fn models(&self) -> Result<Vec<Model>> {
+        let mut conn = self.connection().await?;
+        Ok(models::models(&mut conn).await?)
+    }
+
+    async fn model(&self, model: &ModelName) -> Result<Option<Model>> {
+        let mut conn = self.connection().await?;
+        Ok(models::model(&mut conn, model).await?)
+    }
+
+    async fn versions(&self, model: &ModelName) -> Result<Vec<Version>> {
+        let mut conn = self.connection().await?;
+        Ok(models::versions(&mut conn, model).await?)
+    }
+
+    async fn history(&self, model: &ModelName, alias: Option<&Alias>) -> Result<Vec<Promotion>> {
+        let mut conn = self.connection().await?;
+        Ok(models::history(&mut conn, model, alias).await?)
+    }
+
+    async fn lineage(&self, digest: Digest) -> Result<Vec<LineageNode>> {
+        let mut conn = self.connection().await?;
+        lineage(&mut conn, digest).await
+    }
+
+    async fn ended_before(&self, before_ms: i64) -> Result<Vec<RunId>> {
+        let mut conn = self.connection().await?;
+        let find = "SELECT run FROM runs WHERE state IN ('finished', 'failed', 'cancelled') AND view IS NOT NULL \
+                    AND updated_ms < ? ORDER BY updated_ms, run";
+        let rows = sqlx::query(find).bind(before_ms).fetch_all(&mut *conn).await?;
+        rows.iter().map(|row| Ok(RunId::new(row.try_get::<String, _>(0)?))).collect()
+    }
+
+    async fn metrics(
+        &self,
+        run: &RunId,
+        stage: &StageName,
+        keys: Option<&[String]>,
+        points: usize,
+    ) -> Result<BTreeMap<String, Curve>> {
+        let mut conn = self.connection().await?;
+        let find = sqlx::query(
+            "SELECT s.key, s.task, s.attempt, m.step, m.value FROM series s JOIN metrics m ON m.series = s.id \
+             WHERE s.run = ?1 AND s.stage = ?2 AND (?3 IS NULL OR s.key IN (SELECT value FROM json_each(?3))) \
+             ORDER BY s.key, s.task, s.attempt DESC, m.step",
+        );
+        let keys = keys.map(|keys| json(&keys));
+        let rows = find.bind(run.as_str()).bind(stage.as_str()).bind(keys).fetch_all(&mut *conn).await?;
+        let mut curves = Curves::default();
+        for row in &rows {
+            let step = row.try_get::<i64, _>(3)?.unsigned_abs();
+            curves.push(row.try_get(0)?, row.try_get(1)?, row.try_get(2)?, step, row.try_get(4)?);
+        }
+        Ok(curves.finish(points))
+    }
+
+    async fn needs(&self) -> Result<Needs> {
+        let mut conn = self.connection().await?;
+        // A transaction that reads sees one moment of the database.
+        let mut moment = conn.begin().await?;
+        let needs = retention::needs(&mut moment).await?;
+        moment.rollback().await?;
+        Ok(needs)
+    }
+
+    async fn problems(&self) -> Result<Vec<String>> {
+        let mut conn = self.connection().await?;
+        let mut problems = Vec::new();
+        for row in sqlx::query("PRAGMA integrity_check").fetch_all(&mut *conn).await? {
+            let line: String = row.try_get(0)?;
+            if line != "ok" {
+                problems.push(format!("database: {line}"));
+            }
+        }
+        for row in sqlx::query("PRAGMA foreign_key_check").fetch_all(&mut *conn).await? {
+            problems.push(format!("database: a row of `{}` points at nothing", row.try_get::<String, _>(0)?));
+        }
+        Ok(problems)
+    }
+
+    async fn copy_to(&self, path: &Path) -> Result<Needs> {
+        let mut conn = self.connection().await?;
+        sqlx::query("VACUUM INTO ?").bind(path.to_string_lossy().into_owned()).execute(&mut *conn).await?;
+        drop(conn);
+        let mut copy = super::open_copy(path).await?;
+        let needs = retention::needs(&mut copy).await;
+        let checked: String = sqlx::query("PRAGMA integrity_check").fetch_one(&mut copy).await?.try_get(0)?;
+        copy.close().await?;
+        match checked.as_str() {
+            "ok" => needs,
+            problem => Err(QueryError::Blob(format!("the database is damaged: {problem}"))),
+        }
+    }
+
+    async fn close(&self) {
+        self.0.close().await;
+    }
+}
+
+pub(super) fn digest(row: &SqliteRow, column: &str) -> Result<Digest> {
+    let text: String = row.try_get(column)?;
+    text.parse().map_err(|e| QueryError::Blob(format!("column `{column}`: {e}")))
+}
+
+pub(super) fn digests(text: &str) -> Result<BTreeMap<String, Digest>> {
+    serde_json::from_str(text).map_err(|e| QueryError::Blob(format!("a list of artifacts does not read: {e}")))
+}
+
+fn stage_result(row: &SqliteRow) -> Result<StageResultRow> {
+    Ok(StageResultRow {
+        key: digest(row, "key")?,
+        run: RunId::new(row.try_get::<String, _>("run")?),
+        stage: StageName::new(row.try_get::<String, _>("stage")?),
+        kind: row.try_get("kind")?,
+        outputs: digests(row.try_get("outputs")?)?,
+        metrics: numbers(row.try_get("metrics")?),
+        inputs: digests(row.try_get("inputs")?)?,
+        wall_s: row.try_get("wall_s")?,
+        at_ms: row.try_get("at_ms")?,
+    })
+}
+
+fn run_row(row: &SqliteRow) -> Result<RunRow> {
+    let pipeline: &str = row.try_get("pipeline")?;
+    Ok(RunRow {
+        run: RunId::new(row.try_get::<String, _>("run")?),
+        pipeline: serde_json::from_str(pipeline)
+            .map_err(|e| QueryError::Blob(format!("a stored pipeline is no JSON: {e}")))?,
+        source: row.try_get("source")?,
+        state: row.try_get("state")?,
+        idempotency_key: row.try_get("idempotency_key")?,
+        created_ms: row.try_get("created_ms")?,
+        updated_ms: row.try_get("updated_ms")?,
+    })
+}
+
+pub(super) async fn checkpoints(conn: &mut SqliteConnection, task: &TaskId) -> Result<Vec<CheckpointRow>> {
+    let find = sqlx::query("SELECT * FROM checkpoints WHERE task = ? ORDER BY step DESC, id DESC").bind(task.as_str());
+    let checkpoint = |row: &SqliteRow| -> Result<CheckpointRow> {
+        Ok(CheckpointRow {
+            task: task.clone(),
+            attempt: Attempt(row.try_get::<i64, _>("attempt")?.unsigned_abs()),
+            step: row.try_get::<i64, _>("step")?.unsigned_abs(),
+            manifest: digest(row, "manifest")?,
+            metrics: numbers(row.try_get("metrics")?),
+            at_ms: row.try_get("at_ms")?,
+        })
+    };
+    find.fetch_all(&mut *conn).await?.iter().map(checkpoint).collect()
+}
+
+pub(super) async fn lineage(conn: &mut SqliteConnection, root: Digest) -> Result<Vec<LineageNode>> {
+    let mut nodes: Vec<LineageNode> = Vec::new();
+    let mut next = vec![root];
+    let mut depth = 0;
+    while !next.is_empty() {
+        let mut after = Vec::new();
+        for digest_ in next {
+            if nodes.iter().any(|node| node.digest == digest_) {
+                continue;
+            }
+            let name = digest_.to_string();
+            let row =
+                sqlx::query("SELECT * FROM artifacts WHERE digest = ?").bind(&name).fetch_optional(&mut *conn).await?;
+            let edges = sqlx::query("SELECT parent, role FROM edges WHERE child = ? ORDER BY role").bind(&name);
+            let mut inputs = BTreeMap::new();
+            for edge in edges.fetch_all(&mut *conn).await? {
+                inputs.insert(edge.try_get::<String, _>("role")?, digest(&edge, "parent")?);
+            }
+            after.extend(inputs.values().copied());
+            let mut node = LineageNode {
+                digest: digest_,
+                kind: None,
+                run: None,
+                stage: None,
+                key: None,
+                bytes: None,
+                inputs,
+                depth,
+            };
+            if let Some(row) = row {
+                node.kind = row.try_get("kind")?;
+                node.run = row.try_get("run")?;
+                node.stage = row.try_get("stage")?;
+                node.key = row.try_get("key")?;
+                node.bytes = Some(row.try_get::<i64, _>("bytes")?.unsigned_abs());
+            }
+            nodes.push(node);
+        }
+        next = after;
+        depth += 1;
+    }
+    Ok(nodes)
+}

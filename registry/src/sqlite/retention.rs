@@ -1,0 +1,102 @@
+//! What may go, as rows: checkpoints by policy, shards whose stage is done, pins; and what rows need of the blobs.
+
+use std::collections::{BTreeSet, HashMap};
+
+use protocol::stage::Keep;
+use protocol::{Digest, TaskId};
+use sqlx::{Row, SqliteConnection};
+
+use super::apply::{int, run};
+use super::query::{checkpoints, digest, digests};
+use super::write_error;
+use crate::catalog::{Needs, Root};
+use crate::vouched::{Vouched, complete};
+use crate::{QueryError, WriteError, clock};
+
+/// Forgets a task's checkpoints but those that `keep` names. A metric that none of them has is refused, and all of them stay.
+pub(super) async fn prune(conn: &mut SqliteConnection, task: &TaskId, keep: &Keep) -> Result<Vec<Digest>, WriteError> {
+    let mut rows = checkpoints(conn, task).await?;
+    rows.reverse();
+    let metrics: Vec<_> = rows.iter().map(|row| &row.metrics).collect();
+    if !rows.is_empty() {
+        let saved: BTreeSet<&str> = metrics.iter().flat_map(|row| row.keys().map(String::as_str)).collect();
+        keep.check(saved).map_err(|why| WriteError::Conflict(format!("checkpoints of `{task}`: {why}")))?;
+    }
+    let kept = keep.kept(&metrics);
+    let mut forgotten = Vec::new();
+    for (row, _) in rows.iter().zip(kept).filter(|(_, kept)| !kept) {
+        let forget = sqlx::query("DELETE FROM checkpoints WHERE task = ? AND step = ? AND manifest = ?");
+        run(conn, forget.bind(task.as_str()).bind(int(row.step)).bind(row.manifest.to_string())).await?;
+        forgotten.push(row.manifest);
+    }
+    Ok(forgotten)
+}
+
+/// Sets a pin, or ends it.
+pub(super) async fn pin(
+    conn: &mut SqliteConnection,
+    blobs: &Vouched,
+    digest: Digest,
+    reason: Option<&str>,
+) -> Result<(), WriteError> {
+    let name = digest.to_string();
+    let Some(reason) = reason else {
+        return run(conn, sqlx::query("DELETE FROM pins WHERE digest = ?").bind(name)).await.map(|_| ());
+    };
+    complete(blobs, digest)?;
+    let set =
+        "INSERT INTO pins (digest, reason, at_ms) VALUES (?, ?, ?) ON CONFLICT DO UPDATE SET reason = excluded.reason";
+    run(conn, sqlx::query(set).bind(name).bind(reason).bind(clock::now_ms())).await.map(|_| ())
+}
+
+/// Forgets the shards of finished runs, for which the stage's artifact stands; returns their tasks.
+pub(super) async fn forget_shards(conn: &mut SqliteConnection) -> Result<Vec<TaskId>, WriteError> {
+    let forget = "DELETE FROM shards WHERE run IN (SELECT run FROM runs WHERE state = 'finished') RETURNING task";
+    let rows = sqlx::query(forget).fetch_all(conn).await.map_err(write_error)?;
+    let mut tasks: Vec<_> = rows.iter().map(|row| TaskId::new(row.get::<String, _>(0))).collect();
+    tasks.sort();
+    Ok(tasks)
+}
+
+/// What the rows need of the blobs.
+pub(super) async fn needs(conn: &mut SqliteConnection) -> Result<Needs, QueryError> {
+    let done = "SELECT task FROM shards WHERE run IN (SELECT run FROM runs WHERE state = 'finished') ORDER BY task";
+    let done = sqlx::query(done).fetch_all(&mut *conn).await?;
+    let done_shards = done.iter().map(|row| row.try_get::<String, _>(0).map(TaskId::new)).collect::<Result<_, _>>()?;
+    let mut parents: HashMap<Digest, Vec<Digest>> = HashMap::new();
+    for row in sqlx::query("SELECT parent, child FROM edges").fetch_all(&mut *conn).await? {
+        parents.entry(digest(&row, "child")?).or_default().push(digest(&row, "parent")?);
+    }
+    let live = "SELECT EXISTS (SELECT 1 FROM runs WHERE state IN ('running', 'paused'))";
+    let live = sqlx::query(live).fetch_one(&mut *conn).await?.try_get(0)?;
+    Ok(Needs { roots: roots(conn).await?, parents, done_shards, live })
+}
+
+/// Every digest that a row names and that must therefore be whole, with the row in words.
+async fn roots(conn: &mut SqliteConnection) -> Result<Vec<Root>, QueryError> {
+    let mut roots = Vec::new();
+    let mut add = |digest: Digest, what: String, shard: Option<TaskId>| roots.push(Root { digest, what, shard });
+    for row in sqlx::query("SELECT model, version, artifact FROM versions").fetch_all(&mut *conn).await? {
+        let (model, version): (String, i64) = (row.try_get(0)?, row.try_get(1)?);
+        add(digest(&row, "artifact")?, format!("version {model}:{version}"), None);
+    }
+    for row in sqlx::query("SELECT key, run, stage, outputs FROM stage_results").fetch_all(&mut *conn).await? {
+        let (run, stage): (String, String) = (row.try_get("run")?, row.try_get("stage")?);
+        for (name, digest) in digests(row.try_get("outputs")?)? {
+            add(digest, format!("output `{name}` of `{run}/{stage}`"), None);
+        }
+    }
+    for row in sqlx::query("SELECT task, step, manifest FROM checkpoints").fetch_all(&mut *conn).await? {
+        let (task, step): (String, i64) = (row.try_get(0)?, row.try_get(1)?);
+        add(digest(&row, "manifest")?, format!("checkpoint of `{task}` at step {step}"), None);
+    }
+    for row in sqlx::query("SELECT task, output FROM shards").fetch_all(&mut *conn).await? {
+        let task: String = row.try_get(0)?;
+        add(digest(&row, "output")?, format!("shard `{task}`"), Some(TaskId::new(task)));
+    }
+    for row in sqlx::query("SELECT digest, reason FROM pins").fetch_all(&mut *conn).await? {
+        let reason: String = row.try_get(1)?;
+        add(digest(&row, "digest")?, format!("pin ({reason})"), None);
+    }
+    Ok(roots)
+}
