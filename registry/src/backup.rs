@@ -19,7 +19,7 @@ use std::io::{self, ErrorKind, Read, Write as _};
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 
-use checkpoint::BlobError;
+use checkpoint::{BLOBS, BlobError, blob_path};
 use protocol::Digest;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
@@ -124,11 +124,6 @@ fn sync(path: &Path) -> Result<(), BackupError> {
     File::open(path).and_then(|file| file.sync_all()).map_err(disk("cannot sync", path))
 }
 
-fn blob_path(dir: &Path, digest: Digest) -> PathBuf {
-    let hex = digest.hex();
-    dir.join("blobs/sha256").join(&hex[..2]).join(&hex[2..])
-}
-
 fn names(dir: &Path) -> Result<Vec<String>, BackupError> {
     let entries = match fs::read_dir(dir) {
         Ok(entries) => entries,
@@ -214,7 +209,7 @@ fn prepare(store: &ReadStore, to: &Path) -> Result<(), BackupError> {
             to.display()
         )));
     }
-    make_dir(&to.join("blobs/sha256"))?;
+    make_dir(&to.join(BLOBS))?;
     claim(&folder, marker, store.id())
 }
 
@@ -252,7 +247,7 @@ fn copy_blobs(
         copied.insert(digest, copy_blob(blobs, &blob_path(from, digest), &target, digest)?);
     }
     shards.iter().try_for_each(|shard| sync(shard))?;
-    sync(&to.join("blobs/sha256"))?;
+    sync(&to.join(BLOBS))?;
     sync(to)?;
     Ok(copied)
 }
@@ -283,7 +278,7 @@ fn remove_what_is_over(to: &Path, manifest: &Manifest) -> Result<(), BackupError
             remove(&to.join(name))?;
         }
     }
-    let blobs = to.join("blobs/sha256");
+    let blobs = to.join(BLOBS);
     for shard in names(&blobs)? {
         for name in names(&blobs.join(&shard))? {
             let digest = format!("sha256:{shard}{name}").parse::<Digest>();

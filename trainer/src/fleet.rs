@@ -40,6 +40,7 @@ pub(crate) struct Fleet {
     url: String,
     token: Token,
     backend: Backend,
+    store: PathBuf,
     logs: PathBuf,
     memory: Watch,
 }
@@ -53,10 +54,11 @@ pub(crate) struct Death {
 }
 
 impl Fleet {
-    /// Starts `count` workers for `coordinator`. What they say goes to files in `logs`.
-    pub(crate) fn start(count: usize, coordinator: &Handle, backend: Backend, logs: &Path) -> Result<Self> {
+    /// Starts `count` workers for `coordinator`, which holds `store`. What they say goes to files in its folder `workers`.
+    pub(crate) fn start(count: usize, coordinator: &Handle, backend: Backend, store: &Path) -> Result<Self> {
+        let logs = store.join("workers");
         // Their place is a comfort: without the folder they are silent.
-        let _ = std::fs::create_dir_all(logs);
+        let _ = std::fs::create_dir_all(&logs);
         let devices = device_count(backend);
         let now = Instant::now();
         let member = |i: usize| Member {
@@ -70,7 +72,7 @@ impl Fleet {
         };
         let members = (0..count).map(member).collect();
         let (url, token) = (coordinator.local_url(), coordinator.token().clone());
-        let mut fleet = Self { members, url, token, backend, logs: logs.to_owned(), memory: Watch::new() };
+        let mut fleet = Self { members, url, token, backend, store: store.to_owned(), logs, memory: Watch::new() };
         for i in 0..count {
             fleet.spawn(i)?;
         }
@@ -87,7 +89,8 @@ impl Fleet {
         member.log_from = std::fs::metadata(&log).map_or(0, |log| log.len());
         let child = Command::new(program)
             .args(["worker", "join", &self.url, "--name", member.name.as_str(), "--die-with-parent"])
-            .args(["--backend", self.backend.name(), "--device", &member.device.to_string()])
+            .args(["--backend", self.backend.name(), "--device", &member.device.to_string(), "--store"])
+            .arg(&self.store)
             // Not an argument, which every user of the machine can read.
             .env("STRIDE_TOKEN", self.token.secret())
             // Ours are of another server.

@@ -153,8 +153,7 @@ async fn watch(
         }
         if fleet.is_none() && wants_workers(&view) {
             let count = options.workers.unwrap_or_else(|| fleet::default_size(pipeline.backend));
-            let logs = options.store.join("workers");
-            *fleet = Some(Fleet::start(count, handle, pipeline.backend, &logs)?);
+            *fleet = Some(Fleet::start(count, handle, pipeline.backend, &options.store)?);
         }
         if let Some(fleet) = fleet {
             for death in fleet.reap(true)? {

@@ -148,6 +148,10 @@ impl Blobs for HttpBlobs {
     fn open(&self, digest: Digest) -> Result<Box<dyn Blob>, BlobError> {
         Ok(Box::new(self.cached(digest)?))
     }
+
+    fn map(&self, digest: Digest) -> Result<Bytes, BlobError> {
+        self.cached(digest)?.into_bytes()
+    }
 }
 
 fn error(gave_up: GaveUp, wanted: Option<Digest>) -> BlobError {

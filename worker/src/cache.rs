@@ -13,11 +13,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::SystemTime;
 
+use bytes::Bytes;
 use checkpoint::{Blob, BlobError};
 use protocol::Digest;
 use protocol::digest::Hasher;
 
 use crate::event_count::lock;
+use crate::mapped;
 
 /// Bounds, in bytes.
 #[derive(Debug, Clone, Copy)]
@@ -51,18 +53,20 @@ pub(crate) struct Cache {
     /// Blobs in nameless files that were fetched before somebody needed them.
     ahead: Mutex<HashMap<Digest, Cached>>,
     folder: Option<PathBuf>,
+    /// The folder of the coordinator's store, if it is on this machine: its blobs are read in place.
+    store: Option<PathBuf>,
     /// Bytes in the folder, as far as this process knows.
     disk: Mutex<u64>,
 }
 
 impl Cache {
-    pub(crate) fn new(folder: Option<PathBuf>, bounds: Bounds) -> std::io::Result<Self> {
+    pub(crate) fn new(folder: Option<PathBuf>, store: Option<PathBuf>, bounds: Bounds) -> std::io::Result<Self> {
         let mut bytes = 0;
         if let Some(folder) = &folder {
             fs::create_dir_all(folder)?;
             bytes = files(folder).iter().map(|(_, bytes, _)| bytes).sum();
         }
-        Ok(Self { bounds, memory: Mutex::default(), ahead: Mutex::default(), folder, disk: Mutex::new(bytes) })
+        Ok(Self { bounds, memory: Mutex::default(), ahead: Mutex::default(), folder, store, disk: Mutex::new(bytes) })
     }
 
     /// A blob that was read before, verified again.
@@ -72,6 +76,9 @@ impl Cache {
         }
         if let Some(blob) = lock(&self.ahead).get(&digest) {
             return Some(blob.clone());
+        }
+        if let Some(file) = self.in_store(digest) {
+            return self.keep_small(digest, Cached::File(file)).ok();
         }
         let path = self.path(digest)?;
         let mut file = File::open(&path).ok()?;
@@ -84,6 +91,15 @@ impl Cache {
         let _ = file.set_modified(SystemTime::now());
         let blob = Cached::File(CachedFile::new(digest, file).ok()?);
         self.keep_small(digest, blob).ok()
+    }
+
+    /// A blob of the store on this machine. What is missing or damaged there is the coordinator's to say.
+    fn in_store(&self, digest: Digest) -> Option<CachedFile> {
+        let mut file = File::open(checkpoint::blob_path(self.store.as_ref()?, digest)).ok()?;
+        if file.metadata().is_ok_and(|data| !data.is_file()) || digest_of(&mut file).ok() != Some(digest) {
+            return None;
+        }
+        CachedFile::new(digest, file).ok()
     }
 
     /// Keeps a blob that lies in a nameless file until [`forget_ahead`](Self::forget_ahead): somebody will read it soon.
@@ -217,6 +233,15 @@ impl Cached {
                 Self::File(file).read_at(0, out)?;
                 Ok(bytes)
             }
+        }
+    }
+
+    /// All of it, without memory of this process's own where it lies in a file.
+    pub(crate) fn into_bytes(self) -> Result<Bytes, BlobError> {
+        match self {
+            Self::Memory(bytes) => Ok(Bytes::from_owner(bytes)),
+            Self::File(file) => mapped::file(&file.file)
+                .map_err(|e| BlobError::Unavailable(format!("mapping the cached blob {}: {e}", file.digest))),
         }
     }
 }
@@ -395,7 +420,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let (digest, bytes) = blob(1, 100);
         let bounds = Bounds { small: 0, ..Bounds::default() };
-        let cache = Cache::new(Some(folder.path().to_owned()), bounds).expect("writable");
+        let cache = Cache::new(Some(folder.path().to_owned()), None, bounds).expect("writable");
         cache.insert(digest, &bytes);
         let found = cache.get(digest).expect("kept").into_memory().expect("read");
         assert_eq!(found, bytes);
@@ -405,10 +430,29 @@ mod tests {
     }
 
     #[test]
+    fn blobs_of_a_store_on_this_machine_are_read_in_place_and_verified() {
+        let (store, folder) = (tempfile::tempdir().expect("a folder"), tempfile::tempdir().expect("a folder"));
+        let (digest, bytes) = blob(1, 100);
+        let path = checkpoint::blob_path(store.path(), digest);
+        fs::create_dir_all(path.parent().expect("a shelf")).expect("writable");
+        fs::write(&path, &bytes).expect("writable");
+        let bounds = Bounds { small: 0, ..Bounds::default() };
+        let places = (Some(folder.path().to_owned()), Some(store.path().to_owned()));
+        let cache = Cache::new(places.0, places.1, bounds).expect("writable");
+        let found = cache.get(digest).expect("it is there").into_bytes().expect("mapped");
+        fs::remove_file(&path).expect("it is there");
+        assert_eq!(*found, *bytes, "what is mapped stays");
+        assert!(cache.get(digest).is_none() && files(folder.path()).is_empty(), "there is no second copy");
+        fs::write(&path, b"something else").expect("writable");
+        assert!(cache.get(digest).is_none());
+        assert!(path.exists(), "the store's files are the coordinator's");
+    }
+
+    #[test]
     fn bounds_hold() {
         let folder = tempfile::tempdir().expect("a folder");
         let bounds = Bounds { memory: 250, small: 100, disk: 1000 };
-        let cache = Cache::new(Some(folder.path().to_owned()), bounds).expect("writable");
+        let cache = Cache::new(Some(folder.path().to_owned()), None, bounds).expect("writable");
         for byte in 0..30 {
             let (digest, bytes) = blob(byte, 100);
             cache.insert(digest, &bytes);
@@ -424,7 +468,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         for place in [Some(folder.path().to_owned()), None] {
             let bounds = Bounds { small: 10, ..Bounds::default() };
-            let cache = Cache::new(place.clone(), bounds).expect("writable");
+            let cache = Cache::new(place.clone(), None, bounds).expect("writable");
             let (digest, bytes) = blob(1, 1000);
             let mut arriving = cache.arriving(digest, Some(1000)).expect("writable");
             arriving.write(&bytes[..600]).expect("written");

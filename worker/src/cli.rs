@@ -29,6 +29,9 @@ pub struct JoinArgs {
     /// Keep downloaded blobs in this folder; workers may share it
     #[arg(long, value_name = "DIR")]
     pub cache: Option<PathBuf>,
+    /// The folder of the coordinator's store, if it is on this machine: blobs are read there, and shared by all workers
+    #[arg(long, value_name = "DIR")]
+    pub store: Option<PathBuf>,
     /// Where other workers reach this one [default: the address from which the coordinator is reached, any port]
     #[arg(long, value_name = "HOST:PORT")]
     pub peer_address: Option<String>,
@@ -52,6 +55,7 @@ impl TryFrom<JoinArgs> for Options {
             backend: args.backend,
             device: args.device,
             cache: args.cache,
+            store: args.store,
             peer_address: args.peer_address,
             die_with_parent: args.die_with_parent,
             leave_within: Duration::from_secs(args.leave_within),

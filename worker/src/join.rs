@@ -38,6 +38,8 @@ pub struct Options {
     pub device: usize,
     /// Keep downloaded blobs in this folder.
     pub cache: Option<PathBuf>,
+    /// The folder of the coordinator's store, if it is on this machine.
+    pub store: Option<PathBuf>,
     /// Where peers reach this worker, `host:port`; the address from which the coordinator is reached if `None`.
     pub peer_address: Option<String>,
     /// Be killed when the parent dies, and leave Ctrl-C to it.
@@ -119,7 +121,8 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
     let client = Client::new(options.server.clone(), runtime.handle().clone());
     let (bind, advertised) = peer_address(&options)?;
     let endpoint = Endpoint::open(bind, timing).map_err(system("the listener for peers"))?;
-    let cache = Cache::new(options.cache.clone(), Bounds::default()).map_err(system("the blob cache"))?;
+    let cache = Cache::new(options.cache.clone(), options.store.clone(), Bounds::default())
+        .map_err(system("the blob cache"))?;
     let shared = Shared::new(endpoint.clone());
     let watch = async { watch_signals(shared.clone(), options.die_with_parent, options.leave_within) };
     runtime.block_on(watch).map_err(system("signals"))?;

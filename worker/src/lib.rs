@@ -19,6 +19,7 @@ pub mod failpoints;
 mod gang;
 mod join;
 mod kinds;
+mod mapped;
 mod prepare;
 pub mod process;
 mod retry;

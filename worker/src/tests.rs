@@ -385,7 +385,7 @@ impl Worker {
         let peer_address = endpoint.address().to_string();
         let member = Member { worker: "w0".into(), incarnation: Incarnation(1), peer_address: peer_address.clone() };
         let shared = Shared::new(endpoint);
-        let cache = Arc::new(Cache::new(None, Bounds::default()).expect("memory"));
+        let cache = Arc::new(Cache::new(None, None, Bounds::default()).expect("memory"));
         let preparer = {
             let (shared, client, cache) = (shared.clone(), client.clone(), cache.clone());
             thread::spawn(move || shared.preparation.run(&client, &cache))

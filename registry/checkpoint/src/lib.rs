@@ -6,8 +6,10 @@
 pub mod model;
 
 use std::fmt;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use bytes::Bytes;
 use protocol::Digest;
 
 /// Why a blob could not be read or written.
@@ -57,7 +59,22 @@ pub trait Blobs: Send + Sync + fmt::Debug {
     fn open(&self, digest: Digest) -> Result<Box<dyn Blob>, BlobError> {
         Ok(Box::new(self.get(digest)?))
     }
+
+    /// The blob named `digest`, verified, as bytes that need no memory of this process where a file of the machine has them. For what
+    /// is read again and again, such as a dataset.
+    fn map(&self, digest: Digest) -> Result<Bytes, BlobError> {
+        Ok(Bytes::from_owner(self.get(digest)?))
+    }
 }
+
+/// Where a blob lies below the folder of a store that keeps its blobs beside its database.
+pub fn blob_path(store: &Path, digest: Digest) -> PathBuf {
+    let hex = digest.hex();
+    store.join(BLOBS).join(&hex[..2]).join(&hex[2..])
+}
+
+/// The folder of all blobs, below that of their store.
+pub const BLOBS: &str = "blobs/sha256";
 
 /// A verified blob.
 pub trait Blob: Send + fmt::Debug {

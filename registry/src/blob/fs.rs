@@ -49,7 +49,7 @@ impl Folder {
 
     /// Opens a folder of another file system than the operating system's.
     pub fn open_on(dir: &Path, disk: Arc<dyn Disk>) -> io::Result<Self> {
-        let blobs = dir.join("blobs/sha256");
+        let blobs = dir.join(checkpoint::BLOBS);
         fs::create_dir_all(&blobs)?;
         let staging = Staging::open(dir.join("staging"), Arc::clone(&disk))?;
         disk.sync_dir(dir)?;
@@ -61,15 +61,14 @@ impl Folder {
     pub fn to_read(dir: &Path) -> Self {
         let disk: Arc<dyn Disk> = Arc::new(Os);
         let staging = Staging::to_read(dir.join("staging"), Arc::clone(&disk));
-        let blobs = dir.join("blobs/sha256");
+        let blobs = dir.join(checkpoint::BLOBS);
         Self(Arc::new(Inner { dir: dir.to_owned(), blobs, staging, disk, naming: Mutex::default() }))
     }
 }
 
 impl Inner {
     fn path(&self, digest: Digest) -> PathBuf {
-        let hex = digest.hex();
-        self.blobs.join(&hex[..2]).join(&hex[2..])
+        checkpoint::blob_path(&self.dir, digest)
     }
 
     fn marker(&self) -> PathBuf {

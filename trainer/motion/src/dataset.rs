@@ -1,4 +1,4 @@
-//! A dataset in memory: clips, captions, and the entries that examples are drawn from.
+//! A dataset: clips, captions, and the entries that examples are drawn from.
 //!
 //! An entry is a clip, or the part of a clip that one time-tagged caption describes, in one split. Features are stored
 //! as they are in the files; whoever needs the network's scale calls [`Dataset::normalise`] on a copy.
@@ -19,6 +19,7 @@ pub use open::{OpenError, OpenReport, Problem, ProblemKind, Skip, SkipReason};
 pub use pack::PackError;
 pub use statistics::statistics;
 
+use crate::Floats;
 use crate::random::Stream;
 use crate::skeleton::Skeleton;
 pub use crate::text::Caption;
@@ -71,7 +72,7 @@ pub struct Clip {
     /// L.
     pub frames: usize,
     /// `[L, D]`, not normalised.
-    pub features: Vec<f32>,
+    pub features: Floats,
 }
 
 /// What one example is cropped from.

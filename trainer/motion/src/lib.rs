@@ -17,7 +17,9 @@ pub mod random;
 pub mod skeleton;
 pub mod synthetic;
 pub mod text;
+mod values;
 
 pub use dataset::Dataset;
 pub use random::Stream;
 pub use skeleton::Skeleton;
+pub use values::{Floats, Values};

@@ -367,11 +367,11 @@ pub fn generate(settings: &DataSynthetic, seed: Seed) -> Dataset {
             let captions = (first..dataset.captions.len()).collect();
             let entry = Entry { id: id.clone(), clip: dataset.clips.len(), start: 0, len: frames, captions, split };
             dataset.entries.push(entry);
-            dataset.clips.push(Clip { id, frames, features });
+            dataset.clips.push(Clip { id, frames, features: features.into() });
         }
     }
     dataset.entries.sort_by_key(|entry| entry.split);
-    let (mean, std) = statistics(skeleton, dataset.clips.iter().map(|c| c.features.as_slice()));
+    let (mean, std) = statistics(skeleton, dataset.clips.iter().map(|c| &*c.features));
     dataset.mean = mean.into_iter().map(|v| v as f32).collect();
     dataset.std = std.into_iter().map(|v| v as f32).collect();
     dataset

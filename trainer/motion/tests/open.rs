@@ -36,7 +36,7 @@ fn the_mini_sets_open_with_their_known_counts() {
         let files = dataset.to_files().unwrap();
         assert_eq!(files, Dataset::open(&folder, format).unwrap().0.to_files().unwrap(), "other bytes the second time");
         let fetch = |name: &str| {
-            files.iter().find(|(n, _)| n == name).map(|(_, b)| b.clone()).ok_or_else(|| "not there".to_owned())
+            files.iter().find(|(n, _)| n == name).map(|(_, b)| b.clone().into()).ok_or_else(|| "not there".to_owned())
         };
         assert_eq!(Dataset::from_files(&fetch).unwrap(), dataset);
         assert!(Dataset::from_files(&|_| Err("gone".into())).unwrap_err().to_string().contains("dataset.json: gone"));

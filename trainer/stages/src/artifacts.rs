@@ -8,8 +8,11 @@ use std::cell::RefCell;
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
+use bytemuck::Pod;
+use bytes::Bytes;
 use checkpoint::model::{self, Parts};
 use checkpoint::{Blob, BlobError, Blobs};
+use motion::Values;
 use motion::dataset::{Caption, Dataset, PackError, Split};
 use protocol::artifact::{FileEntry, Role};
 use protocol::stage::{DataFormat, Diffusion, Family, LatentShape, Network};
@@ -173,6 +176,11 @@ pub fn open(blobs: &dyn Blobs, manifest: &Manifest, name: &str) -> Result<Box<dy
     blobs.open(entry(manifest, name)?.digest).map_err(blob_error)
 }
 
+/// One file of an artifact, which stays where it is as far as it can: for what is read again and again.
+pub fn mapped(blobs: &dyn Blobs, manifest: &Manifest, name: &str) -> Result<Bytes, StageError> {
+    blobs.map(entry(manifest, name)?.digest).map_err(blob_error)
+}
+
 /// All files of an artifact.
 pub fn files(blobs: &dyn Blobs, manifest: &Manifest) -> Result<BTreeMap<String, Arc<[u8]>>, StageError> {
     manifest
@@ -247,7 +255,7 @@ pub fn captions(blobs: &dyn Blobs, manifest: &Manifest) -> Result<Vec<Caption>, 
     from_files(blobs, manifest, |fetch| Dataset::captions_from_files(fetch))
 }
 
-type Fetch<'a> = dyn Fn(&str) -> Result<Vec<u8>, String> + 'a;
+type Fetch<'a> = dyn Fn(&str) -> Result<Bytes, String> + 'a;
 
 fn from_files<T>(
     blobs: &dyn Blobs,
@@ -257,8 +265,7 @@ fn from_files<T>(
     // What the store said is kept, so that a lost connection is not taken for a broken dataset.
     let refused = RefCell::new(None);
     let fetch = |name: &str| {
-        let bytes = file(blobs, manifest, name).map(|bytes| bytes.to_vec());
-        bytes.map_err(|error| {
+        mapped(blobs, manifest, name).map_err(|error| {
             let text = error.to_string();
             refused.replace(Some(error));
             text
@@ -272,20 +279,20 @@ fn from_files<T>(
 
 /// A tensor on the host.
 #[derive(Debug, Clone, PartialEq)]
-pub struct HostTensor<T> {
+pub struct HostTensor<T: Pod> {
     /// Its shape.
     pub shape: Vec<usize>,
     /// Row-major values.
-    pub values: Vec<T>,
+    pub values: Values<T>,
 }
 
-impl<T> HostTensor<T> {
+impl<T: Pod> HostTensor<T> {
     /// Wraps values of a shape.
     ///
     /// # Panics
     /// If the counts differ.
-    pub fn new(shape: impl Into<Vec<usize>>, values: Vec<T>) -> Self {
-        let shape = shape.into();
+    pub fn new(shape: impl Into<Vec<usize>>, values: impl Into<Values<T>>) -> Self {
+        let (shape, values) = (shape.into(), values.into());
         assert_eq!(shape.iter().product::<usize>(), values.len(), "values for shape {shape:?}");
         Self { shape, values }
     }
@@ -344,21 +351,21 @@ impl Tensors {
         safetensors::serialize(views, None::<HashMap<String, String>>).map_err(fault)
     }
 
-    /// Reads a safetensors file of f32 and i64 tensors; `what` names it in errors.
-    pub fn from_bytes(bytes: &[u8], what: &str) -> Result<Self, StageError> {
+    /// Reads a safetensors file of f32 and i64 tensors, whose values stay where the bytes are; `what` names it in errors.
+    pub fn from_bytes(bytes: Bytes, what: &str) -> Result<Self, StageError> {
         let bad = |text: String| StageError::Context(ContextError::Corrupt(format!("{what}: {text}")));
-        let parsed = SafeTensors::deserialize(bytes).map_err(|e| bad(e.to_string()))?;
+        let parsed = SafeTensors::deserialize(&bytes).map_err(|e| bad(e.to_string()))?;
         let mut out = Self::default();
         for (name, view) in parsed.iter() {
             let shape = view.shape().to_vec();
             let name = name.to_owned();
             match view.dtype() {
                 Dtype::F32 => {
-                    let values = view.data().as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
+                    let values = Values::view(bytes.slice_ref(view.data())).unwrap_or_else(|| Vec::new().into());
                     out.floats.insert(name, HostTensor::new(shape, values));
                 }
                 Dtype::I64 => {
-                    let values = view.data().as_chunks::<8>().0.iter().map(|b| i64::from_le_bytes(*b)).collect();
+                    let values = Values::view(bytes.slice_ref(view.data())).unwrap_or_else(|| Vec::new().into());
                     out.integers.insert(name, HostTensor::new(shape, values));
                 }
                 other => return Err(bad(format!("tensor `{name}` is {other:?}, expected F32 or I64"))),
@@ -377,7 +384,7 @@ impl Tensors {
         Self::checked(self.integers.remove(name), name, rank, what, self.integers.keys())
     }
 
-    fn checked<'a, T>(
+    fn checked<'a, T: Pod>(
         found: Option<HostTensor<T>>,
         name: &str,
         rank: usize,
@@ -409,9 +416,9 @@ impl Embeddings {
     /// Reads an artifact of kind `embeddings`.
     pub fn read(blobs: &dyn Blobs, manifest: &Manifest) -> Result<Self, StageError> {
         let meta: EmbeddingsMeta = meta(manifest, "the caption embeddings")?;
-        let mut tensors = Tensors::from_bytes(&file(blobs, manifest, EMBEDDINGS_FILE)?, EMBEDDINGS_FILE)?;
+        let mut tensors = Tensors::from_bytes(mapped(blobs, manifest, EMBEDDINGS_FILE)?, EMBEDDINGS_FILE)?;
         let captions = tensors.take("captions", 2, EMBEDDINGS_FILE)?;
-        let null = tensors.take("null", 1, EMBEDDINGS_FILE)?.values;
+        let null = tensors.take("null", 1, EMBEDDINGS_FILE)?.values.into_vec();
         if captions.shape != [meta.captions, meta.dim] || null.len() != meta.dim {
             return Err(StageError::Context(ContextError::Corrupt(format!(
                 "{EMBEDDINGS_FILE}: `captions` has shape {:?} and `null` {}, the manifest says {} x {}",
@@ -440,7 +447,7 @@ impl Latents {
     /// Reads an artifact of kind `latents`.
     pub fn read(blobs: &dyn Blobs, manifest: &Manifest) -> Result<Self, StageError> {
         let meta: LatentsMeta = meta(manifest, "the latents")?;
-        let mut tensors = Tensors::from_bytes(&file(blobs, manifest, LATENTS_FILE)?, LATENTS_FILE)?;
+        let mut tensors = Tensors::from_bytes(mapped(blobs, manifest, LATENTS_FILE)?, LATENTS_FILE)?;
         let mu = tensors.take("mu", 3, LATENTS_FILE)?;
         let sigma = tensors.take("sigma", 3, LATENTS_FILE)?;
         let expected = [meta.splits.len() * meta.crops, meta.latent.tokens, meta.latent.dim];
@@ -471,14 +478,14 @@ mod tests {
             .with_integers("entry", [2], vec![-1, i64::MAX]);
         let bytes = tensors.to_bytes().unwrap();
         assert_eq!(bytes, tensors.to_bytes().unwrap());
-        assert_eq!(Tensors::from_bytes(&bytes, "x").unwrap(), tensors);
+        assert_eq!(Tensors::from_bytes(bytes.into(), "x").unwrap(), tensors);
     }
 
     #[test]
     fn a_missing_tensor_is_named_with_those_there_are() {
         let error = Tensors::default().with("b", [1], vec![0.0]).take("mu", 1, "latents.safetensors").unwrap_err();
         assert_eq!(error.to_string(), "latents.safetensors: no tensor `mu`; there are [\"b\"]");
-        assert!(Tensors::from_bytes(&[1, 2, 3], "x").is_err());
+        assert!(Tensors::from_bytes(Bytes::from_static(&[1, 2, 3]), "x").is_err());
     }
 
     #[test]

@@ -10,7 +10,7 @@ use std::path::Path;
 use checkpoint::Blobs;
 use motion::dataset::Caption;
 use motion::text::{MAX_TOKENS, POS_CLASSES, hashed_word, padded_tokens, pos_class, split_token};
-use motion::{files, npy};
+use motion::{Floats, files, npy};
 use protocol::{Digest, Manifest, limits};
 use pytorch_reader::{PickleValue, PytorchReader};
 use serde::{Deserialize, Serialize};
@@ -56,7 +56,7 @@ pub enum Words {
     /// A published vocabulary.
     Vocabulary {
         /// `[n, 300]`.
-        vectors: Vec<f32>,
+        vectors: Floats,
         /// Row of each word.
         index: HashMap<String, usize>,
     },
@@ -115,7 +115,7 @@ impl Words {
                 return Err(bad(&file, format!("has no word `{word}`, which every caption needs")));
             }
         }
-        Ok(Self::Vocabulary { vectors: array.data, index })
+        Ok(Self::Vocabulary { vectors: array.data.into(), index })
     }
 
     /// What an evaluator's meta says of them.
@@ -136,7 +136,7 @@ impl Words {
             let rows = vectors.len() / WORD_WIDTH;
             draft.add(
                 VECTORS_FILE,
-                Tensors::default().with("vectors", [rows, WORD_WIDTH], vectors.clone()).to_bytes()?,
+                Tensors::default().with("vectors", [rows, WORD_WIDTH], vectors.to_vec()).to_bytes()?,
             )?;
             draft.add(INDEX_FILE, protocol::canonical::to_bytes(&sorted(index)))?;
         }
@@ -149,7 +149,7 @@ impl Words {
             return Ok(Self::Hashed);
         }
         let bad = |text: String| StageError::Context(ContextError::Corrupt(format!("the evaluator's words: {text}")));
-        let mut tensors = Tensors::from_bytes(&artifacts::file(blobs, manifest, VECTORS_FILE)?, VECTORS_FILE)?;
+        let mut tensors = Tensors::from_bytes(artifacts::mapped(blobs, manifest, VECTORS_FILE)?, VECTORS_FILE)?;
         let vectors = tensors.take("vectors", 2, VECTORS_FILE)?.values;
         let index: HashMap<String, usize> = serde_json::from_slice(&artifacts::file(blobs, manifest, INDEX_FILE)?)
             .map_err(|e| bad(format!("{INDEX_FILE}: {e}")))?;
@@ -204,8 +204,8 @@ mod tests {
         assert_eq!((0..6).map(class).collect::<Vec<_>>(), [14, 2, 1, 12, 14, 14].map(Some));
 
         let index = HashMap::from([("sos", 0), ("eos", 1), ("unk", 2), ("walk", 3)].map(|(w, i)| (w.to_owned(), i)));
-        let vectors = (0..4).flat_map(|row| vec![row as f32; WORD_WIDTH]).collect();
-        let words = Words::Vocabulary { vectors, index };
+        let vectors: Vec<f32> = (0..4).flat_map(|row| vec![row as f32; WORD_WIDTH]).collect();
+        let words = Words::Vocabulary { vectors: vectors.into(), index };
         let batch = words.batch([&caption]);
         let firsts: Vec<f32> = batch.words.iter().step_by(WORD_WIDTH).copied().take(6).collect();
         assert_eq!(firsts, [0.0, 2.0, 2.0, 3.0, 1.0, 2.0]);

@@ -291,12 +291,17 @@ fn what_an_evaluator_does_not_fit_is_refused_with_the_reason() {
     let evaluator = bench.run("evaluator", &small(), &[("dataset", data)]).expect("the stage runs").output();
     let whole = artifacts::dataset(&*bench.blobs(), &bench.manifest(data).unwrap()).unwrap();
 
-    let mut normalised = whole.clone();
-    for clip in &mut normalised.clips {
-        whole.normalise(&mut clip.features);
-    }
-    let mut millimetres = whole.clone();
-    millimetres.clips.iter_mut().flat_map(|clip| &mut clip.features).for_each(|v| *v *= 1000.0);
+    let changed = |change: &dyn Fn(&mut [f32])| {
+        let mut changed = whole.clone();
+        for clip in &mut changed.clips {
+            let mut features = clip.features.to_vec();
+            change(&mut features);
+            clip.features = features.into();
+        }
+        changed
+    };
+    let normalised = changed(&|features| whole.normalise(features));
+    let millimetres = changed(&|features| features.iter_mut().for_each(|v| *v *= 1000.0));
     let mut nothing = whole.clone();
     nothing.entries.retain(|entry| entry.split != motion::dataset::Split::Test);
     let few = EvaluateT2m { real: true, split: Split::Val, ..EvaluateT2m::default() };

@@ -124,7 +124,7 @@ impl Gang {
         let held = self.held(seat).expect("a member");
         // Nobody is there; nothing in these tests is recorded or uploaded.
         let client = Client::new(crate::tests::server_at("http://127.0.0.1:9"), self.runtime.handle().clone());
-        let cache = Arc::new(Cache::new(None, Bounds::default()).expect("memory"));
+        let cache = Arc::new(Cache::new(None, None, Bounds::default()).expect("memory"));
         HttpContext::new(held, client, cache, Device::default())
     }
 

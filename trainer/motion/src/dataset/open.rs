@@ -365,7 +365,7 @@ impl Dataset {
                     self.captions.extend(texts.captions.into_iter().map(|(_, caption)| caption));
                     odd.insert(id.clone(), texts.odd.into_iter().map(left_out).collect());
                     stored.insert(id.clone(), (self.clips.len(), lines));
-                    self.clips.push(Clip { id: id.clone(), frames, features });
+                    self.clips.push(Clip { id: id.clone(), frames, features: features.into() });
                 } else {
                     shared.push(id.clone());
                 }

@@ -7,11 +7,13 @@
 
 use std::borrow::Cow;
 
+use bytes::Bytes;
 use protocol::stage::DataFormat;
 use safetensors::tensor::{Dtype, SafeTensors, View};
 use serde::{Deserialize, Serialize};
 
 use super::{Clip, Dataset, Entry};
+use crate::Floats;
 use crate::skeleton::Skeleton;
 use crate::text::Caption;
 
@@ -151,15 +153,15 @@ impl Dataset {
     }
 
     /// The captions alone, without fetching a clip.
-    pub fn captions_from_files(fetch: &dyn Fn(&str) -> Result<Vec<u8>, String>) -> Result<Vec<Caption>, PackError> {
+    pub fn captions_from_files(fetch: &dyn Fn(&str) -> Result<Bytes, String>) -> Result<Vec<Caption>, PackError> {
         let bytes = fetch(INDEX).map_err(|why| PackError::Fetch { file: INDEX.into(), why })?;
         let index: Index = serde_json::from_slice(&bytes)
             .map_err(|e| PackError::Content { file: INDEX.into(), what: e.to_string() })?;
         Ok(index.captions)
     }
 
-    /// Reads what [`Dataset::write_files`] wrote; `fetch` gives a file's content by its name.
-    pub fn from_files(fetch: &dyn Fn(&str) -> Result<Vec<u8>, String>) -> Result<Self, PackError> {
+    /// Reads what [`Dataset::write_files`] wrote; `fetch` gives a file's content by its name. Features stay where the content is.
+    pub fn from_files(fetch: &dyn Fn(&str) -> Result<Bytes, String>) -> Result<Self, PackError> {
         let get = |file: &str| fetch(file).map_err(|why| PackError::Fetch { file: file.into(), why });
         let bad = |file: &str, what: String| PackError::Content { file: file.into(), what };
         let index: Index = serde_json::from_slice(&get(INDEX)?).map_err(|e| bad(INDEX, e.to_string()))?;
@@ -178,8 +180,9 @@ impl Dataset {
                     let found = format!("clip {}: {:?} {:?}", row.id, tensor.dtype(), tensor.shape());
                     return Err(bad(&name, format!("{found}, expected F32 [{}, {width}]", row.frames)));
                 }
-                let features = tensor.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
-                clips.push(Clip { id: row.id.clone(), frames: row.frames, features: features.collect() });
+                let features = Floats::view(bytes.slice_ref(tensor.data()));
+                let features = features.ok_or_else(|| bad(&name, format!("clip {}: a broken number", row.id)))?;
+                clips.push(Clip { id: row.id.clone(), frames: row.frames, features });
             }
         }
         let narrow = |values: &[f64]| values.iter().map(|v| *v as f32).collect::<Vec<_>>();

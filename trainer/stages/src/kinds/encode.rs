@@ -111,9 +111,9 @@ impl Map for EncodeLatents {
                     "a shard begins at entry {first}, the one before it ended at {have}"
                 )));
             }
-            let mut part = Tensors::from_bytes(&artifacts::file(&*blobs, &manifest, LATENTS_FILE)?, LATENTS_FILE)?;
-            mu.extend(part.take("mu", 3, LATENTS_FILE)?.values);
-            sigma.extend(part.take("sigma", 3, LATENTS_FILE)?.values);
+            let mut part = Tensors::from_bytes(artifacts::mapped(&*blobs, &manifest, LATENTS_FILE)?, LATENTS_FILE)?;
+            mu.extend_from_slice(&part.take("mu", 3, LATENTS_FILE)?.values);
+            sigma.extend_from_slice(&part.take("sigma", 3, LATENTS_FILE)?.values);
             match &mut whole {
                 None => whole = Some(latents),
                 Some(whole) => {

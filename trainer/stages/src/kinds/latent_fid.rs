@@ -246,8 +246,8 @@ impl Map for EvaluateLatentFid {
         for digest in shards {
             let manifest = cx.manifest(*digest)?;
             let ShardMeta { units } = artifacts::meta(&manifest, "a shard of the samples")?;
-            let bytes = artifacts::file(&*blobs, &manifest, SAMPLES_FILE)?;
-            let rows = Tensors::from_bytes(&bytes, SAMPLES_FILE)?.take("z", 2, SAMPLES_FILE)?;
+            let bytes = artifacts::mapped(&*blobs, &manifest, SAMPLES_FILE)?;
+            let rows = Tensors::from_bytes(bytes, SAMPLES_FILE)?.take("z", 2, SAMPLES_FILE)?;
             let mut at = 0;
             for unit in units {
                 let end = at + plan.block(unit.block).len() * plan.width();
@@ -331,7 +331,7 @@ fn details(
 
 /// A draw of z from the posterior of every crop, `[rows, width]`.
 fn draw(plan: &Plan<'_>, repeat: u64) -> Vec<f32> {
-    let mut z = plan.latents.sigma.values.clone();
+    let mut z = plan.latents.sigma.values.to_vec();
     for (row, (z, mu)) in
         z.chunks_exact_mut(plan.width()).zip(plan.latents.mu.values.chunks_exact(plan.width())).enumerate()
     {

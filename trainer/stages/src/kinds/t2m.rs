@@ -356,8 +356,8 @@ fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, shards: &[Digest]) -> Result
     for digest in shards {
         let manifest = cx.manifest(*digest)?;
         let ShardMeta { units } = artifacts::meta(&manifest, "a shard of the evaluation")?;
-        let bytes = artifacts::file(&*blobs, &manifest, EMBEDDINGS_FILE)?;
-        let mut tensors = Tensors::from_bytes(&bytes, EMBEDDINGS_FILE)?;
+        let bytes = artifacts::mapped(&*blobs, &manifest, EMBEDDINGS_FILE)?;
+        let mut tensors = Tensors::from_bytes(bytes, EMBEDDINGS_FILE)?;
         let mut take =
             |name: &str, rank| Ok::<_, StageError>(to_f64(&tensors.take(name, rank, EMBEDDINGS_FILE)?.values));
         let (text, made, real) = (take("text", 2)?, take("made", 2)?, take("real", 2)?);
