@@ -1,4 +1,4 @@
-//! A worker that runs out of memory: said once, and not tried again.
+//! What workers need of memory: datasets are shared, and running out of it is said once and not tried again.
 
 use std::fs;
 use std::os::unix::process::CommandExt;
@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use cluster_tests::cluster::stage_of;
-use cluster_tests::{Bench, Running, Said};
+use cluster_tests::{Bench, Running, Said, wait_for};
 use serde_json::Value;
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
@@ -86,4 +86,55 @@ fn p15_a_worker_that_the_kernel_kills_for_want_of_memory_is_final() {
     // The first weights have .8 GB.
     let said = run(&bench, 8_192, &["sh", "-c", &enter, "sh"]);
     check(&bench, said, "the kernel killed it");
+}
+
+/// Kilobytes that a process holds: its own, and those of files that it shares with others.
+fn resident(pid: u32) -> Option<(u64, u64)> {
+    let status = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
+    let field = |name: &str| {
+        let line = status.lines().find(|line| line.starts_with(name))?;
+        line.split_whitespace().nth(1)?.parse::<u64>().ok()
+    };
+    Some((field("RssAnon:")?, field("RssFile:")?))
+}
+
+/// A machine holds a dataset once, however many workers train on it. Sampled: three workers and about 50 MB of clips; sixteen and 4 GB,
+/// which is HumanML3D, with `STRIDE_LONG_TESTS=1`.
+#[test]
+fn p15_workers_of_a_machine_share_a_dataset() {
+    let is_long = std::env::var_os("STRIDE_LONG_TESTS").is_some();
+    let (clips, workers, own_mb) = if is_long { (42_000, 16, 400) } else { (550, 3, 40) };
+    if !is_long {
+        eprintln!("SKIPPED: sixteen workers on a dataset of 4 GB (set STRIDE_LONG_TESTS=1)");
+    }
+    let bench = Bench::new(TRAINER);
+    let pipeline = format!(
+        "name: shared\nseed: 7\ndataset: {{format: synthetic, clips: {clips}, val: 0.02, test: 0.02}}\nstages:\n  \
+         vae: {{kind: train.vae, latent: {{tokens: 1, dim: 16}}, network: {{width: 16, layers: 1, heads: 1, feed_forward: 16}}, \
+         steps: 1000000, batch: {{global: 16, slices: 16}}, checkpoint: {{every: 1000}}}}\n"
+    );
+    fs::write(bench.path().join("shared.yaml"), pipeline).expect("writable");
+    let mut run = bench.spawn(&["run", "shared.yaml", "--workers", &workers.to_string()]);
+    let dataset_kb = || -> u64 {
+        let output = Command::new("du").arg("-sk").arg(bench.store().join("blobs")).output().expect("du");
+        let said = String::from_utf8_lossy(&output.stdout).into_owned();
+        said.split_whitespace().next().and_then(|kb| kb.parse().ok()).unwrap_or_default()
+    };
+    let all = wait_for("all workers to have the dataset mapped and nothing else", || {
+        assert!(run.alive(), "the run goes on until it is ended here");
+        let all: Vec<_> = run.workers().values().filter_map(|pid| resident(*pid)).collect();
+        let kb = dataset_kb();
+        let is_mapped = |(_, shared): &(u64, u64)| *shared > kb / 2;
+        (all.len() == workers && kb > 20_000 && all.iter().all(is_mapped)).then_some(all)
+    });
+    let kb = dataset_kb();
+    eprintln!("dataset {} MB; each worker's own and shared memory in MB: {:?}", kb >> 10, {
+        all.iter().map(|(own, shared)| (own >> 10, shared >> 10)).collect::<Vec<_>>()
+    });
+    assert!(kb >> 10 > own_mb, "the dataset is larger than what a worker may hold: {} MB", kb >> 10);
+    assert!(
+        all.iter().all(|(own, _)| own >> 10 < own_mb),
+        "each worker holds less than {own_mb} MB of its own: {all:?}"
+    );
+    run.kill();
 }

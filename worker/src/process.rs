@@ -22,6 +22,17 @@ pub fn tune_allocator() {
     }
 }
 
+/// Hands freed memory back after all, between two tasks: the one that packed a dataset has held gigabytes, and the next may
+/// need none of them while other workers of the machine do.
+pub(crate) fn give_memory_back() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    {
+        #[expect(unsafe_code, reason = "FFI; malloc_trim takes a number and touches only what is free")]
+        let released = unsafe { libc::malloc_trim(0) };
+        tracing::debug!(released = released == 1, "memory between two tasks");
+    }
+}
+
 /// Binds this process to the one that started it: it is killed when that dies, and is not reached by a Ctrl-C in the
 /// terminal, which the parent turns into an orderly end.
 pub(crate) fn belong_to_parent() {

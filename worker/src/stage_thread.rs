@@ -17,6 +17,7 @@ use crate::cache::Cache;
 use crate::client::{CallError, Client};
 use crate::context::HttpContext;
 use crate::failpoints;
+use crate::process;
 use crate::retry::{self, GaveUp};
 
 /// The stage kinds, as far as a worker knows them. Tests bring their own.
@@ -41,6 +42,8 @@ pub(crate) fn run(shared: &Shared, bench: &Bench) {
         if let Some(held) = shared.next() {
             attempt(&held, bench);
             held.finish();
+            drop(held);
+            process::give_memory_back();
         } else if shared.is_over() {
             return;
         } else {
