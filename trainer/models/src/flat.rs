@@ -32,7 +32,13 @@ const SEQUENCES: [&str; 3] = ["main", "output", "output_net"];
 pub fn layout<M: Module>(module: &M) -> Vec<Entry> {
     struct Layout(Vec<String>, Vec<Entry>);
     impl ModuleVisitor for Layout {
-        fn enter_module(&mut self, name: &str, _: &str) {
+        fn enter_module(&mut self, name: &str, container: &str) {
+            // Which variant an entry of a sequence is has no place in its name.
+            if container.starts_with("Enum:") {
+                return self.0.push(String::new());
+            }
+            // A name that is a word of Rust's.
+            let name = name.strip_prefix("r#").unwrap_or(name);
             let entry =
                 name.rsplit_once('_').filter(|(sequence, n)| SEQUENCES.contains(sequence) && n.parse::<u32>().is_ok());
             self.0.push(entry.map_or_else(|| name.to_owned(), |(sequence, n)| format!("{sequence}.{n}")));
@@ -41,7 +47,8 @@ pub fn layout<M: Module>(module: &M) -> Vec<Entry> {
             self.0.pop();
         }
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-            let name = self.0.join(".");
+            let parts: Vec<&str> = self.0.iter().map(String::as_str).filter(|part| !part.is_empty()).collect();
+            let name = parts.join(".");
             let name = match name.strip_prefix("emb_proj.") {
                 Some(rest) => format!("emb_proj.1.{rest}"),
                 None => name,

@@ -5,11 +5,14 @@
 pub mod device;
 pub mod diffusion;
 pub mod flat;
+pub mod flow;
 pub mod kernels;
 pub mod losses;
 pub mod names;
 pub mod networks;
 pub mod optim;
+pub mod quantizer;
+pub mod tokens;
 
 /// The instruction set that the kernels of this process dispatch to: ours, Burn's and those of `gemm` look for the same features. Another
 /// one rounds differently, so workers of one stage must agree on it.

@@ -8,17 +8,23 @@ use burn::tensor::{Device, Tensor, TensorData};
 
 /// [B, width]: `[cos(t f) | sin(t f)]` with `f_i = 10000^(-i / (width / 2))`.
 pub fn time_sinusoid(timesteps: &[usize], width: usize, device: &Device) -> Tensor<2> {
+    #[expect(clippy::cast_precision_loss, reason = "timesteps are below 1000")]
+    let times: Vec<f32> = timesteps.iter().map(|t| *t as f32).collect();
+    time_sinusoid_f32(&times, width, device)
+}
+
+/// The same for times that are no integers.
+pub fn time_sinusoid_f32(times: &[f32], width: usize, device: &Device) -> Tensor<2> {
     let half = width / 2;
     #[expect(clippy::cast_precision_loss, clippy::cast_possible_truncation, reason = "f32 by definition")]
     let frequencies: Vec<f32> =
         (0..half).map(|i| ((-(10_000_f64.ln()) as f32) * i as f32 / half as f32).exp()).collect();
-    #[expect(clippy::cast_precision_loss, reason = "timesteps are below 1000")]
-    let rows = timesteps.iter().flat_map(|t| {
-        let angles = frequencies.iter().map(|f| *t as f32 * f).collect::<Vec<_>>();
+    let rows = times.iter().flat_map(|t| {
+        let angles = frequencies.iter().map(|f| t * f).collect::<Vec<_>>();
         let cosines: Vec<f32> = angles.iter().map(|a| a.cos()).collect();
         cosines.into_iter().chain(angles.into_iter().map(f32::sin)).collect::<Vec<_>>()
     });
-    Tensor::from_data(TensorData::new(rows.collect(), [timesteps.len(), 2 * half]), device)
+    Tensor::from_data(TensorData::new(rows.collect(), [times.len(), 2 * half]), device)
 }
 
 /// [B, width]: `[sin(1000 w f) | cos(1000 w f)]` with `f_i = 10000^(-i / (width / 2 - 1))`.

@@ -77,6 +77,14 @@ impl<'a> Init<'a> {
         self.param(values, shape)
     }
 
+    /// Normal with this deviation.
+    pub fn scaled_normal<const D: usize>(&mut self, deviation: f64, shape: [usize; D]) -> Param<Tensor<D>> {
+        let mut values = vec![0.0; shape.iter().product()];
+        self.stream.fill_normal(&mut values);
+        values.iter_mut().for_each(|v| *v *= deviation as f32);
+        self.param(values, shape)
+    }
+
     /// A position table [rows, 1, width]: uniform on [0, 1) as published, or sinusoids.
     pub fn positions(&mut self, rows: usize, width: usize) -> Param<Tensor<3>> {
         match self.positions {

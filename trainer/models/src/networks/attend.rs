@@ -1,0 +1,248 @@
+//! Attention whose queries, keys and values are projected apart, as GPT-style code bases publish them, and attention with an additive bias.
+
+use burn::module::{Module, Param};
+use burn::tensor::activation::softmax;
+use burn::tensor::{Device, Int, Tensor, TensorData};
+
+use super::conv::{GAP, Gap};
+use super::{Init, Linear, Norm};
+use crate::kernels::{self, Dropout, KeyMask};
+
+/// Deviation of GPT-style first weights.
+pub(super) const DEVIATION: f64 = 0.02;
+/// Added to variances in layer norms.
+const EPS: f64 = 1e-5;
+/// Far below any score, and finite, so that a gradient through it is 0 and not undefined.
+const HIDDEN: f32 = -1e9;
+
+/// Softmax attention with `bias` added to the scores; it has a size of the batch or 1, of the heads or 1, of the queries or 1, and of the
+/// keys. `q_bqh` [B, Q, H], `k_bkh` and `v_bkh` [B, K, H] -> [B, Q, H].
+pub(super) fn attend(
+    q_bqh: Tensor<3>,
+    k_bkh: Tensor<3>,
+    v_bkh: Tensor<3>,
+    heads: usize,
+    bias: Option<Tensor<4>>,
+    dropout: &mut Dropout,
+) -> Tensor<3> {
+    let ([batch, queries, width], keys) = (q_bqh.dims(), k_bkh.dims()[1]);
+    let split = |x: Tensor<3>, len: usize| x.reshape([batch, len, heads, width / heads]).swap_dims(1, 2);
+    let scale = 1.0 / ((width / heads) as f32).sqrt();
+    let mut scores = split(q_bqh, queries).matmul(split(k_bkh, keys).swap_dims(2, 3)) * scale;
+    if let Some(bias) = bias {
+        scores = scores + bias;
+    }
+    let weights = kernels::dropout(softmax(scores, 3), dropout);
+    weights.matmul(split(v_bkh, keys)).swap_dims(1, 2).reshape([batch, queries, width])
+}
+
+/// A bias [1, 1, len, len] that hides what comes after a position.
+pub(super) fn causal(len: usize, device: &Device) -> Tensor<4> {
+    let values = (0..len).flat_map(|q| (0..len).map(move |k| if k > q { HIDDEN } else { 0.0 })).collect();
+    Tensor::from_data(TensorData::new(values, [1, 1, len, len]), device)
+}
+
+/// A bias [B, 1, 1, K] that hides the keys that are not `visible` [B K].
+pub(super) fn hiding(visible: &[bool], batch: usize, device: &Device) -> Tensor<4> {
+    let values = visible.iter().map(|v| if *v { 0.0 } else { HIDDEN }).collect();
+    Tensor::from_data(TensorData::new(values, [batch, 1, 1, visible.len() / batch]), device)
+}
+
+/// What a block's attention may look at.
+#[derive(Debug, Clone)]
+pub(super) enum Sight {
+    /// Everything, but for keys behind a sequence's end.
+    Keys(Option<KeyMask>),
+    /// As a bias on the scores says.
+    Bias(Tensor<4>),
+}
+
+/// Rows of a table by id.
+#[derive(Module, Debug)]
+pub struct Embedding {
+    /// [rows, width].
+    pub weight: Param<Tensor<2>>,
+}
+
+impl Embedding {
+    /// Normal with deviation 0.02.
+    pub(super) fn new(init: &mut Init<'_>, rows: usize, width: usize) -> Self {
+        Self { weight: init.scaled_normal(DEVIATION, [rows, width]) }
+    }
+
+    /// Ids [B T] -> [B, T, width].
+    pub(super) fn rows(&self, ids: &[usize], batch: usize) -> Tensor<3> {
+        rows_of(self.weight.val(), ids, batch)
+    }
+}
+
+/// Rows [B, n / B, width] of `table` [rows, width].
+pub(super) fn rows_of(table: Tensor<2>, ids: &[usize], batch: usize) -> Tensor<3> {
+    let width = table.dims()[1];
+    let values: Vec<i64> = ids.iter().map(|id| *id as i64).collect();
+    let ids = Tensor::<1, Int>::from_data(TensorData::new(values, [ids.len()]), &table.device());
+    let len = ids.dims()[0] / batch;
+    table.select(0, ids).reshape([batch, len, width])
+}
+
+/// A linear layer with weights of deviation 0.02 and a bias of zeros.
+pub(super) fn linear(init: &mut Init<'_>, inner: usize, out: usize) -> Linear {
+    Linear { weight: init.scaled_normal(DEVIATION, [out, inner]), bias: Some(init.constant(0.0, [out])) }
+}
+
+/// Sines and cosines in turn, [1, len, width]: `sin(p f_i), cos(p f_i)` with `f_i = 10000^(-2i / width)`. In f32 from the frequencies on, as
+/// the tables that upstream stores.
+pub(super) fn sinusoids(len: usize, width: usize, device: &Device) -> Tensor<3> {
+    let step = -(10_000_f64.ln()) / width as f64;
+    let frequency = |i: usize| (((2 * (i / 2)) as f32) * step as f32).exp();
+    let value = |p: usize, i: usize| {
+        let angle = p as f32 * frequency(i);
+        if i.is_multiple_of(2) { angle.sin() } else { angle.cos() }
+    };
+    let values = (0..len).flat_map(|p| (0..width).map(move |i| value(p, i))).collect();
+    Tensor::from_data(TensorData::new(values, [1, len, width]), device)
+}
+
+/// Multi-head attention with a projection each.
+#[derive(Module, Debug)]
+pub struct SplitAttention {
+    /// H -> H.
+    pub key: Linear,
+    /// H -> H.
+    pub query: Linear,
+    /// H -> H.
+    pub value: Linear,
+    /// H -> H.
+    pub proj: Linear,
+    heads: usize,
+}
+
+impl SplitAttention {
+    pub(super) fn new(init: &mut Init<'_>, width: usize, heads: usize) -> Self {
+        let mut layer = || linear(init, width, width);
+        Self { key: layer(), query: layer(), value: layer(), proj: layer(), heads }
+    }
+
+    fn own(&self, x_bth: Tensor<3>, sight: &Sight, dropout: &mut Dropout) -> Tensor<3> {
+        let (q, k, v) = (self.query.forward(x_bth.clone()), self.key.forward(x_bth.clone()), self.value.forward(x_bth));
+        let attended = match sight {
+            Sight::Keys(mask) => {
+                kernels::self_attention(Tensor::cat(vec![q, k, v], 2), self.heads, mask.as_ref(), dropout)
+            }
+            Sight::Bias(bias) => attend(q, k, v, self.heads, Some(bias.clone()), dropout),
+        };
+        kernels::dropout(self.proj.forward(attended), dropout)
+    }
+
+    pub(super) fn cross(&self, x_bth: Tensor<3>, memory_bnh: Tensor<3>, dropout: &mut Dropout) -> Tensor<3> {
+        let kv = Tensor::cat(vec![self.key.forward(memory_bnh.clone()), self.value.forward(memory_bnh)], 2);
+        let attended = kernels::cross_attention(self.query.forward(x_bth), kv, self.heads, None, dropout);
+        kernels::dropout(self.proj.forward(attended), dropout)
+    }
+}
+
+/// Linear, GELU, Linear, dropout.
+pub(super) type Mlp = (Linear, Gap, Linear);
+
+pub(super) fn mlp(init: &mut Init<'_>, width: usize, rate: usize) -> Mlp {
+    (linear(init, width, rate * width), GAP, linear(init, rate * width, width))
+}
+
+pub(super) fn through((first, _, second): &Mlp, x_bth: Tensor<3>, dropout: &mut Dropout) -> Tensor<3> {
+    kernels::dropout(second.forward(kernels::gelu(first.forward(x_bth))), dropout)
+}
+
+/// A pre-norm block: `x += Attn(LN1 x)`, `x += MLP(LN2 x)`.
+#[derive(Module, Debug)]
+pub struct GptBlock {
+    /// Before the attention.
+    pub ln1: Norm,
+    /// Before the feed-forward.
+    pub ln2: Norm,
+    /// Attention.
+    pub attn: SplitAttention,
+    /// Feed-forward.
+    pub mlp: Mlp,
+}
+
+impl GptBlock {
+    pub(super) fn new(init: &mut Init<'_>, width: usize, heads: usize, rate: usize) -> Self {
+        Self {
+            ln1: Norm::new(init, width),
+            ln2: Norm::new(init, width),
+            attn: SplitAttention::new(init, width, heads),
+            mlp: mlp(init, width, rate),
+        }
+    }
+
+    pub(super) fn forward(&self, x_bth: Tensor<3>, sight: &Sight, dropout: &mut Dropout) -> Tensor<3> {
+        let x = x_bth.clone() + self.attn.own(self.ln1.forward(x_bth, EPS), sight, dropout);
+        let hidden = through(&self.mlp, self.ln2.forward(x.clone(), EPS), dropout);
+        x + hidden
+    }
+}
+
+/// Blocks, a norm and the logits of classes.
+#[derive(Module, Debug)]
+pub struct GptHead {
+    /// Blocks.
+    pub blocks: Vec<GptBlock>,
+    /// After them.
+    pub ln_f: Norm,
+    /// H -> classes, no bias.
+    pub head: Linear,
+}
+
+impl GptHead {
+    pub(super) fn new(
+        init: &mut Init<'_>,
+        (width, heads, rate): (usize, usize, usize),
+        layers: usize,
+        classes: usize,
+    ) -> Self {
+        Self {
+            blocks: (0..layers).map(|_| GptBlock::new(init, width, heads, rate)).collect(),
+            ln_f: Norm::new(init, width),
+            head: Linear { weight: init.scaled_normal(DEVIATION, [classes, width]), bias: None },
+        }
+    }
+
+    pub(super) fn forward(&self, x_bth: Tensor<3>, sight: &Sight, dropout: &mut Dropout) -> Tensor<3> {
+        let x = self.blocks.iter().fold(x_bth, |x, block| block.forward(x, sight, dropout));
+        self.head.forward(self.ln_f.forward(x, EPS))
+    }
+}
+
+/// `x += Attn(LN1 x, LN3 w)`, `x += MLP(LN2 x)`: words looked at, no tokens among each other.
+#[derive(Module, Debug)]
+pub struct CrossBlock {
+    /// Before the attention.
+    pub ln1: Norm,
+    /// Before the feed-forward.
+    pub ln2: Norm,
+    /// On the words.
+    pub ln3: Norm,
+    /// Attention to the words.
+    pub attn: SplitAttention,
+    /// Feed-forward.
+    pub mlp: Mlp,
+}
+
+impl CrossBlock {
+    pub(super) fn new(init: &mut Init<'_>, width: usize, heads: usize, rate: usize) -> Self {
+        Self {
+            ln1: Norm::new(init, width),
+            ln2: Norm::new(init, width),
+            ln3: Norm::new(init, width),
+            attn: SplitAttention::new(init, width, heads),
+            mlp: mlp(init, width, rate),
+        }
+    }
+
+    pub(super) fn forward(&self, x_bth: Tensor<3>, words_bnh: Tensor<3>, dropout: &mut Dropout) -> Tensor<3> {
+        let words = self.ln3.forward(words_bnh, EPS);
+        let x = x_bth.clone() + self.attn.cross(self.ln1.forward(x_bth, EPS), words, dropout);
+        let hidden = through(&self.mlp, self.ln2.forward(x.clone(), EPS), dropout);
+        x + hidden
+    }
+}

@@ -1,0 +1,148 @@
+//! The masked token generator of MMM (Pinyoanuntapong et al., CVPR 2024).
+//!
+//! A token is its frozen code, or a learned row for end, pad and mask, through one Linear. Positions are added, the words of the caption are
+//! looked at (cross blocks, no mask on the words), the caption as a whole is put in front, positions are added again from its place on, so
+//! that a token carries two neighbouring rows of the table; then pre-norm blocks without a causal mask. Classes are the codes.
+//!
+//! Departs: the published state holds the frozen tokenizer, a learned position table that nothing reads, and masks; here the codes are an
+//! argument and the others are not parameters.
+
+use burn::module::Module;
+use burn::tensor::Tensor;
+use serde::{Deserialize, Serialize};
+
+use super::attend::{CrossBlock, Embedding, GptBlock, GptHead, Sight, hiding, linear, rows_of, sinusoids};
+use super::{Init, Linear};
+use crate::kernels::{Dropout, KeyMask};
+
+/// Size of the generator.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct MmmConfig {
+    /// Codes K.
+    pub codes: usize,
+    /// Width of a code.
+    pub dim: usize,
+    /// Width H.
+    pub width: usize,
+    /// Heads.
+    pub heads: usize,
+    /// Blocks of the head; the base has as many, cross blocks counted.
+    pub layers: usize,
+    /// Cross blocks.
+    pub local: usize,
+    /// Positions, the caption's and the end's counted.
+    pub block: usize,
+    /// Width of the embeddings of captions and words.
+    pub text_dim: usize,
+    /// Feed-forward width over H.
+    pub rate: usize,
+}
+
+impl MmmConfig {
+    /// The id that ends a motion.
+    pub fn end(&self) -> usize {
+        self.codes
+    }
+
+    /// The id behind the end.
+    pub fn pad(&self) -> usize {
+        self.codes + 1
+    }
+
+    /// The id of a token to be filled in.
+    pub fn mask(&self) -> usize {
+        self.codes + 2
+    }
+
+    /// Positions of tokens and the end.
+    pub fn positions(&self) -> usize {
+        self.block - 1
+    }
+}
+
+/// The first half.
+#[derive(Module, Debug)]
+pub struct MmmBase {
+    /// End, pad, mask -> code width.
+    pub learn_tok_emb: Embedding,
+    /// Code width -> H.
+    pub to_emb: Linear,
+    /// Caption -> H.
+    pub cond_emb: Linear,
+    /// Word -> H.
+    pub word_emb: Linear,
+    /// Blocks that look at the words.
+    pub cross_att: Vec<CrossBlock>,
+    /// Blocks.
+    pub blocks: Vec<GptBlock>,
+}
+
+/// The generator.
+#[derive(Module, Debug)]
+pub struct Mmm {
+    /// Embeddings and the first blocks.
+    pub trans_base: MmmBase,
+    /// The other blocks and the logits.
+    pub trans_head: GptHead,
+}
+
+impl Mmm {
+    /// A fresh one: weights normal with deviation 0.02, biases 0.
+    ///
+    /// # Panics
+    /// If there are more cross blocks than blocks.
+    pub fn new(config: &MmmConfig, init: &mut Init<'_>) -> Self {
+        let MmmConfig { codes, dim, width, heads, layers, local, text_dim, rate, .. } = *config;
+        assert!(local <= layers, "{local} of {layers} blocks look at the words");
+        Self {
+            trans_base: MmmBase {
+                learn_tok_emb: Embedding::new(init, 3, dim),
+                to_emb: linear(init, dim, width),
+                cond_emb: linear(init, text_dim, width),
+                word_emb: linear(init, text_dim, width),
+                cross_att: (0..local).map(|_| CrossBlock::new(init, width, heads, rate)).collect(),
+                blocks: (local..layers).map(|_| GptBlock::new(init, width, heads, rate)).collect(),
+            },
+            trans_head: GptHead::new(init, (width, heads, rate), layers, codes),
+        }
+    }
+
+    /// Logits [B, 1 + P, K] of the caption's place, which means nothing, and of each position of `ids` [B P].
+    ///
+    /// `codes_kd` [K, d] are the tokenizer's; of sequence b the first `visible[b]` positions are looked at, all without; where `text_visible` is
+    /// false the caption's place is not.
+    pub fn forward(
+        &self,
+        ids: &[usize],
+        codes_kd: Tensor<2>,
+        text_bc: Tensor<2>,
+        words_bnc: Tensor<3>,
+        visible: Option<&[usize]>,
+        text_visible: Option<&[bool]>,
+        dropout: &mut Dropout,
+    ) -> Tensor<3> {
+        let base = &self.trans_base;
+        let (batch, device) = (text_bc.dims()[0], text_bc.device());
+        let positions = ids.len() / batch;
+        let table = Tensor::cat(vec![codes_kd, base.learn_tok_emb.weight.val()], 0);
+        let x = base.to_emb.forward(rows_of(table, ids, batch));
+        let width = x.dims()[2];
+        let x = x + sinusoids(positions, width, &device);
+        let words = base.word_emb.forward(words_bnc);
+        let x = base.cross_att.iter().fold(x, |x, block| block.forward(x, words.clone(), dropout));
+        let condition = base.cond_emb.forward(text_bc).reshape([batch, 1, width]);
+        let x = Tensor::cat(vec![condition, x], 1) + sinusoids(positions + 1, width, &device);
+        let sight = match (visible, text_visible) {
+            (visible, Some(text)) => {
+                let of = |b: usize, p: usize| visible.is_none_or(|visible| p < visible[b]);
+                let seen: Vec<bool> = (0..batch)
+                    .flat_map(|b| [text[b]].into_iter().chain((0..positions).map(move |p| of(b, p))))
+                    .collect();
+                Sight::Bias(hiding(&seen, batch, &device))
+            }
+            (visible, None) => Sight::Keys(visible.map(|visible| KeyMask::new(visible, 1))),
+        };
+        let x = base.blocks.iter().fold(x, |x, block| block.forward(x, &sight, dropout));
+        self.trans_head.forward(x, &sight, dropout)
+    }
+}

@@ -1,0 +1,337 @@
+//! Codebooks: which code a row takes, and how codes follow the rows that take them.
+//!
+//! Source: the exponential-moving-average quantiser with resets of T2M-GPT (Zhang et al., CVPR 2023; van den Oord et al., arXiv:1711.00937,
+//! appendix A.1), stacked on residuals by MoMask (Guo et al., CVPR 2024), with another reset rule in MMM (Pinyoanuntapong et al., CVPR 2024).
+//! Notation: N rows of width d, K codes.
+//!
+//! Codes are f32 buffers on the host: no optimizer changes them, and all that changes them is a sum over the rows of a batch, so that a batch
+//! may be cut in slices. Draws are arguments.
+//!
+//! Departs: scores leave out the rows' own norms, which are the same for every code.
+
+use burn::tensor::{Device, Tensor, TensorData};
+
+use crate::kernels;
+
+/// What is kept of a codebook's statistics in each update.
+pub const MU: f64 = 0.99;
+/// Temperature of drawn codes, fixed in MoMask's training pass.
+pub const TEMPERATURE: f32 = 0.5;
+/// The id that stands for no code: it adds the zero vector.
+pub const NO_CODE: i64 = -1;
+/// Updates of MMM's quantiser from one look at unused codes to the next.
+const LOOK_EVERY: f32 = 20.0;
+
+/// Fills draws for one row: layer, row, and a uniform number in [0, 1) for each code.
+pub type Uniforms<'a> = &'a mut dyn FnMut(usize, usize, &mut [f32]);
+
+/// `-log(-log(u))`, with both arguments at least 1e-20.
+pub fn gumbel(uniform: f32) -> f32 {
+    const LEAST: f32 = 1e-20;
+    -((-(uniform.max(LEAST).ln())).max(LEAST).ln())
+}
+
+/// The code of each of `rows` [N, d] in `codes` [K, d]: the nearest, or with `uniforms` the largest of `-distance / 0.5 + gumbel`, the
+/// distance squared. The first of several that are equal.
+///
+/// # Panics
+/// If there are no codes.
+pub fn assign(
+    rows: &[f32],
+    codes: &[f32],
+    width: usize,
+    device: &Device,
+    mut uniforms: Option<&mut dyn FnMut(usize, &mut [f32])>,
+) -> Vec<usize> {
+    let (n, k) = (rows.len() / width, codes.len() / width);
+    assert!(k > 0, "a codebook has codes");
+    let tensor = |values: &[f32], rows| Tensor::<2>::from_data(TensorData::new(values.to_vec(), [rows, width]), device);
+    let products = kernels::linear(tensor(rows, n), tensor(codes, k), None).into_data();
+    let products = products.as_slice::<f32>().expect("f32 throughout");
+    let norms: Vec<f32> = codes.chunks_exact(width).map(|code| code.iter().map(|c| c * c).sum()).collect();
+    let mut draws = vec![0.0; k];
+    let code = |(row, products): (usize, &[f32])| {
+        let near = products.iter().zip(&norms).map(|(product, norm)| 2.0 * product - norm);
+        match &mut uniforms {
+            None => first_largest(near),
+            Some(uniforms) => {
+                uniforms(row, &mut draws);
+                first_largest(near.zip(&draws).map(|(near, u)| near / TEMPERATURE + gumbel(*u)))
+            }
+        }
+    };
+    products.chunks_exact(k).enumerate().map(code).collect()
+}
+
+/// Where the largest value is first; 0 if there is none.
+pub fn first_largest(values: impl Iterator<Item = f32>) -> usize {
+    let mut best = (0, f32::NEG_INFINITY);
+    for (i, value) in values.enumerate() {
+        if value > best.1 {
+            best = (i, value);
+        }
+    }
+    best.0
+}
+
+/// What one layer did with the rows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LayerPass {
+    /// Rows that the layer saw, [N, d]: what the layers before it left over.
+    pub rows: Vec<f32>,
+    /// Code of each row.
+    pub codes: Vec<usize>,
+}
+
+impl LayerPass {
+    /// For each of `count` codes how many rows took it, and their sum [K, d].
+    pub fn statistics(&self, count: usize, width: usize) -> (Vec<f32>, Vec<f32>) {
+        let (mut counts, mut sums) = (vec![0.0; count], vec![0.0; count * width]);
+        for (row, code) in self.rows.chunks_exact(width).zip(&self.codes) {
+            counts[*code] += 1.0;
+            sums[code * width..(code + 1) * width].iter_mut().zip(row).for_each(|(sum, r)| *sum += r);
+        }
+        (counts, sums)
+    }
+}
+
+/// Rows through a stack of codebooks, each of which quantises what those before it left over.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Pass {
+    /// The layers that took part.
+    pub layers: Vec<LayerPass>,
+    /// Sum of the codes taken, [N, d].
+    pub sum: Vec<f32>,
+    width: usize,
+}
+
+impl Pass {
+    /// Quantises `rows` [N, d] by the first `active` of the layers. `codebook` gives a layer's codes [K, d] for the rows that it sees.
+    pub fn through<'a>(
+        rows: Vec<f32>,
+        width: usize,
+        active: usize,
+        device: &Device,
+        mut codebook: impl FnMut(usize, &[f32]) -> std::borrow::Cow<'a, [f32]>,
+        mut uniforms: Option<Uniforms<'_>>,
+    ) -> Self {
+        let mut sum = vec![0.0; rows.len()];
+        let mut layers = Vec::with_capacity(active);
+        let mut left = rows;
+        for layer in 0..active {
+            let book = codebook(layer, &left);
+            let codes = match &mut uniforms {
+                None => assign(&left, &book, width, device, None),
+                Some(uniforms) => {
+                    let mut of_layer = |row: usize, out: &mut [f32]| uniforms(layer, row, out);
+                    assign(&left, &book, width, device, Some(&mut of_layer))
+                }
+            };
+            let rows = left.clone();
+            for ((left, sum), code) in left.chunks_exact_mut(width).zip(sum.chunks_exact_mut(width)).zip(&codes) {
+                let code = &book[code * width..(code + 1) * width];
+                for ((left, sum), code) in left.iter_mut().zip(sum).zip(code) {
+                    *left -= code;
+                    *sum += code;
+                }
+            }
+            layers.push(LayerPass { rows, codes });
+        }
+        Self { layers, sum, width }
+    }
+
+    /// The quantised rows as the decoder gets them, [N, d], and the commitment: squared distances of each active layer's rows to their
+    /// codes, summed over rows and width, and over layers.
+    ///
+    /// `rows` are those of [`through`](Self::through), tracked. The gradient of the quantised rows reaches them once for every active layer,
+    /// as each of upstream's layers passes it straight through.
+    pub fn straight_through(&self, rows_nd: Tensor<2>) -> (Tensor<2>, Tensor<1>) {
+        let dims = rows_nd.dims();
+        let device = rows_nd.device();
+        let constant = |values: Vec<f32>| Tensor::<2>::from_data(TensorData::new(values, dims), &device);
+        let passed = rows_nd.clone() * self.layers.len() as f32;
+        let quantised = passed.clone() - passed.detach() + constant(self.sum.clone());
+        // What a layer saw less its code is what the next one saw.
+        let after = self.layers.iter().skip(1).map(|layer| layer.rows.clone());
+        let whole = &self.layers[0].rows;
+        let last = whole.iter().zip(&self.sum).map(|(row, sum)| row - sum).collect();
+        let commitment = after.chain([last]).map(|left| {
+            // Of the tracked rows everything up to this layer's code is taken off.
+            let taken = whole.iter().zip(&left).map(|(row, left)| row - left).collect();
+            (rows_nd.clone() - constant(taken)).square().sum()
+        });
+        (quantised, commitment.reduce(|a, b| a + b).expect("a layer is active"))
+    }
+
+    /// Ids by row and layer, [N, layers], [`NO_CODE`] for the layers that took no part.
+    pub fn ids(&self, layers: usize) -> Vec<i64> {
+        let rows = self.sum.len() / self.width;
+        let id = |row: usize, layer: usize| self.layers.get(layer).map_or(NO_CODE, |pass| pass.codes[row] as i64);
+        (0..rows).flat_map(|row| (0..layers).map(move |layer| id(row, layer))).collect()
+    }
+}
+
+/// Sums of codes [N, d] for ids [N, layers]; [`NO_CODE`] and layers that `ids` leaves out add nothing.
+///
+/// # Panics
+/// If an id is neither a code nor [`NO_CODE`].
+pub fn look_up(ids: &[i64], layers: usize, books: &[Vec<f32>], width: usize) -> Vec<f32> {
+    let mut out = vec![0.0; ids.len() / layers * width];
+    for (sum, ids) in out.chunks_exact_mut(width).zip(ids.chunks_exact(layers)) {
+        for (id, book) in ids.iter().zip(books).filter(|(id, _)| **id != NO_CODE) {
+            let at = usize::try_from(*id).expect("ids are codes or -1") * width;
+            sum.iter_mut().zip(&book[at..at + width]).for_each(|(sum, code)| *sum += code);
+        }
+    }
+    out
+}
+
+/// How many codes are in use, in effect: `exp(-sum p log(p + 1e-7))` of their shares.
+pub fn perplexity(counts: &[f32]) -> f64 {
+    let all: f64 = counts.iter().map(|c| f64::from(*c)).sum();
+    let entropy = |count: &f32| {
+        let share = f64::from(*count) / all;
+        share * (share + 1e-7).ln()
+    };
+    (-counts.iter().map(entropy).sum::<f64>()).exp()
+}
+
+/// Deviation of the noise on repeated rows.
+fn spread(width: usize) -> f32 {
+    (0.01 / (width as f64).sqrt()) as f32
+}
+
+/// Rows to be codes: the first `count` of `rows` [N, d]. Where there are fewer they are repeated, and `noise` (standard normal, as many
+/// values as the repeated rows have, see [`noise_len`]) times `0.01 / sqrt(d)` is added to all of them.
+pub fn candidates(rows: &[f32], count: usize, width: usize, noise: impl FnOnce(usize) -> Vec<f32>) -> Vec<f32> {
+    let wanted = count * width;
+    match noise_len(rows.len(), wanted) {
+        0 => rows[..wanted].to_vec(),
+        len => {
+            let spread = spread(width);
+            rows.iter().cycle().zip(noise(len)).map(|(row, noise)| row + noise * spread).take(wanted).collect()
+        }
+    }
+}
+
+/// How many values of noise [`candidates`] takes for so many values of rows and of codes.
+pub fn noise_len(rows: usize, wanted: usize) -> usize {
+    if rows >= wanted { 0 } else { rows * wanted.div_ceil(rows.max(1)) }
+}
+
+/// One codebook and what its codes follow.
+#[derive(Debug)]
+pub struct Book<'a> {
+    /// Codes, [K, d].
+    pub codes: &'a mut [f32],
+    /// Running sums of rows, [K, d].
+    pub sums: &'a mut [f32],
+    /// Running counts, [K].
+    pub counts: &'a mut [f32],
+}
+
+impl Book<'_> {
+    /// The first codes: sums equal to them, counts 1.
+    pub fn start(&mut self, codes: &[f32]) {
+        self.codes.copy_from_slice(codes);
+        self.sums.copy_from_slice(codes);
+        self.counts.fill(1.0);
+    }
+
+    /// Sums and counts follow those of a batch.
+    fn follow(&mut self, sums: &[f32], counts: &[f32]) {
+        let (keep, take) = (MU as f32, (1.0 - MU) as f32);
+        // Two roundings: a count of one row in the first update must stay exactly 1.
+        let follow = |kept: &mut [f32], new: &[f32]| {
+            kept.iter_mut().zip(new).for_each(|(kept, new)| *kept = keep * *kept + take * new);
+        };
+        follow(self.sums, sums);
+        follow(self.counts, counts);
+    }
+
+    /// Sets codes for which `stays` to sum over count, the others to their row of `replacements`; gives how many of those there were.
+    ///
+    /// Counts below the smallest normal number are of codes that nobody has taken for some thousand steps: such a code keeps its value.
+    fn set(&mut self, replacements: Option<&[f32]>, stays: impl Fn(usize, f32) -> bool) -> usize {
+        let width = self.codes.len() / self.counts.len();
+        let mut replaced = 0;
+        for (k, count) in self.counts.iter().enumerate() {
+            let range = k * width..(k + 1) * width;
+            let code = &mut self.codes[range.clone()];
+            match replacements {
+                Some(rows) if !stays(k, *count) => {
+                    code.copy_from_slice(&rows[range]);
+                    replaced += 1;
+                }
+                _ if *count < f32::MIN_POSITIVE => {}
+                _ => code.iter_mut().zip(&self.sums[range]).for_each(|(code, sum)| *code = sum / count),
+            }
+        }
+        replaced
+    }
+
+    /// One update of T2M-GPT and MoMask: codes with a running count of at least 1 move to their mean, all others become their row of
+    /// `replacements` [K, d], in every update until their count has grown. Gives how many did.
+    pub fn update(&mut self, sums: &[f32], counts: &[f32], replacements: &[f32]) -> usize {
+        self.follow(sums, counts);
+        self.set(Some(replacements), |_, count| count >= 1.0)
+    }
+
+    /// One update of MMM: all codes move to their means, but for every 21st update, which replaces those whose count is below 1 and that
+    /// `used` does not remember. `since` counts updates since the last such; both start as zeros.
+    pub fn update_remembering(
+        &mut self,
+        sums: &[f32],
+        counts: &[f32],
+        replacements: &[f32],
+        used: &mut [f32],
+        since: &mut f32,
+    ) -> usize {
+        self.follow(sums, counts);
+        used.iter_mut().zip(&*self.counts).for_each(|(used, count)| *used = used.max(f32::from(*count >= 1.0)));
+        let looks = *since >= LOOK_EVERY;
+        *since = if looks { 0.0 } else { *since + 1.0 };
+        self.set(looks.then_some(replacements), |k, _| used[k] > 0.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_gradient_passes_once_for_every_layer_and_the_value_is_the_codes() {
+        let device = Device::flex().autodiff();
+        let rows = vec![0.3, -0.2, 1.1, 0.4, -0.6, 0.8];
+        let books = [vec![0.0, 0.0, 1.0, 0.5], vec![0.25, -0.25, -0.5, 0.75, 0.1, 0.0]];
+        let book = |layer: usize, _: &[f32]| std::borrow::Cow::<[f32]>::Borrowed(books[layer].as_slice());
+        let pass = Pass::through(rows.clone(), 2, 2, &Device::flex(), book, None);
+        assert_eq!(look_up(&pass.ids(2), 2, &books, 2), pass.sum);
+        assert_eq!(pass.ids(3).iter().filter(|id| **id == NO_CODE).count(), 3);
+        let x = Tensor::<2>::from_data(TensorData::new(rows.clone(), [3, 2]), &device).require_grad();
+        let (quantised, commitment) = pass.straight_through(x.clone());
+        let values = quantised.clone().into_data();
+        assert_eq!(values.as_slice::<f32>().unwrap(), pass.sum);
+        let gradient = x.grad(&quantised.sum().backward()).unwrap().into_data();
+        assert_eq!(gradient.as_slice::<f32>().unwrap(), [2.0; 6]);
+        let left: f32 = pass.layers[1].rows.iter().map(|r| r * r).sum();
+        let last: f32 = rows.iter().zip(&pass.sum).map(|(r, s)| (r - s) * (r - s)).sum();
+        assert!((commitment.into_scalar::<f32>() - left - last).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_code_that_nobody_takes_stays_finite() {
+        let (mut codes, mut sums, mut counts) = (vec![1.0, 2.0], vec![0.0, 2.0], vec![0.0, 1.0]);
+        let mut book = Book { codes: &mut codes, sums: &mut sums, counts: &mut counts };
+        book.update_remembering(&[0.0, 0.0], &[0.0, 0.0], &[7.0, 7.0], &mut [0.0, 0.0], &mut 0.0);
+        assert_eq!(codes[0], 1.0);
+        assert!((codes[1] - 2.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn few_rows_are_repeated_with_noise_and_many_are_taken_as_they_are() {
+        assert_eq!(candidates(&[1.0, 2.0, 3.0], 2, 1, |_| unreachable!("enough rows")), [1.0, 2.0]);
+        let tiled = candidates(&[1.0, 2.0], 3, 1, |len| vec![1.0; len]);
+        assert_eq!(tiled, [1.01, 2.01, 1.01]);
+    }
+}

@@ -1,0 +1,140 @@
+//! Filling in the first layer of codes with MoMask's masked transformer (Guo et al., CVPR 2024), and its training examples.
+
+use burn::tensor::Tensor;
+
+use super::{Uniforms, cosine, grid, guided, gumbel_draw, host, keep_top, probability};
+use crate::kernels::Dropout;
+use crate::networks::{MaskedTransformer, MomaskConfig};
+use crate::quantizer::NO_CODE;
+
+/// Score of a token that is never masked again.
+const KEPT: f32 = 1e5;
+
+/// How tokens are drawn.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sampling {
+    /// Iterations.
+    pub steps: usize,
+    /// Scale of classifier-free guidance; 1 for none.
+    pub guidance: f32,
+    /// What logits are divided by.
+    pub temperature: f32,
+    /// Share of the classes that cannot be drawn.
+    pub threshold: f64,
+}
+
+/// A clip to be filled in.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Canvas {
+    /// A known id, or `None` where one is to be drawn.
+    pub tokens: Vec<Option<usize>>,
+}
+
+impl Canvas {
+    /// Nothing known.
+    pub fn empty(len: usize) -> Self {
+        Self { tokens: vec![None; len] }
+    }
+}
+
+/// Ids [B n] of the first layer, [`NO_CODE`] behind the end of each clip; n is the longest clip's length.
+///
+/// Iteration k of T masks the `round(cos(pi t / 2) open)` open tokens of the lowest scores, at least one, with `t = k / (T - 1)`, and draws
+/// them all at once; the score of a drawn token is its share in the softmax. Tokens that an iteration keeps are kept for good. Known tokens
+/// are never masked, and counts are relative to the others.
+///
+/// `see` gets the ids that the network sees in each iteration.
+pub fn generate(
+    network: &MaskedTransformer,
+    config: &MomaskConfig,
+    sampling: &Sampling,
+    text_bc: Tensor<2>,
+    canvases: &[Canvas],
+    uniforms: Uniforms<'_>,
+    mut see: impl FnMut(&[usize]),
+) -> Vec<i64> {
+    let lengths: Vec<usize> = canvases.iter().map(|canvas| canvas.tokens.len()).collect();
+    let len = lengths.iter().copied().max().unwrap_or(0);
+    let (mask, pad, classes) = (config.mask(), config.pad(), config.codes);
+    let mut ids: Vec<usize> = canvases
+        .iter()
+        .flat_map(|canvas| (0..len).map(|p| canvas.tokens.get(p).map_or(pad, |known| known.unwrap_or(mask))))
+        .collect();
+    let mut scores: Vec<f32> = ids.iter().map(|id| if *id == mask { 0.0 } else { KEPT }).collect();
+    let open: Vec<usize> = canvases.iter().map(|c| c.tokens.iter().filter(|token| token.is_none()).count()).collect();
+    let mut draws = vec![0.0; classes];
+    for step in 0..sampling.steps {
+        let t = grid(step, sampling.steps);
+        let mut masked = vec![false; ids.len()];
+        for (b, open) in open.iter().enumerate().filter(|(_, open)| **open > 0) {
+            let count = (cosine(t) * *open as f32).round_ties_even().max(1.0) as usize;
+            let mut order: Vec<usize> = (b * len..(b + 1) * len).collect();
+            order.sort_by(|x, y| scores[*x].total_cmp(&scores[*y]));
+            order.into_iter().take(count).for_each(|at| masked[at] = true);
+        }
+        ids.iter_mut().zip(&masked).filter(|(_, masked)| **masked).for_each(|(id, _)| *id = mask);
+        see(&ids);
+        let logits = guided(sampling.guidance, |conditional| {
+            let text = if conditional { text_bc.clone() } else { text_bc.zeros_like() };
+            network.forward(&ids, text, &lengths, &mut Dropout::off())
+        });
+        for (at, logits) in host(logits).chunks_exact(classes).enumerate() {
+            scores[at] = KEPT;
+            if !masked[at] {
+                continue;
+            }
+            let mut kept = logits.to_vec();
+            keep_top(&mut kept, sampling.threshold);
+            uniforms(step, at / len, at % len, &mut draws);
+            ids[at] = gumbel_draw(&kept, sampling.temperature, &draws);
+            scores[at] = probability(logits, ids[at]);
+        }
+    }
+    let id = |(at, id): (usize, usize)| if at % len < lengths[at / len] { id as i64 } else { NO_CODE };
+    ids.into_iter().enumerate().map(id).collect()
+}
+
+/// The draws for one clip in training; all but the first have as many values as there are positions.
+#[derive(Debug, Clone, Copy)]
+pub struct Corruption<'a> {
+    /// Uniform: gives the share that is chosen, `cos(pi u / 2)` of the positions, padding counted.
+    pub share: f32,
+    /// Uniform: the smallest are chosen.
+    pub order: &'a [f32],
+    /// Uniform: a tenth of the chosen tokens becomes `random`.
+    pub replace: &'a [f32],
+    /// Uniform: 88 of 100 of the others become the mask.
+    pub hide: &'a [f32],
+    /// Codes.
+    pub random: &'a [usize],
+}
+
+/// One clip as the generator is trained on it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Example {
+    /// What the network sees.
+    pub input: Vec<usize>,
+    /// Which positions it is asked for.
+    pub asked: Vec<bool>,
+}
+
+impl Example {
+    /// `tokens`, padding behind `len` of them.
+    pub fn new(config: &MomaskConfig, tokens: &[usize], len: usize, draws: &Corruption<'_>) -> Self {
+        let n = tokens.len();
+        let count = (n as f32 * cosine(draws.share)).round_ties_even().max(1.0) as usize;
+        let mut order: Vec<usize> = (0..n).collect();
+        order.sort_by(|a, b| draws.order[*a].total_cmp(&draws.order[*b]));
+        // Upstream compares the order itself with the count, not ranks: as many positions, another draw of the same kind.
+        let asked: Vec<bool> = order.iter().enumerate().map(|(p, at)| *at < count && p < len).collect();
+        let input = (0..n).map(|p| match (p < len, asked[p]) {
+            (false, _) => config.pad(),
+            (true, false) => tokens[p],
+            (true, true) if draws.replace[p] < 0.1 => draws.random[p],
+            (true, true) if draws.hide[p] < 0.88 => config.mask(),
+            (true, true) => tokens[p],
+        });
+        let input = input.collect();
+        Self { input, asked }
+    }
+}
