@@ -23,6 +23,14 @@ pub enum ArtifactKind {
     Vae,
     /// VAE posteriors of a dataset.
     Latents,
+    /// Turns motion into tokens, and back.
+    Tokenizer,
+    /// Token ids of a dataset.
+    Tokens,
+    /// Turns tokens into motion along a flow.
+    FlowDecoder,
+    /// Draws token ids for captions.
+    TokenGenerator,
     /// Turns captions into vectors.
     TextEncoder,
     /// A latent denoiser: teacher or student.
@@ -49,6 +57,10 @@ impl ArtifactKind {
             Self::Embeddings => "caption embeddings",
             Self::Vae => "a VAE",
             Self::Latents => "latents",
+            Self::Tokenizer => "a tokenizer",
+            Self::Tokens => "tokens",
+            Self::FlowDecoder => "a flow decoder",
+            Self::TokenGenerator => "a token generator",
             Self::TextEncoder => "a text encoder",
             Self::Denoiser => "a denoiser",
             Self::Evaluator => "an evaluator",
@@ -74,6 +86,12 @@ impl Role {
     pub const DENOISER: Self = Self(Cow::Borrowed("denoiser"));
     /// Turns latents into motion.
     pub const VAE: Self = Self(Cow::Borrowed("vae"));
+    /// The network that draws tokens.
+    pub const GENERATOR: Self = Self(Cow::Borrowed("generator"));
+    /// Turns tokens into motion instead of the tokenizer.
+    pub const DECODER: Self = Self(Cow::Borrowed("decoder"));
+    /// Turns tokens into motion.
+    pub const TOKENIZER: Self = Self(Cow::Borrowed("tokenizer"));
     /// Turns captions into what the generator is conditioned on.
     pub const TEXT: Self = Self(Cow::Borrowed("text"));
     /// Says how long a caption's motion is when nobody else does.

@@ -31,9 +31,11 @@ pub use distillation::{Distance, Distillation};
 pub use evaluation::{Mode, Split};
 pub use identity::{Backend, StageIdentity};
 pub use kinds::{
-    DataOpen, DataSynthetic, DistillLcm, DistillPcm, EncodeLatents, EvaluateLatentFid, EvaluateReconstruction,
-    EvaluateT2m, EvaluatorNetwork, ImportEvaluator, MovementPhase, MultiModality, Promote, Register, StageSettings,
-    TextEmbed, TextEncoder, TrainEvaluator, TrainLength, TrainMld, TrainVae, VaeLoss, Windows,
+    DataOpen, DataSynthetic, DistillLcm, DistillPcm, EncodeLatents, EncodeTokens, EvaluateLatentFid,
+    EvaluateReconstruction, EvaluateT2m, EvaluatorNetwork, FlowBackbone, FlowNetwork, FlowProjection, FlowSolver,
+    ImportEvaluator, ModelDecoder, MovementPhase, MultiModality, Promote, Register, Resets, StageSettings, TextEmbed,
+    TextEncoder, TokenGenerator, TokenNetwork, TokenizerLoss, TokenizerNetwork, TrainDiscord, TrainEvaluator,
+    TrainLength, TrainMld, TrainTokenizer, TrainTokens, TrainVae, VaeLoss, Windows, WindowsOf,
 };
 pub use neighbours::Neighbours;
 pub use network::{LatentShape, Network, Positions};

@@ -112,7 +112,10 @@ impl Generator {
             Lap::Decoded => decoded = Instant::now(),
         };
         let features = generator::motions(&*self.model, batch, &sampler, &mut lap)?.concat();
-        let joints = recover_joints(&features, Skeleton::of(self.format()));
+        let skeleton = Skeleton::of(self.format());
+        let joints = recover_joints(&features, skeleton);
+        // An autoregressive model ends a motion where it likes.
+        let frames = features.len() / skeleton.features;
         let timing = Timing { text: embedded - start, sampling: sampled - embedded, decoding: decoded - sampled };
         Ok(Generated { features, joints, frames, format: self.format(), timing })
     }

@@ -257,6 +257,9 @@ impl Denoiser {
                 let fresh: Vec<_> = (1..timesteps.len()).map(|j| on_device(step_noise(j - 1), shape)).collect();
                 lcm_sample(&self.schedule, &timesteps, z, &fresh, &mut eps)
             }
+            Family::Autoregressive | Family::Masked => {
+                return Err(StageError::Input("the denoiser says that it draws tokens, which it does not".into()));
+            }
             Family::Pcm { skip, phases, .. } => {
                 let mut eps = self.student(conditions, sampler, batch);
                 pcm_sample(&self.schedule, &Phases::new(&Grid::new(skip), phases), z, &mut eps)

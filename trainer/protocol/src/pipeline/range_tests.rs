@@ -42,6 +42,16 @@ fn stages() -> Vec<(String, StageSettings)> {
                 ..EvaluateLatentFid::default()
             }),
         ),
+        ("tokenizer", StageSettings::TrainTokenizer(TrainTokenizer::default())),
+        ("tokens", StageSettings::EncodeTokens(EncodeTokens::default())),
+        (
+            "generator",
+            StageSettings::TrainTokens(TrainTokens { generator: TokenGenerator::Masked, ..TrainTokens::default() }),
+        ),
+        (
+            "flow",
+            StageSettings::ModelDecoder(ModelDecoder { model: "generator".into(), decoder: "train_discord".into() }),
+        ),
         ("evaluator", StageSettings::TrainEvaluator(TrainEvaluator::default())),
         ("imported", StageSettings::ImportEvaluator(ImportEvaluator { path: "t2m".into(), ..Default::default() })),
         ("t2m", StageSettings::EvaluateT2m(EvaluateT2m { model: "lcm".into(), sampler, ..EvaluateT2m::default() })),

@@ -76,7 +76,8 @@ impl<'a> Neighbours<'a> {
     /// The skeleton of a dataset, of a model's motions, or the one that an evaluator is for.
     pub fn format(&self, name: &str) -> Option<DataFormat> {
         self.stage(name)?.spec().format().or_else(|| {
-            let from = self.dataset_of(name).or_else(|| self.vae_of_model(name))?;
+            let tokens = || self.read_by(name, ArtifactKind::Tokens);
+            let from = self.dataset_of(name).or_else(|| self.vae_of_model(name)).or_else(tokens)?;
             if from == name { None } else { self.format(from) }
         })
     }
@@ -149,11 +150,17 @@ impl<'a> Neighbours<'a> {
     /// Refuses a student where a teacher is needed.
     pub(crate) fn is_teacher(&self, p: &mut Problems, teacher: &str) {
         if let Some(settings) = self.stage(teacher)
-            && self.family(teacher).is_some_and(|family| family.is_student())
+            && let Some(family) = self.family(teacher)
+            && family != Family::Mld
         {
             let kind = settings.kind();
-            let message = format!("`{teacher}` is a student ({kind}), but `teacher` needs a `train.mld` stage");
-            p.add("teacher", message, "a student has guidance built in, and cannot be asked without it");
+            let (what, why) = if family.is_student() {
+                ("a student", "a student has guidance built in, and cannot be asked without it")
+            } else {
+                ("no latent diffusion", "only such a model gives latents to learn from")
+            };
+            let message = format!("`{teacher}` is {what} ({kind}), but `teacher` needs a `train.mld` stage");
+            p.add("teacher", message, why);
         }
     }
 

@@ -12,9 +12,11 @@ const TIMESTEPS: usize = 1000;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Sampler {
-    /// Network evaluations. A PCM student has as many as phases.
+    /// Network evaluations. A PCM student has as many as phases; a masked token generator fills in a motion in so many; an autoregressive
+    /// one takes no number of steps, so this is 1.
     pub steps: usize,
-    /// Teacher: g in `uncond + g (cond - uncond)`. Student: the embedded w, which is g - 1.
+    /// Teacher and masked token generator: g in `uncond + g (cond - uncond)`. Student: the embedded w, which is g - 1. An autoregressive
+    /// generator has none: 0.
     pub guidance: f64,
     /// LCM only: timesteps, first to last; empty takes evenly spaced points of the training grid from 999 down.
     pub timesteps: Vec<usize>,
@@ -80,12 +82,16 @@ pub enum Family {
         /// M: phases, and sampling steps.
         phases: usize,
     },
+    /// Draws tokens one after the other, and so decides how long a motion is.
+    Autoregressive,
+    /// Fills in all tokens at once, again and again, with classifier-free guidance.
+    Masked,
 }
 
 impl Family {
     /// Whether guidance is built in, so that it cannot be asked without it and teaches nobody.
     pub fn is_student(&self) -> bool {
-        !matches!(self, Self::Mld)
+        matches!(self, Self::Lcm { .. } | Self::Pcm { .. })
     }
 
     /// What must hold of a sampler for a model of this family; `model` is what messages call it.
@@ -106,7 +112,14 @@ impl Family {
                 let points = TIMESTEPS / (*skip).max(1);
                 at_most(points, &format!("the grid of {model} has {points} points"));
             }
-            Self::Lcm { .. } => {}
+            Self::Lcm { .. } | Self::Masked => {}
+            Self::Autoregressive => {
+                at_most(1, &format!("{model} draws a token after the other until it ends"));
+                if sampler.guidance != 0.0 {
+                    let message = format!("`sampler.guidance` is {}, but {model} has none", sampler.guidance);
+                    p.add("sampler.guidance", message, "write `guidance: 0`");
+                }
+            }
             Self::Pcm { phases, .. } if *phases == steps => {}
             Self::Pcm { phases, .. } => {
                 let message = format!(
@@ -130,7 +143,7 @@ impl Family {
     }
 
     /// How the papers draw: a teacher with 50 steps at its published guidance, a student with as many steps as it has phases (an LCM with
-    /// one), at a third of the range of guidance scales that it was trained for. The published range 5 to 15 gives w = 8.3, near
+    /// one), at a third of the range of guidance scales that it was trained for; MoMask in ten steps at 4. The published range 5 to 15 gives w = 8.3, near
     /// MotionLCM's 7 to 12.5. For models that nobody has measured; a measured one has its own.
     pub fn published(&self) -> Sampler {
         let student = |steps: usize, (low, high): (f64, f64)| Sampler {
@@ -140,6 +153,8 @@ impl Family {
         };
         match self {
             Self::Mld => Sampler { steps: 50, guidance: 7.5, timesteps: Vec::new() },
+            Self::Autoregressive => Sampler { steps: 1, guidance: 0.0, timesteps: Vec::new() },
+            Self::Masked => Sampler { steps: 10, guidance: 4.0, timesteps: Vec::new() },
             Self::Lcm { guidance, .. } => student(1, *guidance),
             Self::Pcm { guidance, phases, .. } => student(*phases, *guidance),
         }
@@ -196,7 +211,8 @@ mod tests {
         assert_eq!(Family::Mld.accepts(&sampler(50, &[])), Ok(()));
         assert_eq!(lcm.accepts(&sampler(2, &[699, 299])), Ok(()));
         assert_eq!(pcm.accepts(&sampler(2, &[])), Ok(()));
-        for family in [Family::Mld, lcm, pcm] {
+        assert!(Family::Autoregressive.accepts(&sampler(1, &[])).unwrap_err().contains("has none"));
+        for family in [Family::Mld, lcm, pcm, Family::Autoregressive, Family::Masked] {
             assert_eq!(family.accepts(&family.published()), Ok(()), "{family:?}");
         }
     }

@@ -4,6 +4,7 @@
 //! generator's own matter. To add one: a file here that implements [`MotionGenerator`], and a line in the table of [`open`].
 
 mod latent_diffusion;
+mod tokens;
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -21,6 +22,7 @@ use crate::parts::model_error;
 use crate::text::TextEncoder;
 
 pub(crate) use latent_diffusion::NAME as LATENT_DIFFUSION;
+pub(crate) use tokens::{GeneratorMeta, MASKED_PREFIX, NAME as TOKENS, RESIDUAL_PREFIX};
 
 /// A caption as a generator wants it: what it asked its text encoder for.
 #[derive(Debug, Clone, PartialEq)]
@@ -75,8 +77,8 @@ pub trait MotionGenerator: std::fmt::Debug {
     /// Captions as it wants them.
     fn embed(&self, captions: &[&str]) -> Result<Vec<Text>, StageError>;
 
-    /// A motion for each of the batch, feature rows `[frames, features]` in the data's own scale. The lengths and the sampler are ones
-    /// that it has; [`motions`] sees to that.
+    /// A motion for each of the batch, feature rows `[frames, features]` in the data's own scale, of the length asked for unless the model
+    /// decides on its own. The lengths and the sampler are ones that it has; [`motions`] sees to that.
     fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError>;
 
     /// The way to its latents, if it draws motion from such.
@@ -101,7 +103,7 @@ pub trait LatentGenerator {
 type Open = fn(&Model, &dyn Blobs, &Device) -> Result<Box<dyn MotionGenerator>, StageError>;
 
 /// Every generator by its name in manifests.
-const GENERATORS: [(&str, Open); 1] = [(LATENT_DIFFUSION, latent_diffusion::open)];
+const GENERATORS: [(&str, Open); 2] = [(LATENT_DIFFUSION, latent_diffusion::open), (TOKENS, tokens::open)];
 
 /// The generator of an artifact of kind `model`.
 pub fn open(manifest: &Manifest, blobs: &dyn Blobs, device: &Device) -> Result<Box<dyn MotionGenerator>, StageError> {

@@ -3,7 +3,9 @@
 
 mod consistency;
 mod data;
+mod discord;
 mod encode;
+mod encode_tokens;
 mod evaluator;
 mod import;
 mod latent_data;
@@ -11,10 +13,14 @@ mod latent_fid;
 mod lcm;
 mod length;
 mod mld;
+mod model_decoder;
 mod pcm;
 mod reconstruction;
 mod t2m;
 mod text;
+mod token_windows;
+mod tokenizer;
+mod tokens;
 mod vae;
 
 use std::collections::BTreeMap;
@@ -77,9 +83,9 @@ macro_rules! runners {
 
 // The list of what runs. It is held against `protocol`'s list of kinds by a test below.
 runners! {
-    Plain: DataOpen, DataSynthetic, TextEmbed, ImportEvaluator;
-    Map: EncodeLatents, EvaluateReconstruction, EvaluateLatentFid, EvaluateT2m;
-    Gang: TrainVae, TrainMld, DistillLcm, DistillPcm, TrainEvaluator, TrainLength;
+    Plain: DataOpen, DataSynthetic, TextEmbed, ImportEvaluator, ModelDecoder;
+    Map: EncodeLatents, EncodeTokens, EvaluateReconstruction, EvaluateLatentFid, EvaluateT2m;
+    Gang: TrainVae, TrainMld, DistillLcm, DistillPcm, TrainEvaluator, TrainLength, TrainTokenizer, TrainTokens, TrainDiscord;
 }
 
 /// Runs a plain stage.

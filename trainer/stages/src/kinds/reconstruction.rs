@@ -1,8 +1,9 @@
-//! `evaluate.reconstruction`: what a VAE loses, clip by clip.
+//! `evaluate.reconstruction`: what a VAE or a tokenizer loses, clip by clip.
 //!
 //! Each clip is its entry's first frames, as many as are a multiple of the unit length; it is encoded and decoded alone, so no
 //! number hangs on the sharding. Metrics without a prefix are of a sample z of the posterior, as every later stage uses it; `mu_` of the
-//! posterior's mean; `clip_mean_` of no network at all: the clip's own mean feature vector, held; `real_` of the clip itself.
+//! posterior's mean (a tokenizer has none, and no sample: it decodes what it encodes); `clip_mean_` of no network at all: the clip's own mean feature vector, held; `real_` of the clip itself.
+//! Of a tokenizer also, as means over its codebooks, the share of codes in `used` and the `perplexity` of all clips' codes.
 //! Definitions: [`evaluation::reconstruction`](crate::evaluation::reconstruction).
 
 use std::collections::BTreeMap;
@@ -18,14 +19,17 @@ use crate::artifacts::{self, to_meta};
 use crate::context::{AttemptContext, ContextError, Outcome, StageError};
 use crate::evaluation::joints::time_mean;
 use crate::evaluation::reconstruction::{ClipErrors, real_skating, summary};
+use crate::flow_decoder::FlowDecoder;
 use crate::networks::Autoencoder;
+use crate::tokenizer::TrainedTokenizer;
 
 /// Errors of the three guesses at one clip.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Row {
     entry: String,
     sample: ClipErrors,
-    mu: ClipErrors,
+    /// Of a VAE alone.
+    mu: Option<ClipErrors>,
     clip_mean: ClipErrors,
     /// Skating ratio of the clip.
     real_skating: f64,
@@ -36,16 +40,113 @@ struct Row {
 struct Rows {
     format: DataFormat,
     rows: Vec<Row>,
+    /// How often each codebook's codes were taken; none of a VAE.
+    codes: Vec<Vec<u64>>,
+}
+
+/// What is measured.
+enum Measured {
+    Vae(Autoencoder),
+    Tokenizer(TrainedTokenizer, Option<FlowDecoder>),
+}
+
+impl Measured {
+    fn read(cx: &dyn AttemptContext, settings: &EvaluateReconstruction) -> Result<Self, StageError> {
+        let blobs = cx.blobs();
+        if settings.tokenizer.is_empty() {
+            let (_, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
+            return Autoencoder::read(&*blobs, &vae, &cx.device()).map(Self::Vae);
+        }
+        let (digest, manifest) = artifacts::input(cx, "tokenizer", ArtifactKind::Tokenizer)?;
+        let tokenizer = TrainedTokenizer::read(&*blobs, &manifest, &cx.device())?;
+        if settings.decoder.is_empty() {
+            return Ok(Self::Tokenizer(tokenizer, None));
+        }
+        let (_, manifest) = artifacts::input(cx, "decoder", ArtifactKind::FlowDecoder)?;
+        let decoder = FlowDecoder::read(&*blobs, &manifest, digest, &cx.device())?;
+        Ok(Self::Tokenizer(tokenizer, Some(decoder)))
+    }
+
+    fn check_format(&self, format: DataFormat) -> Result<(), StageError> {
+        match self {
+            Self::Vae(vae) => vae.check_format(format),
+            Self::Tokenizer(tokenizer, _) => tokenizer.check_format(format),
+        }
+    }
+
+    /// Mean and standard deviation of its training data.
+    fn statistics(&self) -> (&[f32], &[f32]) {
+        match self {
+            Self::Vae(vae) => (&vae.meta().mean, &vae.meta().std),
+            Self::Tokenizer(tokenizer, _) => (&tokenizer.meta().mean, &tokenizer.meta().std),
+        }
+    }
+
+    fn normalise(&self, rows: &mut [f32]) {
+        match self {
+            Self::Vae(vae) => vae.normalise(rows),
+            Self::Tokenizer(tokenizer, _) => tokenizer.normalise(rows),
+        }
+    }
+
+    /// Guesses at normalised rows `[frames, D]`: as later stages see them, and of the posterior's mean. Adds to `codes` those taken.
+    fn guesses(
+        &self,
+        truth: &[f32],
+        frames: usize,
+        stream: &mut Stream,
+        codes: &mut [Vec<u64>],
+    ) -> (Vec<f32>, Option<Vec<f32>>) {
+        match self {
+            Self::Vae(vae) => {
+                let posterior = vae.encode(truth.to_vec(), frames);
+                let z = posterior.sample(stream);
+                (vae.decode(z, frames), Some(vae.decode(posterior.mu.clone(), frames)))
+            }
+            Self::Tokenizer(tokenizer, decoder) => {
+                let ids = tokenizer.encode(truth.to_vec());
+                for row in ids.chunks_exact(codes.len()) {
+                    row.iter().zip(&mut *codes).for_each(|(id, counts)| counts[*id as usize] += 1);
+                }
+                let decoded = match decoder {
+                    None => tokenizer.decode(&ids),
+                    Some(decoder) => decoder.decode(tokenizer, &ids, stream),
+                };
+                (decoded, None)
+            }
+        }
+    }
+
+    /// A count for each code of each codebook.
+    fn no_codes(&self) -> Vec<Vec<u64>> {
+        match self {
+            Self::Vae(_) => Vec::new(),
+            Self::Tokenizer(tokenizer, _) => vec![vec![0; tokenizer.meta().codes]; tokenizer.meta().quantizers],
+        }
+    }
+}
+
+/// Share of codes in use and their perplexity, each a mean over the codebooks.
+fn usage(codes: &[Vec<u64>]) -> Vec<(String, f64)> {
+    if codes.is_empty() {
+        return Vec::new();
+    }
+    let mean = |of: fn(&Vec<u64>) -> f64| codes.iter().map(of).sum::<f64>() / codes.len() as f64;
+    let used = mean(|counts| counts.iter().filter(|count| **count > 0).count() as f64 / counts.len() as f64);
+    let perplexity = mean(|counts| {
+        let counts: Vec<f32> = counts.iter().map(|count| *count as f32).collect();
+        models::quantizer::perplexity(&counts)
+    });
+    vec![("used".to_owned(), used), ("perplexity".to_owned(), perplexity)]
 }
 
 impl Map for EvaluateReconstruction {
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
         let blobs = cx.blobs();
-        let (_, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
         let (_, dataset) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
         let dataset = artifacts::dataset(&*blobs, &dataset)?;
-        let vae = Autoencoder::read(&*blobs, &vae, &cx.device())?;
-        vae.check_format(dataset.format)?;
+        let measured = Measured::read(cx, self)?;
+        measured.check_format(dataset.format)?;
         let entries = dataset.entries_of(self.split);
         if entries.is_empty() {
             return Err(no_entries(self.split));
@@ -54,7 +155,8 @@ impl Map for EvaluateReconstruction {
         let range = shard_range(entries.len(), index, of);
         let total = range.len() as u64;
         let (skeleton, width, seed) = (dataset.skeleton(), dataset.mean.len(), cx.task().seed);
-        let meta = vae.meta();
+        let (mean, std) = measured.statistics();
+        let mut codes = measured.no_codes();
         let mut rows = Vec::with_capacity(range.len());
         for &e in &entries[range] {
             if cx.interrupted() {
@@ -63,21 +165,29 @@ impl Map for EvaluateReconstruction {
             let entry = &dataset.entries[e];
             let frames = (entry.len / skeleton.unit * skeleton.unit).max(entry.len.min(skeleton.unit));
             let mut truth = dataset.features(entry)[..frames * width].to_vec();
-            vae.normalise(&mut truth);
-            let posterior = vae.encode(truth.clone(), frames);
+            if let Measured::Tokenizer(tokenizer, _) = &measured
+                && frames < tokenizer.unit()
+            {
+                return Err(StageError::Input(format!(
+                    "clip `{}` has {frames} frames, a token stands for {}; leave it out of the split",
+                    entry.id,
+                    tokenizer.unit()
+                )));
+            }
+            measured.normalise(&mut truth);
             let mut stream = Stream::new(seed, "evaluate.reconstruction/noise", 0, e as u64);
-            let z = posterior.sample(&mut stream);
-            let errors = |guess: &[f32]| ClipErrors::between(&truth, guess, &meta.mean, &meta.std, skeleton);
+            let (sample, mu) = measured.guesses(&truth, frames, &mut stream, &mut codes);
+            let errors = |guess: &[f32]| ClipErrors::between(&truth, guess, mean, std, skeleton);
             rows.push(Row {
                 entry: entry.id.clone(),
-                sample: errors(&vae.decode(z, frames)),
-                mu: errors(&vae.decode(posterior.mu.clone(), frames)),
+                sample: errors(&sample),
+                mu: mu.map(|mu| errors(&mu)),
                 clip_mean: errors(&time_mean(&truth, width)),
-                real_skating: real_skating(&truth, &meta.mean, &meta.std, skeleton),
+                real_skating: real_skating(&truth, mean, std, skeleton),
             });
             cx.progress(rows.len() as u64, total, "clips", &[]);
         }
-        let rows = Rows { format: dataset.format, rows };
+        let rows = Rows { format: dataset.format, rows, codes };
         let bytes = serde_json::to_vec(&rows).map_err(|e| StageError::Fault(e.to_string()))?;
         let meta = serde_json::json!({"shard": index, "of": of});
         let output = artifacts::publish(cx, ArtifactKind::Shard, meta, REPORT_FILE, bytes)?;
@@ -94,20 +204,30 @@ impl Map for EvaluateReconstruction {
                 .map_err(|e| StageError::Context(ContextError::Corrupt(format!("{REPORT_FILE} of a shard: {e}"))))?;
             match &mut whole {
                 None => whole = Some(rows),
-                Some(whole) => whole.rows.extend(rows.rows),
+                Some(whole) => {
+                    whole.rows.extend(rows.rows);
+                    for (all, counts) in whole.codes.iter_mut().zip(rows.codes) {
+                        all.iter_mut().zip(counts).for_each(|(all, count)| *all += count);
+                    }
+                }
             }
         }
-        let Rows { format, rows } = whole.ok_or_else(|| StageError::Fault("an evaluation without shards".into()))?;
+        let Rows { format, rows, codes } =
+            whole.ok_or_else(|| StageError::Fault("an evaluation without shards".into()))?;
         let skeleton = Skeleton::of(format);
         let column = |of: fn(&Row) -> ClipErrors| rows.iter().map(of).collect::<Vec<_>>();
         let mut metrics = summary(&column(|r| r.sample), skeleton, "");
-        metrics.extend(summary(&column(|r| r.mu), skeleton, "mu_"));
+        let means: Vec<ClipErrors> = rows.iter().filter_map(|row| row.mu).collect();
+        if !means.is_empty() {
+            metrics.extend(summary(&means, skeleton, "mu_"));
+        }
+        metrics.extend(usage(&codes));
         metrics.extend(summary(&column(|r| r.clip_mean), skeleton, "clip_mean_"));
         let skating = rows.iter().map(|row| row.real_skating).sum::<f64>() / rows.len() as f64;
         metrics.insert("real_skating_ratio".into(), skating);
         if metrics.values().any(|v| !v.is_finite()) {
             return Err(StageError::Input(
-                "the VAE's reconstructions are not finite; it has not been trained well".into(),
+                "the reconstructions are not finite; what made them has not been trained well".into(),
             ));
         }
         publish_report(cx, metrics, to_meta(&rows))

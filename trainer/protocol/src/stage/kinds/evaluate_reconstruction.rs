@@ -1,4 +1,4 @@
-//! `evaluate.reconstruction`: what a VAE loses. Source: MLD's MPJPE, DisCoRD's sJPE, and our feature error.
+//! `evaluate.reconstruction`: what a VAE or a tokenizer loses. Source: MLD's MPJPE, DisCoRD's sJPE, and our feature error.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -6,12 +6,16 @@ use serde::{Deserialize, Serialize};
 use crate::ArtifactKind;
 use crate::stage::{Output, Problems, Ref, Shape, Split, StageSpec};
 
-/// `evaluate.reconstruction`: MPJPE in mm and feature error of a VAE.
+/// `evaluate.reconstruction`: MPJPE in mm, sJPE and feature error of a VAE or a tokenizer; of the latter also how many codes are in use.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluateReconstruction {
-    /// Stage that gives the VAE.
+    /// Stage that gives the VAE; not read if there is a tokenizer.
     pub vae: String,
+    /// Stage that gives the tokenizer that is measured instead of a VAE; none if empty.
+    pub tokenizer: String,
+    /// Stage that gives the flow decoder that decodes the tokenizer's tokens; the tokenizer's own if empty.
+    pub decoder: String,
     /// Stage that gives the clips.
     pub dataset: String,
     /// Clips.
@@ -22,7 +26,14 @@ pub struct EvaluateReconstruction {
 
 impl Default for EvaluateReconstruction {
     fn default() -> Self {
-        Self { vae: "vae".into(), dataset: "dataset".into(), split: Split::Test, shards: 4 }
+        Self {
+            vae: "vae".into(),
+            tokenizer: String::new(),
+            decoder: String::new(),
+            dataset: "dataset".into(),
+            split: Split::Test,
+            shards: 4,
+        }
     }
 }
 
@@ -34,13 +45,20 @@ impl StageSpec for EvaluateReconstruction {
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 
     fn refs(&mut self) -> Vec<Ref<'_>> {
+        let of_vae = self.tokenizer.is_empty();
+        let flows = !of_vae && !self.decoder.is_empty();
         vec![
-            Ref::stage("vae", &mut self.vae, ArtifactKind::Vae),
+            Ref::stage("vae", &mut self.vae, ArtifactKind::Vae).only_if(of_vae),
+            Ref::stage("tokenizer", &mut self.tokenizer, ArtifactKind::Tokenizer).optional(),
+            Ref::stage("decoder", &mut self.decoder, ArtifactKind::FlowDecoder).only_if(flows),
             Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
         ]
     }
 
     fn check(&self, p: &mut Problems) {
+        if self.tokenizer.is_empty() && !self.decoder.is_empty() {
+            p.add("decoder", "`decoder` decodes tokens, but there is no `tokenizer`; expected both", "");
+        }
         p.shards(self.shards);
     }
 

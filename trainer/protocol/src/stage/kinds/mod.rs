@@ -5,15 +5,20 @@ mod data_synthetic;
 mod distill_lcm;
 mod distill_pcm;
 mod encode_latents;
+mod encode_tokens;
 mod evaluate_latent_fid;
 mod evaluate_reconstruction;
 mod evaluate_t2m;
 mod import_evaluator;
+mod model_decoder;
 mod register;
 mod text_embed;
+mod train_discord;
 mod train_evaluator;
 mod train_length;
 mod train_mld;
+mod train_tokenizer;
+mod train_tokens;
 mod train_vae;
 
 pub use data_open::DataOpen;
@@ -21,15 +26,20 @@ pub use data_synthetic::DataSynthetic;
 pub use distill_lcm::DistillLcm;
 pub use distill_pcm::DistillPcm;
 pub use encode_latents::EncodeLatents;
+pub use encode_tokens::EncodeTokens;
 pub use evaluate_latent_fid::EvaluateLatentFid;
 pub use evaluate_reconstruction::EvaluateReconstruction;
 pub use evaluate_t2m::{EvaluateT2m, MultiModality};
 pub use import_evaluator::ImportEvaluator;
+pub use model_decoder::ModelDecoder;
 pub use register::{Promote, Register};
 pub use text_embed::{TextEmbed, TextEncoder};
+pub use train_discord::{FlowBackbone, FlowNetwork, FlowProjection, FlowSolver, TrainDiscord};
 pub use train_evaluator::{EvaluatorNetwork, MovementPhase, TrainEvaluator};
 pub use train_length::TrainLength;
 pub use train_mld::TrainMld;
+pub use train_tokenizer::{Resets, TokenizerLoss, TokenizerNetwork, TrainTokenizer, WindowsOf};
+pub use train_tokens::{TokenGenerator, TokenNetwork, TrainTokens};
 pub use train_vae::{TrainVae, VaeLoss, Windows};
 
 use super::StageSpec;
@@ -47,6 +57,11 @@ super::spec::stage_kinds! {
     EvaluateLatentFid,
     TrainEvaluator,
     TrainLength,
+    TrainTokenizer,
+    EncodeTokens,
+    TrainTokens,
+    TrainDiscord,
+    ModelDecoder,
     ImportEvaluator,
     EvaluateT2m,
     Register,

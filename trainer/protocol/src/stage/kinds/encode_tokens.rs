@@ -1,0 +1,56 @@
+//! `encode.tokens`: the token ids of every clip, computed once for all who train on them. Source: T2M-GPT, MoMask, MMM.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::ArtifactKind;
+use crate::stage::{Output, Problems, Ref, Shape, StageSpec};
+
+/// Frames that one token stands for.
+const UNIT: usize = 4;
+
+/// `encode.tokens`: ids of all clips.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct EncodeTokens {
+    /// Stage that gives the clips.
+    pub dataset: String,
+    /// Stage that gives the tokenizer.
+    pub tokenizer: String,
+    /// Clips are followed by zeros up to so many frames before they are encoded, as MoMask's are (196); 0 adds none. A token sees some
+    /// 90 frames on either side, so ids differ.
+    pub padded: usize,
+    /// Shards.
+    pub shards: usize,
+}
+
+impl Default for EncodeTokens {
+    fn default() -> Self {
+        Self { dataset: "dataset".into(), tokenizer: "tokenizer".into(), padded: 0, shards: 8 }
+    }
+}
+
+impl StageSpec for EncodeTokens {
+    const KIND: &'static str = "encode.tokens";
+    const SHAPE: Shape = Shape::Map;
+    const OUTPUT: Output = Output { name: "tokens", kind: ArtifactKind::Tokens };
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![
+            Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
+            Ref::stage("tokenizer", &mut self.tokenizer, ArtifactKind::Tokenizer),
+        ]
+    }
+
+    fn check(&self, p: &mut Problems) {
+        if !self.padded.is_multiple_of(UNIT) {
+            let message = format!("`padded` is {}; expected a multiple of {UNIT}, or 0", self.padded);
+            p.add("padded", message, "a token stands for 4 frames");
+        }
+        p.shards(self.shards);
+    }
+
+    fn shards(&self) -> usize {
+        self.shards
+    }
+}

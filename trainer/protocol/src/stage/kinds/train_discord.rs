@@ -1,0 +1,183 @@
+//! `train.discord`: a rectified flow that turns frozen tokens into motion. Source: DisCoRD (Cho et al., arXiv:2411.19527).
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::stage::{Batch, Decay, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training, WindowsOf};
+use crate::{ArtifactKind, Steps, limits};
+
+/// Frames that one token stands for.
+const UNIT: usize = 4;
+
+/// What the velocity is predicted by.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum FlowBackbone {
+    /// A U-Net over time, as published.
+    #[default]
+    Unet,
+    /// A transformer, which the code base has and no released weights.
+    Dit,
+}
+
+/// How tokens become a condition on each frame, of a U-Net.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum FlowProjection {
+    /// Repeat, stack, a linear layer, unstack, another: as published.
+    #[default]
+    Stack,
+    /// Repeat and a linear layer.
+    Repeat,
+    /// Two transposed convolutions.
+    Transposed,
+}
+
+/// How the flow is followed when motion is decoded.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum FlowSolver {
+    /// One evaluation of the network a step; the paper's text says 16 steps.
+    Euler,
+    /// Two; the released code makes 15 steps.
+    #[default]
+    Midpoint,
+}
+
+/// Size of the network. The default is the published U-Net; the transformer in the code base has 512, 384, 4 and 4.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct FlowNetwork {
+    /// Width of the U-Net's first level, of which the second has twice as much; width of the transformer.
+    pub width: usize,
+    /// Width of the condition on a frame.
+    pub condition: usize,
+    /// Residual blocks of a level, or blocks of the transformer.
+    pub layers: usize,
+    /// Heads of the attention, if there is one.
+    pub heads: usize,
+    /// Attention in the U-Net, which the paper found to be worse.
+    pub attention: bool,
+    /// Tokens to condition, of a U-Net.
+    pub projection: FlowProjection,
+    /// Dropout probability.
+    pub dropout: f64,
+}
+
+impl Default for FlowNetwork {
+    fn default() -> Self {
+        Self {
+            width: 512,
+            condition: 256,
+            layers: 1,
+            heads: 4,
+            attention: false,
+            projection: FlowProjection::Stack,
+            dropout: 0.0,
+        }
+    }
+}
+
+/// `train.discord`: a decoder of tokens that draws smooth motion.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct TrainDiscord {
+    /// Stage that gives the clips.
+    pub dataset: String,
+    /// Stage that gives the tokenizer, which stays as it is.
+    pub tokenizer: String,
+    /// What the velocity is predicted by.
+    pub backbone: FlowBackbone,
+    /// Size.
+    pub network: FlowNetwork,
+    /// Frames of an example; a multiple of 4. Shorter clips are left out.
+    pub window: usize,
+    /// Which windows make an epoch.
+    pub windows_of: WindowsOf,
+    /// How the flow is followed when motion is decoded.
+    pub solver: FlowSolver,
+    /// Steps of the solver.
+    pub solver_steps: usize,
+    /// Exponential moving average of the weights that is kept as the result; 0 keeps the weights themselves.
+    pub ema: f64,
+    /// The rest. Published: 200 epochs of all windows with batches of 768, a cosine down to a fiftieth of the rate; here it ends at zero.
+    #[serde(flatten)]
+    pub training: Training,
+}
+
+impl Default for TrainDiscord {
+    fn default() -> Self {
+        Self {
+            dataset: "dataset".into(),
+            tokenizer: "tokenizer".into(),
+            backbone: FlowBackbone::Unet,
+            network: FlowNetwork::default(),
+            window: 64,
+            windows_of: WindowsOf::Frames,
+            solver: FlowSolver::Midpoint,
+            solver_steps: 15,
+            ema: 0.999,
+            training: Training {
+                steps: Steps(481_896),
+                batch: Batch { global: 768, slices: 16 },
+                lr: 5e-4,
+                warmup: Steps(48_000),
+                decay: Decay::Cosine,
+                optimizer: Optimizer { weight_decay: 0.01, ..Optimizer::default() },
+                max_grad_norm: 1.0,
+                stop: None,
+            },
+        }
+    }
+}
+
+impl StageSpec for TrainDiscord {
+    const KIND: &'static str = "train.discord";
+    const SHAPE: Shape = Shape::Gang;
+    const OUTPUT: Output = Output { name: "decoder", kind: ArtifactKind::FlowDecoder };
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![
+            Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
+            Ref::stage("tokenizer", &mut self.tokenizer, ArtifactKind::Tokenizer),
+        ]
+    }
+
+    fn check(&self, p: &mut Problems) {
+        let FlowNetwork { width, condition, layers, heads, dropout, .. } = self.network;
+        for (field, value) in [
+            ("network.width", width),
+            ("network.condition", condition),
+            ("network.layers", layers),
+            ("network.heads", heads),
+            ("solver_steps", self.solver_steps),
+        ] {
+            p.positive(field, value);
+        }
+        // The second level is twice as wide, and blocks on the way up see as much again.
+        let parameters = width.saturating_mul(width).saturating_mul(100).saturating_mul(layers);
+        if parameters > limits::PARAMETERS {
+            let message =
+                format!("its layers have up to {parameters} parameters; expected at most {}", limits::PARAMETERS);
+            p.add("network", message, "take fewer layers, or narrower ones");
+        }
+        if width < 4 || !width.is_multiple_of(2) {
+            p.add("network.width", format!("`network.width` is {width}; expected an even number of at least 4"), "");
+        }
+        if self.backbone == FlowBackbone::Dit && heads > 0 && !width.is_multiple_of(heads) {
+            let message = format!("`network.heads` is {heads}, which does not divide `network.width`, {width}");
+            p.add("network.heads", message, "");
+        }
+        p.fraction("network.dropout", dropout, true);
+        if self.window < UNIT || !self.window.is_multiple_of(UNIT) {
+            let message = format!("`window` is {}; expected a multiple of {UNIT}", self.window);
+            p.add("window", message, "a token stands for 4 frames");
+        }
+        p.fraction("ema", self.ema, true);
+        self.training.check(p);
+    }
+
+    fn training(&mut self) -> Option<&mut Training> {
+        Some(&mut self.training)
+    }
+}

@@ -1,0 +1,193 @@
+//! `train.tokenizer`: motion as tokens out of one codebook (T2M-GPT, MMM) or a stack of them (MoMask).
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::stage::{Batch, Decay, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training};
+use crate::{ArtifactKind, Steps, limits};
+
+/// Frames that one token stands for.
+const UNIT: usize = 4;
+/// Weights of a residual block and of what joins blocks, over the square of the width: a bound, not a count.
+const SQUARES_A_BLOCK: usize = 16;
+
+/// Size of a tokenizer's encoder and decoder.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct TokenizerNetwork {
+    /// Width of the convolutions.
+    pub width: usize,
+    /// Residual blocks of each of the two levels.
+    pub depth: usize,
+    /// What dilations grow by from block to block.
+    pub growth: usize,
+    /// Dropout probability in the blocks: 0.2 in MoMask, none in T2M-GPT and MMM.
+    pub dropout: f64,
+}
+
+impl Default for TokenizerNetwork {
+    fn default() -> Self {
+        Self { width: 512, depth: 3, growth: 3, dropout: 0.2 }
+    }
+}
+
+/// Weights of a tokenizer's loss.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct TokenizerLoss {
+    /// Smooth-L1 on normalised features.
+    pub feature: f64,
+    /// Smooth-L1 on local positions ("velocity" upstream).
+    pub position: f64,
+    /// Squared distance of the encoder's rows to their codes.
+    pub commitment: f64,
+}
+
+impl Default for TokenizerLoss {
+    fn default() -> Self {
+        Self { feature: 1.0, position: 0.5, commitment: 0.02 }
+    }
+}
+
+/// Which codes are taken from the batch anew.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Resets {
+    /// In every update those whose running count is below 1 (T2M-GPT, MoMask).
+    #[default]
+    Always,
+    /// In every 21st update those of them that never had a count of 1 (MMM): none in a run from scratch.
+    Remembering,
+}
+
+/// Which windows make an epoch.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum WindowsOf {
+    /// Every window of every clip once (MoMask): long clips count more.
+    #[default]
+    Frames,
+    /// One drawn window of every clip (T2M-GPT, MMM).
+    Clips,
+}
+
+/// `train.tokenizer`: a VQ-VAE or a residual VQ-VAE. The default is MoMask's; `quantizers: 1` without dropout and draws is T2M-GPT's.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct TrainTokenizer {
+    /// Stage that gives the clips.
+    pub dataset: String,
+    /// Codes of a codebook.
+    pub codes: usize,
+    /// Width of a code.
+    pub code_dim: usize,
+    /// Codebooks, each of which quantises what those before it leave over.
+    pub quantizers: usize,
+    /// Probability that a step leaves out the codebooks above a drawn one.
+    pub quantize_dropout: f64,
+    /// Codes are drawn in training, by their distances, instead of the nearest being taken.
+    pub drawn: bool,
+    /// Which codes are taken from the batch anew.
+    pub resets: Resets,
+    /// Size.
+    pub network: TokenizerNetwork,
+    /// Loss weights.
+    pub loss: TokenizerLoss,
+    /// Frames of an example; a multiple of 4. Shorter clips are left out.
+    pub window: usize,
+    /// Which windows make an epoch.
+    pub windows_of: WindowsOf,
+    /// The rest. Published: MoMask 50 epochs with batches of 256 (about 360,000 steps), T2M-GPT and MMM 300,000 steps; both lower the rate in
+    /// two steps near the end, here it follows a cosine.
+    #[serde(flatten)]
+    pub training: Training,
+}
+
+impl Default for TrainTokenizer {
+    fn default() -> Self {
+        Self {
+            dataset: "dataset".into(),
+            codes: 512,
+            code_dim: 512,
+            quantizers: 6,
+            quantize_dropout: 0.2,
+            drawn: true,
+            resets: Resets::Always,
+            network: TokenizerNetwork::default(),
+            loss: TokenizerLoss::default(),
+            window: 64,
+            windows_of: WindowsOf::Frames,
+            training: Training {
+                steps: Steps(360_000),
+                batch: Batch { global: 256, slices: 8 },
+                lr: 2e-4,
+                warmup: Steps(2_000),
+                decay: Decay::Cosine,
+                optimizer: Optimizer { beta2: 0.99, ..Optimizer::default() },
+                max_grad_norm: 0.0,
+                stop: None,
+            },
+        }
+    }
+}
+
+impl StageSpec for TrainTokenizer {
+    const KIND: &'static str = "train.tokenizer";
+    const SHAPE: Shape = Shape::Gang;
+    const OUTPUT: Output = Output { name: "tokenizer", kind: ArtifactKind::Tokenizer };
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset)]
+    }
+
+    fn check(&self, p: &mut Problems) {
+        for (field, value) in [
+            ("codes", self.codes),
+            ("code_dim", self.code_dim),
+            ("quantizers", self.quantizers),
+            ("network.width", self.network.width),
+            ("network.depth", self.network.depth),
+            ("network.growth", self.network.growth),
+        ] {
+            p.positive(field, value);
+        }
+        p.product(
+            "codes",
+            &[("codes", self.codes), ("code_dim", self.code_dim), ("quantizers", self.quantizers)],
+            limits::PARAMETERS / 16,
+        );
+        let TokenizerNetwork { width, depth, growth, .. } = self.network;
+        let squares = SQUARES_A_BLOCK.saturating_mul(depth.saturating_add(2));
+        let parameters = width.saturating_mul(width).saturating_mul(squares);
+        if parameters > limits::PARAMETERS {
+            let message =
+                format!("its convolutions have some {parameters} weights; expected at most {}", limits::PARAMETERS);
+            p.add("network", message, "take fewer blocks, or narrower ones");
+        }
+        let reach = u32::try_from(depth).ok().and_then(|depth| growth.checked_pow(depth));
+        if reach.is_none_or(|reach| reach > 10_000) {
+            let message =
+                format!("dilations grow to `network.growth` to the power of `network.depth`, {growth}^{depth}");
+            p.add("network.growth", message, "expected at most 10000 frames");
+        }
+        p.fraction("network.dropout", self.network.dropout, true);
+        p.fraction("quantize_dropout", self.quantize_dropout, false);
+        if self.window < UNIT || !self.window.is_multiple_of(UNIT) {
+            let message = format!("`window` is {}; expected a multiple of {UNIT}", self.window);
+            p.add("window", message, "a token stands for 4 frames");
+        }
+        let TokenizerLoss { feature, position, commitment } = self.loss;
+        for (field, weight) in [("loss.feature", feature), ("loss.position", position), ("loss.commitment", commitment)]
+        {
+            p.not_negative(field, weight);
+        }
+        if feature == 0.0 && position == 0.0 {
+            p.add("loss.feature", "`loss.feature` and `loss.position` are both 0, so nothing is reconstructed", "");
+        }
+        self.training.check(p);
+    }
+
+    fn training(&mut self) -> Option<&mut Training> {
+        Some(&mut self.training)
+    }
+}

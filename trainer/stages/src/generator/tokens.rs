@@ -1,0 +1,289 @@
+//! Token generators: a network draws ids for a caption, a tokenizer turns them into motion. Source: T2M-GPT, MoMask.
+//!
+//! Parts: `generator`, `tokenizer`, `text`, and `decoder` if a flow decodes in the tokenizer's place. The generator reads a caption's one vector. An autoregressive one decides how long a motion is:
+//! what is asked for is not looked at; where it ends at once it gives a motion of the single id 1, as T2M-GPT's evaluation does.
+//!
+//! Layers above the first are drawn at guidance 5, as published for both datasets, whatever the sampler says of the first.
+
+use burn::tensor::{Device, Tensor, TensorData};
+use checkpoint::Blobs;
+use checkpoint::model::{Model, Parts};
+use models::names::load;
+use models::networks::{Gpt, GptConfig, Init, MaskedTransformer, MomaskConfig, ResidualTransformer};
+use models::tokens::autoregressive::{self, Draw};
+use models::tokens::masked::{self, Canvas, Sampling};
+use models::tokens::residual;
+use protocol::artifact::Role;
+use protocol::stage::{DataFormat, Family, Positions, Sampler, TokenNetwork};
+use protocol::{ArtifactKind, Manifest, Seed};
+use serde::{Deserialize, Serialize};
+
+use super::{Batch, Lap, MotionGenerator, Seeds, Text};
+use crate::artifacts::{self, MODEL_FILE};
+use crate::context::{ContextError, StageError};
+use crate::flow_decoder::FlowDecoder;
+use crate::parts;
+use crate::text::{self, TextEncoder};
+use crate::tokenizer::TrainedTokenizer;
+
+/// Its name in manifests.
+pub(crate) const NAME: &str = "tokens";
+/// Guidance of the layers above the first.
+const RESIDUAL_GUIDANCE: f32 = 5.0;
+/// Share of the classes that a masked generator cannot draw.
+const THRESHOLD: f64 = 0.9;
+/// Prefix of the first layer's network in the file of a masked generator.
+pub(crate) const MASKED_PREFIX: &str = "mask.";
+/// Prefix of the other network there.
+pub(crate) const RESIDUAL_PREFIX: &str = "res.";
+
+/// Meta of an artifact of kind `token-generator`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct GeneratorMeta {
+    /// How it draws.
+    #[serde(flatten)]
+    pub(crate) family: Family,
+    /// Size.
+    pub(crate) network: TokenNetwork,
+    /// Codes K of a codebook.
+    pub(crate) codes: usize,
+    /// Codebooks Q.
+    pub(crate) quantizers: usize,
+    /// Tokens of the longest motion.
+    pub(crate) longest: usize,
+    /// Width of a caption embedding.
+    pub(crate) text_dim: usize,
+    /// The parts that it was trained with: the tokenizer whose ids it draws, the text encoder.
+    pub(crate) fits: Parts,
+}
+
+impl GeneratorMeta {
+    /// Size of an autoregressive network: one place for the caption, one for the end.
+    pub(crate) fn gpt(&self) -> GptConfig {
+        GptConfig {
+            codes: self.codes,
+            width: self.network.width,
+            heads: self.network.heads,
+            layers: self.network.layers,
+            block: self.longest + 2,
+            text_dim: self.text_dim,
+            rate: self.network.feed_forward / self.network.width,
+        }
+    }
+
+    /// Size of either of a masked generator's networks.
+    pub(crate) fn momask(&self) -> MomaskConfig {
+        MomaskConfig {
+            codes: self.codes,
+            quantizers: self.quantizers,
+            dim: self.network.embedding,
+            width: self.network.width,
+            layers: self.network.layers,
+            heads: self.network.heads,
+            feed_forward: self.network.feed_forward,
+            text_dim: self.text_dim,
+        }
+    }
+
+    /// Whether there are layers above the first.
+    pub(crate) fn layered(&self) -> bool {
+        self.quantizers > 1
+    }
+}
+
+/// What draws ids.
+#[derive(Debug)]
+enum Network {
+    Autoregressive(Box<Gpt>),
+    Masked(Box<MaskedTransformer>, Option<Box<ResidualTransformer>>),
+}
+
+#[derive(Debug)]
+struct TokenModel {
+    network: Network,
+    meta: GeneratorMeta,
+    tokenizer: TrainedTokenizer,
+    decoder: Option<FlowDecoder>,
+    text: Box<dyn TextEncoder>,
+    device: Device,
+}
+
+/// Opens its parts, which must fit each other.
+pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<Box<dyn MotionGenerator>, StageError> {
+    let part = |role: &Role, kind| parts::part(blobs, model, role, kind);
+    let manifest = part(&Role::GENERATOR, ArtifactKind::TokenGenerator)?;
+    let meta: GeneratorMeta = artifacts::meta(&manifest, "the token generator")?;
+    let tokenizer = TrainedTokenizer::read(blobs, &part(&Role::TOKENIZER, ArtifactKind::Tokenizer)?, device)?;
+    let text = text::open(&part(&Role::TEXT, ArtifactKind::TextEncoder)?, blobs, device)?;
+    for role in [Role::TOKENIZER, Role::TEXT] {
+        if meta.fits.get(&role) != model.parts.get(&role) {
+            return Err(StageError::Input(format!(
+                "the token generator was trained with another `{role}` than the model has"
+            )));
+        }
+    }
+    let (ours, theirs) = ((meta.codes, meta.quantizers), (tokenizer.meta().codes, tokenizer.meta().quantizers));
+    if ours != theirs {
+        return Err(StageError::Input(format!(
+            "the generator draws ids of {} codebook(s) of {} codes, the tokenizer has {} of {}",
+            ours.1, ours.0, theirs.1, theirs.0
+        )));
+    }
+    if meta.text_dim != text.dim() {
+        let (wanted, found) = (meta.text_dim, text.dim());
+        return Err(StageError::Input(format!(
+            "the token generator reads {wanted} numbers a caption, the encoder gives {found}"
+        )));
+    }
+    let decoder = match model.parts.contains_key(&Role::DECODER) {
+        true => {
+            let manifest = part(&Role::DECODER, ArtifactKind::FlowDecoder)?;
+            let tokenizer = model.part(&Role::TOKENIZER).map_err(parts::model_error)?;
+            Some(FlowDecoder::read(blobs, &manifest, tokenizer, device)?)
+        }
+        false => None,
+    };
+    let device = device.clone().inner();
+    let network = network(&meta, blobs, &manifest, &device)?;
+    Ok(Box::new(TokenModel { network, meta, tokenizer, decoder, text, device }))
+}
+
+fn network(
+    meta: &GeneratorMeta,
+    blobs: &dyn Blobs,
+    manifest: &Manifest,
+    device: &Device,
+) -> Result<Network, StageError> {
+    let weights = artifacts::file(blobs, manifest, MODEL_FILE)?;
+    let misfit = |error: models::names::LoadError| {
+        StageError::Context(ContextError::Corrupt(format!("the token generator's weights: {error}")))
+    };
+    let mut init = Init::new(Seed(0), "blank", Positions::Uniform, device);
+    match meta.family {
+        Family::Autoregressive => {
+            let network = load(Gpt::new(&meta.gpt(), &mut init), &weights, "").map_err(misfit)?;
+            Ok(Network::Autoregressive(Box::new(network)))
+        }
+        Family::Masked => {
+            let config = meta.momask();
+            let first = load(MaskedTransformer::new(&config, &mut init), &weights, MASKED_PREFIX).map_err(misfit)?;
+            let above = match meta.layered() {
+                true => {
+                    let fresh = ResidualTransformer::new(&config, true, &mut init);
+                    Some(Box::new(load(fresh, &weights, RESIDUAL_PREFIX).map_err(misfit)?))
+                }
+                false => None,
+            };
+            Ok(Network::Masked(Box::new(first), above))
+        }
+        _ => Err(StageError::Input("the token generator's manifest says that it draws no tokens".into())),
+    }
+}
+
+impl TokenModel {
+    /// Ids `[tokens, Q]` of each motion.
+    fn ids(&self, batch: Batch<'_>, sampler: &Sampler) -> Vec<Vec<i64>> {
+        let values = batch.texts.iter().flat_map(|text| text.values.iter().copied()).collect();
+        let shape = [batch.texts.len(), self.meta.text_dim];
+        let text = Tensor::<2>::from_data(TensorData::new(values, shape), &self.device);
+        match &self.network {
+            Network::Autoregressive(network) => {
+                let mut fill = |step: usize, b: usize, out: &mut [f64]| {
+                    let mut draw = (batch.seeds)(step, b);
+                    out.iter_mut().for_each(|e| *e = -(1.0 - draw.uniform()).ln());
+                };
+                let ids = autoregressive::sample(network, &self.meta.gpt(), text, Draw::Categorical(&mut fill));
+                let or_one = |ids: Vec<usize>| if ids.is_empty() { vec![1] } else { ids };
+                ids.into_iter().map(|ids| or_one(ids).into_iter().map(|id| id as i64).collect()).collect()
+            }
+            Network::Masked(first, above) => self.filled_in((first, above.as_deref()), batch, sampler, text),
+        }
+    }
+
+    fn filled_in(
+        &self,
+        (first, above): (&MaskedTransformer, Option<&ResidualTransformer>),
+        batch: Batch<'_>,
+        sampler: &Sampler,
+        text: Tensor<2>,
+    ) -> Vec<Vec<i64>> {
+        let unit = self.tokenizer.unit();
+        let lengths: Vec<usize> = batch.lengths.iter().map(|frames| frames.div_ceil(unit)).collect();
+        let len = lengths.iter().copied().max().unwrap_or(0);
+        let config = self.meta.momask();
+        let of_first = Sampling {
+            steps: sampler.steps,
+            guidance: sampler.guidance as f32,
+            temperature: 1.0,
+            threshold: THRESHOLD,
+        };
+        let canvases: Vec<Canvas> = lengths.iter().map(|len| Canvas::empty(*len)).collect();
+        // Streams are numbered by step, then by position; those of the layers above follow those of the first.
+        let fill = |stream: usize, b: usize, out: &mut [f32], seeds: &Seeds<'_>| {
+            let mut draw = seeds(stream, b);
+            out.iter_mut().for_each(|u| *u = draw.uniform() as f32);
+        };
+        let places = self.meta.longest;
+        let mut draws = |step: usize, b: usize, p: usize, out: &mut [f32]| fill(step * places + p, b, out, batch.seeds);
+        let ids = masked::generate(first, &config, &of_first, text.clone(), &canvases, &mut draws, |_| ());
+        let steps = sampler.steps;
+        let (all, layers) = match above {
+            None => (ids, 1),
+            Some(network) => {
+                let mut draws = |layer: usize, b: usize, p: usize, out: &mut [f32]| {
+                    fill((steps + layer) * places + p, b, out, batch.seeds)
+                };
+                let sampling = Sampling { guidance: RESIDUAL_GUIDANCE, ..of_first };
+                let ids = residual::generate(network, &config, &sampling, text, &ids, &lengths, &mut draws);
+                (ids, self.meta.quantizers)
+            }
+        };
+        lengths.iter().enumerate().map(|(b, own)| all[b * len * layers..][..own * layers].to_vec()).collect()
+    }
+}
+
+impl MotionGenerator for TokenModel {
+    fn format(&self) -> DataFormat {
+        self.tokenizer.meta().format
+    }
+
+    fn longest(&self) -> usize {
+        self.meta.longest * self.tokenizer.unit()
+    }
+
+    fn family(&self) -> &Family {
+        &self.meta.family
+    }
+
+    fn text(&self) -> &dyn TextEncoder {
+        &*self.text
+    }
+
+    fn embed(&self, captions: &[&str]) -> Result<Vec<Text>, StageError> {
+        let pooled = self.text.pooled(captions)?;
+        Ok(pooled.chunks_exact(self.text.dim()).map(|row| Text { values: row.to_vec() }).collect())
+    }
+
+    fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError> {
+        let ids = self.ids(batch, sampler);
+        lap(Lap::Sampled);
+        let width = self.tokenizer.meta().features;
+        let decides = matches!(self.network, Network::Autoregressive(_));
+        // Behind all streams that ids are drawn from.
+        let noise = (sampler.steps + self.meta.quantizers) * self.meta.longest.max(2);
+        let motion = |(b, (ids, frames)): (usize, (Vec<i64>, &usize))| {
+            let mut rows = match &self.decoder {
+                None => self.tokenizer.decode(&ids),
+                Some(decoder) => decoder.decode(&self.tokenizer, &ids, &mut (batch.seeds)(noise, b)),
+            };
+            if !decides {
+                rows.truncate(frames * width);
+            }
+            self.tokenizer.denormalise(&mut rows);
+            rows
+        };
+        let motions = ids.into_iter().zip(batch.lengths).enumerate().map(motion).collect();
+        lap(Lap::Decoded);
+        Ok(motions)
+    }
+}

@@ -1,0 +1,38 @@
+//! `model.decoder`: the parts of a model of tokens, and a flow decoder.
+
+use std::collections::BTreeMap;
+
+use checkpoint::model::Model;
+use protocol::ArtifactKind;
+use protocol::artifact::Role;
+use protocol::stage::ModelDecoder;
+
+use super::Plain;
+use crate::artifacts;
+use crate::context::{AttemptContext, Outcome, StageError};
+use crate::flow_decoder::FlowDecoder;
+use crate::generator::TOKENS;
+use crate::parts::{self, model_error};
+
+impl Plain for ModelDecoder {
+    fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
+        let blobs = cx.blobs();
+        let (_, manifest) = artifacts::input(cx, "model", ArtifactKind::Model)?;
+        let model = Model::read(&manifest).map_err(model_error)?;
+        if model.generator != TOKENS {
+            return Err(StageError::Input(format!(
+                "`model` is drawn by `{}`, which makes no tokens; name a model of `train.tokens`",
+                model.generator
+            )));
+        }
+        let (_, decoder) = artifacts::input(cx, "decoder", ArtifactKind::FlowDecoder)?;
+        FlowDecoder::read(&*blobs, &decoder, model.part(&Role::TOKENIZER).map_err(model_error)?, &cx.device())?;
+        let part = |(role, digest): (&Role, &protocol::Digest)| {
+            Ok((role.clone(), parts::manifest(&*blobs, *digest, &format!("the part `{role}`"))?))
+        };
+        let mut all = model.parts.iter().map(part).collect::<Result<BTreeMap<_, _>, StageError>>()?;
+        all.insert(Role::DECODER, decoder);
+        let output = parts::publish_model(cx, TOKENS, model.format, &all)?;
+        Ok(Outcome::Finished { output, metrics: BTreeMap::new() })
+    }
+}

@@ -1,0 +1,239 @@
+//! Tokenizers and what draws their tokens: end to end at toy sizes, and with members that come, go and are killed.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use std::collections::BTreeMap;
+
+use protocol::stage::{
+    Batch, CheckpointPolicy, DataSynthetic, Decay, EncodeTokens, EvaluateReconstruction, FlowNetwork, ModelDecoder,
+    Optimizer, Resets, Sampler, StageSettings, TextEmbed, TokenGenerator, TokenNetwork, TokenizerNetwork, TrainDiscord,
+    TrainTokenizer, TrainTokens, Training,
+};
+use protocol::{Digest, Seed, Steps};
+use stages::generate::Generator;
+use stages::testing::{Bench, Script};
+
+const STEPS: u64 = 14;
+
+fn training(steps: u64) -> Training {
+    Training {
+        steps: Steps(steps),
+        batch: Batch { global: 6, slices: 6 },
+        lr: 1e-3,
+        warmup: Steps(2),
+        decay: Decay::Cosine,
+        optimizer: Optimizer::default(),
+        max_grad_norm: 1.0,
+        stop: None,
+    }
+}
+
+/// So many codebooks of eight codes. A batch has 24 rows; with 40 codes they are repeated.
+fn tokenizer(quantizers: usize, codes: usize, resets: Resets) -> StageSettings {
+    StageSettings::from(TrainTokenizer {
+        codes,
+        code_dim: 4,
+        quantizers,
+        quantize_dropout: 0.5,
+        drawn: quantizers > 1,
+        resets,
+        network: TokenizerNetwork { width: 8, depth: 2, growth: 2, dropout: 0.1 },
+        window: 16,
+        training: training(STEPS),
+        ..TrainTokenizer::default()
+    })
+}
+
+fn generator(generator: TokenGenerator) -> StageSettings {
+    StageSettings::from(TrainTokens {
+        generator,
+        network: TokenNetwork { width: 16, layers: 1, heads: 2, feed_forward: 32, dropout: 0.1, embedding: 8 },
+        longest: 20,
+        training: training(STEPS),
+        ..TrainTokens::default()
+    })
+}
+
+fn discord() -> StageSettings {
+    StageSettings::from(TrainDiscord {
+        network: FlowNetwork { width: 8, condition: 6, ..FlowNetwork::default() },
+        window: 16,
+        solver_steps: 2,
+        ema: 0.9,
+        training: training(STEPS),
+        ..TrainDiscord::default()
+    })
+}
+
+type Link = (&'static str, StageSettings, Vec<(&'static str, &'static str)>);
+
+/// Everything from clips to models: a plain tokenizer with an autoregressive generator, a residual one with a masked one.
+fn chain(shards: usize) -> Vec<Link> {
+    let encode = || StageSettings::from(EncodeTokens { padded: 40, shards, ..EncodeTokens::default() });
+    let evaluate = || {
+        let tokenizer = "tokenizer".into();
+        StageSettings::from(EvaluateReconstruction { tokenizer, shards, ..EvaluateReconstruction::default() })
+    };
+    let smooth = StageSettings::from(EvaluateReconstruction {
+        tokenizer: "tokenizer".into(),
+        decoder: "decoder".into(),
+        shards,
+        ..EvaluateReconstruction::default()
+    });
+    let data = || vec![("dataset", "dataset")];
+    let with = |tokenizer| vec![("dataset", "dataset"), ("tokenizer", tokenizer)];
+    let model = |tokens, tokenizer| vec![("tokens", tokens), ("tokenizer", tokenizer), ("text", "text")];
+    let clips = DataSynthetic { clips: 24, val: 0.1, test: 0.25, mirror: false };
+    vec![
+        ("dataset", clips.into(), vec![]),
+        ("text", TextEmbed::default().into(), data()),
+        ("plain", tokenizer(1, 8, Resets::Remembering), data()),
+        ("residual", tokenizer(3, 40, Resets::Always), data()),
+        ("plain-tokens", encode(), with("plain")),
+        ("residual-tokens", encode(), with("residual")),
+        ("reconstruction", evaluate(), with("residual")),
+        ("gpt", generator(TokenGenerator::Autoregressive), model("plain-tokens", "plain")),
+        ("momask", generator(TokenGenerator::Masked), model("residual-tokens", "residual")),
+        ("discord", discord(), with("residual")),
+        ("smooth", ModelDecoder::default().into(), vec![("model", "momask"), ("decoder", "discord")]),
+        (
+            "smooth-reconstruction",
+            smooth,
+            vec![("dataset", "dataset"), ("tokenizer", "residual"), ("decoder", "discord")],
+        ),
+    ]
+}
+
+fn bench(members: usize) -> Bench {
+    let mut bench = Bench::new(burn::tensor::Device::flex(), 7, members);
+    bench.checkpoint = CheckpointPolicy { every: Steps(5), ..CheckpointPolicy::default() };
+    bench
+}
+
+struct World {
+    bench: Bench,
+    outputs: BTreeMap<&'static str, Digest>,
+    metrics: BTreeMap<&'static str, BTreeMap<String, f64>>,
+}
+
+impl World {
+    fn inputs(&self, inputs: &[(&'static str, &'static str)]) -> Vec<(&'static str, Digest)> {
+        inputs.iter().map(|(field, from)| (*field, self.outputs[from])).collect()
+    }
+}
+
+fn run(members: usize, shards: usize) -> World {
+    let mut world = World { bench: bench(members), outputs: BTreeMap::new(), metrics: BTreeMap::new() };
+    for (name, settings, inputs) in chain(shards) {
+        let inputs = world.inputs(&inputs);
+        let ran = world.bench.run(name, &settings, &inputs).unwrap_or_else(|e| panic!("{name}: {e}"));
+        world.metrics.insert(name, ran.metrics().clone());
+        world.outputs.insert(name, ran.output());
+    }
+    world
+}
+
+#[test]
+fn p6_tokens_and_what_draws_them_have_the_same_bytes_for_any_number_of_members_and_shards() {
+    let one = run(1, 1);
+    for (members, shards) in [(2, 3), (3, 2)] {
+        let other = run(members, shards);
+        for (name, digest) in &one.outputs {
+            assert_eq!(digest, &other.outputs[name], "{name}: {members} members, {shards} shards");
+        }
+    }
+    let used = one.metrics["residual-tokens"]["used"];
+    assert!(used > 0.0 && used <= 1.0, "{used}");
+    for metric in ["mpjpe_mm", "used", "perplexity"] {
+        assert!(one.metrics["reconstruction"][metric] > 0.0, "{metric}");
+    }
+}
+
+#[test]
+fn models_of_tokens_draw_motions_as_all_others_do() {
+    let world = run(1, 1);
+    for (name, sampler) in [
+        ("gpt", Sampler { steps: 1, guidance: 0.0, timesteps: vec![] }),
+        ("smooth", Sampler { steps: 3, guidance: 1.0, timesteps: vec![] }),
+        ("momask", Sampler { steps: 4, guidance: 2.0, timesteps: vec![] }),
+    ] {
+        let manifest = world.bench.manifest(world.outputs[name]).unwrap();
+        let model = Generator::load(&manifest, &*world.bench.blobs(), &burn::tensor::Device::flex()).unwrap();
+        let draw = |seed| model.generate("a person walks", Some(50), Some(&sampler), Seed(seed)).unwrap();
+        let (motion, again, other) = (draw(1), draw(1), draw(2));
+        assert_eq!(motion.features, again.features, "{name}");
+        assert_ne!(motion.features, other.features, "{name}");
+        assert!(motion.features.iter().all(|v| v.is_finite()));
+        if name == "gpt" {
+            assert!(motion.frames.is_multiple_of(4) && motion.frames <= 84, "{}", motion.frames);
+        } else {
+            assert_eq!(motion.frames, 50, "{name}");
+        }
+        let wrong = Sampler { steps: 2000, ..sampler.clone() };
+        assert!(model.check_sampler(&wrong).is_err(), "{name}");
+    }
+}
+
+/// Chains of kills with 1 to 3 members in turn, some right after a checkpoint, one before the first step; then members that join, take
+/// the state of a peer and are lost.
+#[test]
+fn p5_p6_kills_joins_and_losses_change_no_byte() {
+    let whole = run(1, 1);
+    for (name, settings, inputs) in chain(1) {
+        if !["plain", "residual", "gpt", "momask", "discord"].contains(&name) {
+            continue;
+        }
+        let inputs = whole.inputs(&inputs);
+        let mut bench = run_up_to(name);
+        for kills in [&[0_u64, 6][..], &[5, 9, 13]] {
+            bench.forget(name);
+            for (round, step) in kills.iter().enumerate() {
+                let members = 1 + round % 3;
+                bench.members = members;
+                bench.script = Script { lost: (0..members).map(|m| (m, *step)).collect(), ..Script::default() };
+                assert!(bench.run(name, &settings, &inputs).is_err(), "{name}: over before the kill at step {step}");
+            }
+            bench.script = Script::default();
+            bench.members = 2;
+            let output = bench.run(name, &settings, &inputs).unwrap().output();
+            assert_eq!(output, whole.outputs[name], "{name} killed at {kills:?}");
+        }
+        bench.forget(name);
+        bench.members = 1;
+        bench.script = Script { joins: vec![(1, 3), (2, 3)], lost: vec![(2, 8), (0, 11)], ..Script::default() };
+        let output = bench.run(name, &settings, &inputs).unwrap().output();
+        assert_eq!(output, whole.outputs[name], "{name} with members that come and go");
+    }
+}
+
+/// A world in which everything before stage `name` has run.
+fn run_up_to(name: &str) -> Bench {
+    let mut world = World { bench: bench(1), outputs: BTreeMap::new(), metrics: BTreeMap::new() };
+    for (stage, settings, inputs) in chain(1) {
+        if stage == name {
+            break;
+        }
+        let inputs = world.inputs(&inputs);
+        let output = world.bench.run(stage, &settings, &inputs).unwrap().output();
+        world.outputs.insert(stage, output);
+    }
+    world.bench
+}
+
+#[test]
+fn what_does_not_fit_is_refused_with_a_reason() {
+    let mut world = run(1, 1);
+    let refused = |world: &mut World, settings: StageSettings, inputs: &[(&'static str, &'static str)]| {
+        let inputs = world.inputs(inputs);
+        world.bench.run("wrong", &settings, &inputs).unwrap_err().to_string()
+    };
+    let other = [("tokens", "plain-tokens"), ("tokenizer", "residual"), ("text", "text")];
+    let error = refused(&mut world, generator(TokenGenerator::Autoregressive), &other);
+    assert!(error.contains("another tokenizer"), "{error}");
+    let layered = [("tokens", "residual-tokens"), ("tokenizer", "residual"), ("text", "text")];
+    let error = refused(&mut world, generator(TokenGenerator::Autoregressive), &layered);
+    assert!(error.contains("one codebook"), "{error}");
+    let StageSettings::TrainTokenizer(mut settings) = tokenizer(1, 8, Resets::Always) else { unreachable!() };
+    settings.window = 4_000;
+    let error = refused(&mut world, settings.into(), &[("dataset", "dataset")]);
+    assert!(error.contains("the longest clip"), "{error}");
+}
