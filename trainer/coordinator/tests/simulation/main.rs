@@ -4,8 +4,8 @@
 //! without, and comes back by replay. [`INJECTED`] lists it all. Invariants are checked after every event; in the end
 //! everything that was submitted is done exactly once.
 //!
-//! `SIM_SEED=n` replays one seed; `SIM_SEEDS=n` runs so many instead of the 2,000 of every `cargo test`. A seed that fails
-//! is added to `seeds.txt` beside this file, which is run first ever after.
+//! `SIM_SEED=n` replays one seed; `SIM_SEEDS=n` runs so many instead of the 500 of every `cargo test`, or the 2,000 with
+//! `STRIDE_LONG_TESTS=1`. A seed that fails is added to `seeds.txt` beside this file, which is run first ever after.
 
 mod pipelines;
 mod random;
@@ -27,7 +27,9 @@ use protocol::stage::WorkerRange;
 use crate::world::{CHAOS_MS, INJECTED, World};
 
 /// Seeds of every run of the tests, beside those that once failed.
-const SEEDS: u64 = 2_000;
+const SEEDS: u64 = 500;
+/// The same of long tests.
+const MANY_SEEDS: u64 = 2_000;
 /// Of so many seeds at least one has each thing that goes wrong.
 const ENOUGH: usize = 100;
 
@@ -68,7 +70,8 @@ fn seeds() -> Vec<u64> {
     if let Ok(seed) = std::env::var("SIM_SEED") {
         return vec![number(seed)];
     }
-    let count = std::env::var("SIM_SEEDS").map_or(SEEDS, number);
+    let usual = if std::env::var_os("STRIDE_LONG_TESTS").is_some() { MANY_SEEDS } else { SEEDS };
+    let count = std::env::var("SIM_SEEDS").map_or(usual, number);
     let kept = std::fs::read_to_string(seeds_file()).expect("the kept seeds");
     let kept = kept.lines().filter(|line| !line.starts_with('#') && !line.trim().is_empty());
     kept.map(|line| number(line.to_owned())).chain(1000..1000 + count).collect()
