@@ -83,6 +83,9 @@ impl HttpBlobs {
                 return Ok(());
             }
             offset = there.staged;
+            if offset > 0 {
+                tracing::info!("{offset} of {bytes} bytes of blob {digest} have arrived; sending the rest");
+            }
         }
         loop {
             let part = cut(pieces, offset);

@@ -9,7 +9,7 @@ use burn::tensor::Device;
 use checkpoint::{BlobError, Blobs};
 use protocol::message::{CommitCheckpoint, Progress, StageTask};
 use protocol::{ArtifactKind, Digest, Manifest};
-use stages::context::{AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
+use stages::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
 
 use crate::active_assignment::ActiveAssignment;
 use crate::blobs::HttpBlobs;
@@ -19,6 +19,7 @@ use crate::failpoints;
 use crate::gang::exchange::{self, Contribution, Met};
 use crate::gang::mesh::{Halt, Mesh, Phase};
 use crate::gang::tree;
+use crate::process;
 use crate::retry::{self, GaveUp};
 use crate::telemetry_buffer::{Sender, TelemetryBuffer};
 
@@ -32,8 +33,18 @@ pub(crate) struct HttpContext {
     blobs: Arc<HttpBlobs>,
     telemetry: Arc<TelemetryBuffer>,
     mesh: Option<Arc<Mesh>>,
+    behind: Option<Behind>,
     gang: bool,
     _sender: Sender,
+}
+
+/// A peer's state that is on its way to a member that came to the rendezvous with `applied`.
+#[derive(Debug)]
+struct Behind {
+    mesh: Arc<Mesh>,
+    source: usize,
+    applied: Option<u64>,
+    begun: Instant,
 }
 
 impl HttpContext {
@@ -42,7 +53,8 @@ impl HttpContext {
         let gang = matches!(assignment.role, protocol::message::Role::Member { .. });
         let blobs = Arc::new(HttpBlobs { held: held.clone(), client: client.clone(), cache, gang });
         let (telemetry, sender) = TelemetryBuffer::open(held.clone(), client.clone());
-        Self { task: assignment.stage, device, held, client, blobs, telemetry, mesh: None, gang, _sender: sender }
+        let task = assignment.stage;
+        Self { task, device, held, client, blobs, telemetry, mesh: None, behind: None, gang, _sender: sender }
     }
 
     /// Waits until everything recorded and logged is stored.
@@ -93,6 +105,33 @@ impl HttpContext {
             }
             self.held.event_count().wait(ticket, Duration::from_secs(1));
         }
+    }
+
+    /// What a barrier that was not reached means: `Ok` if it is tried again with other members.
+    fn halted(&mut self, mesh: &Mesh, halt: Halt) -> Result<(), ContextError> {
+        match halt {
+            Halt::Ended(reason) => {
+                self.part();
+                Err(ContextError::GrantEnded(reason))
+            }
+            Halt::Disagree(message) => Err(ContextError::Unavailable(message)),
+            Halt::Regroup | Halt::Peer => self.await_regroup(mesh),
+        }
+    }
+
+    /// Says that the members are at one state, of which `adopted` bytes came here in so many seconds.
+    fn met(&self, mesh: &Mesh, adopted: Option<(usize, f64)>) {
+        tracing::info!(
+            task = %mesh.config.task,
+            generation = %mesh.config.generation,
+            rank = mesh.config.rank,
+            members = mesh.size(),
+            adopts = adopted.is_some(),
+            bytes = adopted.map(|(bytes, _)| bytes),
+            seconds = adopted.map(|(_, seconds)| seconds),
+            peak_mib = process::peak_memory().map(|bytes| bytes >> 20),
+            "met the gang"
+        );
     }
 
     /// A member that asks for blobs between two steps is about to save.
@@ -192,38 +231,35 @@ impl GangContext for HttpContext {
             let length = (kept.len() as u64).to_le_bytes();
             let offered: Vec<&[u8]> = state.iter().copied().chain([&kept[..], &length[..]]).collect();
             match exchange::rendezvous(&mesh, applied, &offered, &|| held.halt(generation)) {
-                Ok(mut met) => {
-                    if let Met::Adopt { pieces, .. } = &mut met {
-                        let rows = split_rows(pieces).ok_or_else(|| malformed("is cut short"))?;
-                        self.telemetry.take_over(&rows, applied).map_err(|e| malformed(&e.to_string()))?;
-                    }
-                    let adopted = match &met {
-                        Met::Adopt { pieces, took } => {
-                            Some((pieces.iter().map(Vec::len).sum::<usize>(), took.as_secs_f64()))
-                        }
-                        Met::Keep => None,
-                    };
-                    tracing::info!(
-                        task = %mesh.config.task,
-                        %generation,
-                        rank = mesh.config.rank,
-                        members = mesh.size(),
-                        adopts = adopted.is_some(),
-                        bytes = adopted.map(|(bytes, _)| bytes),
-                        seconds = adopted.map(|(_, seconds)| seconds),
-                        "met the gang"
-                    );
-                    return Ok(match met {
-                        Met::Keep => Rendezvous::Keep,
-                        Met::Adopt { pieces, .. } => Rendezvous::Adopt(pieces),
-                    });
+                Ok(Met::Behind(source)) => {
+                    self.behind = Some(Behind { mesh, source, applied, begun: Instant::now() });
+                    return Ok(Rendezvous::Behind);
                 }
-                Err(Halt::Ended(reason)) => {
-                    self.part();
-                    return Err(ContextError::GrantEnded(reason));
+                Ok(Met::Keep) => {
+                    self.met(&mesh, None);
+                    return Ok(Rendezvous::Keep);
                 }
-                Err(Halt::Disagree(message)) => return Err(ContextError::Unavailable(message)),
-                Err(Halt::Regroup | Halt::Peer) => self.await_regroup(&mesh)?,
+                Err(halt) => self.halted(&mesh, halt)?,
+            }
+        }
+    }
+
+    fn adopt(&mut self, state: &mut [&mut [u8]]) -> Result<Adopted, ContextError> {
+        let Some(Behind { mesh, source, applied, begun }) = self.behind.take() else { return Ok(Adopted::Cut) };
+        let held = self.held.clone();
+        let generation = mesh.config.generation;
+        let directly = applied.is_none();
+        match exchange::adopt(&mesh, source, state, directly, &|| held.halt(generation)) {
+            Ok(rest) => {
+                let rows = rows(&rest).ok_or_else(|| malformed("is cut short"))?;
+                self.telemetry.take_over(rows, applied).map_err(|e| malformed(&e.to_string()))?;
+                let bytes = state.iter().map(|piece| piece.len()).sum::<usize>() + rest.len();
+                self.met(&mesh, Some((bytes, begun.elapsed().as_secs_f64())));
+                Ok(Adopted::Whole)
+            }
+            Err(halt) => {
+                self.halted(&mesh, halt)?;
+                Ok(Adopted::Cut)
             }
         }
     }
@@ -261,13 +297,8 @@ impl GangContext for HttpContext {
                 self.telemetry.forget(total.durable);
                 Ok(Exchange::Sum { sum: total.sum, drain: total.drain })
             }
-            Err(Halt::Ended(reason)) => {
-                self.part();
-                Err(ContextError::GrantEnded(reason))
-            }
-            Err(Halt::Disagree(message)) => Err(ContextError::Unavailable(message)),
-            Err(Halt::Regroup | Halt::Peer) => {
-                self.await_regroup(&mesh)?;
+            Err(halt) => {
+                self.halted(&mesh, halt)?;
                 Ok(Exchange::Regroup)
             }
         }
@@ -286,14 +317,8 @@ impl GangContext for HttpContext {
         let held = self.held.clone();
         let generation = mesh.config.generation;
         let barrier = format!("barrier `closing` of generation {generation}");
-        match mesh.watch(0, &barrier, &|| held.halt(generation)) {
-            Halt::Ended(reason) => {
-                self.part();
-                Err(ContextError::GrantEnded(reason))
-            }
-            Halt::Disagree(message) => Err(ContextError::Unavailable(message)),
-            Halt::Regroup | Halt::Peer => self.await_regroup(&mesh),
-        }
+        let halt = mesh.watch(0, &barrier, &|| held.halt(generation));
+        self.halted(&mesh, halt)
     }
 
     fn can_save(&self) -> bool {
@@ -323,17 +348,10 @@ impl GangContext for HttpContext {
     }
 }
 
-/// Takes the kept rows off the end of a state that came from a peer; frames never span two of the pieces that were offered.
-fn split_rows(pieces: &mut Vec<Vec<u8>>) -> Option<Vec<u8>> {
-    let length = u64::from_le_bytes(pieces.pop()?.try_into().ok()?);
-    let (mut chunks, mut there) = (Vec::new(), 0);
-    while there < length {
-        let chunk = pieces.pop()?;
-        there += chunk.len() as u64;
-        chunks.push(chunk);
-    }
-    chunks.reverse();
-    (there == length).then(|| chunks.concat())
+/// The kept rows, of what came behind a peer's state: their length follows them.
+fn rows(behind: &[u8]) -> Option<&[u8]> {
+    let (rows, length) = behind.split_at_checked(behind.len().checked_sub(8)?)?;
+    (u64::from_le_bytes(length.try_into().ok()?) == rows.len() as u64).then_some(rows)
 }
 
 fn malformed(why: &str) -> ContextError {
@@ -364,13 +382,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rows_come_off_the_end_of_a_state_however_they_were_cut() {
-        let length = 5u64.to_le_bytes().to_vec();
-        let mut pieces = vec![vec![1, 2], vec![3], vec![10, 11, 12], vec![13, 14], length.clone()];
-        assert_eq!(split_rows(&mut pieces), Some(vec![10, 11, 12, 13, 14]));
-        assert_eq!(pieces, [vec![1, 2], vec![3]], "the state");
-        for mut broken in [vec![], vec![vec![1, 2]], vec![vec![1; 3], length.clone()], vec![vec![1; 6], length]] {
-            assert_eq!(split_rows(&mut broken), None, "{broken:?}");
+    fn rows_that_came_behind_a_state_are_whole_or_refused() {
+        let behind = |rows: &[u8], length: u64| [rows, &length.to_le_bytes()].concat();
+        assert_eq!(rows(&behind(&[10, 11], 2)), Some(&[10, 11][..]));
+        assert_eq!(rows(&behind(&[], 0)), Some(&[][..]));
+        for broken in [vec![], vec![1, 2], behind(&[1; 3], 5), behind(&[1; 6], 5)] {
+            assert_eq!(rows(&broken), None, "{broken:?}");
         }
     }
 }

@@ -1,5 +1,7 @@
 //! Parameters and gradients as flat f32 buffers in declaration order: what is reduced, clipped, updated, saved and compared.
 
+use std::convert::Infallible;
+
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Gradients, Tensor, TensorData};
 
@@ -70,7 +72,7 @@ pub fn read<M: Module>(module: &M) -> Vec<f32> {
             self.0.extend_from_slice(data.as_slice::<f32>().expect("parameters are f32"));
         }
     }
-    let mut visitor = Read(Vec::new());
+    let mut visitor = Read(Vec::with_capacity(module.num_params()));
     module.visit(&mut visitor);
     visitor.0
 }
@@ -79,24 +81,62 @@ pub fn read<M: Module>(module: &M) -> Vec<f32> {
 ///
 /// # Panics
 /// If `flat` has another length than the module has parameters.
-pub fn write<M: Module>(module: M, flat: &[f32]) -> M {
-    struct Write<'a>(&'a [f32]);
-    impl ModuleMapper for Write<'_> {
+pub fn write<M: Module>(module: M, mut flat: &[f32]) -> M {
+    let Ok(module) = replace(module, |values| {
+        let (head, tail) = flat.split_at(values.len());
+        values.copy_from_slice(head);
+        flat = tail;
+        Ok::<_, Infallible>(())
+    });
+    assert!(flat.is_empty(), "the buffer is longer than the module");
+    module
+}
+
+/// The module with the parameters that `fill` gives, one after the other; identities and gradient tracking stay. After an error it is
+/// asked no more.
+pub(crate) fn replace<M: Module, E>(module: M, fill: impl FnMut(&mut [f32]) -> Result<(), E>) -> Result<M, E> {
+    struct Replace<F, E> {
+        fill: F,
+        failed: Option<E>,
+    }
+    impl<F: FnMut(&mut [f32]) -> Result<(), E>, E> ModuleMapper for Replace<F, E> {
         fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+            if self.failed.is_some() {
+                return param;
+            }
             let shape = param.dims();
-            let (head, tail) = self.0.split_at(shape.iter().product());
-            self.0 = tail;
-            let data = TensorData::new(head.to_vec(), shape);
+            let mut values = vec![0.0; shape.iter().product()];
+            if let Err(error) = (self.fill)(&mut values) {
+                self.failed = Some(error);
+                return param;
+            }
+            let data = TensorData::new(values, shape);
             param.map(|old| {
                 let tracked = old.is_require_grad();
                 Tensor::from_data(data, &old.device()).set_require_grad(tracked)
             })
         }
     }
-    let mut mapper = Write(flat);
+    let mut mapper = Replace { fill, failed: None };
     let module = module.map(&mut mapper);
-    assert!(mapper.0.is_empty(), "the buffer is longer than the module");
-    module
+    mapper.failed.map_or(Ok(module), Err)
+}
+
+/// Replaces the parameters of `module` by `flat`, as [`write`] does, tensor by tensor: old and new ones are not all in memory together.
+///
+/// # Panics
+/// As [`write`].
+pub fn assign<M: Module>(module: &mut M, flat: &[f32]) {
+    struct Hollow;
+    impl ModuleMapper for Hollow {
+        fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+            param.map(|old| Tensor::zeros([1; D], &old.device()))
+        }
+    }
+    // Clones share their tensors, and what is shared is freed by nobody: the only whole one is taken out.
+    let hollow = module.clone().map(&mut Hollow);
+    let whole = std::mem::replace(module, hollow);
+    *module = write(whole, flat);
 }
 
 /// Adds the gradients of all parameters to `out`, in the order of [`read`]. A parameter that took no part adds nothing.

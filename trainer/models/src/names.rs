@@ -1,10 +1,14 @@
 //! Safetensors under the published names: what is exported, imported and kept in artifacts.
 
-use burn::module::Module;
-use safetensors::tensor::{Dtype, TensorView};
-use safetensors::{SafeTensors, serialize};
+use std::collections::BTreeMap;
+use std::convert::Infallible;
 
-use crate::flat::{Entry, layout, read, write};
+use burn::module::Module;
+use bytemuck::{cast_slice, cast_slice_mut};
+use safetensors::SafeTensorError;
+use safetensors::tensor::{Dtype, Metadata, TensorInfo};
+
+use crate::flat::{Entry, layout, read, replace};
 
 /// Why weights do not fit a network.
 #[derive(Debug, thiserror::Error)]
@@ -22,18 +26,127 @@ pub enum LoadError {
     },
 }
 
-/// Tensors named by `entries`, cut out of a flat buffer.
+/// Parameters as the safetensors file that they are kept as, in pieces that lie where they are: no second copy of large weights is made.
+#[derive(Debug)]
+pub struct Weights<'a> {
+    header: Vec<u8>,
+    /// In the order of the file.
+    tensors: Vec<&'a [f32]>,
+}
+
+impl<'a> Weights<'a> {
+    /// Tensors named by `entries`, cut out of a flat buffer. The file is in the order and with the alignment of the `safetensors` crate.
+    ///
+    /// # Panics
+    /// If `flat` has another length than `entries` have elements, or two of them have one name.
+    pub fn new(entries: &[Entry], mut flat: &'a [f32]) -> Self {
+        let mut by_name = BTreeMap::new();
+        for entry in entries {
+            let (tensor, rest) = flat.split_at(entry.len());
+            flat = rest;
+            by_name.insert(entry.name.as_str(), (&entry.shape, tensor));
+        }
+        assert!(flat.is_empty() && by_name.len() == entries.len(), "every name stands for its part of the buffer");
+        let mut end = 0;
+        let info = |(name, (shape, tensor)): (&&str, &(&Vec<usize>, &[f32]))| {
+            let begin = end;
+            end += size_of_val(*tensor);
+            let info = TensorInfo { dtype: Dtype::F32, shape: (*shape).clone(), data_offsets: (begin, end) };
+            ((*name).to_owned(), info)
+        };
+        let metadata = Metadata::new(None, by_name.iter().map(info).collect()).expect("tensors one after the other");
+        let mut json = serde_json::to_vec(&metadata).expect("names and numbers");
+        json.resize(json.len().next_multiple_of(8), b' ');
+        let header = [&(json.len() as u64).to_le_bytes()[..], &json].concat();
+        Self { header, tensors: by_name.into_values().map(|(_, tensor)| tensor).collect() }
+    }
+
+    /// The bytes of the file, one piece after the other.
+    pub fn pieces(&self) -> Vec<&[u8]> {
+        std::iter::once(&self.header[..]).chain(self.tensors.iter().map(|tensor| cast_slice(tensor))).collect()
+    }
+}
+
+/// Tensors named by `entries`, cut out of a flat buffer, as one file.
 pub fn to_bytes(entries: &[Entry], flat: &[f32]) -> Vec<u8> {
-    let bytes: Vec<u8> = flat.iter().flat_map(|v| v.to_le_bytes()).collect();
-    let mut at = 0;
-    let views = entries.iter().map(|entry| {
-        let size = 4 * entry.len();
-        let view = TensorView::new(Dtype::F32, entry.shape.clone(), &bytes[at..at + size]).expect("sizes agree");
-        at += size;
-        (entry.name.clone(), view)
-    });
-    let views: Vec<_> = views.collect();
-    serialize(views, None).expect("f32 tensors serialise")
+    Weights::new(entries, flat).pieces().concat()
+}
+
+/// A safetensors file whose header was read.
+#[derive(Debug)]
+struct Header {
+    metadata: Metadata,
+    /// Where its tensors begin.
+    data: u64,
+}
+
+impl Header {
+    /// Of a file of `bytes` bytes, of which `read` fills a buffer with those at an offset.
+    fn read<E>(bytes: u64, read: &mut ReadAt<'_, E>) -> Result<Result<Self, LoadError>, E> {
+        let unreadable = |e: SafeTensorError| Ok(Err(LoadError::Unreadable(e)));
+        let mut length = [0; 8];
+        if bytes < 8 {
+            return unreadable(SafeTensorError::HeaderTooSmall);
+        }
+        read(0, &mut length)?;
+        let length = u64::from_le_bytes(length);
+        if length > HEADER_BYTES {
+            return unreadable(SafeTensorError::HeaderTooLarge);
+        }
+        if length > bytes - 8 {
+            return unreadable(SafeTensorError::InvalidHeaderLength);
+        }
+        let mut json = vec![0; usize::try_from(length).unwrap_or_default()];
+        read(8, &mut json)?;
+        let metadata: Metadata = match serde_json::from_slice(&json) {
+            Ok(metadata) => metadata,
+            Err(e) => return unreadable(SafeTensorError::InvalidHeaderDeserialization(e)),
+        };
+        if metadata.data_len() as u64 != bytes - 8 - length {
+            return unreadable(SafeTensorError::MetadataIncompleteBuffer);
+        }
+        Ok(Ok(Self { metadata, data: 8 + length }))
+    }
+
+    /// Where the tensors of `entries` are in the file, whose names begin with `prefix` there.
+    fn places(&self, entries: &[Entry], prefix: &str) -> Result<Vec<u64>, LoadError> {
+        let mut unused: BTreeMap<String, &TensorInfo> = self.metadata.tensors().into_iter().collect();
+        unused.retain(|name, _| name.starts_with(prefix));
+        let (mut places, mut missing) = (Vec::with_capacity(entries.len()), Vec::new());
+        for entry in entries {
+            let name = format!("{prefix}{}", entry.name);
+            match unused.remove(&name) {
+                Some(info) if info.shape == entry.shape && info.dtype == Dtype::F32 => {
+                    places.push(self.data + info.data_offsets.0 as u64);
+                }
+                other => {
+                    missing.push(format!("{name} {:?}", entry.shape));
+                    unused.extend(other.map(|info| (name, info)));
+                }
+            }
+        }
+        if missing.is_empty() && unused.is_empty() {
+            return Ok(places);
+        }
+        let unused = unused.into_iter().map(|(name, info)| format!("{name} {:?}", info.shape)).collect();
+        Err(LoadError::Mismatch { missing, unused })
+    }
+}
+
+/// The largest header that is read; that of a thousand tensors has a hundred kilobytes.
+const HEADER_BYTES: u64 = 16 << 20;
+
+/// Fills a buffer with what begins at an offset of a file.
+pub type ReadAt<'a, E> = dyn FnMut(u64, &mut [u8]) -> Result<(), E> + 'a;
+
+/// Reads a file that is in memory.
+fn in_memory(bytes: &[u8]) -> impl FnMut(u64, &mut [u8]) -> Result<(), Infallible> {
+    |offset, out| {
+        // The header was held against the length.
+        let from = usize::try_from(offset).unwrap_or(usize::MAX);
+        out.copy_from_slice(&bytes[from..from + out.len()]);
+        Ok(())
+    }
 }
 
 /// A flat buffer in the order of `entries`, out of the tensors of `bytes` whose names start with `prefix`.
@@ -41,29 +154,25 @@ pub fn to_bytes(entries: &[Entry], flat: &[f32]) -> Vec<u8> {
 /// # Errors
 /// If the file is not safetensors, or its names or shapes are not those of `entries`.
 pub fn from_bytes(entries: &[Entry], bytes: &[u8], prefix: &str) -> Result<Vec<f32>, LoadError> {
-    let file = SafeTensors::deserialize(bytes)?;
-    let mut unused: Vec<String> =
-        file.names().into_iter().filter(|n| n.starts_with(prefix)).map(ToString::to_string).collect();
-    let (mut flat, mut missing) = (Vec::new(), Vec::new());
-    for entry in entries {
-        let name = format!("{prefix}{}", entry.name);
-        match file.tensor(&name) {
-            Ok(view) if view.shape() == entry.shape && view.dtype() == Dtype::F32 => {
-                unused.retain(|n| *n != name);
-                flat.extend(view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])));
-            }
-            _ => missing.push(format!("{name} {:?}", entry.shape)),
-        }
+    let mut read = in_memory(bytes);
+    let Ok(header) = Header::read(bytes.len() as u64, &mut read);
+    let places = header?.places(entries, prefix)?;
+    let mut flat = vec![0.0; entries.iter().map(Entry::len).sum()];
+    let mut rest = flat.as_mut_slice();
+    for (entry, place) in entries.iter().zip(places) {
+        let (tensor, later) = rest.split_at_mut(entry.len());
+        let Ok(()) = read_values(place, tensor, &mut read);
+        rest = later;
     }
-    if missing.is_empty() && unused.is_empty() {
-        return Ok(flat);
+    Ok(flat)
+}
+
+fn read_values<E>(place: u64, values: &mut [f32], read: &mut ReadAt<'_, E>) -> Result<(), E> {
+    read(place, cast_slice_mut(values))?;
+    if cfg!(target_endian = "big") {
+        values.iter_mut().for_each(|value| *value = f32::from_bits(value.to_bits().swap_bytes()));
     }
-    unused.sort();
-    let with_shape = |name: String| {
-        let shape = file.tensor(&name).map_or_else(|_| Vec::new(), |view| view.shape().to_vec());
-        format!("{name} {shape:?}")
-    };
-    Err(LoadError::Mismatch { missing, unused: unused.into_iter().map(with_shape).collect() })
+    Ok(())
 }
 
 /// The module's parameters under their published names.
@@ -76,6 +185,29 @@ pub fn save<M: Module>(module: &M) -> Vec<u8> {
 /// # Errors
 /// As [`from_bytes`].
 pub fn load<M: Module>(module: M, bytes: &[u8], prefix: &str) -> Result<M, LoadError> {
-    let flat = from_bytes(&layout(&module), bytes, prefix)?;
-    Ok(write(module, &flat))
+    let Ok(loaded) = load_from(module, bytes.len() as u64, &mut in_memory(bytes), prefix);
+    loaded
+}
+
+/// As [`load`], from a file of `bytes` bytes of which `read` fills a buffer with those at an offset, tensor by tensor.
+///
+/// # Errors
+/// What `read` says; inside, as [`from_bytes`].
+pub fn load_from<M: Module, E>(
+    module: M,
+    bytes: u64,
+    read: &mut ReadAt<'_, E>,
+    prefix: &str,
+) -> Result<Result<M, LoadError>, E> {
+    let places = Header::read(bytes, read)?.and_then(|header| header.places(&layout(&module), prefix));
+    let places = match places {
+        Ok(places) => places,
+        Err(error) => return Ok(Err(error)),
+    };
+    let mut places = places.into_iter();
+    let module = replace(module, |values| {
+        let place = places.next().expect("a place for each parameter");
+        read_values(place, values, read)
+    })?;
+    Ok(Ok(module))
 }

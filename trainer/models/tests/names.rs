@@ -4,14 +4,15 @@ use std::collections::BTreeMap;
 
 use burn::module::Module;
 use burn::tensor::Device;
-use models::flat::layout;
-use models::names::{LoadError, load, save, to_bytes};
+use models::flat::{self, layout};
+use models::names::{LoadError, Weights, load, load_from, save, to_bytes};
 use models::networks::{
     Denoiser, DenoiserConfig, Discriminator, Evaluator, EvaluatorConfig, Init, POSITIONS, Vae, VaeConfig,
 };
 use protocol::Seed;
 use protocol::stage::Positions;
-use safetensors::SafeTensors;
+use safetensors::tensor::TensorView;
+use safetensors::{Dtype, SafeTensors, serialize};
 
 fn vae_config(v2: bool) -> VaeConfig {
     VaeConfig {
@@ -214,6 +215,77 @@ fn weights_that_do_not_fit_are_listed_from_both_sides() {
 
     let teacher = with(|init| Denoiser::new(&small_denoiser(None), init));
     assert!(matches!(load(teacher, b"not weights", ""), Err(LoadError::Unreadable(_))));
+}
+
+/// The file is the `safetensors` crate's, and what is large in it is not copied.
+#[test]
+fn weights_are_written_from_where_they_lie() {
+    let network = with(|init| Denoiser::new(&small_denoiser(None), init));
+    let (entries, flat) = (layout(&network), flat::read(&network));
+    let weights = Weights::new(&entries, &flat);
+    let (pieces, place) = (weights.pieces(), flat.as_ptr_range());
+    let (start, end) = (place.start.cast::<u8>(), place.end.cast::<u8>());
+    assert_eq!(pieces.len(), 1 + entries.len());
+    assert!(pieces[1..].iter().all(|piece| start <= piece.as_ptr() && piece.as_ptr() < end));
+
+    let mut at = 0;
+    let bytes: Vec<Vec<u8>> = entries
+        .iter()
+        .map(|entry| {
+            at += entry.len();
+            flat[at - entry.len()..at].iter().flat_map(|v| v.to_le_bytes()).collect()
+        })
+        .collect();
+    let views = entries
+        .iter()
+        .zip(&bytes)
+        .map(|(entry, bytes)| (entry.name.clone(), TensorView::new(Dtype::F32, entry.shape.clone(), bytes).unwrap()));
+    assert_eq!(pieces.concat(), serialize(views, None).unwrap());
+}
+
+#[test]
+fn weights_are_read_tensor_by_tensor() {
+    let network = with(|init| Denoiser::new(&small_denoiser(None), init));
+    let bytes = save(&network);
+    let blank =
+        || Denoiser::new(&small_denoiser(None), &mut Init::new(Seed(8), "x", Positions::Uniform, &Device::flex()));
+    let largest = layout(&network).iter().map(|entry| 4 * entry.len()).max().unwrap();
+    let header = 8 + u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+    let mut read = |offset: u64, out: &mut [u8]| {
+        assert!(out.len() <= largest || offset == 8 && out.len() == header - 8, "{} bytes at once", out.len());
+        out.copy_from_slice(&bytes[usize::try_from(offset).unwrap()..][..out.len()]);
+        Ok::<_, String>(())
+    };
+    let loaded = load_from(blank(), bytes.len() as u64, &mut read, "").unwrap().unwrap();
+    assert_eq!(save(&loaded), bytes);
+    let cut = load_from(blank(), bytes.len() as u64 - 4, &mut read, "").unwrap();
+    assert!(matches!(cut, Err(LoadError::Unreadable(_))));
+    let mut reads = 0;
+    let broken = load_from(
+        blank(),
+        bytes.len() as u64,
+        &mut |offset, out| {
+            reads += 1;
+            if reads > 4 { Err("the line is cut".to_owned()) } else { read(offset, out) }
+        },
+        "",
+    );
+    assert_eq!((broken.unwrap_err().as_str(), reads), ("the line is cut", 5));
+}
+
+/// In the place of the old ones, which need not be there any more.
+#[test]
+fn parameters_are_assigned_in_place() {
+    for device in [Device::flex(), Device::flex().autodiff()] {
+        let make =
+            |seed| Denoiser::new(&small_denoiser(None), &mut Init::new(Seed(seed), "x", Positions::Uniform, &device));
+        let (mut network, other) = (make(1), make(2));
+        let values = flat::read(&other);
+        flat::assign(&mut network, &values);
+        assert_eq!((flat::read(&network), layout(&network)), (values.clone(), layout(&other)));
+        let written = flat::write(make(3), &values);
+        assert_eq!(format!("{network:?}").len(), format!("{written:?}").len(), "gradients are tracked as before");
+    }
 }
 
 #[test]

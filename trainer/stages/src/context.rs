@@ -84,12 +84,22 @@ pub enum Outcome {
 }
 
 /// What a member of a gang finds when it (re)joins.
-#[derive(Debug)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Rendezvous {
     /// Nobody is ahead: go on from the state you have.
     Keep,
-    /// A peer is ahead, or you have just started: replace your state by its bytes, cut anyhow.
-    Adopt(Vec<Vec<u8>>),
+    /// A peer is ahead, or you have just started: [`GangContext::adopt`] its state.
+    Behind,
+}
+
+/// What became of taking over a peer's state.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Adopted {
+    /// All of it is there.
+    Whole,
+    /// The members changed meanwhile: [`GangContext::rendezvous`] again. A member that came with a state of its own still has it; what
+    /// one that had only initialised itself has now is of no use.
+    Cut,
 }
 
 /// What an exchange gave.
@@ -137,6 +147,10 @@ pub trait GangContext: AttemptContext {
     /// Meets the other members of the current generation. `applied` is the number of steps in the caller's state, `None`
     /// when it has only initialised itself; `state` is its bytes, piece after piece, for a peer that needs them.
     fn rendezvous(&mut self, applied: Option<u64>, state: &[&[u8]]) -> Result<Rendezvous, ContextError>;
+
+    /// After [`Rendezvous::Behind`]: fills `state`, cut as the caller likes, with the bytes of the peer that is ahead. Those of a member
+    /// that had only initialised itself arrive where they belong, so that a large state is in memory once.
+    fn adopt(&mut self, state: &mut [&mut [u8]]) -> Result<Adopted, ContextError>;
 
     /// The slices of the coming step that are this worker's: a contiguous range of `0..slices`. Changes only with
     /// [`rendezvous`](Self::rendezvous).

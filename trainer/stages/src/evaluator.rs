@@ -6,7 +6,8 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
-use models::names::{load, save};
+use models::flat::Entry;
+use models::names::save;
 use models::networks::{Evaluator, EvaluatorConfig, Init};
 use motion::Skeleton;
 use motion::dataset::{Caption, Dataset, statistics};
@@ -14,9 +15,10 @@ use protocol::stage::{DataFormat, EvaluatorNetwork, Positions};
 use protocol::{ArtifactKind, Digest, Manifest, Seed};
 use serde::{Deserialize, Serialize};
 
-use crate::artifacts::{self, Draft, MODEL_FILE, to_meta};
-use crate::context::{AttemptContext, ContextError, StageError};
+use crate::artifacts::{self, Draft, to_meta};
+use crate::context::{AttemptContext, StageError};
 use crate::kinds::word;
+use crate::weights;
 use crate::words::{CLASSES, WORD_WIDTH, WORDS, Words, WordsMeta};
 
 /// Frames of a movement.
@@ -57,11 +59,11 @@ pub fn config(network: &EvaluatorNetwork, skeleton: &Skeleton) -> EvaluatorConfi
 pub fn publish(
     cx: &mut dyn AttemptContext,
     meta: &EvaluatorMeta,
-    weights: Vec<u8>,
+    (entries, values): (&[Entry], &[f32]),
     words: &Words,
 ) -> Result<Digest, StageError> {
     let mut draft = Draft::new(cx, ArtifactKind::Evaluator, to_meta(meta));
-    draft.add(MODEL_FILE, weights)?;
+    weights::add(&mut draft, entries, values)?;
     words.write(&mut draft)?;
     draft.finish(cx)
 }
@@ -91,8 +93,7 @@ impl TrainedEvaluator {
         let words = Words::read(blobs, manifest, &meta.words)?;
         let device = device.clone().inner();
         let fresh = Evaluator::new(&meta.config, &mut Init::new(Seed(0), "blank", Positions::Uniform, &device));
-        let network = load(fresh, &artifacts::file(blobs, manifest, MODEL_FILE)?, "")
-            .map_err(|e| StageError::Context(ContextError::Corrupt(format!("the evaluator's weights: {e}"))))?;
+        let network = weights::load(fresh, blobs, manifest, "the evaluator's weights")?;
         Ok(Self { network, meta, words, device })
     }
 

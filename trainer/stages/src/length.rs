@@ -4,15 +4,15 @@ use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
 use checkpoint::model::Parts;
 use models::kernels::Dropout;
-use models::names::load;
 use models::networks::{Init, LengthEstimator};
 use motion::Stream;
 use protocol::stage::{DataFormat, Positions};
 use protocol::{ArtifactKind, Manifest, Seed};
 use serde::{Deserialize, Serialize};
 
-use crate::artifacts::{self, MODEL_FILE};
-use crate::context::{ContextError, StageError};
+use crate::artifacts;
+use crate::context::StageError;
+use crate::weights;
 
 /// Meta of an artifact of kind `length`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -51,8 +51,7 @@ impl Lengths {
         let device = device.clone().inner();
         let mut blank = Init::new(Seed(0), "blank", Positions::Uniform, &device);
         let fresh = LengthEstimator::new(meta.text_dim, meta.classes, &mut blank);
-        let network = load(fresh, &artifacts::file(blobs, manifest, MODEL_FILE)?, "")
-            .map_err(|e| StageError::Context(ContextError::Corrupt(format!("the length estimator's weights: {e}"))))?;
+        let network = weights::load(fresh, blobs, manifest, "the length estimator's weights")?;
         Ok(Self { network, meta, device })
     }
 

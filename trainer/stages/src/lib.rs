@@ -19,4 +19,5 @@ pub mod timing;
 pub mod tokenizer;
 pub mod train;
 pub mod verify;
+pub mod weights;
 pub mod words;

@@ -9,15 +9,15 @@ use models::diffusion::{
     Grid, LcmTimesteps, Phases, Schedule, TIMESTEPS, ddim_sample, guided, lcm_sample, lcm_timesteps, pcm_sample,
 };
 use models::kernels::Dropout;
-use models::names::load;
 use models::networks::{self, DenoiserConfig, Init, POSITIONS, Vae, VaeConfig, guidance_embedding};
 use motion::Stream;
 use protocol::stage::{DataFormat, Family, Positions, Sampler};
 use protocol::{Manifest, Seed};
 
-use crate::artifacts::{self, DenoiserMeta, MODEL_FILE, VaeMeta};
-use crate::context::{ContextError, StageError};
+use crate::artifacts::{self, DenoiserMeta, VaeMeta};
+use crate::context::StageError;
 use crate::kinds::word;
+use crate::weights;
 
 /// Width of the time sinusoid in every published denoiser.
 const TIME_DIM: usize = 768;
@@ -66,11 +66,6 @@ fn blank(device: &Device) -> Init<'_> {
     Init::new(Seed(0), "blank", Positions::Uniform, device)
 }
 
-/// Weights that do not fit their manifest are a broken artifact.
-fn misfit(what: &str, error: &models::names::LoadError) -> StageError {
-    StageError::Context(ContextError::Corrupt(format!("{what}: {error}")))
-}
-
 fn tensor(values: Vec<f32>, shape: [usize; 3], device: &Device) -> Tensor<3> {
     Tensor::from_data(TensorData::new(values, shape), device)
 }
@@ -106,14 +101,10 @@ impl Posterior {
 impl Autoencoder {
     /// Reads an artifact of kind `vae`.
     pub fn read(blobs: &dyn Blobs, manifest: &Manifest, device: &Device) -> Result<Self, StageError> {
-        Self::load(artifacts::meta(manifest, "the VAE")?, &artifacts::file(blobs, manifest, MODEL_FILE)?, device)
-    }
-
-    /// A VAE from its meta and weights.
-    pub fn load(meta: VaeMeta, weights: &[u8], device: &Device) -> Result<Self, StageError> {
+        let meta: VaeMeta = artifacts::meta(manifest, "the VAE")?;
         let device = device.clone().inner();
         let fresh = Vae::new(&meta.config(), &mut blank(&device));
-        let vae = load(fresh, weights, "").map_err(|e| misfit("the VAE's weights", &e))?;
+        let vae = weights::load(fresh, blobs, manifest, "the VAE's weights")?;
         Ok(Self { vae, meta, device })
     }
 
@@ -206,14 +197,10 @@ pub struct Denoiser {
 impl Denoiser {
     /// Reads an artifact of kind `denoiser`.
     pub fn read(blobs: &dyn Blobs, manifest: &Manifest, device: &Device) -> Result<Self, StageError> {
-        Self::load(artifacts::meta(manifest, "the denoiser")?, &artifacts::file(blobs, manifest, MODEL_FILE)?, device)
-    }
-
-    /// A denoiser from its meta and weights.
-    pub fn load(meta: DenoiserMeta, weights: &[u8], device: &Device) -> Result<Self, StageError> {
+        let meta: DenoiserMeta = artifacts::meta(manifest, "the denoiser")?;
         let device = device.clone().inner();
         let fresh = networks::Denoiser::new(&meta.config(), &mut blank(&device));
-        let network = load(fresh, weights, "").map_err(|e| misfit("the denoiser's weights", &e))?;
+        let network = weights::load(fresh, blobs, manifest, "the denoiser's weights")?;
         let schedule = Schedule::new(&meta.diffusion, TIMESTEPS);
         Ok(Self { network, meta, schedule, device })
     }

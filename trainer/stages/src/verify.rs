@@ -13,7 +13,7 @@ use checkpoint::{BlobError, Blobs};
 use protocol::message::StageTask;
 use protocol::{Digest, Manifest};
 
-use crate::context::{AttemptContext, ContextError, Exchange, GangContext, Outcome, Rendezvous, StageError};
+use crate::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Outcome, Rendezvous, StageError};
 use crate::kinds;
 use crate::train::{STATE_FILE, tree_sum};
 
@@ -126,6 +126,10 @@ impl GangContext for Solo {
 
     fn rendezvous(&mut self, _: Option<u64>, _: &[&[u8]]) -> Result<Rendezvous, ContextError> {
         Ok(Rendezvous::Keep)
+    }
+
+    fn adopt(&mut self, _: &mut [&mut [u8]]) -> Result<Adopted, ContextError> {
+        Ok(Adopted::Cut)
     }
 
     fn share(&self, slices: usize) -> Range<usize> {

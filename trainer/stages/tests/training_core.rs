@@ -298,6 +298,20 @@ fn p6_buffers_have_the_same_bits_for_any_number_of_members() {
     }
 }
 
+/// A joiner has part of a peer's state in the place of its own when the peer is lost: it goes on from a checkpoint, or from the beginning.
+#[test]
+fn p4_a_state_that_is_cut_short_on_its_way_is_not_used() {
+    for toy in toys() {
+        let expected = run(&mut world(1), &toy).unwrap();
+        for every in [0, 5] {
+            let mut bench = world(1);
+            bench.checkpoint.every = Steps(every);
+            bench.script = Script { joins: vec![(1, 7)], lost_donating: vec![1], ..Script::default() };
+            assert_eq!(run(&mut bench, &toy).unwrap(), expected, "a checkpoint every {every} steps");
+        }
+    }
+}
+
 #[test]
 fn p5_a_kill_at_every_step_changes_no_bit_of_the_buffers() {
     for toy in toys() {

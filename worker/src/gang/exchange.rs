@@ -14,7 +14,7 @@
 //! members stop after the same step.
 
 use std::ops::Range;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use bytemuck::cast_slice;
 
@@ -24,21 +24,18 @@ use super::tree::{self, Node};
 
 const WIND_DOWN: u32 = 1;
 
-/// A state larger than this is refused before memory is taken for it.
-const MAX_STATE: u64 = 64 << 30;
+/// What travels behind a state, namely recorded values that are not known to be stored, is refused if it is larger than this.
+const MAX_BEHIND_STATE: u64 = 256 << 20;
 
 /// Whether to give up, asked often.
 pub(crate) type Interrupt<'a> = &'a dyn Fn() -> Option<Halt>;
 
 /// What a rendezvous says to this member.
-#[derive(Debug)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Met {
     Keep,
-    /// A peer's state, and how long it took from the offer's being waited for to its last byte.
-    Adopt {
-        pieces: Vec<Vec<u8>>,
-        took: Duration,
-    },
+    /// This rank sends its state now.
+    Behind(usize),
 }
 
 /// Finds the newest state among members and brings everybody to it.
@@ -48,7 +45,7 @@ pub(crate) fn rendezvous(
     state: &[&[u8]],
     interrupt: Interrupt<'_>,
 ) -> Result<Met, Halt> {
-    let barrier = format!("barrier `rendezvous` of generation {}", mesh.config.generation);
+    let barrier = rendezvous_barrier(mesh);
     let own = mesh.config.rank;
     let head = Head::new(Kind::Applied, applied.unwrap_or(0), u32::from(applied.is_some()), 0);
     for peer in mesh.others() {
@@ -85,14 +82,29 @@ pub(crate) fn rendezvous(
     if applied == Some(newest) {
         return Ok(Met::Keep);
     }
-    let begun = Instant::now();
+    Ok(Met::Behind(source))
+}
+
+/// Receives the state that `source` sends after a rendezvous, into `room`. What follows the state is returned.
+///
+/// `directly` it arrives in the room itself, and what is there when it is cut short is of no use; otherwise all of it is received first.
+pub(crate) fn adopt(
+    mesh: &Mesh,
+    source: usize,
+    room: &mut [&mut [u8]],
+    directly: bool,
+    interrupt: Interrupt<'_>,
+) -> Result<Vec<u8>, Halt> {
+    let barrier = rendezvous_barrier(mesh);
     let length = expect(mesh.next(source, &barrier, interrupt)?, Kind::StateLength, mesh, source)?.step;
-    if length > MAX_STATE {
+    let wanted: u64 = room.iter().map(|piece| piece.len() as u64).sum();
+    if length < wanted || length - wanted > MAX_BEHIND_STATE {
         return Err(Halt::Disagree(format!(
-            "{barrier}: a state of {length} bytes is offered, at most {MAX_STATE} are taken"
+            "{barrier}: `{}` offers a state of {length} bytes, expected {wanted} and at most {MAX_BEHIND_STATE} more; is it the same build?",
+            mesh.config.members[source].worker
         )));
     }
-    // Pieces stay as they came: to put a large state together would take memory for it once more.
+    let mut room = Room::new(room);
     let (mut pieces, mut there) = (Vec::new(), 0);
     while there < length {
         let frame = expect(mesh.next(source, &barrier, interrupt)?, Kind::State, mesh, source)?;
@@ -103,9 +115,50 @@ pub(crate) fn rendezvous(
                 "{barrier}: a state of {length} bytes arrives in pieces of another length"
             )));
         }
-        pieces.push(piece);
+        if directly {
+            room.fill(&piece);
+        } else {
+            // To put a large state together would take memory for it once more.
+            pieces.push(piece);
+        }
     }
-    Ok(Met::Adopt { pieces, took: begun.elapsed() })
+    pieces.iter().for_each(|piece| room.fill(piece));
+    Ok(room.behind)
+}
+
+/// Pieces of memory that are filled one after the other.
+struct Room<'a, 'b> {
+    rest: std::slice::IterMut<'a, &'b mut [u8]>,
+    now: &'a mut [u8],
+    /// What came when all was full.
+    behind: Vec<u8>,
+}
+
+impl<'a, 'b> Room<'a, 'b> {
+    fn new(pieces: &'a mut [&'b mut [u8]]) -> Self {
+        Self { rest: pieces.iter_mut(), now: &mut [], behind: Vec::new() }
+    }
+
+    fn fill(&mut self, mut bytes: &[u8]) {
+        while !bytes.is_empty() {
+            if self.now.is_empty() {
+                let Some(next) = self.rest.next() else {
+                    self.behind.extend_from_slice(bytes);
+                    return;
+                };
+                self.now = next;
+                continue;
+            }
+            let fits = bytes.len().min(self.now.len());
+            let (into, later) = std::mem::take(&mut self.now).split_at_mut(fits);
+            into.copy_from_slice(&bytes[..fits]);
+            (self.now, bytes) = (later, &bytes[fits..]);
+        }
+    }
+}
+
+fn rendezvous_barrier(mesh: &Mesh) -> String {
+    format!("barrier `rendezvous` of generation {}", mesh.config.generation)
 }
 
 /// What a member brings to an exchange.

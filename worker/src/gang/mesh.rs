@@ -25,6 +25,9 @@ use super::handshake::{self, HandshakeError, Session};
 use super::link::{BLINK, Link, Writer};
 use crate::event_count::{EventCount, lock};
 
+/// Frames of a state that are queued for a member that takes them more slowly than they come, each of a megabyte at most.
+const STATE_FRAMES: usize = 16;
+
 /// How patient members are with each other.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Timing {
@@ -242,6 +245,12 @@ impl Mesh {
         self.closed.load(Ordering::SeqCst)
     }
 
+    /// Frames from `rank` that nobody has taken.
+    #[cfg(test)]
+    pub(crate) fn queued(&self, rank: usize) -> usize {
+        lock(&self.peers)[rank].inbox.len()
+    }
+
     /// Ends every connection without a word, as the death of the process would.
     #[cfg(test)]
     pub(crate) fn sever(&self) {
@@ -353,8 +362,27 @@ impl Mesh {
         spawn("gang-read", move || read(&mesh, rank, reader, receives));
     }
 
+    /// Waits while as much of a state is queued as may be: the rest stays with its sender, who sends nothing else meanwhile. Parts of a sum
+    /// are queued without bound, for all members send theirs before they take others'.
+    fn await_room(&self, rank: usize) {
+        loop {
+            let ticket = self.event_count.ticket();
+            {
+                let peer = &mut lock(&self.peers)[rank];
+                peer.heard = Instant::now();
+                if self.is_closed() || peer.standing != Standing::Up || peer.inbox.len() < STATE_FRAMES {
+                    return;
+                }
+            }
+            self.event_count.wait(ticket, BLINK);
+        }
+    }
+
     /// What a frame means for the connection; those of the exchange are queued.
     fn receive(&self, rank: usize, frame: Frame) {
+        if frame.kind == Kind::State {
+            self.await_room(rank);
+        }
         if self.is_closed() {
             return;
         }
@@ -394,7 +422,11 @@ impl Mesh {
 
     /// The next frame from `rank`. What came before a connection ended is still handed out.
     pub(crate) fn next(&self, rank: usize, barrier: &str, interrupt: &dyn Fn() -> Option<Halt>) -> Result<Frame, Halt> {
-        self.wait(rank, barrier, interrupt, |peer| peer.inbox.pop_front())
+        let frame = self.wait(rank, barrier, interrupt, |peer| peer.inbox.pop_front())?;
+        if frame.kind == Kind::State {
+            self.event_count.notify();
+        }
+        Ok(frame)
     }
 
     /// Waits for as long as `rank` lives, and after it has left in good order for what the coordinator says about that.

@@ -1,5 +1,6 @@
 //! Gangs of threads over loopback, with a coordinator of a few lines that does what the real one does about losses.
 
+mod states;
 mod strangers;
 
 use std::collections::BTreeMap;
@@ -13,7 +14,7 @@ use proptest::prelude::*;
 use protocol::message::{Assignment, Grant, Member, Role, StageTask};
 use protocol::stage::{CheckpointPolicy, StageSettings, TrainVae};
 use protocol::{Attempt, Fence, Generation, Incarnation, RunId, Seed, StageName, TaskId, WorkerId};
-use stages::context::{ContextError, Exchange, GangContext, Rendezvous};
+use stages::context::{Adopted, ContextError, Exchange, GangContext, Rendezvous};
 use tokio::runtime::Runtime;
 
 use super::endpoint::Endpoint;
@@ -197,15 +198,16 @@ fn train(context: &mut HttpContext, plan: Plan, mut before: impl FnMut(u64)) -> 
     let mut met = false;
     while applied.unwrap_or(0) < plan.steps {
         if !met {
-            let at = applied.unwrap_or(0).to_le_bytes();
-            if let Rendezvous::Adopt(adopted) = context.rendezvous(applied, &[&at, bytemuck::cast_slice(&state)])? {
-                let adopted = adopted.concat();
-                let at = u64::from_le_bytes(adopted[..8].try_into().expect("8 bytes"));
-                state = adopted[8..].chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().expect("4"))).collect();
-                applied = Some(at);
+            let mut at = applied.unwrap_or(0).to_le_bytes();
+            met = context.rendezvous(applied, &[&at, bytemuck::cast_slice(&state)])? == Rendezvous::Keep;
+            if !met && context.adopt(&mut [&mut at, bytemuck::cast_slice_mut(&mut state)])? == Adopted::Whole {
+                applied = Some(u64::from_le_bytes(at));
                 parts.clear();
+                met = true;
+            } else if applied.is_none() {
+                // Whatever came of a state that was cut short.
+                state.fill(0.0);
             }
-            met = true;
             continue;
         }
         let step = applied.unwrap_or(0);

@@ -12,7 +12,6 @@ use models::diffusion::{Grid, Schedule, TIMESTEPS, affine, guided_by, unzip};
 use models::flat::{self, Entry};
 use models::kernels::Dropout;
 use models::losses;
-use models::names;
 use models::networks::{Denoiser, Init, guidance_embedding};
 use protocol::artifact::Role;
 use protocol::stage::{Distance, Distillation, Family, Positions};
@@ -20,10 +19,11 @@ use protocol::{ArtifactKind, Digest, Manifest, Seed};
 
 use super::group;
 use super::latent_data::{self, LatentData, LatentSlice};
-use crate::artifacts::{self, DenoiserMeta, MODEL_FILE};
-use crate::context::{AttemptContext, ContextError, GangContext, StageError};
+use crate::artifacts::{self, DenoiserMeta};
+use crate::context::{AttemptContext, GangContext, StageError};
 use crate::parts::{self, model_error};
 use crate::train::{Average, GroupPlan, TrainState};
+use crate::weights;
 
 /// Networks and data of a distillation.
 pub(super) struct Distiller {
@@ -82,13 +82,11 @@ impl Distiller {
             ));
         }
         let device = cx.device();
-        let weights = artifacts::file(&*blobs, &manifest, MODEL_FILE)?;
-        let corrupt = |e: names::LoadError| StageError::Context(ContextError::Corrupt(format!("the teacher: {e}")));
         let blank = |guidance: Option<usize>, device: &Device| {
             let config = models::networks::DenoiserConfig { guidance_dim: guidance, ..teacher_meta.config() };
             Denoiser::new(&config, &mut Init::new(Seed(0), "blank", Positions::Uniform, device))
         };
-        let teacher = names::load(blank(None, &device), &weights, "").map_err(corrupt)?;
+        let teacher = weights::load(blank(None, &device), &*blobs, &manifest, "the teacher")?;
         let tracked = device.clone().autodiff();
         let student = start_from(blank(Some(settings.guidance_dim), &tracked), &teacher);
         let target = start_from(blank(Some(settings.guidance_dim), &device), &teacher);
@@ -119,9 +117,9 @@ impl Distiller {
     /// Takes over student and target.
     pub(super) fn load(&mut self, state: &TrainState) {
         let group = &state.groups[0];
-        self.student = flat::write(self.student.clone(), &group.params);
+        flat::assign(&mut self.student, &group.params);
         let average = group.average.as_ref().expect("the group was planned with an average");
-        self.target = flat::write(self.target.clone(), average);
+        flat::assign(&mut self.target, average);
     }
 
     /// Dropout of the student in one slice.
@@ -207,7 +205,7 @@ impl Distiller {
         &self,
         cx: &mut dyn AttemptContext,
         family: Family,
-        weights: Vec<u8>,
+        trained: (&[Entry], &[f32]),
     ) -> Result<Digest, StageError> {
         let meta = DenoiserMeta { family, guidance_dim: self.settings.guidance_dim, ..self.teacher_meta.clone() };
         let blobs = cx.blobs();
@@ -216,7 +214,7 @@ impl Distiller {
             Ok((role.clone(), parts::manifest(&*blobs, *digest, &format!("the part `{role}`"))?))
         };
         let parts: BTreeMap<Role, Manifest> = others.map(part).collect::<Result<_, StageError>>()?;
-        latent_data::publish(cx, self.base.format, &meta, weights, parts)
+        latent_data::publish(cx, self.base.format, &meta, trained, parts)
     }
 }
 

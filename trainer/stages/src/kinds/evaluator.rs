@@ -13,7 +13,6 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use models::flat;
 use models::kernels::Dropout;
-use models::names::to_bytes;
 use models::networks::{Evaluator, Init, MotionEncoder, MovementDecoder, MovementEncoder, TextEncoder};
 use motion::Stream;
 use motion::dataset::{Dataset, crop, window};
@@ -239,13 +238,13 @@ impl Objective for EvaluatorObjective {
     }
 
     fn load(&mut self, state: &TrainState) {
-        self.text = flat::write(self.text.clone(), &state.groups[0].params);
-        self.motion = flat::write(self.motion.clone(), &state.groups[1].params);
-        self.movements = flat::write(self.movements.clone(), &state.groups[2].params);
+        flat::assign(&mut self.text, &state.groups[0].params);
+        flat::assign(&mut self.motion, &state.groups[1].params);
+        flat::assign(&mut self.movements, &state.groups[2].params);
         if state.step >= self.turning_point() {
             // The average, where one is kept: it is what the evaluator will have.
             let encoder = self.frozen.num_params();
-            self.frozen = flat::write(self.frozen.clone(), &state.result(2)[..encoder]);
+            flat::assign(&mut self.frozen, &state.result(2)[..encoder]);
         }
     }
 
@@ -325,8 +324,8 @@ impl Gang for TrainEvaluator {
                 let mut weights = state.result(0).to_vec();
                 weights.extend_from_slice(state.result(1));
                 weights.extend_from_slice(&state.result(2)[..encoder]);
-                let bytes = to_bytes(&flat::layout(&blank), &weights);
-                let output = evaluator::publish(cx, &objective.meta, bytes, &objective.words)?;
+                let trained = (&flat::layout(&blank)[..], &weights[..]);
+                let output = evaluator::publish(cx, &objective.meta, trained, &objective.words)?;
                 Ok(Outcome::Finished { output, metrics })
             }
         }

@@ -13,7 +13,7 @@ use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use models::flat::layout;
-use models::names::{from_bytes, to_bytes};
+use models::names::from_bytes;
 use models::networks::{Evaluator, EvaluatorConfig, Init};
 use motion::{Skeleton, files, npy};
 use protocol::stage::{ImportEvaluator, Positions};
@@ -77,7 +77,7 @@ impl Plain for ImportEvaluator {
         }
         let meta =
             EvaluatorMeta { format: self.format, config, mean, std, words: words.meta(), origin: "imported".into() };
-        let output = evaluator::publish(cx, &meta, to_bytes(&entries, &flat), &words)?;
+        let output = evaluator::publish(cx, &meta, (&entries, &flat), &words)?;
         let metrics = BTreeMap::from([("parameters".to_owned(), flat.len() as f64)]);
         Ok(Outcome::Finished { output, metrics })
     }
@@ -250,6 +250,7 @@ mod tests {
     use std::io::Write as _;
 
     use models::flat;
+    use models::names::to_bytes;
 
     use super::*;
 

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use burn::tensor::{Device, Tensor, TensorData};
+use models::flat::Entry;
 use motion::Stream;
 use motion::dataset::Split;
 use protocol::artifact::Role;
@@ -10,11 +11,12 @@ use protocol::stage::{DataFormat, Training};
 use protocol::{ArtifactKind, Digest, Manifest, Seed, StageName};
 
 use super::no_clips;
-use crate::artifacts::{self, DenoiserMeta, Draft, Embeddings, Latents, MODEL_FILE, to_meta};
+use crate::artifacts::{self, DenoiserMeta, Draft, Embeddings, Latents, to_meta};
 use crate::context::{AttemptContext, StageError};
 use crate::generator::LATENT_DIFFUSION;
 use crate::parts;
 use crate::train::{Order, Pick};
+use crate::weights;
 
 /// Latents and captions of the training split, in the order of a stage.
 #[derive(Debug)]
@@ -143,16 +145,17 @@ impl LatentData {
     }
 }
 
-/// Uploads a model of latent diffusion: the denoiser, made of its meta and weights, and the parts that it was trained with.
+/// Uploads a model of latent diffusion: the denoiser, made of its meta and its weights in a flat buffer, and the parts that it was
+/// trained with.
 pub(super) fn publish(
     cx: &mut dyn AttemptContext,
     format: DataFormat,
     meta: &DenoiserMeta,
-    weights: Vec<u8>,
+    (entries, values): (&[Entry], &[f32]),
     mut parts: BTreeMap<Role, Manifest>,
 ) -> Result<Digest, StageError> {
     let mut denoiser = Draft::new(cx, ArtifactKind::Denoiser, to_meta(meta));
-    denoiser.add(MODEL_FILE, weights)?;
+    weights::add(&mut denoiser, entries, values)?;
     parts.insert(Role::DENOISER, denoiser.into_manifest());
     parts::publish_model(cx, LATENT_DIFFUSION, format, &parts)
 }

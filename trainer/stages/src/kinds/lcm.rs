@@ -3,7 +3,6 @@
 //! `y = c_skip(t) z_t + c_out(t) z_0(z_t, t)` by the student against the same at the teacher's solver step by the target.
 
 use models::diffusion::{affine, consistency, unzip};
-use models::names::to_bytes;
 use protocol::stage::{DistillLcm, StageSpec};
 
 use super::consistency::Distiller;
@@ -46,9 +45,9 @@ impl Gang for DistillLcm {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {
                 // The online network is what is kept, as upstream; its average only was the target.
-                let bytes = to_bytes(&state.groups[0].entries, &state.groups[0].params);
+                let trained = (&state.groups[0].entries[..], &state.groups[0].params[..]);
                 let family = self.family().expect("a distillation gives a student");
-                let output = objective.0.publish(cx, family, bytes)?;
+                let output = objective.0.publish(cx, family, trained)?;
                 Ok(Outcome::Finished { output, metrics })
             }
         }

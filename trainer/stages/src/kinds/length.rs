@@ -10,7 +10,6 @@ use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::model::Parts;
 use models::flat;
 use models::kernels::Dropout;
-use models::names::to_bytes;
 use models::networks::{Init, LengthEstimator};
 use motion::Stream;
 use motion::dataset::Dataset;
@@ -19,10 +18,11 @@ use protocol::stage::{Positions, Split, TrainLength};
 use protocol::{ArtifactKind, Seed};
 
 use super::{Gang, dropout_seed, group, no_clips, slice_result};
-use crate::artifacts::{self, Embeddings, MODEL_FILE, to_meta};
+use crate::artifacts::{self, Embeddings, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::length::LengthMeta;
 use crate::train::{GroupPlan, Losses, Objective, Order, SliceResult, TrainState, Trained, train};
+use crate::weights;
 
 /// Frames between the mean of the predicted lengths and the true one.
 const OFF: &str = "frames_off";
@@ -50,7 +50,7 @@ impl Objective for Lengths {
     }
 
     fn load(&mut self, state: &TrainState) {
-        self.network = flat::write(self.network.clone(), &state.groups[0].params);
+        flat::assign(&mut self.network, &state.groups[0].params);
     }
 
     fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
@@ -128,8 +128,8 @@ impl Gang for TrainLength {
         match train(&mut objective, &self.training, cx)? {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {
-                let bytes = to_bytes(&state.groups[0].entries, state.result(0));
-                let output = artifacts::publish(cx, ArtifactKind::Length, to_meta(&meta), MODEL_FILE, bytes)?;
+                let trained = (&state.groups[0].entries[..], state.result(0));
+                let output = weights::publish(cx, ArtifactKind::Length, to_meta(&meta), trained)?;
                 Ok(Outcome::Finished { output, metrics })
             }
         }

@@ -10,7 +10,6 @@ use models::diffusion::{Schedule, TIMESTEPS, affine, unzip};
 use models::flat;
 use models::kernels::Dropout;
 use models::losses;
-use models::names::to_bytes;
 use models::networks::{Denoiser, Init};
 use protocol::ArtifactKind;
 use protocol::artifact::Role;
@@ -43,7 +42,7 @@ impl Objective for Mld {
     }
 
     fn load(&mut self, state: &TrainState) {
-        self.network = flat::write(self.network.clone(), &state.groups[0].params);
+        flat::assign(&mut self.network, &state.groups[0].params);
     }
 
     fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
@@ -97,9 +96,9 @@ impl Gang for TrainMld {
         match train(&mut objective, &self.training, cx)? {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {
-                let bytes = to_bytes(&state.groups[0].entries, state.result(0));
+                let trained = (&state.groups[0].entries[..], state.result(0));
                 let parts = BTreeMap::from([(Role::VAE, vae_part), (Role::TEXT, text_part)]);
-                let output = latent_data::publish(cx, vae.format, &meta, bytes, parts)?;
+                let output = latent_data::publish(cx, vae.format, &meta, trained, parts)?;
                 Ok(Outcome::Finished { output, metrics })
             }
         }

@@ -14,7 +14,6 @@ use models::diffusion::{Phases, affine, unzip};
 use models::flat;
 use models::kernels::Dropout;
 use models::losses;
-use models::names::to_bytes;
 use models::networks::{Discriminator, Init};
 use protocol::stage::{DistillPcm, StageSpec, Training};
 
@@ -145,9 +144,9 @@ impl Gang for DistillPcm {
         match train(&mut objective, &self.distillation.training, cx)? {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {
-                let bytes = to_bytes(&state.groups[0].entries, &state.groups[0].params);
+                let trained = (&state.groups[0].entries[..], &state.groups[0].params[..]);
                 let family = self.family().expect("a distillation gives a student");
-                let output = objective.it.publish(cx, family, bytes)?;
+                let output = objective.it.publish(cx, family, trained)?;
                 Ok(Outcome::Finished { output, metrics })
             }
         }

@@ -8,7 +8,6 @@ use burn::tensor::{Device, Tensor, TensorData};
 use models::flat;
 use models::kernels::Dropout;
 use models::losses::{self, Body, VaeRecipe};
-use models::names::to_bytes;
 use models::networks::{Init, Vae};
 use motion::Stream;
 use motion::dataset::{Dataset, crop, window};
@@ -16,9 +15,10 @@ use protocol::stage::{Split, TrainVae};
 use protocol::{ArtifactKind, Seed};
 
 use super::{Gang, group, no_clips, slice_result};
-use crate::artifacts::{self, MODEL_FILE, VaeMeta, to_meta};
+use crate::artifacts::{self, VaeMeta, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::train::{GroupPlan, Losses, Objective, Order, Pick, SliceResult, TrainState, Trained, train};
+use crate::weights;
 
 /// Batches that are sorted by length together.
 const POOL: usize = 4;
@@ -85,7 +85,7 @@ impl Objective for VaeObjective {
     }
 
     fn load(&mut self, state: &TrainState) {
-        self.network = flat::write(self.network.clone(), &state.groups[0].params);
+        flat::assign(&mut self.network, &state.groups[0].params);
     }
 
     fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
@@ -171,8 +171,8 @@ impl Gang for TrainVae {
         match train(&mut objective, &self.training, cx)? {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {
-                let bytes = to_bytes(&state.groups[0].entries, state.result(0));
-                let output = artifacts::publish(cx, ArtifactKind::Vae, to_meta(&meta), MODEL_FILE, bytes)?;
+                let trained = (&state.groups[0].entries[..], state.result(0));
+                let output = weights::publish(cx, ArtifactKind::Vae, to_meta(&meta), trained)?;
                 Ok(Outcome::Finished { output, metrics })
             }
         }

@@ -13,7 +13,7 @@ use protocol::message::StageTask;
 use protocol::{Digest, Manifest};
 
 use super::{MemoryAttempt, Ran, Told, lock};
-use crate::context::{AttemptContext, ContextError, Exchange, GangContext, Outcome, Rendezvous, StageError};
+use crate::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Outcome, Rendezvous, StageError};
 use crate::train::tree_sum;
 
 /// Who leaves or joins a gang, and when. Members are numbered from 0; the lowest alive leads.
@@ -23,6 +23,8 @@ pub struct Script {
     pub lost: Vec<(usize, u64)>,
     /// Member and step: it is lost when it commits the checkpoint of that step.
     pub lost_saving: Vec<(usize, u64)>,
+    /// Members that had only initialised themselves: the one whose state they take over is lost while it arrives, once.
+    pub lost_donating: Vec<usize>,
     /// Member and step: it starts once that step is summed. Its number is above those of the first members.
     pub joins: Vec<(usize, u64)>,
     /// All members are told to stop after applying this step.
@@ -67,9 +69,16 @@ struct Member {
     gang: Arc<Gang>,
     generation: u64,
     members: Vec<usize>,
+    /// It came to the last rendezvous with a state.
+    has_own: bool,
     lost_at: Option<u64>,
     lost_saving: Option<u64>,
+    loses_donor: bool,
     drain: Option<u64>,
+}
+
+fn other_length(bytes: usize) -> ContextError {
+    ContextError::Unavailable(format!("a peer's state has {bytes} bytes, which is another length than this member's"))
 }
 
 impl Member {
@@ -104,8 +113,10 @@ pub(super) fn run(
         gang: Arc::clone(&gang),
         generation: 0,
         members: (0..count).collect(),
+        has_own: false,
         lost_at: script.lost.iter().find(|(who, _)| *who == me).map(|(_, step)| *step),
         lost_saving: script.lost_saving.iter().find(|(who, _)| *who == me).map(|(_, step)| *step),
+        loses_donor: script.lost_donating.contains(&me),
         drain: script.drain,
     };
     let starters = (0..count).map(|me| (member(me), None));
@@ -251,10 +262,36 @@ impl GangContext for Member {
             while !state.over && state.generation == self.generation && state.donated.is_none() {
                 state = gang.changed.wait(state).unwrap_or_else(std::sync::PoisonError::into_inner);
             }
-            if let (true, Some(donated)) = (state.generation == self.generation, &state.donated) {
-                return Ok(Rendezvous::Adopt(vec![donated.clone()]));
+            if state.generation == self.generation && state.donated.is_some() {
+                self.has_own = applied.is_some();
+                return Ok(Rendezvous::Behind);
             }
         }
+    }
+
+    fn adopt(&mut self, into: &mut [&mut [u8]]) -> Result<Adopted, ContextError> {
+        let mut state = lock(&self.gang.state);
+        if self.loses_donor && !self.has_own {
+            self.loses_donor = false;
+            let newest = state.arrived.values().max().copied();
+            let donor = state.arrived.iter().find(|(_, a)| Some(**a) == newest).map(|(who, _)| *who);
+            state.regroup(|members| members.retain(|m| Some(*m) != donor));
+            self.gang.changed.notify_all();
+        }
+        let Some(donated) = state.donated.as_ref().filter(|_| state.generation == self.generation) else {
+            if !self.has_own {
+                // As far as it came.
+                into.iter_mut().for_each(|piece| piece.fill(0xff));
+            }
+            return Ok(Adopted::Cut);
+        };
+        let mut rest = donated.as_slice();
+        for piece in into {
+            let (now, later) = rest.split_at_checked(piece.len()).ok_or_else(|| other_length(donated.len()))?;
+            piece.copy_from_slice(now);
+            rest = later;
+        }
+        if rest.is_empty() { Ok(Adopted::Whole) } else { Err(other_length(donated.len())) }
     }
 
     fn share(&self, slices: usize) -> Range<usize> {
@@ -364,11 +401,17 @@ mod tests {
             None => (0, 1.0),
         };
         let mut applied = saved.is_some().then_some(step);
-        let meet = |cx: &mut dyn GangContext, applied: Option<u64>, state: (u64, f32)| match cx
-            .rendezvous(applied, &[&serde_json::to_vec(&state).expect("numbers")])?
-        {
-            Rendezvous::Keep => Ok(state),
-            Rendezvous::Adopt(pieces) => serde_json::from_slice(&pieces.concat()).map_err(fault),
+        let meet = |cx: &mut dyn GangContext, applied: Option<u64>, mut state: (u64, f32)| {
+            loop {
+                let (mut step, mut value) = (state.0.to_le_bytes(), state.1.to_le_bytes());
+                if cx.rendezvous(applied, &[&step, &value])? == Rendezvous::Keep {
+                    return Ok::<_, StageError>(state);
+                }
+                if cx.adopt(&mut [&mut step, &mut value])? == Adopted::Whole {
+                    state = (u64::from_le_bytes(step), f32::from_le_bytes(value));
+                    return Ok(state);
+                }
+            }
         };
         (step, value) = meet(cx, applied, (step, value))?;
         while step < STEPS {

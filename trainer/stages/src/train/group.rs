@@ -138,20 +138,20 @@ pub struct Group {
 }
 
 impl Group {
-    pub(super) fn new(plan: &GroupPlan) -> Self {
+    pub(super) fn new(plan: GroupPlan) -> Self {
         let moments = if plan.turns == Turns::NEVER { 0 } else { plan.params.len() };
         Self {
             name: plan.name,
-            entries: plan.entries.clone(),
-            params: plan.params.clone(),
+            entries: plan.entries,
             m: vec![0.0; moments],
             v: vec![0.0; moments],
             average: plan.average.map(|_| plan.params.clone()),
+            params: plan.params,
             lr: plan.lr,
             optimizer: plan.optimizer,
             clip: plan.clip,
             averaging: plan.average,
-            turns: plan.turns.clone(),
+            turns: plan.turns,
         }
     }
 
@@ -262,7 +262,7 @@ mod tests {
             GroupPlan { clip: clip(2.0, "c"), ..plan("c", Turns::ALWAYS) },
             plan("d", Turns::ALWAYS),
         ];
-        let groups: Vec<Group> = plans.iter().map(Group::new).collect();
+        let groups: Vec<Group> = plans.into_iter().map(Group::new).collect();
         let (a, b): (&[f32], &[f32]) = (&[3.0, 0.0], &[0.0, 4.0]);
         let factors = |step, b| Gradients::of(&groups, step, vec![Some(a), b, Some(a), Some(a)]).factors(&groups);
         let near = |found: Vec<f64>, expected: [f64; 4]| {
@@ -275,10 +275,10 @@ mod tests {
 
     #[test]
     fn a_frozen_group_has_no_moments_and_an_average_its_own_pace() {
-        let frozen = Group::new(&plan("frozen", Turns::NEVER));
+        let frozen = Group::new(plan("frozen", Turns::NEVER));
         assert!(frozen.m.is_empty() && frozen.v.is_empty() && frozen.turn(0).is_none());
         let average = Average { decay: 0.5, every: 2, starts_as_copy: true };
-        let mut group = Group::new(&GroupPlan { average: Some(average), ..plan("model", Turns::ALWAYS) });
+        let mut group = Group::new(GroupPlan { average: Some(average), ..plan("model", Turns::ALWAYS) });
         let mut seen = Vec::new();
         for turn in 0..4 {
             group.update(turn, &[1.0, -1.0], 1.0);

@@ -22,7 +22,7 @@ use protocol::message::StageTask;
 use protocol::stage::Training;
 
 use crate::artifacts::Draft;
-use crate::context::{ContextError, Exchange, GangContext, Rendezvous, StageError};
+use crate::context::{Adopted, ContextError, Exchange, GangContext, Rendezvous, StageError};
 use protocol::ArtifactKind;
 use serde_json::json;
 
@@ -57,7 +57,7 @@ pub struct SliceResult {
 
 /// The mathematics of one stage: parameters and examples to gradients.
 pub trait Objective {
-    /// What is trained, with its first values.
+    /// What is trained, with its first values. Asked before the first [`load`](Self::load), and maybe once more then.
     fn groups(&mut self) -> Vec<GroupPlan>;
 
     /// What is kept besides, and changed by [`after`](Self::after) alone.
@@ -133,8 +133,8 @@ pub fn train(
         .map_err(StageError::Input)?;
     // Names of other stages say nothing about a state, which the key of the next rung rests on.
     let config = cx.task().settings.digest();
-    let mut state = TrainState::new(&objective.groups(), objective.buffers());
-    let mut saved_at = begin(&mut state, cx)?;
+    let mut state = TrainState::new(objective.groups(), objective.buffers());
+    let mut saved_at = begin(objective, &mut state, cx)?;
     let mut save_is_due = false;
     let mut stop = false;
     let mut recent = Recent::default();
@@ -157,7 +157,7 @@ pub fn train(
             cx.hold()?;
             stop = false;
             let applied = Some(state.step);
-            if meet(&mut state, applied, cx)? {
+            if meet(&mut state, applied, cx)? == Met::Adopted {
                 objective.load(&state);
             }
             continue;
@@ -175,7 +175,7 @@ pub fn train(
             Exchange::Sum { sum, drain } => (sum, drain),
             Exchange::Regroup => {
                 let applied = Some(state.step);
-                if meet(&mut state, applied, cx)? {
+                if meet(&mut state, applied, cx)? == Met::Adopted {
                     // A peer was ahead: these slices are of a step that is over.
                     done.clear();
                     objective.load(&state);
@@ -211,7 +211,11 @@ pub fn train(
 
 /// Brings `state` to where the gang is, or to where the task was left: rank 0 alone reads the checkpoint, or the state that the rung
 /// before left, and the others take it from there. Gives the step that is committed already, if this member read it.
-fn begin(state: &mut TrainState, cx: &mut dyn GangContext) -> Result<Option<u64>, StageError> {
+fn begin(
+    objective: &mut dyn Objective,
+    state: &mut TrainState,
+    cx: &mut dyn GangContext,
+) -> Result<Option<u64>, StageError> {
     let (mut applied, mut saved_at) = (None, None);
     loop {
         let checkpoint = cx.latest_checkpoint()?;
@@ -228,9 +232,12 @@ fn begin(state: &mut TrainState, cx: &mut dyn GangContext) -> Result<Option<u64>
                 cx.log(&format!("goes on from the rung that ended after step {}", state.step));
             }
         }
-        let adopted = meet(state, applied, cx)?;
+        let met = meet(state, applied, cx)?;
+        if met == Met::Spoiled {
+            *state = TrainState::new(objective.groups(), objective.buffers());
+        }
         // Nobody has a state if rank 0 was lost before it met the others. Then the next one reads it.
-        if applied.is_some() || adopted || !continues {
+        if applied.is_some() || met == Met::Adopted || !continues {
             return Ok(saved_at);
         }
     }
@@ -245,13 +252,35 @@ fn restore(state: &mut TrainState, manifest: &protocol::Manifest, cx: &dyn GangC
     })
 }
 
-/// Meets the others, and takes over a peer's state where one is ahead or this member has none (`applied` is `None`); true if so.
-fn meet(state: &mut TrainState, applied: Option<u64>, cx: &mut dyn GangContext) -> Result<bool, StageError> {
-    let step = state.step.to_le_bytes();
-    let Rendezvous::Adopt(pieces) = cx.rendezvous(applied, &state.pieces(&step))? else { return Ok(false) };
-    state.adopt(&pieces).map_err(StageError::Fault)?;
-    cx.log(&format!("took over the state after step {} from a peer", state.step));
-    Ok(true)
+/// What meeting the others came to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Met {
+    /// This member's state is as it was.
+    Kept,
+    /// It is a peer's.
+    Adopted,
+    /// It had only initialised itself, and some of a peer's state came over that before the peer was lost; nobody is ahead any more.
+    Spoiled,
+}
+
+/// Meets the others, and takes over a peer's state where one is ahead or this member has none (`applied` is `None`).
+fn meet(state: &mut TrainState, applied: Option<u64>, cx: &mut dyn GangContext) -> Result<Met, StageError> {
+    let mut kept = Met::Kept;
+    loop {
+        let mut step = state.step.to_le_bytes();
+        if cx.rendezvous(applied, &state.pieces(&step))? == Rendezvous::Keep {
+            return Ok(kept);
+        }
+        match cx.adopt(&mut state.room(&mut step))? {
+            Adopted::Whole => {
+                state.step = u64::from_le_bytes(step);
+                cx.log(&format!("took over the state after step {} from a peer", state.step));
+                return Ok(Met::Adopted);
+            }
+            Adopted::Cut if applied.is_none() => kept = Met::Spoiled,
+            Adopted::Cut => {}
+        }
+    }
 }
 
 /// Values are recorded for every one of the first 2,000 steps of a stage, then for every tenth, and for the last.

@@ -40,8 +40,9 @@ impl TrainState {
     ///
     /// # Panics
     /// If two groups or two buffers have one name.
-    pub fn new(groups: &[GroupPlan], buffers: Vec<BufferPlan>) -> Self {
-        let state = Self { step: 0, groups: groups.iter().map(Group::new).collect(), buffers: Buffers::new(buffers) };
+    pub fn new(groups: Vec<GroupPlan>, buffers: Vec<BufferPlan>) -> Self {
+        let groups = groups.into_iter().map(Group::new).collect();
+        let state = Self { step: 0, groups, buffers: Buffers::new(buffers) };
         let names: usize = state.groups.iter().map(|group| 3 + usize::from(group.average.is_some())).sum();
         assert_eq!(state.values().len(), names + state.buffers.iter().count(), "every name stands for one buffer");
         state
@@ -167,41 +168,14 @@ impl TrainState {
         std::iter::once(step.as_slice()).chain(groups).chain(buffers).collect()
     }
 
-    /// Takes over what [`Self::pieces`] of another member gave, however it was cut on the way.
-    ///
-    /// # Errors
-    /// If it has another length; nothing is changed then.
-    pub fn adopt(&mut self, pieces: &[Vec<u8>]) -> Result<(), String> {
-        let mut step = self.step.to_le_bytes();
-        let expected: usize = self.pieces(&step).iter().map(|piece| piece.len()).sum();
-        let found: usize = pieces.iter().map(Vec::len).sum();
-        if found != expected {
-            return Err(format!("a peer's state has {found} bytes, expected {expected}"));
-        }
-        let mut pieces = pieces.iter().map(Vec::as_slice);
-        let mut piece: &[u8] = &[];
-        let mut fill = |mut into: &mut [u8]| {
-            while !into.is_empty() {
-                if piece.is_empty() {
-                    piece = pieces.next().expect("as many bytes as there is room for");
-                    continue;
-                }
-                let (now, later) = into.split_at_mut(piece.len().min(into.len()));
-                now.copy_from_slice(&piece[..now.len()]);
-                (piece, into) = (&piece[now.len()..], later);
-            }
-        };
-        fill(&mut step);
-        self.step = u64::from_le_bytes(step);
-        for group in &mut self.groups {
-            for values in [&mut group.params, &mut group.m, &mut group.v].into_iter().chain(&mut group.average) {
-                fill(cast_slice_mut(values));
-            }
-        }
-        for (_, values) in self.buffers.values_mut() {
-            fill(cast_slice_mut(values));
-        }
-        Ok(())
+    /// Where [`Self::pieces`] of another member belong; what arrives in `step` is the step.
+    pub fn room<'a>(&'a mut self, step: &'a mut [u8; 8]) -> Vec<&'a mut [u8]> {
+        let groups = self.groups.iter_mut().flat_map(|group| {
+            let Group { params, m, v, average, .. } = group;
+            [params, m, v].into_iter().chain(average).map(|values| cast_slice_mut(values))
+        });
+        let buffers = self.buffers.values_mut().map(|(_, values)| cast_slice_mut(values));
+        std::iter::once(step.as_mut_slice()).chain(groups).chain(buffers).collect()
     }
 
     /// The parameters of group `index` as they should be used: their average where one is kept.
@@ -223,7 +197,7 @@ mod tests {
     use crate::train::{Average, Turns};
 
     #[test]
-    fn a_member_takes_over_a_peers_state_bit_for_bit_or_not_at_all() {
+    fn a_state_is_taken_over_bit_for_bit_from_a_peer_and_from_a_checkpoint() {
         let plan = |name, average, turns| GroupPlan {
             name,
             entries: Vec::new(),
@@ -243,28 +217,30 @@ mod tests {
             let buffer = |name: &str, values| BufferPlan { name: name.into(), values };
             vec![buffer("codebook", vec![0.25; 4]), buffer("count", vec![0.0])]
         };
-        let mut donor = TrainState::new(&plans, buffers());
+        let mut donor = TrainState::new(plans.to_vec(), buffers());
         for step in 0..3 {
             donor.groups[..2].iter_mut().for_each(|group| group.update(step, &[0.1, 0.2, -0.3], 1.0));
             donor.buffers.get_mut("codebook")[1] += 0.5;
             donor.buffers.get_mut("count")[0] += 1.0;
             donor.step = step + 1;
         }
-        let step = donor.step.to_le_bytes();
-        let mut joiner = TrainState::new(&plans, buffers());
+        let mut step = donor.step.to_le_bytes();
+        let mut joiner = TrainState::new(plans.to_vec(), buffers());
         let before = joiner.clone();
         let bytes = donor.pieces(&step).concat();
-        for wrong in [&bytes[..bytes.len() - 4], &[bytes.clone(), vec![0; 4]].concat(), &[]] {
-            assert!(joiner.adopt(&[wrong.to_vec()]).unwrap_err().contains("expected 124"), "{}", wrong.len());
-            assert_eq!(joiner, before);
+        step = [0; 8];
+        let mut rest = bytes.as_slice();
+        for room in joiner.room(&mut step) {
+            let (now, later) = rest.split_at(room.len());
+            room.copy_from_slice(now);
+            rest = later;
         }
-        for cut in [3, 8, 50, bytes.len()] {
-            joiner.clone_from(&before);
-            joiner.adopt(&bytes.chunks(cut).map(<[u8]>::to_vec).collect::<Vec<_>>()).unwrap();
-            assert_eq!(joiner, donor, "in pieces of {cut} bytes");
-        }
-        // What is saved says the same.
+        joiner.step = u64::from_le_bytes(step);
+        assert_eq!((joiner, rest), (donor.clone(), &[][..]));
+        // What is saved says the same, and lies where it is.
         let bytes: Arc<[u8]> = donor.saved(|pieces| pieces.concat()).into();
+        let lies = |piece: &&&[u8]| donor.values().values().any(|values| values.as_ptr().cast() == piece.as_ptr());
+        assert_eq!(donor.saved(|pieces| pieces.iter().filter(lies).count()), donor.values().len());
         let mut saved = before.clone();
         saved.restore(&bytes).unwrap();
         assert_eq!(saved, donor);
@@ -281,10 +257,10 @@ mod tests {
             assert!(matches!(error, RestoreError::Wrong(_)), "{end}: {error}");
             assert_eq!(cut, before);
         }
-        let mut other = TrainState::new(&plans, buffers());
+        let mut other = TrainState::new(plans.to_vec(), buffers());
         other.groups[0].params.push(0.0);
         assert!(matches!(other.restore(&bytes), Err(RestoreError::Wrong(_))));
-        let error = TrainState::new(&plans, Vec::new()).restore(&bytes).unwrap_err();
+        let error = TrainState::new(plans.to_vec(), Vec::new()).restore(&bytes).unwrap_err();
         assert!(error.to_string().contains("buffer.codebook"), "{error}");
     }
 }

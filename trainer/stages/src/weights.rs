@@ -1,0 +1,35 @@
+//! Weights on their way between a flat buffer or a network and a store, without a second copy of them in memory.
+
+use burn::module::Module;
+use checkpoint::Blobs;
+use models::flat::Entry;
+use models::names::{Weights, load_from};
+use protocol::{ArtifactKind, Digest, Manifest};
+
+use crate::artifacts::{self, Draft, MODEL_FILE};
+use crate::context::{AttemptContext, ContextError, StageError};
+
+/// Uploads weights as the file of an artifact.
+pub fn add(draft: &mut Draft, entries: &[Entry], values: &[f32]) -> Result<(), StageError> {
+    draft.add_pieces(MODEL_FILE, &Weights::new(entries, values).pieces())
+}
+
+/// Uploads weights and a manifest around them.
+pub fn publish(
+    cx: &mut dyn AttemptContext,
+    kind: ArtifactKind,
+    meta: serde_json::Value,
+    (entries, values): (&[Entry], &[f32]),
+) -> Result<Digest, StageError> {
+    let mut draft = Draft::new(cx, kind, meta);
+    add(&mut draft, entries, values)?;
+    draft.finish(cx)
+}
+
+/// `blank` with the weights of an artifact, read tensor by tensor; `what` names them in the error.
+pub fn load<M: Module>(blank: M, blobs: &dyn Blobs, manifest: &Manifest, what: &str) -> Result<M, StageError> {
+    let file = artifacts::open(blobs, manifest, MODEL_FILE)?;
+    let loaded = load_from(blank, file.bytes(), &mut |offset, out| file.read_at(offset, out), "");
+    let misfit = |e| StageError::Context(ContextError::Corrupt(format!("{what}: {e}")));
+    loaded.map_err(artifacts::blob_error)?.map_err(misfit)
+}

@@ -1,0 +1,85 @@
+//! States on their way from one member to another.
+
+use std::thread;
+
+use super::{Gang, Halt, Head, Kind, QUICK, exchange, mesh, wait_until};
+use crate::gang::exchange::Met;
+use crate::gang::frame::MAX_PAYLOAD;
+
+const BARRIER: &str = "barrier `rendezvous` of generation 7";
+
+fn bytes(length: usize) -> Vec<u8> {
+    (0..length).map(|i| (i % 251) as u8).collect()
+}
+
+#[test]
+fn a_state_arrives_where_it_belongs_however_it_is_cut() {
+    let gang = Gang::new(2, QUICK);
+    let [ahead, behind] = [0, 1].map(|own| mesh(&gang, &[0, 1], own, "s").0);
+    let state = bytes(3 * MAX_PAYLOAD + 70);
+    for (applied, cuts) in [(None, [8, MAX_PAYLOAD, 0]), (Some(4), [2 * MAX_PAYLOAD + 1, 3, 7])] {
+        thread::scope(|scope| {
+            scope.spawn(|| {
+                let pieces = [&state[..8], &state[8..], b"rows behind it"];
+                assert_eq!(exchange::rendezvous(&ahead, Some(5), &pieces, &|| None), Ok(Met::Keep));
+            });
+            assert_eq!(exchange::rendezvous(&behind, applied, &[], &|| None), Ok(Met::Behind(0)));
+            let mut room = vec![0; state.len()];
+            let mut rest = room.as_mut_slice();
+            let mut pieces = Vec::new();
+            for cut in cuts {
+                let (piece, later) = rest.split_at_mut(cut);
+                pieces.push(piece);
+                rest = later;
+            }
+            pieces.push(rest);
+            let more = exchange::adopt(&behind, 0, &mut pieces, applied.is_none(), &|| None);
+            assert_eq!(more, Ok(b"rows behind it".to_vec()));
+            assert!(room == state);
+        });
+    }
+    // Of another build, say.
+    thread::scope(|scope| {
+        scope.spawn(|| exchange::rendezvous(&ahead, Some(5), &[&state[..100]], &|| None).expect("sent"));
+        assert_eq!(exchange::rendezvous(&behind, None, &[], &|| None), Ok(Met::Behind(0)));
+        let refused = exchange::adopt(&behind, 0, &mut [&mut [0; 101]], true, &|| None);
+        assert!(matches!(&refused, Err(Halt::Disagree(why)) if why.contains("100 bytes, expected 101")), "{refused:?}");
+    });
+    [ahead, behind].into_iter().for_each(|mesh| mesh.close(None));
+}
+
+/// A member that came with a state of its own has it yet when the one that is ahead is lost.
+#[test]
+fn a_state_that_is_cut_short_takes_the_place_of_none() {
+    let gang = Gang::new(2, QUICK);
+    let [ahead, behind] = [0, 1].map(|own| mesh(&gang, &[0, 1], own, "s").0);
+    let length = Head::new(Kind::StateLength, 2 * MAX_PAYLOAD as u64, 0, 0);
+    ahead.send(1, BARRIER, length, &[], &|| None).expect("sent");
+    ahead.send(1, BARRIER, Head::new(Kind::State, 5, 0, 0), &bytes(MAX_PAYLOAD), &|| None).expect("sent");
+    wait_until("the first half is there", || behind.queued(0) == 2);
+    ahead.sever();
+    let mut room = vec![9; 2 * MAX_PAYLOAD];
+    assert_eq!(exchange::adopt(&behind, 0, &mut [&mut room], false, &|| None), Err(Halt::Peer));
+    assert!(room.iter().all(|byte| *byte == 9));
+    behind.close(None);
+}
+
+/// What is not taken waits with whoever sends it, and not in memory here.
+#[test]
+fn a_state_is_queued_within_bounds() {
+    let gang = Gang::new(2, QUICK);
+    let [ahead, behind] = [0, 1].map(|own| mesh(&gang, &[0, 1], own, "s").0);
+    let state = bytes(96 * MAX_PAYLOAD);
+    thread::scope(|scope| {
+        let sending = scope.spawn(|| exchange::rendezvous(&ahead, Some(5), &[&state], &|| None));
+        assert_eq!(exchange::rendezvous(&behind, None, &[], &|| None), Ok(Met::Behind(0)));
+        wait_until("as much as may be is queued", || behind.queued(0) == 16);
+        thread::sleep(QUICK.patience / 4);
+        assert!(behind.queued(0) <= 17 && !sending.is_finished(), "{} frames are here", behind.queued(0));
+        let mut room = vec![0; state.len()];
+        assert_eq!(exchange::adopt(&behind, 0, &mut [&mut room], true, &|| None), Ok(Vec::new()));
+        assert!(room == state);
+        assert_eq!(sending.join().expect("no panic"), Ok(Met::Keep));
+    });
+    [ahead, behind].into_iter().for_each(|mesh| mesh.close(None));
+}
