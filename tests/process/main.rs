@@ -7,6 +7,7 @@ mod bad_input;
 mod checkpoints;
 mod closed_pipes;
 mod cluster;
+mod damage;
 mod determinism;
 mod documented;
 mod failpoints;

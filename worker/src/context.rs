@@ -372,7 +372,7 @@ fn blob_error(error: BlobError) -> ContextError {
         BlobError::Storage(message) => ContextError::Storage(message),
         BlobError::Unavailable(message) => ContextError::Unavailable(message),
         error @ (BlobError::NotFound(_) | BlobError::Corrupt { .. } | BlobError::Damaged(_)) => {
-            ContextError::Corrupt(error.to_string())
+            ContextError::Damaged(error.to_string())
         }
     }
 }

@@ -17,6 +17,8 @@ use crate::event_count::lock;
 
 /// Between two tries to fetch something.
 const PAUSE: Duration = Duration::from_secs(1);
+/// After so many tries in a row something that is not there is taken for lost.
+const MISSED: u32 = 5;
 
 /// What is to be fetched ahead, and what is there. The poll sets one and reads the other.
 #[derive(Debug)]
@@ -79,6 +81,7 @@ impl Preparation {
     /// Fetches what is wanted, until [`end`](Self::end). The body of a thread.
     pub(crate) fn run(&self, client: &Client, cache: &Cache) {
         let mut news = self.wanted.subscribe();
+        let mut missed = 0;
         loop {
             let Some(wanted) = news.borrow_and_update().clone() else { return };
             let missing = wanted.into_iter().find(|task| !lock(&self.ready).iter().any(|(ready, _)| ready == task));
@@ -90,7 +93,20 @@ impl Preparation {
             // Trials of a sweep read the same things.
             let has_all = |ready: &Prepare| (&ready.inputs, ready.resume) == (&task.inputs, task.resume);
             let known = lock(&self.ready).iter().find(|(ready, _)| has_all(ready)).map(|(_, all)| all.clone());
-            match known.map_or_else(|| prepare(&task, client, cache, &mut news), Ok) {
+            let prepared = match known.map_or_else(|| prepare(&task, client, cache, &mut news), Ok) {
+                // Whoever has the task can say so, and is heard.
+                Err(Stopped::Call(CallError::Damaged(why))) => {
+                    tracing::warn!(task = %task.task, "not all of its inputs can be fetched ahead: {why}");
+                    Ok(Vec::new())
+                }
+                Err(Stopped::Call(CallError::NotFound(why))) if missed >= MISSED => {
+                    tracing::warn!(task = %task.task, "not all of its inputs can be fetched ahead: {why}");
+                    Ok(Vec::new())
+                }
+                prepared => prepared,
+            };
+            missed = if matches!(prepared, Err(Stopped::Call(CallError::NotFound(_)))) { missed + 1 } else { 0 };
+            match prepared {
                 Ok(all) => {
                     tracing::info!(task = %task.task, "its inputs are here");
                     // Not if it is not wanted any more: then its blobs are just cached.

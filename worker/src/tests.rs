@@ -762,7 +762,7 @@ fn a_blob_that_is_damaged_in_the_store_fails_the_attempt_at_once() {
     worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
     assert_eq!(worker.fake.received.load(Ordering::SeqCst), 1, "asked once");
     let outcomes = worker.leave().outcomes.clone();
-    let TaskOutcome::Failed { class: FailureClass::Storage, .. } = &outcomes[0].outcome else { panic!("{outcomes:?}") };
+    let TaskOutcome::Failed { class: FailureClass::Damaged, .. } = &outcomes[0].outcome else { panic!("{outcomes:?}") };
 }
 
 #[test]
@@ -829,6 +829,17 @@ fn what_a_task_needs_is_fetched_before_it_is_given() {
     let coordinator = worker.leave();
     assert_eq!(coordinator.fetched.len(), fetched, "the stage fetches nothing");
     assert!(matches!(coordinator.outcomes[0].outcome, TaskOutcome::Finished { .. }), "{:?}", coordinator.outcomes);
+}
+
+/// A task whose input is damaged in the store is not waited for by everybody for ever: it is taken, and its attempt says so.
+#[test]
+fn a_damaged_input_does_not_keep_a_task_from_being_given() {
+    let worker = Worker::start(Box::new(finished));
+    worker.fake.rotten.store(true, Ordering::SeqCst);
+    let (data, _) = artifact(&worker.fake, b"data");
+    worker.fake.desired(|coordinator| coordinator.prepare = vec![prepare("run/stage", data, None)]);
+    worker.wait("it to be taken as it is", |coordinator| says_ready(coordinator, &["run/stage"]));
+    worker.leave();
 }
 
 #[test]

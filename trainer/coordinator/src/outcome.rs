@@ -8,6 +8,7 @@
 //! | failed: infrastructure | tried again | the member leaves the gang | as above |
 //! | failed: fault | tried again | tried again | as above |
 //! | failed: memory, others in the gang | tried without the member | tried without the member | as above |
+//! | failed: an input is damaged | waits until that is made again | the same | as above |
 //! | failed: input, diverged, memory and alone, storage | final | final | as above |
 
 use std::collections::BTreeMap;
@@ -96,6 +97,11 @@ impl Deciding<'_> {
                     FailureClass::OutOfMemory if self.state.executions[&key].tasks[i].holders().len() > 1 => {
                         self.change(key, i, |task| task.too_small.push(worker.clone()));
                         self.take_from(key, i, std::slice::from_ref(&worker), Loss::Lost);
+                        self.accepted(key, i, &report);
+                        return Ok(true);
+                    }
+                    FailureClass::Damaged => {
+                        self.mend(key, i, message);
                         self.accepted(key, i, &report);
                         return Ok(true);
                     }

@@ -24,6 +24,7 @@ impl Deciding<'_> {
                 continue;
             }
             self.state.visits += 1;
+            self.go_on_with_whole_inputs(number);
             self.take_over_results(number);
             self.sweep(number);
             let run = &self.state.runs[&number];
@@ -48,7 +49,10 @@ impl Deciding<'_> {
             self.count_time_of(key, now);
             let execution = &self.state.executions[&key];
             let status = match &execution.state {
-                ExecutionState::Looking | ExecutionState::Open | ExecutionState::Bundling => continue,
+                ExecutionState::Looking
+                | ExecutionState::Open
+                | ExecutionState::Mending { .. }
+                | ExecutionState::Bundling => continue,
                 ExecutionState::Failed { message, .. } => Status::Failed { key, message: message.clone() },
                 ExecutionState::Done { known, cached } => {
                     let how = match (cached, execution.resumed) {
@@ -108,9 +112,10 @@ impl Deciding<'_> {
                     self.record(Fact::ExecutionPlacement { key, placement: stage.placement.clone() });
                 }
                 let lost = match execution.state {
-                    ExecutionState::Looking | ExecutionState::Open | ExecutionState::Bundling => {
-                        return Status::Active { key };
-                    }
+                    ExecutionState::Looking
+                    | ExecutionState::Open
+                    | ExecutionState::Mending { .. }
+                    | ExecutionState::Bundling => return Status::Active { key },
                     ExecutionState::Done { .. } => true,
                     ExecutionState::Failed { .. } => {
                         if execution.has_something() {
@@ -149,7 +154,7 @@ impl Deciding<'_> {
     }
 
     /// Wanted again after it was over: the store is asked first, and budgets are whole again.
-    fn want_again(&mut self, execution: &StageExecution, run: &Run, stage: &StageName, lost_value: bool) {
+    pub(crate) fn want_again(&mut self, execution: &StageExecution, run: &Run, stage: &StageName, lost_value: bool) {
         let key = execution.key;
         if execution.tasks.is_empty() {
             // Nothing was done here; what will be bears the name of who asks.

@@ -163,6 +163,9 @@ impl State {
         let held = execution.is_busy();
         match execution.state {
             ExecutionState::Looking => (StageState::Ready, None),
+            ExecutionState::Mending { .. } => {
+                (StageState::Ready, Some("waits for a damaged input to be made again".to_owned()))
+            }
             ExecutionState::Bundling => (StageState::Running, None),
             ExecutionState::Open if held => (StageState::Running, None),
             ExecutionState::Open if run.state == RunState::Paused => (StageState::Ready, Some("paused".to_owned())),

@@ -16,7 +16,7 @@ use crate::sweep::{SearchKind, Values};
 use crate::{Attempt, Digest, Fence, Generation, Incarnation, RunId, Seed, StageName, TaskId, WorkerId};
 
 /// The version of these messages; a worker of another version is turned away.
-pub const PROTOCOL_VERSION: u32 = 3;
+pub const PROTOCOL_VERSION: u32 = 4;
 
 /// `POST /v1/workers`: a process offers itself.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -287,6 +287,8 @@ pub enum FailureClass {
     OutOfMemory,
     /// No space or no permission in the store: final, once freed `resume` goes on.
     Storage,
+    /// The store has no whole copy of something that the task reads: what gave it does so again, within the restart budget.
+    Damaged,
     /// A panic or another fault of ours: counts against the restart budget.
     Fault,
     /// A lost peer, a network error: counts against the infrastructure budget.

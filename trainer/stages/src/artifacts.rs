@@ -132,7 +132,7 @@ pub fn to_meta<T: Serialize>(meta: &T) -> serde_json::Value {
 pub fn blob_error(error: BlobError) -> StageError {
     let text = error.to_string();
     StageError::Context(match error {
-        BlobError::NotFound(_) | BlobError::Corrupt { .. } | BlobError::Damaged(_) => ContextError::Corrupt(text),
+        BlobError::NotFound(_) | BlobError::Corrupt { .. } | BlobError::Damaged(_) => ContextError::Damaged(text),
         BlobError::Refused(_) => ContextError::GrantEnded(text),
         BlobError::Storage(_) => ContextError::Storage(text),
         BlobError::Unavailable(_) => ContextError::Unavailable(text),

@@ -23,9 +23,12 @@ pub enum ContextError {
     /// The store is full or not writable.
     #[error("{0}")]
     Storage(String),
-    /// A stored object does not hold what its name says.
+    /// A stored object is whole and does not hold what it should.
     #[error("{0}")]
     Corrupt(String),
+    /// A stored object is damaged or missing.
+    #[error("{0}")]
+    Damaged(String),
 }
 
 /// Why a stage failed. The message does not name the stage: whoever shows it knows which one it was.
@@ -60,6 +63,7 @@ impl StageError {
             Self::Diverged { .. } => FailureClass::Diverged,
             Self::Context(ContextError::Storage(_)) => FailureClass::Storage,
             Self::Context(ContextError::Corrupt(_)) => FailureClass::Storage,
+            Self::Context(ContextError::Damaged(_)) => FailureClass::Damaged,
             Self::Context(_) => FailureClass::Infrastructure,
             Self::Fault(_) => FailureClass::Fault,
         }

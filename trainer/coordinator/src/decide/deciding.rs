@@ -62,15 +62,15 @@ impl<'a> Deciding<'a> {
             Fact::RunState { run, .. } => {
                 runs.push(*run);
                 let known = self.state.runs.get(run).into_iter();
-                self.touched.extend(known.flat_map(|run| &run.stages).filter_map(|status| match status {
-                    Status::Active { key } => Some(*key),
-                    _ => None,
-                }));
+                let active: Vec<Digest> = known.flat_map(|run| run.all_active()).map(|(_, key)| key).collect();
+                self.touched.extend(active.iter().flat_map(|key| self.state.mended_for(*key)));
+                self.touched.extend(active);
             }
             Fact::Stages { run, stages } => {
                 runs.push(*run);
                 if let Some(run) = self.state.runs.get(run) {
-                    let before = stages.iter().filter_map(|(i, _)| run.stages.get(*i)?.key());
+                    let before: Vec<Digest> = stages.iter().filter_map(|(i, _)| run.stages.get(*i)?.key()).collect();
+                    self.touched.extend(before.iter().flat_map(|key| self.state.mended_for(*key)));
                     self.touched.extend(before);
                 }
                 self.touched.extend(stages.iter().filter_map(|(_, status)| status.key()));
@@ -85,6 +85,7 @@ impl<'a> Deciding<'a> {
             Fact::Execution { execution } => drop(self.touched.insert(execution.key)),
             Fact::ExecutionState { key, .. } => {
                 self.touched.insert(*key);
+                self.touched.extend(self.state.mended_for(*key));
                 runs.extend(self.state.executions.get(key).into_iter().flat_map(|execution| execution.users.keys()));
             }
             Fact::ExecutionPlacement { key, .. }

@@ -15,6 +15,7 @@ pub(crate) mod attempts;
 pub(crate) mod deciding;
 pub(crate) mod executions;
 mod forget;
+mod mending;
 mod runs;
 mod start;
 mod workers;

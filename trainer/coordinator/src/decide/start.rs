@@ -35,7 +35,10 @@ impl Deciding<'_> {
                     let candidates = registration.candidates.clone();
                     self.effects.push(Effect::Register { key, candidates });
                 }
-                ExecutionState::Open | ExecutionState::Done { .. } | ExecutionState::Failed { .. } => {}
+                ExecutionState::Open
+                | ExecutionState::Mending { .. }
+                | ExecutionState::Done { .. }
+                | ExecutionState::Failed { .. } => {}
             }
         }
         let names: Vec<WorkerId> = self.state.workers.keys().cloned().collect();

@@ -1,17 +1,20 @@
 //! The work of one stage, by the stage's key: done once however many runs wait for it.
 //!
-//! | progress \ event | looked up: known | looked up: unknown | all tasks done | bundled | failed for good | wanted again |
-//! |---|---|---|---|---|---|---|
-//! | Looking | Done | Open or Bundling | - | - | - | Looking |
-//! | Open | - | - | Done | - | Failed | Open |
-//! | Bundling | - | - | - | Done | Failed | Bundling |
-//! | Done | - | - | - | - | - | Looking |
-//! | Failed | - | - | - | - | - | Looking |
+//! | progress \ event | looked up: known | looked up: unknown | all tasks done | bundled | failed for good | wanted again | an input is damaged | inputs are whole |
+//! |---|---|---|---|---|---|---|---|---|
+//! | Looking | Done | Open or Bundling | - | - | - | Looking | - | - |
+//! | Open | - | - | Done | - | Failed | Open | Mending | - |
+//! | Mending | - | - | - | - | Failed | Mending | - | Open |
+//! | Bundling | - | - | - | Done | Failed | Bundling | - | - |
+//! | Done | - | - | - | - | - | Looking | - | - |
+//! | Failed | - | - | - | - | - | Looking | - | - |
+//!
+//! What gave a damaged input is wanted again, and so `Looking`: the store finds what of it is not whole.
 //!
 //! A run owns its statuses, not the work: cancelling one of two runs that want the same stage does not disturb the other,
 //! and a run that is submitted again after a failure finds tasks, checkpoints and the seconds already spent.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use protocol::stage::{Backend, Placement, Shape, StageSettings, WorkerRange};
@@ -32,6 +35,11 @@ pub enum ExecutionState {
     Looking,
     /// Tasks are to be done.
     Open,
+    /// It waits for inputs that a worker found damaged or missing to be made again.
+    Mending {
+        /// The executions that give them.
+        inputs: BTreeSet<Digest>,
+    },
     /// The coordinator itself makes the model bundles.
     Bundling,
     /// Done.
@@ -152,7 +160,10 @@ impl StageExecution {
     pub fn is_over(&self) -> bool {
         match self.state {
             ExecutionState::Done { .. } | ExecutionState::Failed { .. } => true,
-            ExecutionState::Looking | ExecutionState::Open | ExecutionState::Bundling => false,
+            ExecutionState::Looking
+            | ExecutionState::Open
+            | ExecutionState::Mending { .. }
+            | ExecutionState::Bundling => false,
         }
     }
 

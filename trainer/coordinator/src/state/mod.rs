@@ -24,7 +24,7 @@ use protocol::message::{Grant, Progress};
 use protocol::{Digest, Fence, Incarnation, RunId, StageName, TaskId, WorkerId};
 
 pub use self::apply::Misfit;
-use self::execution::StageExecution;
+use self::execution::{ExecutionState, StageExecution};
 use self::run::Run;
 use self::task::Task;
 use self::worker::Worker;
@@ -141,17 +141,39 @@ impl State {
     }
 
     /// The keys of executions that a running run waits for, in the order in which they are served: runs as submitted, stages
-    /// as in the pipeline.
+    /// as in the pipeline. What is made again for one of them comes before it.
     pub fn wanted(&self) -> Vec<Digest> {
         let mut seen = HashSet::new();
         let active = self.runs.values().flat_map(|run| run.active());
-        active.map(|(_, key)| key).filter(|key| seen.insert(*key)).collect()
+        let mut wanted = Vec::new();
+        for (_, key) in active {
+            if !seen.contains(&key) {
+                wanted.extend(self.mended_for(key).into_iter().filter(|input| seen.insert(*input)));
+                wanted.push(key);
+                seen.insert(key);
+            }
+        }
+        wanted
     }
 
     /// Whether a running run waits for an execution.
     pub fn is_wanted(&self, execution: &StageExecution) -> bool {
-        let waits = |run: &Arc<Run>| run.active().any(|(_, key)| key == execution.key);
+        let waits_for = |key| key == execution.key || self.mended_for(key).contains(&execution.key);
+        let waits = |run: &Arc<Run>| run.active().any(|(_, key)| waits_for(key));
         execution.users.keys().filter_map(|number| self.runs.get(number)).any(waits)
+    }
+
+    /// What is made again so that an execution can go on, and what for that; what comes first is waited for by what comes later. Mostly
+    /// nothing.
+    pub(crate) fn mended_for(&self, key: Digest) -> Vec<Digest> {
+        let mut all = Vec::new();
+        if let Some(ExecutionState::Mending { inputs }) = self.executions.get(&key).map(|execution| &execution.state) {
+            for input in inputs {
+                all.extend(self.mended_for(*input));
+                all.push(*input);
+            }
+        }
+        all
     }
 
     /// The execution behind a stage of a run, if it has begun or was done here before.

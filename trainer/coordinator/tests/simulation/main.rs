@@ -140,6 +140,39 @@ fn every_event_in_every_state_is_taken_or_refused() {
     }
 }
 
+/// What a stage reads is made again while it waits, and all stages end with the values that they had.
+#[test]
+fn a_damaged_input_is_made_again_within_the_run() {
+    let mut world = World::new(7);
+    world.now = Millis(CHAOS_MS);
+    let pipeline = Box::new(pipelines::quickstart(9, WorkerRange::default(), &[]));
+    let submit = Event::Submit { pipeline, source: String::new(), idempotency_key: None, until: None };
+    world.submissions = vec![(Millis(0), submit)];
+    let damaged = loop {
+        world.step();
+        let reads =
+            |worker: &&mut worker::FakeWorker| worker.grant().is_some_and(|g| g.task.as_str().ends_with("/lcm"));
+        let now = world.now;
+        let found = world.workers.iter_mut().find(reads).and_then(|reader| reader.finds_damage(now, |_| true));
+        if let Some(input) = found {
+            break input;
+        }
+    };
+    let results = world.store.results.len();
+    world.store.damage(damaged);
+    assert_eq!(world.store.results.len(), results - 1, "one stage gave it");
+    let mut waited = false;
+    while !world.is_over() {
+        world.step();
+        let waits = |message: &Option<String>| message.as_ref().is_some_and(|m| m.contains("damaged input"));
+        waited |= world.views()[0].stages.iter().any(|stage| waits(&stage.message));
+        assert!(world.views()[0].stages.iter().all(|stage| stage.state != StageState::Failed), "{:?}", world.views());
+    }
+    assert!(waited, "its reader says what it waits for");
+    assert!(world.store.results.values().any(|(known, ..)| known.outputs.values().any(|output| *output == damaged)));
+    assert!(world.views()[0].stages.iter().all(|stage| stage.state == StageState::Ran), "{:?}", world.views());
+}
+
 #[test]
 fn two_runs_of_one_pipeline_compute_once_and_a_third_finds_everything() {
     let mut world = World::new(7);

@@ -25,6 +25,8 @@ pub(crate) struct FakeStore {
     pub(crate) promotions: u64,
     /// How often each task's end was accepted.
     pub(crate) accepted: BTreeMap<TaskId, u64>,
+    /// How often what a task gave was found damaged: so often it may be accepted besides.
+    pub(crate) remade: BTreeMap<TaskId, u64>,
     pub(crate) checkpoints: BTreeMap<(TaskId, u64), Digest>,
     /// What was collected between its upload and the report that names it: whoever names it is refused.
     pub(crate) collected: BTreeSet<Digest>,
@@ -116,6 +118,23 @@ impl FakeStore {
             }
             Write::Version { .. } => self.versions += 1,
             Write::Promote { .. } => self.promotions += 1,
+        }
+    }
+
+    /// An artifact is found damaged: what gave it is not known any more, and may be done once more.
+    #[allow(dead_code, reason = "not every test that shares this file damages anything")]
+    pub(crate) fn damage(&mut self, digest: Digest) {
+        let gave = |(known, ..): &(Known, RunId, StageName)| known.outputs.values().any(|output| *output == digest);
+        let keys: Vec<Digest> = self.results.iter().filter(|(_, result)| gave(result)).map(|(key, _)| *key).collect();
+        for key in keys {
+            let Some((_, run, stage)) = self.results.remove(&key) else { continue };
+            let whole = TaskId::of(&run, &stage, None);
+            let is_of_it = |task: &TaskId| {
+                task.as_str().strip_prefix(whole.as_str()).is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
+            };
+            for task in self.accepted.keys().filter(|task| is_of_it(task)) {
+                *self.remade.entry(task.clone()).or_default() += 1;
+            }
         }
     }
 

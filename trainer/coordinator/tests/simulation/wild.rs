@@ -87,6 +87,7 @@ pub(crate) fn events(state: &State, ended: &[Run]) -> Vec<Event> {
                 failed(FailureClass::Diverged),
                 failed(FailureClass::OutOfMemory),
                 failed(FailureClass::Storage),
+                failed(FailureClass::Damaged),
                 failed(FailureClass::Fault),
                 failed(FailureClass::Infrastructure),
             ] {

@@ -229,6 +229,18 @@ impl FakeWorker {
         self.saving = Saving::Report(ReportOutcome { grant, outcome });
     }
 
+    /// Finds the first of its task's inputs that `can_be` damaged to be so, and says it; gives which.
+    pub(crate) fn finds_damage(&mut self, now: Millis, can_be: impl Fn(Digest) -> bool) -> Option<Digest> {
+        if !self.runs(now) || self.saving != Saving::No {
+            return None;
+        }
+        let assignment = self.assignment()?.clone();
+        let input = assignment.stage.inputs.values().copied().find(|input| can_be(*input))?;
+        let message = format!("blob {input} is damaged");
+        self.report(assignment.grant, TaskOutcome::Failed { class: FailureClass::Damaged, message });
+        Some(input)
+    }
+
     /// One unit of work. `peers` says for a gang how far the furthest member is, or `None` if not all are there.
     pub(crate) fn execution(
         &mut self,

@@ -1,7 +1,11 @@
 //! What happens in a quarter of a second: mischief, what the coordinator hears and does, what the workers say and compute.
 
+use std::sync::Arc;
+
 use coordinator::batch::Ask;
-use coordinator::{Control, Effect, Event, Millis, Moment, Observation, Refused, Rejected, decide, invariants};
+use coordinator::state::execution::StageExecution;
+use coordinator::state::run::Status;
+use coordinator::{Control, Effect, Event, Millis, Moment, Observation, Refused, Rejected, State, decide, invariants};
 use protocol::message::{Poll, RunState};
 use protocol::{Digest, Incarnation, WorkerId};
 use registry::WriteError;
@@ -370,9 +374,29 @@ impl World {
             let furthest = together.then(|| peers.iter().filter_map(|peer| peer.live(&grant)).max());
             let saved = task.and_then(|task| task.newest()).map_or(0, |saved| saved.step);
             let chaos = self.chaos();
+            // What the run of a task has from before it ended and was taken up again is not made again within it.
+            let state = Arc::clone(self.batches.state());
+            let reader = state.task(&grant.task).ok().map(|(execution, _)| execution);
+            let can_be = |input| reader.is_some_and(|reader| is_given_here(&state, reader, input));
+            if chaos
+                && self.random.chance(1)
+                && let Some(input) = self.workers[i].finds_damage(now, can_be)
+            {
+                self.store.damage(input);
+                self.count("an input that was found damaged");
+                continue;
+            }
             self.workers[i].execution(now, furthest, saved, &mut self.random, chaos);
         }
     }
+}
+
+/// Whether what gave an input is in memory, in a run of its reader.
+fn is_given_here(state: &State, reader: &StageExecution, input: Digest) -> bool {
+    let runs = reader.users.keys().filter_map(|number| state.runs.get(number));
+    let gave = |status: &Status| status.known().is_some_and(|known| known.outputs.values().any(|it| *it == input));
+    let mut givers = runs.flat_map(|run| &run.stages).filter(|status| gave(status)).filter_map(Status::key);
+    givers.any(|giver| state.executions.contains_key(&giver))
 }
 
 fn extract<T>(queue: &mut Vec<(Millis, usize, u32, T)>, now: Millis) -> Vec<(Millis, usize, u32, T)> {
