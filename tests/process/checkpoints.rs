@@ -70,13 +70,10 @@ fn a_checkpoint_of(network: &str) {
     cluster.join_by("b", &dies, &[]);
     let run = cluster.submit(&config(), &words(&large_vae(network, 2)));
 
-    // One step of training has had its memory before the first save.
-    cluster.wait_step(&run, "vae", 1);
     let trainers = ["a", "b"].map(|name| (name, cluster.pid(name)));
-    let before = trainers.map(|(_, pid)| peak(pid).expect("it runs"));
-    let mut after = before;
+    let mut trained = [0_u64; 2];
     while trainers.iter().all(|(name, _)| cluster.alive(name)) {
-        for ((_, pid), most) in trainers.iter().zip(&mut after) {
+        for ((_, pid), most) in trainers.iter().zip(&mut trained) {
             *most = (*most).max(peak(*pid).unwrap_or_default());
         }
         std::thread::sleep(Duration::from_millis(2));
@@ -113,10 +110,10 @@ fn a_checkpoint_of(network: &str) {
         bare.1 / MIB,
     );
     assert!(over(served, bare.0) <= most / MIB, "the coordinator");
-    for ((name, _), (before, after)) in trainers.iter().zip(before.into_iter().zip(after)) {
-        eprintln!("{name}: {} MiB while it trains, {} MiB more with saving", before / MIB, over(after, before));
-        assert!(over(after, before) <= most / MIB, "{name} saves");
-    }
+    // The two train alike, and one of them saves.
+    let [one, other] = trained;
+    eprintln!("a: {} MiB at most, b: {} MiB; one of them has saved", one / MIB, other / MIB);
+    assert!(one.abs_diff(other) <= most, "saving makes a difference");
     for (name, adopts, then, end) in taken {
         let held = bare.1 + state + network;
         let (how, begun, ended) =
