@@ -25,12 +25,13 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
 use crate::blob::Backend;
+use crate::blob::disk::write_whole;
 use crate::blob::fs::Folder;
 use crate::blob::place::Place;
 use crate::identity::Marker;
 use crate::lock::CollectionLock;
 use crate::retention::{self, Rows};
-use crate::{BlobStore, QueryError, ReadStore, StoreId, clock, folder, identity, sqlite};
+use crate::{BlobStore, QueryError, ReadStore, StoreId, clock, folder, sqlite};
 
 const MANIFEST: &str = "backup.json";
 const FORMAT: u32 = 1;
@@ -188,7 +189,7 @@ impl ReadStore {
             let manifest = Manifest { format: FORMAT, store, at_ms, database, database_bytes, database_digest, blobs };
             let text = serde_json::to_string_pretty(&manifest).unwrap_or_default();
             let path = to.join(MANIFEST);
-            identity::write_whole(&path, text.as_bytes()).map_err(disk("cannot write", &path))?;
+            write_whole(&path, text.as_bytes()).map_err(disk("cannot write", &path))?;
             remove_what_is_over(&to, &manifest)?;
             Ok(manifest.summary())
         };

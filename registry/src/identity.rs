@@ -25,7 +25,7 @@
 
 use std::fmt;
 use std::fs::{self, File};
-use std::io::{self, ErrorKind, Write as _};
+use std::io::{self, ErrorKind};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -35,6 +35,7 @@ use checkpoint::BlobError;
 use serde::{Deserialize, Serialize};
 
 use crate::blob::Backend;
+use crate::blob::disk::write_whole;
 use crate::catalog::Records;
 use crate::folder;
 use crate::store_id::{StoreId, Stored};
@@ -222,16 +223,6 @@ fn is_absent(e: &io::Error) -> bool {
 
 fn unreadable(path: &Path, message: impl fmt::Display) -> Mismatch {
     Mismatch::Unreadable { path: path.display().to_string(), message: message.to_string() }
-}
-
-/// Replaces a small file: after a loss of power it holds the old bytes or the new ones.
-pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let fresh = path.with_extension("new");
-    let mut file = File::create(&fresh)?;
-    file.write_all(bytes)?;
-    file.sync_all()?;
-    fs::rename(&fresh, path)?;
-    path.parent().map_or(Ok(()), |dir| File::open(dir)?.sync_all())
 }
 
 impl Found {

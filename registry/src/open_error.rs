@@ -3,8 +3,8 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
-use crate::blob::fs::{is_full, is_read_only};
 use crate::blob::place::Place;
+use crate::blob::{is_full, is_read_only};
 use crate::identity::Mismatch;
 use crate::lock::Holder;
 

@@ -5,7 +5,7 @@ use std::io;
 use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 
-use crate::blob::fs::free_bytes;
+use crate::blob::disk::free_bytes;
 
 /// Below this much free space nothing is opened for anything but collecting: the database's log would not fit.
 pub(crate) const OPEN_NEEDS_BYTES: u64 = 16 << 20;

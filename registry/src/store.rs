@@ -24,7 +24,7 @@ use checkpoint::BlobError;
 use protocol::stage::Keep;
 use protocol::{Alias, Digest, ModelName, RunId, TaskId};
 
-use crate::blob::fs::free_bytes;
+use crate::blob::disk::free_bytes;
 use crate::blob::place::{Looked, Place};
 use crate::blob::{Backend, BlobStore};
 use crate::catalog::{Catalog, Done, Order, PromoteOrder, Records, RollbackOrder, Which};

@@ -63,7 +63,7 @@ impl Disk for Os {
     }
 
     fn sync_dir(&self, path: &Path) -> io::Result<()> {
-        super::fs::sync_dir(path)
+        sync_dir(path)
     }
 }
 
@@ -88,4 +88,26 @@ pub(crate) fn regular(options: &mut OpenOptions, path: &Path) -> io::Result<File
         return Ok(file);
     }
     Err(io::Error::new(io::ErrorKind::InvalidInput, "it is not a regular file"))
+}
+
+/// Makes the names in a folder outlive a loss of power.
+pub(crate) fn sync_dir(dir: &Path) -> io::Result<()> {
+    fs::File::open(dir)?.sync_all()
+}
+
+/// Bytes that this user may still write where `path` lies.
+pub(crate) fn free_bytes(path: &Path) -> io::Result<u64> {
+    let stat = nix::sys::statvfs::statvfs(path)?;
+    #[expect(clippy::useless_conversion, reason = "the fields' width differs between targets")]
+    Ok(u64::from(stat.blocks_available()).saturating_mul(u64::from(stat.fragment_size())))
+}
+
+/// Replaces a small file: after a loss of power it holds the old bytes or the new ones.
+pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let fresh = path.with_extension("new");
+    let mut file = File::create(&fresh)?;
+    file.write_all(bytes)?;
+    file.sync_all()?;
+    fs::rename(&fresh, path)?;
+    path.parent().map_or(Ok(()), |dir| File::open(dir)?.sync_all())
 }

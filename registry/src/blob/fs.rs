@@ -20,11 +20,11 @@ use fail::fail_point;
 use nix::fcntl::{Flock, FlockArg};
 use protocol::Digest;
 
-use super::disk::{Disk, Os, regular};
-use super::staging::{Part, RESERVE_BYTES, Staging};
-use super::{Backend, Entry, Staged, Stat};
+use super::backend::{Backend, Entry, Staged, Stat};
+use super::disk::{Disk, Os, regular, write_whole};
+pub(super) use super::disk_error::error;
+use super::staging::{Part, Staging};
 use crate::clock;
-use crate::identity::write_whole;
 
 /// Blobs in a folder.
 #[derive(Debug)]
@@ -354,50 +354,4 @@ fn stat(metadata: &fs::Metadata) -> Stat {
 fn modified_ms(metadata: &fs::Metadata) -> i64 {
     let since = metadata.modified().ok().and_then(|t| t.duration_since(UNIX_EPOCH).ok());
     since.map_or(0, |d| i64::try_from(d.as_millis()).unwrap_or(i64::MAX))
-}
-
-/// Makes the names in a folder outlive a loss of power.
-pub(crate) fn sync_dir(dir: &Path) -> io::Result<()> {
-    fs::File::open(dir)?.sync_all()
-}
-
-/// Bytes that this user may still write where `path` lies.
-pub(crate) fn free_bytes(path: &Path) -> io::Result<u64> {
-    let stat = nix::sys::statvfs::statvfs(path)?;
-    #[expect(clippy::useless_conversion, reason = "the fields' width differs between targets")]
-    Ok(u64::from(stat.blocks_available()).saturating_mul(u64::from(stat.fragment_size())))
-}
-
-pub(super) fn full(path: &Path, needed: u64, free: u64) -> String {
-    format!(
-        "no space for {needed} bytes where `{}` lies: {free} bytes are free and {RESERVE_BYTES} are kept for the database; \
-         `registry gc` removes what nothing needs, on a full disk too; then run the same command again",
-        path.display()
-    )
-}
-
-/// Whether an error means that the disk is full or a quota is used up.
-pub(crate) fn is_full(e: &io::Error) -> bool {
-    matches!(e.kind(), ErrorKind::StorageFull | ErrorKind::QuotaExceeded | ErrorKind::FileTooLarge)
-}
-
-/// Whether an error means that the user may not write there.
-pub(crate) fn is_read_only(e: &io::Error) -> bool {
-    matches!(e.kind(), ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem)
-}
-
-pub(super) fn error(did: &str, path: &Path, e: &io::Error) -> BlobError {
-    let path = path.display();
-    if is_full(e) {
-        BlobError::Storage(format!(
-            "failed to {did} `{path}`: the disk is full or a quota is used up ({e}); `registry gc` removes what \
-             nothing needs, on a full disk too; then run the same command again"
-        ))
-    } else if is_read_only(e) {
-        BlobError::Storage(format!(
-            "failed to {did} `{path}`: not writable ({e}); make it writable or choose another folder with `--store`"
-        ))
-    } else {
-        BlobError::Unavailable(format!("failed to {did} `{path}`: {e}"))
-    }
 }

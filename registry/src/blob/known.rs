@@ -9,9 +9,11 @@ use std::collections::HashMap;
 use std::fs::{self, File, OpenOptions};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use protocol::Digest;
 
+use super::backend::Stat;
 use super::disk::regular;
 
 /// How many lines more than blobs the file may have before it is written anew.
@@ -103,4 +105,26 @@ fn rewrite(path: &Path, found: &HashMap<Digest, (String, Finding)>) -> std::io::
     file.write_all(text.as_bytes())?;
     fs::rename(&fresh, path)?;
     Ok(file)
+}
+
+/// What was found, for all who read: a store and its readers share it.
+#[derive(Debug)]
+pub(super) struct Findings(Mutex<Known>);
+
+impl Findings {
+    pub(super) fn new(known: Known) -> Self {
+        Self(Mutex::new(known))
+    }
+
+    pub(super) fn lock(&self) -> MutexGuard<'_, Known> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes note of what reading a blob has shown.
+    pub(super) fn note(&self, digest: Digest, stat: &Stat, finding: Finding) {
+        if let Finding::Damaged(found) = finding {
+            tracing::error!("blob {digest} is damaged: its bytes hash to {found}");
+        }
+        self.lock().set(digest, stat.stamp.clone(), finding);
+    }
 }

@@ -13,11 +13,10 @@ use std::sync::Arc;
 
 use checkpoint::BlobError;
 
-use super::disk::regular;
+use super::disk::{regular, write_whole};
 use super::fs::Folder;
 use super::objects::{Objects, Remote, check_url};
 use super::{Backend, BlobStore};
-use crate::identity::write_whole;
 
 /// A place for blobs, as a user names it.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -2,13 +2,14 @@
 
 use std::fmt;
 use std::io::Read;
+use std::sync::Arc;
 
 use checkpoint::BlobError;
 use protocol::Digest;
 use protocol::digest::Hasher;
 
-use super::known::Finding;
-use super::{BlobStore, Stat};
+use super::backend::{Backend, Stat};
+use super::known::{Finding, Findings};
 
 /// How much is read at once.
 pub const PART_BYTES: usize = 1 << 20;
@@ -16,7 +17,7 @@ pub const PART_BYTES: usize = 1 << 20;
 /// A blob that is being read. Every part is held back until the next one was read, and the last one until all bytes were
 /// hashed: a damaged blob is never handed out whole.
 pub struct Reader {
-    store: BlobStore,
+    findings: Arc<Findings>,
     digest: Digest,
     stat: Stat,
     source: Box<dyn Read + Send>,
@@ -39,15 +40,26 @@ impl fmt::Debug for Reader {
 }
 
 impl Reader {
-    pub(super) fn new(store: BlobStore, digest: Digest, stat: Stat) -> Result<Self, BlobError> {
-        let source = store.backend().read(digest, 0)?;
-        Ok(Self { store, digest, stat, source, state: State::Hashing(Hasher::default()), held_back: None })
+    pub(super) fn new(
+        backend: &dyn Backend,
+        findings: &Arc<Findings>,
+        digest: Digest,
+        stat: Stat,
+    ) -> Result<Self, BlobError> {
+        let (source, findings) = (backend.read(digest, 0)?, Arc::clone(findings));
+        Ok(Self { findings, digest, stat, source, state: State::Hashing(Hasher::default()), held_back: None })
     }
 
     /// Of a blob that was found whole, from byte `from` on.
-    pub(super) fn verified(store: BlobStore, digest: Digest, stat: Stat, from: u64) -> Result<Self, BlobError> {
-        let source = store.backend().read(digest, from)?;
-        Ok(Self { store, digest, stat, source, state: State::Verified, held_back: None })
+    pub(super) fn verified(
+        backend: &dyn Backend,
+        findings: &Arc<Findings>,
+        digest: Digest,
+        stat: Stat,
+        from: u64,
+    ) -> Result<Self, BlobError> {
+        let (source, findings) = (backend.read(digest, from)?, Arc::clone(findings));
+        Ok(Self { findings, digest, stat, source, state: State::Verified, held_back: None })
     }
 
     /// The blob's length.
@@ -73,10 +85,10 @@ impl Reader {
                 self.state = State::Ended;
                 if found != self.digest {
                     self.held_back = None;
-                    self.store.found(self.digest, &self.stat, Finding::Damaged(found));
+                    self.findings.note(self.digest, &self.stat, Finding::Damaged(found));
                     return Err(BlobError::Corrupt { expected: self.digest, found });
                 }
-                self.store.found(self.digest, &self.stat, Finding::Whole);
+                self.findings.note(self.digest, &self.stat, Finding::Whole);
             } else if let Some(before) = self.held_back.replace(part) {
                 return Ok(Some(before));
             }

@@ -11,11 +11,11 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use checkpoint::BlobError;
 use fail::fail_point;
 
-use super::disk::{Disk, DiskFile, regular};
-use super::fs::{error, free_bytes, full};
+use super::disk::{Disk, DiskFile, free_bytes, regular};
+use super::disk_error::error;
 
 /// Free space that a blob must leave, so that the database can still be written to.
-pub(super) const RESERVE_BYTES: u64 = 16 << 20;
+const RESERVE_BYTES: u64 = 16 << 20;
 
 /// Ends the names of our files; anything else in the folder is somebody else's.
 const SUFFIX: &str = ".part";
@@ -187,4 +187,12 @@ impl Drop for Part {
             let _ = self.disk.remove(&self.path);
         }
     }
+}
+
+fn full(path: &Path, needed: u64, free: u64) -> String {
+    format!(
+        "no space for {needed} bytes where `{}` lies: {free} bytes are free and {RESERVE_BYTES} are kept for the database; \
+         `registry gc` removes what nothing needs, on a full disk too; then run the same command again",
+        path.display()
+    )
 }

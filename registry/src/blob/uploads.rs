@@ -5,49 +5,22 @@
 //! ends or when nothing came for [`IDLE`]. A stored blob is noted for its task until the task is let go, so that collection leaves it
 //! alone however long the row that will name it takes ([`Holds`]).
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeSet, HashMap};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use checkpoint::BlobError;
 use protocol::digest::Hasher;
 use protocol::message::Grant;
-use protocol::{Digest, Incarnation, TaskId, WorkerId};
+use protocol::{Digest, TaskId};
 
-use super::holds::Holds;
-use super::{BlobStore, Upload};
+use super::BlobStore;
+use super::begun::{Begun, Holder, Upload};
 
 /// How long an upload may rest.
 pub const IDLE: Duration = Duration::from_secs(600);
 /// How many uploads one holder may have begun.
 const PER_HOLDER: usize = 8;
-
-/// Whose upload it is. The fence is left out: it grows when a gang regroups, and its lead uploads on.
-type Holder = (TaskId, WorkerId, Incarnation);
-
-#[derive(Debug)]
-pub(super) struct Uploads {
-    begun: Mutex<HashMap<(Holder, Digest), Begun>>,
-    held: Mutex<Holds>,
-    /// Blobs that somebody in this process is about to name in a row, and how many do.
-    protected: Mutex<BTreeMap<Digest, usize>>,
-    since: Instant,
-}
-
-impl Uploads {
-    pub(super) fn new(held: Holds) -> Self {
-        Self { begun: Mutex::default(), held: Mutex::new(held), protected: Mutex::default(), since: Instant::now() }
-    }
-}
-
-#[derive(Debug)]
-struct Begun {
-    /// `None` while a request writes to it.
-    upload: Option<Upload>,
-    /// `None` if it was begun by an earlier process, which was told.
-    bytes: Option<u64>,
-    touched: Instant,
-}
 
 /// Why an upload does not go on.
 #[derive(Debug, thiserror::Error)]

@@ -9,6 +9,7 @@
 
 mod print;
 mod published;
+mod row;
 
 pub(crate) use print::in_words;
 
@@ -19,6 +20,7 @@ use serde::{Deserialize, Serialize};
 use crate::versions::Version;
 
 pub use print::Style;
+pub use row::{Measure, Row};
 
 /// Which way is better.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -84,28 +86,6 @@ const PAPER_COLUMNS: usize = 8;
 
 fn better(key: &str) -> Better {
     COLUMNS.iter().find(|column| column.key == key).map_or(Better::Neither, |column| column.better)
-}
-
-/// A value with its 95 % interval.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Measure {
-    /// The mean.
-    pub value: f64,
-    /// Half the width of its interval, if repeats were measured.
-    pub half: Option<f64>,
-}
-
-/// One evaluation of one model, or a published result.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Row {
-    /// What a table calls it.
-    pub label: String,
-    /// `MODEL:VERSION` of ours; the paper of a published row.
-    pub source: String,
-    /// Whether a paper says so.
-    pub published: bool,
-    /// By metric.
-    pub measures: BTreeMap<String, Measure>,
 }
 
 /// A table of rows.

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::{Measure, Row};
+use super::row::{Measure, Row};
 
 const TABLE: &str = include_str!("published.tsv");
 

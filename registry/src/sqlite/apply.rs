@@ -11,7 +11,9 @@ use protocol::{Digest, Fence, TaskId};
 use sqlx::query_builder::Separated;
 use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 
-use super::{moves, write_error};
+use super::error::write_error;
+use super::moves;
+use super::statement::{int, json, one, run};
 use crate::catalog::{PromoteOrder, Which};
 use crate::vouched::{Vouched, complete};
 use crate::write::two_states;
@@ -99,27 +101,6 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
     add_facts(conn, &decisions).await?;
     add_shards(conn, &shards).await?;
     fences.write(conn).await
-}
-
-pub(super) type Query<'q> = sqlx::query::Query<'q, sqlx::Sqlite, sqlx::sqlite::SqliteArguments>;
-
-/// Runs a statement and returns how many rows it changed.
-pub(super) async fn run(conn: &mut SqliteConnection, query: Query<'_>) -> Result<u64> {
-    query.execute(conn).await.map(|done| done.rows_affected()).map_err(write_error)
-}
-
-pub(super) async fn one(conn: &mut SqliteConnection, query: Query<'_>) -> Result<Option<sqlx::sqlite::SqliteRow>> {
-    query.fetch_optional(conn).await.map_err(write_error)
-}
-
-/// SQLite's integers are signed; none of our counters comes near the sign.
-pub(super) fn int(number: u64) -> i64 {
-    i64::try_from(number).unwrap_or(i64::MAX)
-}
-
-pub(super) fn json<T: serde::Serialize>(value: &T) -> String {
-    // Maps of names to numbers or digests always serialise.
-    serde_json::to_string(value).unwrap_or_else(|e| panic!("a row that is no JSON: {e}"))
 }
 
 /// Runs `begin` with a tuple of values for each row, and `end`, as few statements as there may be.

@@ -5,8 +5,8 @@ use std::collections::BTreeSet;
 use protocol::{RunId, StageName};
 use sqlx::{Row, SqliteConnection};
 
-use super::apply::{one, run as execute};
-use super::write_error;
+use super::error::write_error;
+use super::statement::{one, run as execute};
 use crate::forget::Forgotten;
 use crate::{WriteError, clock};
 

@@ -6,8 +6,9 @@ use protocol::{Alias, ArtifactKind, Digest, ModelName};
 use serde_json::Value;
 use sqlx::{Row, SqliteConnection};
 
-use super::apply::{int, json, one, run};
-use super::{models, write_error};
+use super::error::write_error;
+use super::models;
+use super::statement::{int, json, one, run};
 use crate::catalog::{PromoteOrder, RollbackOrder, Which};
 use crate::versions::{self, Action, Gate, GateResult, ModelRef, Pick, Promotion, Version};
 use crate::{QueryError, WriteError, clock};

@@ -9,9 +9,10 @@ use sqlx::pool::PoolConnection;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Connection, Row, Sqlite, SqliteConnection, SqlitePool};
 
-use super::apply::json;
-use super::models::{self, numbers};
-use super::retention;
+use super::open::{open_copy, stored};
+use super::rows::{checkpoints, digest, run_row, stage_result};
+use super::statement::json;
+use super::{models, retention};
 use crate::QueryError;
 use crate::catalog::{CheckpointRow, EndedRow, LineageNode, LogRow, Needs, Records, Recovery, RunRow, StageResultRow};
 use crate::curve::{Curve, Curves};
@@ -38,7 +39,7 @@ impl SqliteRecords {
 #[async_trait]
 impl Records for SqliteRecords {
     async fn stored(&self) -> Result<Option<Stored>> {
-        Ok(super::stored(&mut *self.connection().await?).await?)
+        Ok(stored(&mut *self.connection().await?).await?)
     }
 
     async fn recovery(&self) -> Result<Recovery> {
@@ -235,7 +236,7 @@ impl Records for SqliteRecords {
         let mut conn = self.connection().await?;
         sqlx::query("VACUUM INTO ?").bind(path.to_string_lossy().into_owned()).execute(&mut *conn).await?;
         drop(conn);
-        let mut copy = super::open_copy(path).await?;
+        let mut copy = open_copy(path).await?;
         let needs = retention::needs(&mut copy).await;
         let checked: String = sqlx::query("PRAGMA integrity_check").fetch_one(&mut copy).await?.try_get(0)?;
         copy.close().await?;
@@ -248,58 +249,6 @@ impl Records for SqliteRecords {
     async fn close(&self) {
         self.0.close().await;
     }
-}
-
-pub(super) fn digest(row: &SqliteRow, column: &str) -> Result<Digest> {
-    let text: String = row.try_get(column)?;
-    text.parse().map_err(|e| QueryError::Blob(format!("column `{column}`: {e}")))
-}
-
-pub(super) fn digests(text: &str) -> Result<BTreeMap<String, Digest>> {
-    serde_json::from_str(text).map_err(|e| QueryError::Blob(format!("a list of artifacts does not read: {e}")))
-}
-
-fn stage_result(row: &SqliteRow) -> Result<StageResultRow> {
-    Ok(StageResultRow {
-        key: digest(row, "key")?,
-        run: RunId::new(row.try_get::<String, _>("run")?),
-        stage: StageName::new(row.try_get::<String, _>("stage")?),
-        kind: row.try_get("kind")?,
-        outputs: digests(row.try_get("outputs")?)?,
-        metrics: numbers(row.try_get("metrics")?),
-        inputs: digests(row.try_get("inputs")?)?,
-        wall_s: row.try_get("wall_s")?,
-        at_ms: row.try_get("at_ms")?,
-    })
-}
-
-fn run_row(row: &SqliteRow) -> Result<RunRow> {
-    let pipeline: &str = row.try_get("pipeline")?;
-    Ok(RunRow {
-        run: RunId::new(row.try_get::<String, _>("run")?),
-        pipeline: serde_json::from_str(pipeline)
-            .map_err(|e| QueryError::Blob(format!("a stored pipeline is no JSON: {e}")))?,
-        source: row.try_get("source")?,
-        state: row.try_get("state")?,
-        idempotency_key: row.try_get("idempotency_key")?,
-        created_ms: row.try_get("created_ms")?,
-        updated_ms: row.try_get("updated_ms")?,
-    })
-}
-
-pub(super) async fn checkpoints(conn: &mut SqliteConnection, task: &TaskId) -> Result<Vec<CheckpointRow>> {
-    let find = sqlx::query("SELECT * FROM checkpoints WHERE task = ? ORDER BY step DESC, id DESC").bind(task.as_str());
-    let checkpoint = |row: &SqliteRow| -> Result<CheckpointRow> {
-        Ok(CheckpointRow {
-            task: task.clone(),
-            attempt: Attempt(row.try_get::<i64, _>("attempt")?.unsigned_abs()),
-            step: row.try_get::<i64, _>("step")?.unsigned_abs(),
-            manifest: digest(row, "manifest")?,
-            metrics: numbers(row.try_get("metrics")?),
-            at_ms: row.try_get("at_ms")?,
-        })
-    };
-    find.fetch_all(&mut *conn).await?.iter().map(checkpoint).collect()
 }
 
 pub(super) async fn lineage(conn: &mut SqliteConnection, root: Digest) -> Result<Vec<LineageNode>> {

@@ -6,9 +6,9 @@ use protocol::stage::Keep;
 use protocol::{Digest, TaskId};
 use sqlx::{Row, SqliteConnection};
 
-use super::apply::{int, run};
-use super::query::{checkpoints, digest, digests};
-use super::write_error;
+use super::error::write_error;
+use super::rows::{checkpoints, digest, digests};
+use super::statement::{int, run};
 use crate::catalog::{Needs, Root};
 use crate::vouched::{Vouched, complete};
 use crate::{QueryError, WriteError, clock};

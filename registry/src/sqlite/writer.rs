@@ -12,7 +12,9 @@ use fail::fail_point;
 use sqlx::{Connection, Row, SqliteConnection};
 use tokio::sync::{mpsc, oneshot};
 
-use super::{apply, forget, moves, retention, write_error};
+use super::error::write_error;
+use super::statement::int;
+use super::{apply, forget, moves, retention};
 use crate::WriteError;
 use crate::catalog::{Done, Order};
 use crate::identity::Witness;
@@ -131,7 +133,7 @@ async fn commit(session: &mut Session, blobs: &Vouched, group: &mut Vec<(Order, 
 /// Counts the transaction, if no other process has opened the database since. Returns the count.
 async fn count(conn: &mut SqliteConnection, epoch: u64) -> Result<u64, WriteError> {
     let count = sqlx::query("UPDATE store SET commits = commits + 1 WHERE epoch = ? RETURNING commits");
-    let row = count.bind(apply::int(epoch)).fetch_optional(conn).await.map_err(write_error)?;
+    let row = count.bind(int(epoch)).fetch_optional(conn).await.map_err(write_error)?;
     let row = row.ok_or(WriteError::Superseded { epoch })?;
     Ok(row.get::<i64, _>(0).unsigned_abs())
 }

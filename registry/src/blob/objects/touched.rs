@@ -12,8 +12,7 @@ use std::path::{Path, PathBuf};
 
 use protocol::Digest;
 
-use crate::blob::disk::regular;
-use crate::blob::fs::sync_dir;
+use crate::blob::disk::{regular, sync_dir};
 use crate::clock;
 
 /// How many lines more than blobs the file may have before it is written anew.

@@ -1,0 +1,333 @@
+//! The store of blobs: verifies what is read and what is used again, stores equal bytes once, and mends what was damaged.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
+
+use checkpoint::{Blob, BlobError, Blobs};
+use protocol::Digest;
+use protocol::digest::Hasher;
+
+use super::backend::{Backend, Entry, Stat};
+use super::begun::{Upload, Uploads};
+use super::fs::Folder;
+use super::holds::Holds;
+use super::known::{Finding, Findings, Known};
+use super::memory::Memory;
+use super::reader::Reader;
+
+/// The file that remembers what held tasks have stored.
+const HELD: &str = "held";
+
+/// Content-addressed bytes over a [`Backend`]. Clones share it.
+#[derive(Debug, Clone)]
+pub struct BlobStore(Arc<Shared>);
+
+#[derive(Debug)]
+struct Shared {
+    backend: Arc<dyn Backend>,
+    /// Held shared while a blob is touched, exclusively while one is removed: so that nobody is told that a blob is stored
+    /// which is going away.
+    removal: RwLock<()>,
+    /// Held while a damaged blob is looked at once more and put aside.
+    mending: Mutex<()>,
+    known: Arc<Findings>,
+    uploads: Uploads,
+}
+
+impl BlobStore {
+    /// Over `backend`.
+    pub fn new(backend: impl Backend + 'static) -> Self {
+        Self::over(Arc::new(backend))
+    }
+
+    /// Over a backend that is chosen at run time.
+    pub fn over(backend: Arc<dyn Backend>) -> Self {
+        Self::with(backend, Known::default(), Holds::default())
+    }
+
+    /// Over a backend; `verified` is the file that remembers what was hashed, and beside it lies another, `held`, that remembers what
+    /// held tasks have stored. Only for the holder of the store's lock.
+    pub fn remembering(backend: Arc<dyn Backend>, verified: &Path) -> Self {
+        Self::with(backend, Known::read(verified), Holds::keep(&verified.with_file_name(HELD)))
+    }
+
+    /// Over a backend, beside the holder of the store's lock, who remembers at `verified`.
+    pub fn beside(backend: Arc<dyn Backend>, verified: &Path) -> Self {
+        Self::with(backend, Known::default(), Holds::of_others(&verified.with_file_name(HELD)))
+    }
+
+    fn with(backend: Arc<dyn Backend>, known: Known, held: Holds) -> Self {
+        Self(Arc::new(Shared {
+            backend,
+            removal: RwLock::default(),
+            mending: Mutex::default(),
+            known: Arc::new(Findings::new(known)),
+            uploads: Uploads::new(held),
+        }))
+    }
+
+    /// The blobs of the store in a folder. Only for the holder of the store's lock.
+    pub fn open_folder(dir: &Path) -> std::io::Result<Self> {
+        let folder = Folder::open(dir)?;
+        Ok(Self::remembering(Arc::new(folder), &dir.join("blobs/verified")))
+    }
+
+    /// The blobs of the store in a folder, for reading only; another process may hold its lock.
+    pub fn folder_to_read(dir: &Path) -> Self {
+        Self::beside(Arc::new(Folder::to_read(dir)), &dir.join("blobs/verified"))
+    }
+
+    /// In memory, for tests.
+    pub fn in_memory() -> Self {
+        Self::new(Memory::default())
+    }
+
+    pub(super) fn backend(&self) -> &dyn Backend {
+        &*self.0.backend
+    }
+
+    /// Where the bytes lie.
+    pub(crate) fn place(&self) -> Arc<dyn Backend> {
+        Arc::clone(&self.0.backend)
+    }
+
+    pub(super) fn uploads(&self) -> &Uploads {
+        &self.0.uploads
+    }
+
+    fn known(&self) -> MutexGuard<'_, Known> {
+        self.0.known.lock()
+    }
+
+    pub(super) fn must_stat(&self, digest: Digest) -> Result<Stat, BlobError> {
+        self.backend().stat(digest)?.ok_or(BlobError::NotFound(digest))
+    }
+
+    /// Refuses a blob that was found damaged and was not written to since.
+    fn not_damaged(&self, digest: Digest) -> Result<Stat, BlobError> {
+        let stat = self.must_stat(digest)?;
+        match self.known().finding(digest, &stat.stamp) {
+            Some(Finding::Damaged(found)) => Err(BlobError::Corrupt { expected: digest, found }),
+            Some(Finding::Whole) | None => Ok(stat),
+        }
+    }
+
+    /// The bytes named `digest`, verified, in memory.
+    pub fn get(&self, digest: Digest) -> Result<Vec<u8>, BlobError> {
+        let mut reader = self.read(digest)?;
+        let mut bytes = Vec::with_capacity(usize::try_from(reader.bytes()).unwrap_or_default());
+        while let Some(part) = reader.next_part()? {
+            bytes.extend_from_slice(&part);
+        }
+        Ok(bytes)
+    }
+
+    /// The bytes named `digest` part by part, verified by the time the last part is there.
+    pub fn read(&self, digest: Digest) -> Result<Reader, BlobError> {
+        let stat = self.not_damaged(digest)?;
+        Reader::new(self.backend(), &self.0.known, digest, stat)
+    }
+
+    /// The bytes named `digest` from byte `from` on, once all of it is known to be whole.
+    pub fn read_from(&self, digest: Digest, from: u64) -> Result<Reader, BlobError> {
+        let stat = self.verify(digest)?;
+        if from > stat.bytes {
+            return Err(checkpoint::past_the_end(from, 0, stat.bytes));
+        }
+        Reader::verified(self.backend(), &self.0.known, digest, stat, from)
+    }
+
+    /// Makes sure that a blob is there and whole. Hashes it, unless that was done since it was last written to.
+    pub fn verify(&self, digest: Digest) -> Result<Stat, BlobError> {
+        let stat = self.not_damaged(digest)?;
+        if self.known().finding(digest, &stat.stamp) != Some(Finding::Whole) {
+            let mut reader = Reader::new(self.backend(), &self.0.known, digest, stat.clone())?;
+            while reader.next_part()?.is_some() {}
+        }
+        Ok(stat)
+    }
+
+    /// Hashes a blob whatever is known of it: a disk may lose bytes without a write.
+    pub fn check(&self, digest: Digest) -> Result<(), BlobError> {
+        let mut reader = Reader::new(self.backend(), &self.0.known, digest, self.must_stat(digest)?)?;
+        while reader.next_part()?.is_some() {}
+        Ok(())
+    }
+
+    /// Stores bytes and returns their name, once they would survive a loss of power.
+    pub fn put(&self, bytes: &[u8]) -> Result<Digest, BlobError> {
+        self.put_pieces(&[bytes])
+    }
+
+    /// Stores the bytes that `pieces` are one after the other.
+    pub fn put_pieces(&self, pieces: &[&[u8]]) -> Result<Digest, BlobError> {
+        let mut hasher = Hasher::default();
+        pieces.iter().for_each(|piece| hasher.update(piece));
+        let digest = hasher.finish();
+        if !self.reuse(digest)? {
+            let mut upload = self.begin(pieces.iter().map(|piece| piece.len() as u64).sum())?;
+            for piece in pieces {
+                upload.write(piece)?;
+            }
+            self.commit(upload, digest)?;
+        }
+        Ok(digest)
+    }
+
+    /// Stores bytes that somebody else named, and refuses them if they are named wrongly.
+    pub fn put_named(&self, digest: Digest, bytes: &[u8]) -> Result<(), BlobError> {
+        let mut upload = self.begin(bytes.len() as u64)?;
+        upload.write(bytes)?;
+        self.commit(upload, digest)
+    }
+
+    /// Begins to store a blob of `bytes` bytes.
+    pub fn begin(&self, bytes: u64) -> Result<Upload, BlobError> {
+        Ok(Upload { staged: self.backend().stage(bytes)?, hasher: Hasher::default(), written: 0, bytes })
+    }
+
+    /// Gives an upload the name `digest`, and refuses it if that is not what its bytes hash to. Returns once it would survive a
+    /// loss of power.
+    pub fn commit(&self, upload: Upload, digest: Digest) -> Result<(), BlobError> {
+        let found = upload.hasher.finish();
+        if found != digest {
+            return Err(BlobError::Corrupt { expected: digest, found });
+        }
+        if self.reuse(digest)? {
+            return Ok(());
+        }
+        // A collection that runs now removes only what was old when it began.
+        if upload.staged.commit(digest)? {
+            let stat = self.must_stat(digest)?;
+            self.known().set(digest, stat.stamp, Finding::Whole);
+            return Ok(());
+        }
+        // Another thread was faster with the same bytes.
+        if self.reuse(digest)? {
+            return Ok(());
+        }
+        Err(BlobError::Unavailable(format!("blob {digest} went away while it was stored; store it again")))
+    }
+
+    /// Uses a blob again that is there and whole, as if it had been put just now. What is damaged is put aside, to be put anew.
+    pub fn reuse(&self, digest: Digest) -> Result<bool, BlobError> {
+        loop {
+            let stat = match self.verify(digest) {
+                Ok(stat) => stat,
+                Err(BlobError::NotFound(_)) => return Ok(false),
+                Err(BlobError::Corrupt { .. }) => {
+                    let _mending = self.0.mending.lock().unwrap_or_else(PoisonError::into_inner);
+                    // Somebody else may have mended it.
+                    if let Err(BlobError::Corrupt { .. }) = self.verify(digest) {
+                        self.backend().put_aside(digest)?;
+                        self.known().forget(digest);
+                    }
+                    continue;
+                }
+                Err(e) => return Err(e),
+            };
+            // Not held while gigabytes are hashed: a collection would wait, and everybody who waits for it.
+            let _no_removal = self.0.removal.read().unwrap_or_else(PoisonError::into_inner);
+            if self.backend().stat(digest)?.is_some_and(|now| now.stamp == stat.stamp) {
+                let touched = self.backend().touch(digest)?;
+                self.known().set(digest, touched.stamp, Finding::Whole);
+                return Ok(true);
+            }
+        }
+    }
+
+    /// The length, if it is there. Does not read it.
+    pub fn size(&self, digest: Digest) -> Result<Option<u64>, BlobError> {
+        Ok(self.backend().stat(digest)?.map(|stat| stat.bytes))
+    }
+
+    /// Whether it is there. Does not read it.
+    pub fn exists(&self, digest: Digest) -> Result<bool, BlobError> {
+        Ok(self.size(digest)?.is_some())
+    }
+
+    /// A blob as a listing shows it, if it is there.
+    pub(crate) fn entry(&self, digest: Digest) -> Result<Option<Entry>, BlobError> {
+        let stat = self.backend().stat(digest)?;
+        Ok(stat.map(|stat| Entry { digest, bytes: stat.bytes, put_ms: stat.put_ms }))
+    }
+
+    /// All blobs by name.
+    pub fn list(&self) -> Result<BTreeMap<Digest, Entry>, BlobError> {
+        Ok(self.backend().list()?.into_iter().map(|entry| (entry.digest, entry)).collect())
+    }
+
+    /// What lies among the blobs and is not the store's. It is left alone.
+    pub fn strays(&self) -> Result<Vec<String>, BlobError> {
+        self.backend().strays()
+    }
+
+    /// Damaged blobs that were put aside.
+    pub fn aside(&self) -> Result<Vec<String>, BlobError> {
+        self.backend().aside()
+    }
+
+    /// Removes a blob unless it was put after `before_ms` or a held task has put it; says whether it did. One that is known
+    /// to be damaged is put aside instead.
+    pub(crate) fn remove_older(&self, digest: Digest, before_ms: i64) -> Result<bool, BlobError> {
+        let _alone = self.0.removal.write().unwrap_or_else(PoisonError::into_inner);
+        if self.held().contains(&digest) {
+            return Ok(false);
+        }
+        match self.backend().stat(digest)? {
+            Some(stat) if stat.put_ms < before_ms => {
+                let damaged = self.known().is_damaged(digest);
+                if damaged {
+                    self.backend().put_aside(digest)?
+                } else {
+                    self.backend().remove(digest)?
+                }
+                self.known().forget(digest);
+                Ok(true)
+            }
+            _ => Ok(false),
+        }
+    }
+}
+
+impl Blobs for BlobStore {
+    fn get(&self, digest: Digest) -> Result<Arc<[u8]>, BlobError> {
+        Self::get(self, digest).map(Arc::from)
+    }
+
+    fn put(&self, bytes: Vec<u8>) -> Result<Digest, BlobError> {
+        Self::put(self, &bytes)
+    }
+
+    fn put_pieces(&self, pieces: &[&[u8]]) -> Result<Digest, BlobError> {
+        Self::put_pieces(self, pieces)
+    }
+
+    fn open(&self, digest: Digest) -> Result<Box<dyn Blob>, BlobError> {
+        let bytes = self.verify(digest)?.bytes;
+        Ok(Box::new(Opened { store: self.clone(), digest, bytes }))
+    }
+}
+
+/// A blob that was found whole.
+#[derive(Debug)]
+struct Opened {
+    store: BlobStore,
+    digest: Digest,
+    bytes: u64,
+}
+
+impl Blob for Opened {
+    fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), BlobError> {
+        if offset.checked_add(out.len() as u64).is_none_or(|end| end > self.bytes) {
+            return Err(checkpoint::past_the_end(offset, out.len(), self.bytes));
+        }
+        let failed = |e| BlobError::Unavailable(format!("failed to read blob {}: {e}", self.digest));
+        self.store.backend().read(self.digest, offset)?.read_exact(out).map_err(failed)
+    }
+}

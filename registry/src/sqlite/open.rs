@@ -1,0 +1,275 @@
+//! Opening a database: for writing, once its schema is the newest and its parts belong together, and for reading.
+
+use std::cmp::Ordering;
+use std::path::Path;
+use std::time::Duration;
+
+use sqlx::migrate::{MigrateError, Migrator};
+use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
+use sqlx::{Connection, Row, SqliteConnection, SqlitePool};
+
+use super::error::open_error;
+use super::statement::int;
+use crate::clock;
+use crate::folder::{self, DATABASE};
+use crate::identity::{Found, Verdict};
+use crate::open_error::OpenError;
+use crate::store_id::{StoreId, Stored};
+
+pub(crate) static MIGRATOR: Migrator = sqlx::migrate!("../migrations");
+
+fn options(dir: &Path) -> SqliteConnectOptions {
+    SqliteConnectOptions::new()
+        .filename(folder::database(dir))
+        .journal_mode(SqliteJournalMode::Wal)
+        .synchronous(SqliteSynchronous::Full)
+        .foreign_keys(true)
+        .busy_timeout(Duration::from_secs(10))
+        .statement_cache_capacity(200)
+}
+
+/// A database opened for writing.
+#[derive(Debug)]
+pub(crate) struct Opened {
+    pub(crate) conn: SqliteConnection,
+    pub(crate) store: StoreId,
+    /// What the folder was found to be.
+    pub(crate) verdict: Verdict,
+}
+
+/// Opens the writing connection and brings the schema up to date, once the database belongs to what was `found` beside it. Only
+/// for the holder of the store's lock.
+pub(crate) async fn open_writer(dir: &Path, found: &Found, adopt: bool) -> Result<Opened, OpenError> {
+    let path = folder::database(dir);
+    let existed = folder::has_database(dir);
+    let mismatch = |mismatch| OpenError::Mismatch { dir: dir.to_owned(), mismatch };
+    if !existed {
+        found.judge(None).map_err(mismatch)?;
+    }
+    let mut conn = SqliteConnection::connect_with(&options(dir).create_if_missing(!existed))
+        .await
+        .map_err(|e| open_error(&path, &e))?;
+    let verdict = match belongs(dir, found, adopt, existed, &mut conn).await {
+        Ok(verdict) => verdict,
+        Err(refused) => {
+            // Takes the empty log with it that opening has made. That it is refused matters more than how closing goes.
+            let _ = conn.close().await;
+            return Err(refused);
+        }
+    };
+    if existed {
+        back_up_before_migrating(dir, &mut conn).await?;
+    }
+    // Not `run`: its future cannot be sent to another thread.
+    MIGRATOR.run_direct(None, &mut conn, false).await.map_err(|e| match e {
+        MigrateError::VersionMissing(found) => OpenError::NewerSchema { path: path.clone(), found, known: newest() },
+        MigrateError::Execute(e) | MigrateError::ExecuteMigration(e, _) => open_error(&path, &e),
+        e => OpenError::Damaged { path: path.clone(), message: e.to_string() },
+    })?;
+    let store = match &verdict {
+        Verdict::Whole(store) | Verdict::Unfinished(store) => store.clone(),
+        Verdict::New => name(&path, &mut conn).await?,
+    };
+    Ok(Opened { conn, store, verdict })
+}
+
+/// Whether an open database belongs to what was `found` beside it.
+async fn belongs(
+    dir: &Path,
+    found: &Found,
+    adopt: bool,
+    existed: bool,
+    conn: &mut SqliteConnection,
+) -> Result<Verdict, OpenError> {
+    if !existed {
+        return Ok(Verdict::New);
+    }
+    let failed = |e: &sqlx::Error| open_error(&folder::database(dir), e);
+    let stored = stored(conn).await.map_err(|e| failed(&e))?;
+    match (found.judge(stored.as_ref()), stored) {
+        (Ok(verdict), _) => Ok(verdict),
+        (Err(why), Some(stored)) if adopt && why.may_be_adopted() => {
+            let reach = sqlx::query("UPDATE store SET commits = max(commits, ?), epoch = max(epoch, ?)");
+            let reach = reach.bind(int(found.witnessed())).bind(int(found.marked_epoch()));
+            reach.execute(conn).await.map_err(|e| failed(&e))?;
+            Ok(Verdict::Unfinished(stored.id))
+        }
+        (Err(mismatch), _) => Err(OpenError::Mismatch { dir: dir.to_owned(), mismatch }),
+    }
+}
+
+/// What a database says of its store; `None` if it was never one of a store.
+pub(super) async fn stored(conn: &mut SqliteConnection) -> Result<Option<Stored>, sqlx::Error> {
+    let has_table = sqlx::query("SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name = 'store'");
+    let has_table: i64 = has_table.fetch_one(&mut *conn).await?.try_get(0)?;
+    if has_table == 0 {
+        return Ok(None);
+    }
+    let row = sqlx::query("SELECT id, epoch, commits FROM store").fetch_optional(&mut *conn).await?;
+    row.map(|row| {
+        let id: String = row.try_get(0)?;
+        let id = id.parse().map_err(|e: String| sqlx::Error::ColumnDecode { index: "id".into(), source: e.into() })?;
+        let (epoch, commits): (i64, i64) = (row.try_get(1)?, row.try_get(2)?);
+        Ok(Stored { id, epoch: epoch.unsigned_abs(), commits: commits.unsigned_abs() })
+    })
+    .transpose()
+}
+
+/// Gives a new database the name of a new store.
+async fn name(path: &Path, conn: &mut SqliteConnection) -> Result<StoreId, OpenError> {
+    let io = |e: std::io::Error| OpenError::Other { path: path.to_owned(), message: e.to_string() };
+    let id = StoreId::random().map_err(io)?;
+    let row = sqlx::query("INSERT INTO store (one, id, epoch, commits, at_ms) VALUES (1, ?, 0, 0, ?)");
+    let row = row.bind(id.as_str()).bind(clock::now_ms());
+    row.execute(conn).await.map_err(|e| open_error(path, &e))?;
+    Ok(id)
+}
+
+/// Raises the database's epoch: from here on whoever opened it before cannot write to it.
+pub(crate) async fn raise_epoch(dir: &Path, conn: &mut SqliteConnection) -> Result<Stored, OpenError> {
+    let failed = |e: &sqlx::Error| open_error(&folder::database(dir), e);
+    let raise = "UPDATE store SET epoch = epoch + 1, commits = commits + 1";
+    sqlx::query(raise).execute(&mut *conn).await.map_err(|e| failed(&e))?;
+    let stored = stored(conn).await.map_err(|e| failed(&e))?;
+    stored.ok_or_else(|| OpenError::Damaged {
+        path: folder::database(dir),
+        message: "the row of the store is gone".into(),
+    })
+}
+
+/// Makes the epoch of a database that nobody has opened at least `epoch`.
+pub(crate) async fn reach_epoch(dir: &Path, epoch: u64) -> Result<(), sqlx::Error> {
+    let options = SqliteConnectOptions::new().filename(folder::database(dir)).synchronous(SqliteSynchronous::Full);
+    let mut conn = SqliteConnection::connect_with(&options).await?;
+    let reach = sqlx::query("UPDATE store SET epoch = max(epoch, ?)").bind(int(epoch));
+    reach.execute(&mut conn).await?;
+    conn.close().await
+}
+
+/// Read-only connections for queries. They connect when first used. `closed`: nobody writes as long as they are open, and there is
+/// no log.
+pub(crate) fn open_readers(dir: &Path, closed: bool) -> SqlitePool {
+    SqlitePoolOptions::new().max_connections(4).connect_lazy_with(reading(dir, closed))
+}
+
+/// A copy of a database that nobody writes to.
+pub(crate) async fn open_copy(path: &Path) -> Result<SqliteConnection, sqlx::Error> {
+    SqliteConnection::connect_with(&SqliteConnectOptions::new().filename(path).read_only(true).immutable(true)).await
+}
+
+fn reading(dir: &Path, closed: bool) -> SqliteConnectOptions {
+    SqliteConnectOptions::new()
+        .filename(folder::database(dir))
+        .read_only(true)
+        .immutable(closed)
+        .busy_timeout(Duration::from_secs(10))
+        .statement_cache_capacity(200)
+}
+
+/// Whether a database that is only read belongs to what was `found` beside it and has the schema that this build reads; gives the
+/// store's name.
+pub(crate) async fn check_to_read(dir: &Path, found: &Found, closed: bool) -> Result<StoreId, OpenError> {
+    let path = folder::database(dir);
+    let mismatch = |mismatch| OpenError::Mismatch { dir: dir.to_owned(), mismatch };
+    let failed = |e: &sqlx::Error| open_error(&path, e);
+    if !folder::has_database(dir) {
+        found.judge(None).map_err(mismatch)?;
+        return Err(OpenError::NotAStore(dir.to_owned()));
+    }
+    let mut conn = SqliteConnection::connect_with(&reading(dir, closed)).await.map_err(|e| failed(&e))?;
+    let Some(stored) = stored(&mut conn).await.map_err(|e| failed(&e))? else {
+        found.judge(None).map_err(mismatch)?;
+        return Err(OpenError::NotAStore(dir.to_owned()));
+    };
+    found.judge(Some(&stored)).map_err(mismatch)?;
+    let applied = sqlx::query("SELECT coalesce(max(version), 0) FROM _sqlx_migrations");
+    let applied: i64 = applied.fetch_one(&mut conn).await.map_err(|e| failed(&e))?.get(0);
+    conn.close().await.map_err(|e| failed(&e))?;
+    match applied.cmp(&newest()) {
+        Ordering::Equal => Ok(stored.id),
+        Ordering::Greater => Err(OpenError::NewerSchema { path, found: applied, known: newest() }),
+        Ordering::Less => Err(OpenError::OlderSchema { path, found: applied, known: newest() }),
+    }
+}
+
+fn newest() -> i64 {
+    MIGRATOR.iter().map(|m| m.version).max().unwrap_or(0)
+}
+
+/// Keeps a copy beside the database when this build is about to change its schema.
+async fn back_up_before_migrating(dir: &Path, conn: &mut SqliteConnection) -> Result<(), OpenError> {
+    let path = folder::database(dir);
+    let has_table = sqlx::query("SELECT count(*) FROM sqlite_master WHERE name = '_sqlx_migrations'");
+    let has_table: i64 = has_table.fetch_one(&mut *conn).await.map_err(|e| open_error(&path, &e))?.get(0);
+    if has_table == 0 {
+        return Ok(());
+    }
+    let applied = sqlx::query("SELECT coalesce(max(version), 0) FROM _sqlx_migrations");
+    let applied: i64 = applied.fetch_one(&mut *conn).await.map_err(|e| open_error(&path, &e))?.get(0);
+    if applied == 0 || applied >= newest() {
+        return Ok(());
+    }
+    let copy = dir.join(format!("{DATABASE}.before-{:04}", newest()));
+    if copy.exists() {
+        // A migration that was cut short has been here; its copy is the older and so the better one.
+        return Ok(());
+    }
+    let backup = sqlx::query("VACUUM INTO ?").bind(copy.to_string_lossy().into_owned());
+    backup.execute(&mut *conn).await.map_err(|e| open_error(&copy, &e))?;
+    tracing::info!(copy = %copy.display(), "copied the database before changing its schema");
+    Ok(())
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a test may panic")]
+mod tests {
+    use super::*;
+
+    async fn opened(dir: &Path) -> SqliteConnection {
+        let found = Found::look(dir, &crate::blob::fs::Folder::to_read(dir)).unwrap();
+        open_writer(dir, &found, false).await.unwrap().conn
+    }
+
+    /// A commit that SQLite does not sync is lost with the power, and with it what was acknowledged.
+    #[tokio::test]
+    async fn p2_the_writer_syncs_every_commit_and_appends_to_a_log() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut conn = opened(dir.path()).await;
+        let synchronous: i64 = sqlx::query("PRAGMA synchronous").fetch_one(&mut conn).await.unwrap().get(0);
+        let journal: String = sqlx::query("PRAGMA journal_mode").fetch_one(&mut conn).await.unwrap().get(0);
+        assert_eq!((synchronous, journal.as_str()), (2, "wal"), "2 is FULL");
+    }
+
+    async fn schema(conn: &mut SqliteConnection) -> Vec<(String, Option<String>)> {
+        let all = "SELECT name, sql FROM sqlite_master WHERE name NOT LIKE 'sqlite_%' ORDER BY name";
+        let rows = sqlx::query(all).fetch_all(conn).await.unwrap();
+        rows.iter().map(|row| (row.get(0), row.get(1))).collect()
+    }
+
+    #[tokio::test]
+    async fn every_old_schema_becomes_the_newest_with_a_copy_kept_before() {
+        let fresh = tempfile::tempdir().unwrap();
+        let newest_schema = schema(&mut opened(fresh.path()).await).await;
+        let all: Vec<_> = MIGRATOR.iter().cloned().collect();
+        for count in 1..all.len() {
+            let dir = tempfile::tempdir().unwrap();
+            let mut conn = SqliteConnection::connect_with(&options(dir.path()).create_if_missing(true)).await.unwrap();
+            Migrator::with_migrations(all[..count].to_vec()).run(&mut conn).await.unwrap();
+            conn.close().await.unwrap();
+            let mut conn = opened(dir.path()).await;
+            assert_eq!(schema(&mut conn).await, newest_schema, "from {count} migrations");
+            assert!(dir.path().join(format!("{DATABASE}.before-{:04}", newest())).exists());
+        }
+    }
+
+    #[tokio::test]
+    async fn each_migration_may_run_again() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut conn = opened(dir.path()).await;
+        let before = schema(&mut conn).await;
+        for migration in MIGRATOR.iter() {
+            sqlx::raw_sql(migration.sql.clone()).execute(&mut conn).await.unwrap();
+        }
+        assert_eq!(schema(&mut conn).await, before);
+    }
+}
