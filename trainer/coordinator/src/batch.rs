@@ -16,11 +16,13 @@ use protocol::message::Poll;
 use registry::{Write, WriteError};
 
 use crate::decide::decide;
-use crate::event::{Effect, Event, Millis, Moment, Observation, Rejected};
+use crate::event::{Effect, Event, Observation};
 use crate::invariants;
 use crate::observe::{is_quiet, observe};
 use crate::outcome::refused_for_good;
+use crate::rejected::Rejected;
 use crate::state::State;
+use crate::time::{Millis, Moment};
 
 /// How many asks are decided together at most.
 pub const TOGETHER: usize = 128;

@@ -4,65 +4,15 @@
 //! merely says (a poll, a tick of the clock) is an [`Observation`]; [`observe`](crate::observe) turns it into events when
 //! it means something, so that heartbeats cost no disk write.
 
-use std::collections::BTreeMap;
-
-use checkpoint::model::Parts;
 use protocol::message::{CommitCheckpoint, Grant, Join, Poll, ReportOutcome};
 use protocol::pipeline::Pipeline;
-use protocol::stage::{Keep, Sampler};
+use protocol::stage::Keep;
 use protocol::{Digest, Fence, Incarnation, RunId, StageName, TaskId, WorkerId};
 use registry::Write;
-use serde::{Deserialize, Serialize};
 
 use crate::state::execution::StageExecution;
-use crate::state::run::Run;
-
-/// Milliseconds since 1970. Handed in, never read.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(transparent)]
-pub struct Millis(pub u64);
-
-impl Millis {
-    /// This much later.
-    #[must_use]
-    pub fn after(self, milliseconds: u64) -> Self {
-        Self(self.0.saturating_add(milliseconds))
-    }
-
-    /// Milliseconds from `earlier` to here; 0 when that is later.
-    pub fn since(self, earlier: Self) -> u64 {
-        self.0.saturating_sub(earlier.0)
-    }
-}
-
-/// When an event is decided, and the randomness it may use.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Moment {
-    /// The time.
-    pub now: Millis,
-    /// Unpredictable bytes from which the secrets of new gangs are derived.
-    pub entropy: Digest,
-}
-
-/// What a client asks of a run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Control {
-    /// Lease back; work yields.
-    Pause,
-    /// Go on: after a pause, a failure or a cancellation.
-    Resume,
-    /// End it.
-    Cancel,
-}
-
-/// A stage's value as the store knows it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Known {
-    /// Outputs by name.
-    pub outputs: BTreeMap<String, Digest>,
-    /// Final values.
-    pub metrics: BTreeMap<String, f64>,
-}
+use crate::state::run::{Control, Run};
+use crate::value::{Candidate, Known};
 
 /// Something that happened, or that somebody asks for.
 #[derive(Debug, Clone, PartialEq)]
@@ -202,23 +152,10 @@ pub enum Observation {
     },
     /// The clock was looked at.
     Tick {
-        /// How much later than it meant to, in milliseconds: then this whole process was stopped or starved and heard nobody. A wait
+        /// How much later than it meant to, in milliseconds: then this whole process did not run and heard nobody. A wait
         /// for the disk is not part of it, for polls are heard meanwhile.
         overslept: u64,
     },
-}
-
-/// A model that a register stage makes a version of.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Candidate {
-    /// The stage that made it.
-    pub stage: StageName,
-    /// The model as that stage gave it.
-    pub model: Digest,
-    /// How it is drawn from when nobody says otherwise; `None` if nobody measured it.
-    pub sampler: Option<Sampler>,
-    /// Parts that are added to it.
-    pub parts: Parts,
 }
 
 /// What is to be done about an event.
@@ -251,28 +188,4 @@ pub enum Effect {
     Joined(Incarnation),
     /// Somebody's orders or a run's state may have changed: waiting polls look again.
     Wake,
-}
-
-/// Why an event did not happen. Nothing has changed.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum Rejected {
-    /// The grant has been superseded.
-    #[error("stale fence: task `{task}` is at fence {current}, the call carries {carried}")]
-    StaleFence {
-        /// The task.
-        task: TaskId,
-        /// Its fence now.
-        current: Fence,
-        /// The fence of the call.
-        carried: Fence,
-    },
-    /// No such thing.
-    #[error("{0}")]
-    NotFound(String),
-    /// It contradicts what is.
-    #[error("{0}")]
-    Conflict(String),
-    /// It cannot be.
-    #[error("{0}")]
-    Invalid(String),
 }

@@ -13,12 +13,12 @@ use protocol::stage::Placement;
 use protocol::{Attempt, Digest, Fence, RunId, StageName, WorkerId};
 use serde::{Deserialize, Serialize};
 
-use crate::event::Millis;
 use crate::search::Progress;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::run::{Run, Status, Sweeping};
 use crate::state::task::{Lease, Saved, Task};
 use crate::state::worker::Worker;
+use crate::time::Millis;
 
 /// How something is from now on.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -9,13 +9,13 @@ use protocol::{Fence, Incarnation, WorkerId};
 use registry::Recovery;
 use serde::{Deserialize, Serialize};
 
-use crate::event::Millis;
 use crate::fact::Fact;
 use crate::policy::Policy;
 use crate::state::State;
 use crate::state::execution::StageExecution;
 use crate::state::run::Run;
 use crate::state::worker::Worker;
+use crate::time::Millis;
 
 /// The version of what is stored. Another major version is refused. A later minor one has kinds or fields that this build does not know:
 /// it is read for as long as none of them occurs.

@@ -6,10 +6,12 @@ use std::sync::Arc;
 use protocol::WorkerId;
 use protocol::message::Poll;
 
-use crate::event::{Event, Millis, Observation, Rejected};
+use crate::event::{Event, Observation};
+use crate::rejected::Rejected;
 use crate::state::State;
 use crate::state::task::Lease;
 use crate::state::worker::{Presence, Worker};
+use crate::time::Millis;
 
 /// Takes note of `observation`, which was made at `at`, and says which events follow from it.
 pub fn observe(state: &mut State, at: Millis, observation: Observation) -> Result<Vec<Event>, Rejected> {

@@ -23,10 +23,12 @@ use registry::{Write, WriteError};
 use crate::decide::attempts::Loss;
 use crate::decide::deciding::Deciding;
 use crate::decide::executions::result;
-use crate::event::{Effect, Event, Known, Rejected};
+use crate::event::{Effect, Event};
 use crate::fact::Fact;
+use crate::rejected::Rejected;
 use crate::state::execution::ExecutionState;
 use crate::state::task::{Lease, Part, Saved, Task};
+use crate::value::Known;
 
 impl Deciding<'_> {
     pub(crate) fn checkpoint(&mut self, commit: CommitCheckpoint) -> Result<bool, Rejected> {

@@ -9,12 +9,13 @@ use protocol::stage::{Register, Shape};
 use protocol::{Digest, StageName};
 
 use crate::decide::deciding::Deciding;
-use crate::event::{Effect, Millis};
+use crate::event::Effect;
 use crate::fact::Fact;
 use crate::register::Registration;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::run::{Run, Status};
 use crate::state::tasks::Tasks;
+use crate::time::Millis;
 
 impl Deciding<'_> {
     /// Brings every run that was touched up to date with its executions, until nothing moves.

@@ -13,8 +13,8 @@ use registry::Write;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
-use crate::event::{Candidate, Known};
 use crate::state::run::{Run, Status, value};
+use crate::value::{Candidate, Known};
 
 /// All that a register stage needs to know, once its inputs are there.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

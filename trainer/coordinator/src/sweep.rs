@@ -18,11 +18,11 @@ use protocol::message::{RunState, StageState, SweepView, TrialState, TrialView};
 use protocol::{Digest, Steps};
 
 use crate::decide::deciding::Deciding;
-use crate::event::Known;
 use crate::search::{Score, Search, Ticket};
 use crate::state::State;
 use crate::state::execution::ExecutionState;
 use crate::state::run::{Run, Status, Sweeping, value};
+use crate::value::Known;
 
 /// What became of a ticket.
 enum Found {

@@ -7,12 +7,13 @@ use protocol::stage::Backend;
 use protocol::{Generation, Incarnation, TaskId, WorkerId, canonical};
 use serde::{Deserialize, Serialize};
 
-use crate::event::{Millis, Rejected};
+use crate::rejected::Rejected;
 use crate::state::State;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::run::{Run, Status};
 use crate::state::task::{Lease, Part, Task};
 use crate::state::worker::{Presence, Worker};
+use crate::time::Millis;
 
 /// A worker as clients see it: `GET /v1/workers`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]

@@ -4,8 +4,8 @@ use protocol::message::Member;
 use protocol::{Digest, Fence, TaskId, WorkerId};
 
 use super::deciding::Deciding;
-use crate::event::Rejected;
 use crate::fact::Fact;
+use crate::rejected::Rejected;
 use crate::state::execution::ExecutionState;
 use crate::state::gang::{self, Change};
 use crate::state::task::{Lease, Part, Task};

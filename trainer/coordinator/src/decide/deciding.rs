@@ -7,11 +7,13 @@ use std::sync::Arc;
 use protocol::{Digest, TaskId};
 use registry::Write;
 
-use crate::event::{Effect, Millis, Moment, Rejected};
+use crate::event::Effect;
 use crate::fact::{Fact, TaskChange};
+use crate::rejected::Rejected;
 use crate::state::State;
 use crate::state::run::{Run, Status};
 use crate::state::task::Task;
+use crate::time::{Millis, Moment};
 
 /// A decision under way.
 #[derive(Debug)]

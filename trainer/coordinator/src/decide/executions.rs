@@ -7,10 +7,13 @@ use protocol::{Digest, RunId, StageName};
 use registry::Write;
 
 use super::deciding::Deciding;
-use crate::event::{Effect, Known, Millis, Rejected};
+use crate::event::Effect;
 use crate::fact::Fact;
+use crate::rejected::Rejected;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::task::Task;
+use crate::time::Millis;
+use crate::value::Known;
 
 impl Deciding<'_> {
     pub(crate) fn looked_up(

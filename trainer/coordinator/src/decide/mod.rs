@@ -24,13 +24,15 @@ use registry::Write;
 
 use self::attempts::Loss;
 use self::deciding::Deciding;
-use crate::event::{Effect, Event, Moment, Rejected};
+use crate::event::{Effect, Event};
 use crate::fact::Fact;
 use crate::journal::Decision;
+use crate::rejected::Rejected;
 use crate::schedule;
 use crate::state::State;
 use crate::state::execution::ExecutionState;
 use crate::state::worker::Sign;
+use crate::time::Moment;
 
 /// Decides what `event` does. `state` is changed only by an accepted event; an event that changes nothing has no effect
 /// but the answer to whoever sent it.

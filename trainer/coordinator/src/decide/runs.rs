@@ -9,8 +9,10 @@ use protocol::{RunId, StageName, limits};
 use registry::Write;
 
 use super::deciding::Deciding;
-use crate::event::{Control, Effect, Rejected};
+use crate::event::Effect;
 use crate::fact::Fact;
+use crate::rejected::Rejected;
+use crate::state::run::Control;
 use crate::state::run::Run;
 
 impl Deciding<'_> {

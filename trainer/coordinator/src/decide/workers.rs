@@ -8,8 +8,9 @@ use protocol::{Incarnation, TaskId, WorkerId};
 
 use super::attempts::Loss;
 use super::deciding::Deciding;
-use crate::event::{Effect, Rejected};
+use crate::event::Effect;
 use crate::fact::Fact;
+use crate::rejected::Rejected;
 use crate::state::worker::{Sign, Worker};
 
 impl Deciding<'_> {

@@ -5,45 +5,45 @@
 //! both because the number of trials is fixed: lower rungs come first, so that a promotion rests on as many results as there can be, and a
 //! rung never takes more trials than it would if one had waited, so that the cost is known before anything runs.
 
-use super::{Score, Search};
+use super::score::{Score, Standing};
 
 /// How many trials get to `rung`.
-pub(super) fn quota(search: &Search, rung: usize) -> usize {
-    let trials = search.trials.len();
-    let divided = (0..rung).fold(trials, |count, _| count / search.factor);
+pub(super) fn quota(standing: Standing<'_>, rung: usize) -> usize {
+    let trials = standing.known.len();
+    let divided = (0..rung).fold(trials, |count, _| count / standing.factor);
     divided.max(1).min(trials)
 }
 
 /// The trial that goes on now, and to which rung.
-pub(super) fn promoted(search: &Search) -> Option<(usize, usize)> {
-    (1..search.rungs.len()).find_map(|rung| {
-        if begun(search, rung) >= quota(search, rung) {
+pub(super) fn promoted(standing: Standing<'_>) -> Option<(usize, usize)> {
+    (1..standing.rungs).find_map(|rung| {
+        if begun(standing, rung) >= quota(standing, rung) {
             return None;
         }
-        let ranking = search.ranking(rung - 1);
-        let good = ranking.len() / search.factor;
-        ranking.into_iter().take(good).find(|trial| may_go_on(search, *trial, rung)).map(|trial| (trial, rung))
+        let ranking = standing.ranking(rung - 1);
+        let good = ranking.len() / standing.factor;
+        ranking.into_iter().take(good).find(|trial| may_go_on(standing, *trial, rung)).map(|trial| (trial, rung))
     })
 }
 
 /// Who goes on when nothing is under way, nobody may go on by rank, and no trial has got to the end: so few trials that a third of them is
 /// none, or a promoted one that failed.
-pub(super) fn finalist(search: &Search) -> Option<(usize, usize)> {
-    let last = search.rungs.len() - 1;
-    if search.known.iter().any(|scores| matches!(scores.get(last), Some(Score::Value(_)))) {
+pub(super) fn finalist(standing: Standing<'_>) -> Option<(usize, usize)> {
+    let last = standing.rungs - 1;
+    if standing.known.iter().any(|scores| matches!(scores.get(last), Some(Score::Value(_)))) {
         return None;
     }
     (1..=last).rev().find_map(|rung| {
-        let ranking = search.ranking(rung - 1);
-        ranking.into_iter().find(|trial| may_go_on(search, *trial, rung)).map(|trial| (trial, rung))
+        let ranking = standing.ranking(rung - 1);
+        ranking.into_iter().find(|trial| may_go_on(standing, *trial, rung)).map(|trial| (trial, rung))
     })
 }
 
-fn begun(search: &Search, rung: usize) -> usize {
-    search.issued.iter().filter(|rungs| **rungs > rung).count()
+fn begun(standing: Standing<'_>, rung: usize) -> usize {
+    standing.issued.iter().filter(|rungs| **rungs > rung).count()
 }
 
 /// Its result at the rung before counts and is a number, and it has not gone on yet.
-fn may_go_on(search: &Search, trial: usize, rung: usize) -> bool {
-    search.issued[trial] == rung && matches!(search.known[trial].get(rung - 1), Some(Score::Value(_)))
+fn may_go_on(standing: Standing<'_>, trial: usize, rung: usize) -> bool {
+    standing.issued[trial] == rung && matches!(standing.known[trial].get(rung - 1), Some(Score::Value(_)))
 }

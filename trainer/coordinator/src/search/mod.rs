@@ -1,6 +1,6 @@
 //! Who is tried next: a sweep's searcher as a pure fold over its results.
 //!
-//! StageExecution is handed out as numbered tickets, one rung of one trial each. Results come in any order, but they are folded in the order of the
+//! Work is handed out as numbered tickets, one rung of one trial each. Results come in any order, but they are folded in the order of the
 //! tickets, and ticket `n` is issued as a function of the results of tickets `0..=n - parallel` alone. So neither the number of workers nor
 //! who is fast, who is killed and who starts again can change a trial, a rung or the best: the decisions are a function of the sweep and the
 //! seed. The price is that a slow ticket holds up those `parallel` behind it.
@@ -16,6 +16,7 @@
 mod asha;
 mod grid;
 mod random;
+mod score;
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -24,6 +25,9 @@ use protocol::stage::{Mode, StageSettings};
 use protocol::sweep::{SearchKind, Sweep, Values};
 use protocol::{Seed, StageName};
 use serde::{Deserialize, Serialize};
+
+pub use self::score::Score;
+use self::score::Standing;
 
 /// A thing to do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -38,32 +42,6 @@ pub enum Ticket {
     },
     /// Nothing: with what is known now there is nothing to do. It keeps the count of tickets in step with the results.
     Idle,
-}
-
-/// How a rung of a trial ended.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Score {
-    /// The metric, finite.
-    Value(f64),
-    /// It failed, or the metric is no finite number.
-    Failed,
-}
-
-impl Score {
-    /// The metric, or [`Score::Failed`] if it is not finite.
-    pub fn of(value: f64) -> Self {
-        if value.is_finite() { Self::Value(value) } else { Self::Failed }
-    }
-
-    /// The metric, turned so that less is better; the worst for a failure.
-    fn loss(self, mode: Mode) -> f64 {
-        match (self, mode) {
-            (Self::Value(value), Mode::Min) => value,
-            (Self::Value(value), Mode::Max) => -value,
-            (Self::Failed, _) => f64::INFINITY,
-        }
-    }
 }
 
 /// What became of a searcher, without the rules by which: as they are kept.
@@ -164,14 +142,20 @@ impl Search {
             return Ticket::Rung { trial, rung: 0 };
         }
         let open = self.tickets[self.folded..].iter().any(|ticket| *ticket != Ticket::Idle);
+        let standing = self.standing();
         let promoted = match self.kind {
-            SearchKind::Asha => asha::promoted(self).or_else(|| if open { None } else { asha::finalist(self) }),
+            SearchKind::Asha => asha::promoted(standing).or_else(|| if open { None } else { asha::finalist(standing) }),
             SearchKind::Grid | SearchKind::Random => None,
         };
         match promoted {
             Some((trial, rung)) => Ticket::Rung { trial, rung },
             None => Ticket::Idle,
         }
+    }
+
+    fn standing(&self) -> Standing<'_> {
+        let (mode, factor, rungs) = (self.mode, self.factor, self.rungs.len());
+        Standing { mode, factor, rungs, known: &self.known, issued: &self.issued }
     }
 
     /// Whether nothing is under way and nothing will be.
@@ -250,27 +234,16 @@ impl Search {
     /// The best trial at the whole budget so far, and its metric.
     pub fn best(&self) -> Option<(usize, f64)> {
         let last = self.rungs.len() - 1;
-        self.ranking(last).into_iter().next().and_then(|trial| match self.known[trial][last] {
+        self.standing().ranking(last).into_iter().next().and_then(|trial| match self.known[trial][last] {
             Score::Value(value) => Some((trial, value)),
             Score::Failed => None,
         })
     }
 
-    /// Trials with a result at `rung`, best first; failures at the end.
-    fn ranking(&self, rung: usize) -> Vec<usize> {
-        let mut trials: Vec<(f64, usize)> = self
-            .known
-            .iter()
-            .enumerate()
-            .filter_map(|(trial, scores)| Some((scores.get(rung)?.loss(self.mode), trial)))
-            .collect();
-        trials.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        trials.into_iter().map(|(_, trial)| trial).collect()
-    }
-
     /// Steps that the sweep will take if no trial fails.
     pub fn planned(&self) -> u64 {
-        (0..self.rungs.len()).map(|rung| asha::quota(self, rung) as u64 * self.steps(rung)).sum()
+        let standing = self.standing();
+        (0..self.rungs.len()).map(|rung| asha::quota(standing, rung) as u64 * self.steps(rung)).sum()
     }
 
     /// Steps of every trial at the whole budget.

@@ -16,9 +16,10 @@ use axum::response::{IntoResponse, Response};
 use protocol::limits;
 use tokio::sync::Semaphore;
 
-use super::api::{Failure, Route};
-use super::body::Paced;
+use super::failure::Failure;
 use super::listener::Peer;
+use super::paced::Paced;
+use super::route::Route;
 
 /// What the door knows.
 #[derive(Debug)]
@@ -102,7 +103,7 @@ pub(crate) async fn admit(
     }
     let length = request.headers().get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
     if length.is_some_and(|length: usize| length > route.body) {
-        return closing(too_large(route.body));
+        return closing(Failure::too_large(route.body));
     }
     let extensions = request.extensions_mut();
     extensions.insert(caller);
@@ -122,10 +123,6 @@ pub(crate) fn forbidden(caller: &Caller, needed: &[Scope]) -> Failure {
         format!("the token of `{}` may {}; this call needs {}", caller.name, caller.scopes, needed.join(" or "));
     Failure::new(StatusCode::FORBIDDEN, "forbidden", message)
         .hint("use another token, or add the scope to the server's token file")
-}
-
-pub(crate) fn too_large(limit: usize) -> Failure {
-    Failure::new(StatusCode::PAYLOAD_TOO_LARGE, "invalid", format!("the body is larger than {limit} bytes"))
 }
 
 fn late(time: Duration) -> Failure {

@@ -1,69 +1,20 @@
 //! Bodies: read within limits of size, time and memory, and parsed where a large one holds nobody up.
 
-use std::future::Future;
-use std::pin::Pin;
 use std::sync::Arc;
-use std::task::{Context, Poll};
-use std::time::Duration;
 
-use axum::body::{Body, Bytes, HttpBody};
+use axum::body::HttpBody;
 use axum::extract::{FromRequest, Request};
 use axum::http::{StatusCode, header};
-use http_body::{Frame, SizeHint};
 use serde::de::DeserializeOwned;
 use tokio::sync::OwnedSemaphorePermit;
-use tokio::time::{Instant, Sleep};
 
-use super::api::{Failure, Route};
-use super::auth::{Gate, too_large};
-use super::effects::blocking;
+use super::auth::Gate;
+use super::blocking::blocking;
+use super::failure::Failure;
+use super::route::Route;
 
-/// How long a body may say nothing.
-const SILENCE: Duration = Duration::from_secs(30);
 /// Larger bodies wait for memory, and are parsed beside the threads that answer heartbeats.
 const LARGE: usize = 64 << 10;
-
-/// A body that ends with an error when its sender pauses for too long.
-#[derive(Debug)]
-pub(crate) struct Paced {
-    body: Body,
-    silence: Pin<Box<Sleep>>,
-}
-
-impl Paced {
-    pub(crate) fn new(body: Body) -> Self {
-        Self { body, silence: Box::pin(tokio::time::sleep(SILENCE)) }
-    }
-}
-
-impl HttpBody for Paced {
-    type Data = Bytes;
-    type Error = axum::Error;
-
-    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
-        match Pin::new(&mut self.body).poll_frame(cx) {
-            Poll::Ready(frame) => {
-                self.silence.as_mut().reset(Instant::now() + SILENCE);
-                Poll::Ready(frame)
-            }
-            Poll::Pending => match self.silence.as_mut().poll(cx) {
-                Poll::Ready(()) => {
-                    let message = format!("nothing of the body came for {} s", SILENCE.as_secs());
-                    Poll::Ready(Some(Err(axum::Error::new(std::io::Error::new(std::io::ErrorKind::TimedOut, message)))))
-                }
-                Poll::Pending => Poll::Pending,
-            },
-        }
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
-    }
-}
 
 /// A message as JSON, like `axum::Json`, but bounded by its route and by what all bodies together may take: a large one gives its share
 /// of that back when it is answered.
@@ -121,7 +72,7 @@ fn unread(error: &axum::Error, limit: usize) -> Failure {
             return Failure::new(StatusCode::REQUEST_TIMEOUT, "slow", inner.to_string());
         }
         if inner.to_string().contains("length limit exceeded") {
-            return too_large(limit);
+            return Failure::too_large(limit);
         }
         cause = inner.source();
     }

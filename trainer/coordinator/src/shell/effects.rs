@@ -10,9 +10,11 @@ use registry::blob::{IDLE, Protected};
 use registry::{BlobStore, QueryError};
 use tokio::sync::watch;
 
-use super::actor::ActorHandle;
+use super::actor_handle::ActorHandle;
+use super::blocking::blocking;
 use crate::batch::Refused;
-use crate::event::{Candidate, Effect, Event, Known, Observation};
+use crate::event::{Effect, Event, Observation};
+use crate::value::{Candidate, Known};
 
 /// How long after a failed read of the store it is tried again.
 const RETRY: Duration = Duration::from_secs(1);
@@ -141,18 +143,6 @@ pub(crate) fn let_go(actor_handle: &ActorHandle) {
     let state = actor_handle.state();
     let is_held = |task: &TaskId| state.task(task).is_ok_and(|(_, task)| !task.holders().is_empty());
     actor_handle.store.blobs().let_go(IDLE, is_held);
-}
-
-/// Runs what blocks on a disk outside the threads that serve requests.
-pub(crate) async fn blocking<T: Send + 'static>(execution: impl FnOnce() -> T + Send + 'static) -> T {
-    match tokio::task::spawn_blocking(execution).await {
-        Ok(value) => value,
-        Err(error) => match error.try_into_panic() {
-            Ok(panic) => std::panic::resume_unwind(panic),
-            // Only at the end of the runtime: this task is about to go as well.
-            Err(_) => std::future::pending().await,
-        },
-    }
 }
 
 /// Looks at the clock until the coordinator stops. It does not wait until what it saw is taken up, which takes as long as the disk

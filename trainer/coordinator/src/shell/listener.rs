@@ -27,7 +27,7 @@ use tokio::task::JoinSet;
 use tokio_rustls::TlsAcceptor;
 use tower::Service;
 
-use super::api::Failure;
+use super::failure::Failure;
 
 /// So much of a request's head is held in memory.
 const HEAD_BYTES: usize = 64 << 10;

@@ -4,14 +4,21 @@
 //! copy. What a refused transaction would have changed has therefore never been. Everybody else reads published copies.
 
 mod actor;
+mod actor_handle;
 mod api;
 mod auth;
+mod blocking;
 mod body;
+mod clock;
 mod effects;
+mod failure;
 mod listener;
+mod paced;
 mod polls;
 mod queries;
 mod records;
+mod route;
+mod start_error;
 mod uploads;
 
 use std::net::{Ipv4Addr, SocketAddr};
@@ -20,24 +27,27 @@ use std::sync::Arc;
 use access::{Scopes, Token, Tokens};
 use protocol::message::{RunView, Submit};
 use protocol::{RunId, WorkerId};
-use registry::{QueryError, Store, WriteError};
+use registry::Store;
 use rustls::ServerConfig;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 use crate::batch::Refused;
-use crate::event::{Control, Event, Rejected};
-use crate::journal::{self, RecoverError};
+use crate::event::Event;
+use crate::journal;
 use crate::policy::Policy;
+use crate::state::run::Control;
 use crate::view::WorkerView;
 
-use self::actor::ActorHandle;
-pub use self::api::{Route, routes};
+use self::actor_handle::ActorHandle;
+pub use self::api::routes;
 use self::auth::Gate;
 use self::listener::Listener;
 pub use self::listener::{Connections, raise_descriptor_limit};
-pub use self::queries::{BlobStored, StageMetrics, Submitted};
-pub use self::records::{Records, RecordsError};
+pub use self::queries::{BlobStored, Submitted};
+pub use self::records::{Records, RecordsError, StageMetrics};
+pub use self::route::Route;
+pub use self::start_error::StartError;
 
 /// How a coordinator is run.
 #[derive(Debug, Clone)]
@@ -95,51 +105,6 @@ impl Config {
             return Err(StartError::NoTls(self.listen));
         }
         Ok(())
-    }
-}
-
-/// Why a coordinator did not start.
-#[derive(Debug, thiserror::Error)]
-pub enum StartError {
-    /// Nobody could call it.
-    #[error("refusing to listen on {0} without a token: nobody beyond this machine could be let in")]
-    NoToken(SocketAddr),
-    /// Whoever listens on the network would have the tokens.
-    #[error("refusing to listen on {0} without TLS: whoever sees the traffic has the tokens")]
-    NoTls(SocketAddr),
-    /// The address is taken, or not ours.
-    #[error("cannot listen on {address}: {cause}")]
-    Listen {
-        /// Where.
-        address: SocketAddr,
-        /// Why not.
-        cause: std::io::Error,
-    },
-    /// What was decided before cannot be read.
-    #[error("cannot read what was decided before: {0}")]
-    Read(#[from] QueryError),
-    /// What was decided before is not what this build understands.
-    #[error("cannot recover: {0}")]
-    Recover(#[from] RecoverError),
-    /// The first event cannot be stored.
-    #[error("cannot write to the store: {0}")]
-    Store(#[from] WriteError),
-    /// A fault of ours.
-    #[error("{0}; this is a bug of Stride's")]
-    Failed(String),
-    /// The first event is refused.
-    #[error("cannot recover: {0}")]
-    Rejected(#[from] Rejected),
-}
-
-impl From<Refused> for StartError {
-    fn from(refused: Refused) -> Self {
-        match refused {
-            Refused::Rejected(rejected) => Self::Rejected(rejected),
-            Refused::Write(write) => Self::Store(write),
-            Refused::Stopped => Self::Rejected(Rejected::Conflict("it was stopped while it started".to_owned())),
-            Refused::Failed(failure) => Self::Failed(failure),
-        }
     }
 }
 

@@ -8,10 +8,11 @@ use axum::extract::{Path, State};
 use protocol::WorkerId;
 use protocol::message::{DesiredAssignments, Join, Joined, PROTOCOL_VERSION, Poll};
 
-use super::actor::ActorHandle;
-use super::api::Failure;
+use super::actor_handle::ActorHandle;
 use super::body::Message;
-use crate::event::{Effect, Event, Rejected};
+use super::failure::Failure;
+use crate::event::{Effect, Event};
+use crate::rejected::Rejected;
 
 pub(crate) async fn join(
     State(actor_handle): State<Arc<ActorHandle>>,

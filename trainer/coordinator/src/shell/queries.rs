@@ -1,6 +1,5 @@
 //! Clients: submitting, looking, pausing.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use access::Caller;
@@ -10,17 +9,18 @@ use axum::response::IntoResponse;
 use axum::{Extension, Json};
 use protocol::message::{RunView, Submit};
 use protocol::{Digest, RunId, StageName, limits};
-use registry::Curve;
 use registry::LogRow;
 use serde::{Deserialize, Serialize};
 use tokio::sync::SemaphorePermit;
 
-use super::actor::ActorHandle;
-use super::api::Failure;
+use super::actor_handle::ActorHandle;
 use super::auth;
+use super::blocking::blocking;
 use super::body::Message;
-use super::effects::blocking;
-use crate::event::{Control, Rejected};
+use super::failure::Failure;
+use super::records::StageMetrics;
+use crate::rejected::Rejected;
+use crate::state::run::Control;
 use crate::view::WorkerView;
 
 /// The answer to `PUT /v1/blobs/{digest}` and `GET /v1/blobs/{digest}/staged`.
@@ -40,9 +40,6 @@ pub struct Submitted {
     /// The run; the same for every submission with one idempotency key.
     pub run: RunId,
 }
-
-/// The answer to `GET /v1/runs/{run}/metrics`: values by step, by key, by stage.
-pub type StageMetrics = BTreeMap<StageName, BTreeMap<String, Curve>>;
 
 /// `?stage=&after=&limit=`.
 #[derive(Debug, Deserialize)]

@@ -6,16 +6,22 @@ use std::sync::Arc;
 
 use protocol::message::RunView;
 use protocol::{Digest, RunId, StageName};
-use registry::{LogRow, OpenError, ReadStore, Write, WriteError};
+use registry::{Curve, LogRow, OpenError, ReadStore, Write, WriteError};
 
-use super::queries::StageMetrics;
-use super::{Refused, StartError, actor};
+use super::clock::wall_clock;
+use super::start_error::StartError;
+use crate::batch::Refused;
 use crate::decide::decide;
-use crate::event::{Effect, Event, Millis, Moment, Rejected};
+use crate::event::{Effect, Event};
 use crate::policy::Policy;
+use crate::rejected::Rejected;
 use crate::state::State;
+use crate::time::{Millis, Moment};
 use crate::view::WorkerView;
 use crate::{journal, state};
+
+/// The answer to `GET /v1/runs/{run}/metrics`: values by step, by key, by stage.
+pub type StageMetrics = BTreeMap<StageName, BTreeMap<String, Curve>>;
 
 /// A state and the tables beside it, for questions that change nothing.
 #[derive(Debug, Clone)]
@@ -52,7 +58,7 @@ impl Records {
         let store = ReadStore::open(dir).await?;
         let stored = store.recovery().await.map_err(StartError::from)?;
         let mut state = journal::recover(Policy::default(), &stored).map_err(StartError::from)?;
-        let now = actor::wall_clock().max(state.now);
+        let now = wall_clock().max(state.now);
         // No secret comes of it: nobody is granted anything.
         let moment = Moment { now, entropy: Digest::of(b"") };
         let effects = decide(&mut state, moment, Event::Started { alone: true, park: true });
@@ -105,10 +111,10 @@ impl Records {
             Err(unknown) => unknown,
         };
         if let Some(view) = self.ending.get(run) {
-            return actor::read(run, view);
+            return read(run, view);
         }
         match self.store.ended(run).await.map_err(WriteError::from)? {
-            Some(row) => actor::read(run, &row.view),
+            Some(row) => read(run, &row.view),
             None => Err(unknown.into()),
         }
     }
@@ -183,4 +189,12 @@ impl Records {
         };
         Ok(begun.into_iter().map(source).collect())
     }
+}
+
+/// What the tables keep of a run that ended.
+pub(super) fn read<T: serde::de::DeserializeOwned>(run: &RunId, text: &str) -> Result<T, Refused> {
+    serde_json::from_str(text).map_err(|error| {
+        Rejected::Conflict(format!("what is kept of run `{run}` does not read: {error}; use the build that wrote it"))
+            .into()
+    })
 }

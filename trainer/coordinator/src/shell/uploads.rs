@@ -16,10 +16,10 @@ use protocol::{Digest, limits};
 use registry::blob::{Arriving, PART_BYTES, ResumeError};
 use registry::{Write, WriteError};
 
-use super::actor::ActorHandle;
-use super::api::Failure;
+use super::actor_handle::ActorHandle;
+use super::blocking::blocking;
 use super::body::Message;
-use super::effects::blocking;
+use super::failure::Failure;
 use super::queries::BlobStored;
 use crate::event::Event;
 

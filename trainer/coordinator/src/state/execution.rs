@@ -24,8 +24,9 @@ use serde::{Deserialize, Serialize};
 use super::task::{Part, Task};
 use super::tasks::Tasks;
 use super::worker::Worker;
-use crate::event::{Known, Millis};
 use crate::register::Registration;
+use crate::time::Millis;
+use crate::value::Known;
 
 /// How far the work is.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

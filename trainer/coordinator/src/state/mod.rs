@@ -28,8 +28,9 @@ use self::execution::{ExecutionState, StageExecution};
 use self::run::Run;
 use self::task::Task;
 use self::worker::Worker;
-use crate::event::{Millis, Rejected};
 use crate::policy::Policy;
+use crate::rejected::Rejected;
+use crate::time::Millis;
 
 /// What is merely heard: lost with the process, and no loss.
 #[derive(Debug, Clone, Default)]

@@ -20,8 +20,19 @@ use protocol::sweep::STATE_OUTPUT;
 use protocol::{ArtifactKind, Attempt, Digest, RunId, StageName};
 use serde::{Deserialize, Serialize};
 
-use crate::event::{Control, Known};
 use crate::search::Search;
+use crate::value::Known;
+
+/// What a client asks of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Control {
+    /// Lease back; work yields.
+    Pause,
+    /// Go on: after a pause, a failure or a cancellation.
+    Resume,
+    /// End it.
+    Cancel,
+}
 
 /// Where a stage of a run stands.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -18,7 +18,8 @@ use protocol::{Attempt, Digest, Fence, Incarnation, TaskId, WorkerId};
 use registry::Write;
 use serde::{Deserialize, Serialize};
 
-use crate::event::{Millis, Rejected};
+use crate::rejected::Rejected;
+use crate::time::Millis;
 
 /// What part of a stage a task is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

@@ -19,7 +19,7 @@ use protocol::{Digest, Incarnation, TaskId};
 
 use serde::{Deserialize, Serialize};
 
-use crate::event::Millis;
+use crate::time::Millis;
 
 /// Whether a worker can be given work.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

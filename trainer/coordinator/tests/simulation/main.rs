@@ -19,7 +19,7 @@ mod world;
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use coordinator::event::Known;
+use coordinator::value::Known;
 use coordinator::{Event, Millis};
 use protocol::message::StageState;
 use protocol::stage::WorkerRange;

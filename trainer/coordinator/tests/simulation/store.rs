@@ -2,8 +2,9 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use coordinator::event::{Event, Known};
+use coordinator::event::Event;
 use coordinator::state::run::Run;
+use coordinator::value::Known;
 use coordinator::{State, journal};
 use protocol::message::{Grant, RunView};
 use protocol::{Digest, Fence, RunId, StageName, TaskId};

@@ -2,9 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use coordinator::event::Known;
 use coordinator::state::execution::StageExecution;
 use coordinator::state::run::Run;
+use coordinator::value::Known;
 use coordinator::{Control, Event, State};
 use protocol::message::{CommitCheckpoint, FailureClass, Grant, Join, PROTOCOL_VERSION, ReportOutcome, TaskOutcome};
 use protocol::stage::Backend;

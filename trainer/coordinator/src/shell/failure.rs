@@ -1,0 +1,135 @@
+//! How a refused call looks on the wire.
+
+use axum::Json;
+use axum::http::{HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use checkpoint::BlobError;
+use protocol::limits;
+use protocol::message::ApiError;
+use registry::{QueryError, WriteError};
+
+use crate::batch::Refused;
+use crate::rejected::Rejected;
+
+/// A refused call.
+#[derive(Debug)]
+pub(crate) struct Failure {
+    status: StatusCode,
+    error: ApiError,
+    /// After how many seconds the same call may succeed.
+    retry_after: Option<u32>,
+}
+
+impl Failure {
+    pub(crate) fn new(status: StatusCode, code: &str, message: String) -> Self {
+        Self { status, error: ApiError { code: code.to_owned(), message, hint: None }, retry_after: None }
+    }
+
+    /// There is too much of this already; it may come again.
+    pub(crate) fn busy(message: String) -> Self {
+        let failure = Self::new(StatusCode::TOO_MANY_REQUESTS, "busy", message);
+        Self { retry_after: Some(limits::COME_AGAIN_S), ..failure }
+    }
+
+    pub(crate) fn hint(mut self, hint: &str) -> Self {
+        self.error.hint = Some(hint.to_owned());
+        self
+    }
+
+    pub(crate) fn invalid(message: String) -> Self {
+        Self::new(StatusCode::BAD_REQUEST, "invalid", message)
+    }
+
+    pub(crate) fn too_large(limit: usize) -> Self {
+        Self::new(StatusCode::PAYLOAD_TOO_LARGE, "invalid", format!("the body is larger than {limit} bytes"))
+    }
+
+    /// As the whole answer to a request that is not read.
+    pub(crate) fn to_http(&self) -> Vec<u8> {
+        let body = serde_json::json!(self.error).to_string();
+        let (status, length) = (self.status, body.len());
+        let head = format!(
+            "HTTP/1.1 {status}\r\ncontent-type: application/json\r\nconnection: close\r\ncontent-length: {length}"
+        );
+        format!("{head}\r\n\r\n{body}").into_bytes()
+    }
+}
+
+impl IntoResponse for Failure {
+    fn into_response(self) -> Response {
+        let mut response = (self.status, Json(self.error)).into_response();
+        if let Some(seconds) = self.retry_after {
+            response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from(seconds));
+        }
+        response
+    }
+}
+
+impl From<Rejected> for Failure {
+    fn from(rejected: Rejected) -> Self {
+        let (status, code) = match rejected {
+            Rejected::StaleFence { .. } => (StatusCode::CONFLICT, "stale-fence"),
+            Rejected::NotFound(_) => (StatusCode::NOT_FOUND, "not-found"),
+            Rejected::Conflict(_) => (StatusCode::CONFLICT, "conflict"),
+            Rejected::Invalid(_) => (StatusCode::BAD_REQUEST, "invalid"),
+        };
+        Self::new(status, code, rejected.to_string())
+    }
+}
+
+impl From<WriteError> for Failure {
+    fn from(error: WriteError) -> Self {
+        let message = error.to_string();
+        match error {
+            WriteError::StaleFence { .. } => Self::new(StatusCode::CONFLICT, "stale-fence", message),
+            WriteError::Conflict(_) => Self::new(StatusCode::CONFLICT, "conflict", message),
+            WriteError::Gate(_) => Self::new(StatusCode::CONFLICT, "gate", message),
+            WriteError::NotFound(_) => Self::new(StatusCode::NOT_FOUND, "not-found", message),
+            WriteError::Storage(_) => Self::new(StatusCode::INSUFFICIENT_STORAGE, "storage", message)
+                .hint("free some space or make the store writable, then `trainer resume`"),
+            WriteError::Superseded { .. } => Self::new(StatusCode::SERVICE_UNAVAILABLE, "storage", message),
+            WriteError::Internal(_) => Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", message),
+        }
+    }
+}
+
+impl From<Refused> for Failure {
+    fn from(refused: Refused) -> Self {
+        match refused {
+            Refused::Rejected(rejected) => rejected.into(),
+            Refused::Write(error) => error.into(),
+            Refused::Stopped => Self::new(StatusCode::SERVICE_UNAVAILABLE, "internal", refused.to_string()),
+            Refused::Failed(_) => Self::new(StatusCode::SERVICE_UNAVAILABLE, "failed", refused.to_string())
+                .hint("start it again: what was acknowledged is stored; and report this, for it is a bug of Stride's"),
+        }
+    }
+}
+
+impl From<QueryError> for Failure {
+    fn from(error: QueryError) -> Self {
+        let message = error.to_string();
+        match error {
+            QueryError::NotFound(_) => Self::new(StatusCode::NOT_FOUND, "not-found", message),
+            QueryError::Invalid(_) => Self::invalid(message),
+            QueryError::Database(_) | QueryError::Blob(_) | QueryError::Storage(_) => {
+                Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", message)
+            }
+        }
+    }
+}
+
+impl From<BlobError> for Failure {
+    fn from(error: BlobError) -> Self {
+        let message = error.to_string();
+        match error {
+            BlobError::NotFound(_) => Self::new(StatusCode::NOT_FOUND, "not-found", message),
+            BlobError::Storage(_) => Self::new(StatusCode::INSUFFICIENT_STORAGE, "storage", message)
+                .hint("free some space or make the store writable, then `trainer resume`"),
+            // Not 5xx: the bytes on our disk are wrong, and asking again would not change them.
+            BlobError::Corrupt { .. } | BlobError::Damaged(_) => Self::new(StatusCode::CONFLICT, "damaged", message)
+                .hint("run the pipeline again: the stage that made it is computed anew, which mends it"),
+            BlobError::Refused(_) => Self::new(StatusCode::CONFLICT, "stale-fence", message),
+            BlobError::Unavailable(_) => Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", message),
+        }
+    }
+}
