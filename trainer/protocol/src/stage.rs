@@ -37,7 +37,7 @@ pub use kinds::{
     TextEncoder, TokenGenerator, TokenNetwork, TokenizerLoss, TokenizerNetwork, TrainDiscord, TrainEvaluator,
     TrainLength, TrainMld, TrainTokenizer, TrainTokens, TrainVae, VaeLoss, Windows, WindowsOf,
 };
-pub use neighbours::Neighbours;
+pub use neighbours::{Neighbour, Neighbours};
 pub use network::{LatentShape, Network, Positions};
 pub use placement::{CheckpointPolicy, Keep, Placement, WorkerRange};
 pub use problems::{Problem, Problems};
@@ -171,5 +171,39 @@ impl StageSettings {
 
     pub(crate) fn check_neighbours(&self, stages: &Neighbours<'_>, problems: &mut Problems) {
         self.spec().check_neighbours(stages, problems);
+    }
+}
+
+impl Neighbour for StageSettings {
+    fn kind(&self) -> &'static str {
+        self.kind()
+    }
+
+    fn inputs(&self) -> Vec<(String, String, ArtifactKind)> {
+        self.inputs()
+    }
+
+    fn evaluated_model(&self) -> Option<String> {
+        self.evaluated_model()
+    }
+
+    fn sampler(&self) -> Option<&Sampler> {
+        self.sampler()
+    }
+
+    fn family(&self) -> Option<Family> {
+        self.spec().family()
+    }
+
+    fn format(&self) -> Option<DataFormat> {
+        self.spec().format()
+    }
+
+    fn latent(&self) -> Option<LatentShape> {
+        self.spec().latent()
+    }
+
+    fn settings(&self) -> &dyn std::any::Any {
+        self.spec()
     }
 }

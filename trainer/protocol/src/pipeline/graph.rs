@@ -2,9 +2,9 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use super::definition::{PipelineStage, StageInput};
 use super::rules::Problems;
-use super::{PipelineStage, StageInput};
-use crate::stage::{Neighbours, Register, StageSettings};
+use crate::stage::{Neighbour, Neighbours, Register, StageSettings};
 use crate::sweep::Domain;
 use crate::{ArtifactKind, StageName, limits};
 
@@ -163,7 +163,7 @@ pub(super) fn check_references(stages: &[PipelineStage], found: &mut ByStage) {
 
 /// Shapes, samplers and data that must agree. Call when references are sound.
 pub(super) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
-    let neighbours = Neighbours::new(stages.iter().map(|stage| (&stage.name, &stage.settings)));
+    let neighbours = Neighbours::new(stages.iter().map(|stage| (&stage.name, &stage.settings as &dyn Neighbour)));
     for stage in stages {
         let problems = found.entry(stage.name.clone()).or_default();
         stage.settings.check_neighbours(&neighbours, problems);

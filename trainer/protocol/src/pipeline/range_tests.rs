@@ -4,8 +4,8 @@ use serde_json::{Value, json};
 
 use super::ranges::{Range, range};
 use super::*;
-use crate::Steps;
 use crate::stage::*;
+use crate::{ArtifactKind, Digest, Steps};
 
 /// A setting is replaced by each of these.
 const NUMBERS: &[&str] = &[

@@ -6,8 +6,8 @@
 
 use serde_json::Value;
 
-use super::rules::{Problem, Problems};
 use crate::limits;
+use crate::stage::{Problem, Problems};
 
 /// The numbers that a setting may be, both ends included.
 #[derive(Debug, Clone, Copy, PartialEq)]

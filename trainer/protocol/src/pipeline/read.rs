@@ -6,12 +6,15 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use super::definition::{Pipeline, PipelineStage};
+use super::described::described;
 use super::diagnostic::{Diagnostic, Diagnostics, Position, nearest, window};
 use super::overrides::{self, TOP_KEYS};
+use super::reader::Reader;
 use super::rules::{self, Problem};
 use super::schema::{Mistake, list_keys, overlay};
 use super::yaml::{self, Budget, Content, Entry, Node};
-use super::{Pipeline, PipelineStage, graph};
+use super::{graph, sweep_rules, trial};
 use crate::id::{is_name, is_stage_name};
 use crate::limits;
 use crate::stage::{Backend, DataOpen, DataSynthetic, Placement, StageSettings, TextEmbed};
@@ -65,7 +68,7 @@ impl Default for Head {
 
 /// The keys of a pipeline that have a type of their own.
 pub(super) fn described_head() -> Value {
-    super::reference::described(&Head::default())
+    described(&Head::default())
 }
 
 /// A stage as it stands in the file.
@@ -78,15 +81,7 @@ struct Written {
     path: String,
 }
 
-pub(super) struct Reader {
-    pub(super) mistakes: Vec<Mistake>,
-}
-
 impl Reader {
-    pub(super) fn mistake(&mut self, at: Position, path: &str, message: impl Into<String>, help: Option<String>) {
-        self.mistakes.push(Mistake { at, path: path.to_owned(), message: message.into(), help });
-    }
-
     fn pipeline(&mut self, text: &str, sets: &[String]) -> Option<Pipeline> {
         let mut budget = Budget::default();
         let mut root = match yaml::parse(text, 0, &mut budget) {
@@ -220,7 +215,7 @@ impl Reader {
                         if let Some((settings, placement, sweep)) = self.stage(entry) {
                             let mut stage = stage(&entry.key, settings, placement);
                             stage.sweep = sweep;
-                            stage.inputs.extend(super::trial::references(&stage));
+                            stage.inputs.extend(trial::references(&stage));
                             stages.push(stage);
                         }
                     }
@@ -273,39 +268,6 @@ impl Reader {
         }
     }
 
-    /// A settings struct by itself; `None` if anything in it is wrong.
-    pub(super) fn typed<T: Default + Serialize + serde::de::DeserializeOwned>(
-        &mut self,
-        node: &Node,
-        owner: &str,
-        path: &str,
-        skip: &[&str],
-    ) -> Option<T> {
-        self.overlaid(serde_json::to_value(T::default()).ok()?, node, owner, path, skip)
-    }
-
-    pub(super) fn overlaid<T: serde::de::DeserializeOwned>(
-        &mut self,
-        mut base: Value,
-        node: &Node,
-        owner: &str,
-        path: &str,
-        skip: &[&str],
-    ) -> Option<T> {
-        let before = self.mistakes.len();
-        overlay::<T>(&mut base, node, owner, path, skip, &mut self.mistakes);
-        if self.mistakes.len() > before {
-            return None;
-        }
-        match serde_json::from_value(base) {
-            Ok(value) => Some(value),
-            Err(error) => {
-                self.mistake(node.at, path, format!("{owner} does not fit together: {error}"), None);
-                None
-            }
-        }
-    }
-
     fn stage(&mut self, entry: &Entry) -> Option<(StageSettings, Placement, Option<Sweep>)> {
         let (name, node) = (&entry.key, &entry.value);
         let path = format!("stages.{name}");
@@ -343,29 +305,6 @@ impl Reader {
         Some((settings?, placement?, sweep?))
     }
 
-    /// The default settings of the kind that `node` names.
-    pub(super) fn kind(&mut self, node: &Node, at: Position, owner: &str, path: &str) -> Option<StageSettings> {
-        let mut all = StageSettings::all();
-        let kinds: Vec<&str> = all.iter().map(StageSettings::kind).collect();
-        let Some(kind) = node.entry("kind") else {
-            let message = format!("{owner} has no `kind`");
-            self.mistake(at, &format!("{path}.kind"), message, Some(format!("kinds: {}", list_keys(kinds))));
-            return None;
-        };
-        let Some(found) = kind.value.as_text().and_then(|text| all.iter().position(|s| s.kind() == text)) else {
-            let near = kind.value.as_text().and_then(|text| nearest(text, kinds.iter().copied()));
-            let question = near.map(|near| format!("; did you mean `{near}`?")).unwrap_or_default();
-            let message = match kind.value.as_text() {
-                Some(text) => format!("unknown kind `{text}` of {owner}{question}"),
-                None => format!("`kind` of {owner} is {}; expected a text", kind.value.describe()),
-            };
-            let help = Some(format!("kinds: {}", list_keys(kinds)));
-            self.mistake(kind.value.at, &format!("{path}.kind"), message, help);
-            return None;
-        };
-        Some(all.swap_remove(found))
-    }
-
     /// Adds edges, applies rules, sorts. Rules between stages wait until every stage could be read.
     fn connect(
         &mut self,
@@ -374,11 +313,10 @@ impl Reader {
         mut stages: Vec<PipelineStage>,
     ) -> Option<Vec<PipelineStage>> {
         for stage in &mut stages {
-            for problem in super::trial::resolve_best(stage, written.iter().map(|w| (&w.name, w.swept()))) {
+            for problem in trial::resolve_best(stage, written.iter().map(|w| (&w.name, w.swept()))) {
                 self.problem(written, &stage.name, problem);
             }
-            let problems =
-                rules::stage(&stage.settings, &stage.placement).into_iter().chain(super::sweep::rules(stage));
+            let problems = rules::stage(&stage.settings, &stage.placement).into_iter().chain(sweep_rules::rules(stage));
             for problem in problems.collect::<Vec<_>>() {
                 self.problem(written, &stage.name, problem);
             }
@@ -413,7 +351,7 @@ impl Reader {
             Ok(stages) => {
                 if sound {
                     graph::check_agreement(&stages, &mut found);
-                    super::sweep::check_agreement(&stages, &mut found);
+                    sweep_rules::check_agreement(&stages, &mut found);
                 }
                 Some(stages)
             }

@@ -15,6 +15,11 @@ pub(super) fn stage(settings: &StageSettings, placement: &Placement) -> Vec<Prob
     problems.0
 }
 
+/// What does not hold of one stage's settings, a line for each.
+pub fn broken_rules(settings: &StageSettings, placement: &Placement) -> Vec<String> {
+    stage(settings, placement).into_iter().map(|problem| problem.message).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

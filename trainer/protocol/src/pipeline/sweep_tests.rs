@@ -1,8 +1,10 @@
 //! `sweep:` as people write it, and each way to write it wrong.
 
+use std::collections::BTreeMap;
+
 use super::*;
-use crate::Steps;
 use crate::sweep::{Domain, SearchKind, Values, rung_name};
+use crate::{Digest, Steps};
 
 pub(super) const GOOD: &str = "name: p
 dataset: {format: synthetic, clips: 10}

@@ -1,9 +1,11 @@
 //! The reader against files that are wrong in one way each, files that are wrong in many, and the shipped ones.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use super::*;
 use crate::stage::{Keep, Mode};
+use crate::{Digest, Seed};
 
 /// A pipeline that is right; cases replace a part of it.
 const GOOD: &str = "name: p

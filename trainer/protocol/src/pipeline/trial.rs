@@ -2,8 +2,9 @@
 
 use std::collections::BTreeMap;
 
+use super::definition::{PipelineStage, StageInput};
+use super::graph;
 use super::rules::{Problem, Problems};
-use super::{PipelineStage, StageInput, graph};
 use crate::stage::{Shape, StageSettings};
 use crate::sweep::{Derived, STATE_OUTPUT, Values, beside, judged_field, rung_name, with_values};
 use crate::{ArtifactKind, StageName, Steps};

@@ -1,14 +1,42 @@
 //! The other stages of a pipeline, as a kind's checks see them: found by following references, not by kind.
 
+use std::any::Any;
 use std::collections::BTreeMap;
 
-use super::{DataFormat, Family, LatentShape, Problems, Sampler, StageSettings};
+use super::{DataFormat, Family, LatentShape, Problems, Sampler};
 use crate::{ArtifactKind, StageName};
+
+/// What other stages may ask of a stage; all its settings, if they know its kind.
+pub trait Neighbour: std::fmt::Debug {
+    /// Its kind's name in YAML.
+    fn kind(&self) -> &'static str;
+    /// The stages that it reads: field, stage, what that stage must give.
+    fn inputs(&self) -> Vec<(String, String, ArtifactKind)>;
+    /// The stage that it measures.
+    fn evaluated_model(&self) -> Option<String>;
+    /// How it draws from what it measures.
+    fn sampler(&self) -> Option<&Sampler>;
+    /// What the model that it trains can do.
+    fn family(&self) -> Option<Family>;
+    /// The skeleton of what it gives, if it decides that.
+    fn format(&self) -> Option<DataFormat>;
+    /// The shape of the latents that it gives or works on, if it decides that.
+    fn latent(&self) -> Option<LatentShape>;
+    /// Its settings.
+    fn settings(&self) -> &dyn Any;
+}
+
+impl dyn Neighbour + '_ {
+    /// The settings of kind `S`, if it is of that kind.
+    pub fn get<S: 'static>(&self) -> Option<&S> {
+        self.settings().downcast_ref()
+    }
+}
 
 /// The stages of a pipeline by name. References are sound: they lead to stages that give the right kind, and nowhere in a circle.
 #[derive(Debug)]
 pub struct Neighbours<'a> {
-    stages: BTreeMap<&'a str, &'a StageSettings>,
+    stages: BTreeMap<&'a str, &'a dyn Neighbour>,
     /// For each stage, the stages that it reads by what they give.
     reads: BTreeMap<&'a str, Vec<(ArtifactKind, String)>>,
     /// For each measured stage, the evaluations of it and how they draw.
@@ -16,12 +44,12 @@ pub struct Neighbours<'a> {
 }
 
 impl<'a> Neighbours<'a> {
-    pub(crate) fn new(stages: impl Iterator<Item = (&'a StageName, &'a StageSettings)>) -> Self {
-        let stages: BTreeMap<&str, &StageSettings> = stages.map(|(name, settings)| (name.as_str(), settings)).collect();
-        let read = |settings: &StageSettings| -> Vec<(ArtifactKind, String)> {
+    pub(crate) fn new(stages: impl Iterator<Item = (&'a StageName, &'a dyn Neighbour)>) -> Self {
+        let stages: BTreeMap<&str, &dyn Neighbour> = stages.map(|(name, settings)| (name.as_str(), settings)).collect();
+        let read = |settings: &dyn Neighbour| -> Vec<(ArtifactKind, String)> {
             settings.inputs().into_iter().map(|(_, stage, kind)| (kind, stage)).collect()
         };
-        let reads = stages.iter().map(|(name, settings)| (*name, read(settings))).collect();
+        let reads = stages.iter().map(|(name, settings)| (*name, read(*settings))).collect();
         let mut measured: BTreeMap<String, Vec<_>> = BTreeMap::new();
         for (name, settings) in &stages {
             if let Some(model) = settings.evaluated_model() {
@@ -32,7 +60,7 @@ impl<'a> Neighbours<'a> {
     }
 
     /// The stage of that name.
-    pub fn stage(&self, name: &str) -> Option<&'a StageSettings> {
+    pub fn stage(&self, name: &str) -> Option<&'a dyn Neighbour> {
         self.stages.get(name).copied()
     }
 
@@ -53,7 +81,7 @@ impl<'a> Neighbours<'a> {
 
     /// What a model can do.
     pub fn family(&self, model: &str) -> Option<Family> {
-        self.of_model(model, &|name| self.stage(name)?.spec().family())
+        self.of_model(model, &|name| self.stage(name)?.family())
     }
 
     /// What `own` says of the stage that trained `model`. A stage that only passes models on, such as `register`, is asked for what all of
@@ -75,7 +103,7 @@ impl<'a> Neighbours<'a> {
 
     /// The skeleton of a dataset, of a model's motions, or the one that an evaluator is for.
     pub fn format(&self, name: &str) -> Option<DataFormat> {
-        self.stage(name)?.spec().format().or_else(|| {
+        self.stage(name)?.format().or_else(|| {
             let tokens = || self.read_by(name, ArtifactKind::Tokens);
             let from = self.dataset_of(name).or_else(|| self.vae_of_model(name)).or_else(tokens)?;
             if from == name { None } else { self.format(from) }
@@ -84,7 +112,7 @@ impl<'a> Neighbours<'a> {
 
     /// The shape of a VAE's latents.
     pub fn latent(&self, vae: &str) -> Option<LatentShape> {
-        self.stage(vae)?.spec().latent()
+        self.stage(vae)?.latent()
     }
 
     /// Whether an evaluation measures stage `name`.

@@ -1,0 +1,187 @@
+//! The rules of `sweep:`. Every value of a choice and both ends of a range are checked as if they stood in the stage.
+
+use serde_json::Value;
+
+use super::definition::PipelineStage;
+use super::graph::{self, ByStage};
+use super::rules::{self, Problem, Problems};
+use crate::limits;
+use crate::stage::Placement;
+use crate::sweep::{Domain, MAX_TRIALS, Rungs, SearchKind, Sweep, Values, judged_field, setting, with_values};
+use crate::{ArtifactKind, StageName};
+
+/// Everything that can be said of a stage's sweep without looking at other stages.
+pub(super) fn rules(stage: &PipelineStage) -> Vec<Problem> {
+    let mut problems = Problems::default();
+    let (p, Some(sweep)) = (&mut problems, &stage.sweep) else { return problems.0 };
+    let Some(training) = stage.settings.training() else {
+        p.add("sweep", format!("`{}` does not train; only training stages are swept", stage.settings.kind()), "");
+        return problems.0;
+    };
+    space_rules(p, stage, sweep);
+    if judged_field(&sweep.evaluate, stage.settings.output().kind).is_none()
+        || sweep.evaluate.output().kind != ArtifactKind::Report
+    {
+        let (judge, gives) = (sweep.evaluate.kind(), stage.settings.output().kind.noun());
+        p.add("sweep.evaluate", format!("`{judge}` does not measure {gives}"), "");
+    }
+    if !p.0.is_empty() {
+        return problems.0;
+    }
+    if sweep.metric.trim().is_empty() {
+        p.add("sweep.metric", "`metric` is missing: the value of `evaluate` that decides which trial is best", "");
+    }
+    if !(1..=1000).contains(&sweep.parallel) {
+        p.add("sweep.parallel", format!("`parallel` is {}; expected 1 to 1000", sweep.parallel), "");
+    }
+    match (sweep.search, sweep.points()) {
+        (SearchKind::Grid, None) => {
+            let ranges = sweep.space.iter().filter(|(_, domain)| !matches!(domain, Domain::Choice(_)));
+            for (path, _) in ranges {
+                let message = format!("`{path}` is a range, which has no grid");
+                p.add(
+                    &format!("sweep.space.{path}"),
+                    message,
+                    "list values with `choice`, or search with `random` or `asha`",
+                );
+            }
+        }
+        (SearchKind::Grid, Some(points)) => {
+            if sweep.trials != 0 && sweep.trials != points {
+                let message = format!("`trials` is {}, but the grid has {points} points", sweep.trials);
+                p.add("sweep.trials", message, "leave it out, or search with `random`");
+            }
+            if points > MAX_TRIALS {
+                p.add("sweep.space", format!("the grid has {points} points; expected at most {MAX_TRIALS}"), "");
+            }
+        }
+        (SearchKind::Random | SearchKind::Asha, _) => {
+            if !(1..=MAX_TRIALS).contains(&sweep.trials) {
+                let message = format!("`trials` is {}; expected 1 to {MAX_TRIALS}", sweep.trials);
+                p.add("sweep.trials", message, "how many points of the space are tried");
+            }
+        }
+    }
+    if sweep.search == SearchKind::Asha {
+        let (Rungs { first, factor }, steps) = (sweep.rungs, training.steps);
+        if first.0 == 0 || first >= steps {
+            let message =
+                format!("`rungs.first` is {first}; expected fewer steps than the stage's {steps}, and at least 1");
+            p.add("sweep.rungs.first", message, "the steps after which trials are compared for the first time");
+        }
+        if !(2..=1000).contains(&factor) {
+            p.add("sweep.rungs.factor", format!("`rungs.factor` is {factor}; expected 2 to 1000"), "");
+        }
+    } else if sweep.rungs != Rungs::default() {
+        let message = format!("`rungs` are for `asha`; with `{}` every trial trains to the end", sweep.search.name());
+        p.add("sweep.rungs", message, "leave them out");
+    }
+    for (path, domain) in &sweep.space {
+        let field = format!("sweep.space.{path}");
+        let whole = setting(&stage.settings, path).is_some_and(|value| value.is_number() && !value.is_f64());
+        for (at, value) in tried(domain, whole) {
+            let at = format!("{field}{at}");
+            let problem = match with_values(&stage.settings, &Values::from([(path.clone(), value.clone())])) {
+                Ok(_) => None,
+                // What is wrong with the stage itself is said there.
+                Err(_) if !rules::stage(&stage.settings, &stage.placement).is_empty() => None,
+                Err(problem) => Some(problem),
+            };
+            if let Some(problem) = problem {
+                p.add(&at, format!("with `{path}` at {value}: {problem}"), "");
+            }
+        }
+    }
+    // What is wrong with the stage's placement is said there.
+    p.0.extend(rules::stage(&sweep.evaluate, &Placement::default()).into_iter().map(in_judge));
+    problems.0
+}
+
+/// What the reader makes sure of, for a sweep that came as JSON: each path is a setting that may be searched, each domain has values.
+fn space_rules(p: &mut Problems, stage: &PipelineStage, sweep: &Sweep) {
+    let settings = sweep.space.len();
+    if !(1..=limits::SWEPT_SETTINGS).contains(&settings) {
+        let message = format!("`space` has {settings} settings; expected 1 to {}", limits::SWEPT_SETTINGS);
+        p.add("sweep.space", message, "");
+    }
+    if sweep.metric.len() > limits::KEY_BYTES || sweep.metric.contains(char::is_control) {
+        p.add("sweep.metric", "`metric` is not the name of a value", "such as `latent_fid`");
+    }
+    let mut settings = stage.settings.clone();
+    let references: Vec<String> = settings.refs().into_iter().map(|reference| reference.field.into_owned()).collect();
+    for (path, domain) in &sweep.space {
+        let field = format!("sweep.space.{path}");
+        let found = setting(&stage.settings, path).filter(|value| !value.is_object());
+        if found.is_none() || path == "kind" || path == "steps" || references.contains(path) {
+            p.add(&field, format!("`{}` is not a setting that can be searched", path.escape_debug()), "");
+            continue;
+        }
+        let sound = match domain {
+            Domain::Choice(values) => (1..=limits::SWEPT_VALUES).contains(&values.len()),
+            Domain::Uniform(low, high) => low < high && low.is_finite() && high.is_finite(),
+            Domain::LogUniform(low, high) => 0.0 < *low && low < high && high.is_finite(),
+        };
+        if !sound {
+            p.add(&field, format!("`{path}` has no values to try, or more than {}", limits::SWEPT_VALUES), "");
+        }
+    }
+}
+
+/// The values of a domain that are tried before anything runs, with their places below it.
+fn tried(domain: &Domain, whole: bool) -> Vec<(String, Value)> {
+    let end = |value: f64| if whole { Value::from(value as u64) } else { Value::from(value) };
+    match domain {
+        Domain::Choice(values) => {
+            values.iter().enumerate().map(|(i, value)| (format!(".choice[{i}]"), value.clone())).collect()
+        }
+        Domain::Uniform(low, high) => vec![(".uniform[0]".into(), end(*low)), (".uniform[1]".into(), end(*high))],
+        Domain::LogUniform(low, high) => {
+            vec![(".log_uniform[0]".into(), end(*low)), (".log_uniform[1]".into(), end(*high))]
+        }
+    }
+}
+
+fn in_judge(problem: Problem) -> Problem {
+    Problem { field: format!("sweep.evaluate.{}", problem.field), ..problem }
+}
+
+/// Whether trials and their evaluations agree with the other stages, value by value. Call when the stages themselves do.
+pub(super) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
+    for (i, stage) in stages.iter().enumerate() {
+        let Some(sweep) = &stage.sweep else { continue };
+        let judge_name = StageName::new(format!("{}.eval", stage.name));
+        let judge = PipelineStage {
+            name: judge_name.clone(),
+            settings: (*sweep.evaluate).clone(),
+            inputs: graph::references(&sweep.evaluate),
+            sweep: None,
+            ..stage.clone()
+        };
+        let mut all = stages.to_vec();
+        all.push(judge);
+        let mut problems = ByStage::new();
+        graph::check_agreement(&all, &mut problems);
+        if let Some(wrong) = problems.remove(&judge_name).filter(|wrong| !wrong.0.is_empty()) {
+            found.entry(stage.name.clone()).or_default().0.extend(wrong.0.into_iter().map(in_judge));
+            continue;
+        }
+        for (path, domain) in &sweep.space {
+            let Domain::Choice(values) = domain else { continue };
+            for (at, value) in values.iter().enumerate() {
+                let values = Values::from([(path.clone(), value.clone())]);
+                let Ok(settings) = with_values(&stage.settings, &values) else { continue };
+                all[i].settings = settings;
+                let mut problems = ByStage::new();
+                graph::check_agreement(&all, &mut problems);
+                if let Some((other, problem)) =
+                    problems.into_iter().find_map(|(name, wrong)| Some((name, wrong.0.into_iter().next()?)))
+                {
+                    let field = format!("sweep.space.{path}.choice[{at}]");
+                    let message = format!("with `{path}` at {value} stage `{other}` does not fit: {}", problem.message);
+                    found.entry(stage.name.clone()).or_default().add(&field, message, "");
+                }
+            }
+        }
+        all[i] = stage.clone();
+    }
+}
