@@ -16,7 +16,8 @@ use tokio::sync::Notify;
 
 use crate::event_count::{EventCount, lock};
 use crate::gang::endpoint::Endpoint;
-use crate::gang::mesh::{Busy, Halt, Mesh, MeshConfig};
+use crate::gang::member::{Busy, MeshConfig};
+use crate::gang::mesh::{Halt, Mesh};
 
 /// After a refused write, how long to wait for orders that explain it.
 const STALE_PATIENCE: Duration = Duration::from_secs(30);

@@ -18,7 +18,7 @@ use crate::assignments::{self, End, Shared};
 use crate::cache::{Bounds, Cache};
 use crate::client::Client;
 use crate::gang::endpoint::Endpoint;
-use crate::gang::mesh::Timing;
+use crate::gang::member::Timing;
 use crate::stage_thread::{self, Bench, Kinds};
 use crate::{failpoints, kinds, process};
 

@@ -30,7 +30,7 @@ use crate::cache::{Bounds, Cache};
 use crate::client::Client;
 use crate::event_count::lock;
 use crate::gang::endpoint::Endpoint;
-use crate::gang::mesh::Timing;
+use crate::gang::member::Timing;
 use crate::stage_thread::{self, Bench, Kinds};
 
 /// Long enough that no poll of a busy machine is given up in vain.

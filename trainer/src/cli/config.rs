@@ -4,7 +4,7 @@ use clap::{Args, Subcommand};
 use models::device::{self, DeviceInfo};
 use serde_json::Value;
 
-use super::PipelineArgs;
+use super::args::PipelineArgs;
 use crate::pipeline_file;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result, exit};

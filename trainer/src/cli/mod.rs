@@ -1,5 +1,6 @@
 //! Arguments, one type and one function per verb.
 
+mod args;
 mod config;
 mod generate;
 mod model;
@@ -15,8 +16,9 @@ use std::process::ExitCode;
 use access::ServerOptions;
 use clap::{Args, Parser, Subcommand};
 use protocol::StageName;
-use registry::{OpenError, Place, ReadStore};
+use registry::{OpenError, ReadStore};
 
+use self::args::{BlobArgs, PipelineArgs};
 use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result, exit};
@@ -80,16 +82,6 @@ enum WorkerVerb {
     List(remote::WorkersArgs),
 }
 
-/// A pipeline on the command line.
-#[derive(Debug, Clone, Args)]
-pub(crate) struct PipelineArgs {
-    /// The pipeline, a YAML file
-    pipeline: PathBuf,
-    /// Overrides a key, such as `stages.vae.lr=1e-4`; may be repeated
-    #[arg(long = "set", value_name = "KEY=VALUE")]
-    set: Vec<String>,
-}
-
 #[derive(Debug, Args)]
 struct RunArgs {
     #[command(flatten)]
@@ -111,15 +103,6 @@ struct RunArgs {
     /// How the result is printed
     #[arg(short, long, value_enum, default_value_t)]
     output: Output,
-}
-
-/// Where a store's blobs lie.
-#[derive(Debug, Args)]
-struct BlobArgs {
-    /// Where the blobs of a new store are to lie, which remembers it: another folder, s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or
-    /// az://CONTAINER/PREFIX; credentials come from AWS_*, GOOGLE_* or AZURE_* in the environment [default: in the store's folder]
-    #[arg(long, env = "STRIDE_BLOBS", value_name = "PLACE")]
-    blobs: Option<Place>,
 }
 
 #[derive(Debug, Args)]

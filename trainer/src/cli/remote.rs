@@ -7,7 +7,7 @@ use clap::Args;
 use protocol::StageName;
 use protocol::message::{RunState, RunView, Submit};
 
-use super::PipelineArgs;
+use super::args::PipelineArgs;
 use crate::client::{Client, Target};
 use crate::pipeline_file;
 use crate::print::{self, Output};

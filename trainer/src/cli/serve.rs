@@ -41,7 +41,7 @@ pub(crate) struct ServeArgs {
     #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR")]
     store: PathBuf,
     #[command(flatten)]
-    blobs: super::BlobArgs,
+    blobs: super::args::BlobArgs,
 }
 
 impl ServeArgs {

@@ -4,7 +4,7 @@
 //! motion is a function of (model, sentence, frames, sampler, seed).
 
 use std::rc::Rc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
 use checkpoint::Blobs;
@@ -19,7 +19,6 @@ use crate::context::StageError;
 use crate::generator::{self, Batch, Lap, MotionGenerator};
 use crate::length::Lengths;
 use crate::parts::{self, model_error};
-use crate::timing::Timing;
 
 /// Length of a motion when neither the user nor the model says: 6 seconds of HumanML3D, 9.6 of KIT-ML, near the mean length of their clips.
 pub const DEFAULT_FRAMES: usize = 120;
@@ -30,6 +29,24 @@ pub struct Generator {
     model: Box<dyn MotionGenerator>,
     lengths: Option<Lengths>,
     sampler: Option<Sampler>,
+}
+
+/// Where the time of one sentence went.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Timing {
+    /// Embedding the sentence.
+    pub text: Duration,
+    /// Drawing the latent.
+    pub sampling: Duration,
+    /// Decoding it, to features in the data's own scale.
+    pub decoding: Duration,
+}
+
+impl Timing {
+    /// All three.
+    pub fn total(&self) -> Duration {
+        self.text + self.sampling + self.decoding
+    }
 }
 
 /// A motion.

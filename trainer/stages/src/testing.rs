@@ -3,170 +3,24 @@
 //! What it promises is what [`context`](crate::context) promises, no more: sums along the fixed tree, one leader, verified
 //! blobs. Not its job: fences, leases, networks; the worker's own tests cover those.
 
+mod attempt;
 mod gang;
 
-use std::collections::{BTreeMap, HashMap};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use burn::tensor::Device;
-use checkpoint::{BlobError, Blobs};
+use checkpoint::Blobs as _;
 use protocol::message::StageTask;
 use protocol::stage::{CheckpointPolicy, Shape, StageSettings};
 use protocol::{Digest, Manifest, RunId, Seed, StageName};
 
-use crate::context::{AttemptContext, ContextError, Outcome, Part, StageError};
+use crate::context::{ContextError, Part, StageError};
 use crate::kinds;
 
 pub use crate::train::tree_sum;
+pub use attempt::{MemoryAttempt, MemoryBlobs, Ran, Told};
 pub use gang::{Body, Script};
-
-/// Locks, whether or not another thread panicked while it held the lock: the panic is reported where it happened.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
-}
-
-/// Blobs in memory.
-#[derive(Debug, Default)]
-pub struct MemoryBlobs {
-    blobs: Mutex<HashMap<Digest, Arc<[u8]>>>,
-}
-
-impl MemoryBlobs {
-    /// Bytes of all blobs together.
-    pub fn total_bytes(&self) -> usize {
-        lock(&self.blobs).values().map(|b| b.len()).sum()
-    }
-}
-
-impl Blobs for MemoryBlobs {
-    fn get(&self, digest: Digest) -> Result<Arc<[u8]>, BlobError> {
-        lock(&self.blobs).get(&digest).cloned().ok_or(BlobError::NotFound(digest))
-    }
-
-    fn put(&self, bytes: Vec<u8>) -> Result<Digest, BlobError> {
-        let digest = Digest::of(&bytes);
-        lock(&self.blobs).entry(digest).or_insert_with(|| bytes.into());
-        Ok(digest)
-    }
-}
-
-/// What an attempt told the world.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct Told {
-    /// Log lines.
-    pub log: Vec<String>,
-    /// Values by step: step, name, value.
-    pub records: Vec<(u64, String, f64)>,
-    /// The last progress: done, total, unit.
-    pub progress: Option<(u64, u64, String)>,
-}
-
-/// An attempt whose world is memory.
-#[derive(Debug)]
-pub struct MemoryAttempt {
-    task: StageTask,
-    device: Device,
-    blobs: Arc<MemoryBlobs>,
-    stop: Arc<AtomicBool>,
-    /// What it was told.
-    pub told: Told,
-}
-
-impl MemoryAttempt {
-    /// An attempt at `task` that computes on `device`.
-    pub fn new(task: StageTask, device: Device, blobs: Arc<MemoryBlobs>) -> Self {
-        Self { task, device, blobs, stop: Arc::default(), told: Told::default() }
-    }
-
-    /// Makes [`AttemptContext::interrupted`] true once set.
-    pub fn stop_switch(&self) -> Arc<AtomicBool> {
-        Arc::clone(&self.stop)
-    }
-}
-
-impl AttemptContext for MemoryAttempt {
-    fn task(&self) -> &StageTask {
-        &self.task
-    }
-
-    fn device(&self) -> Device {
-        self.device.clone()
-    }
-
-    fn blobs(&self) -> Arc<dyn Blobs> {
-        Arc::clone(&self.blobs) as Arc<dyn Blobs>
-    }
-
-    fn manifest(&self, digest: Digest) -> Result<Manifest, ContextError> {
-        let bytes = self.blobs.get(digest).map_err(|e| ContextError::Corrupt(e.to_string()))?;
-        serde_json::from_slice(&bytes).map_err(|e| ContextError::Corrupt(format!("manifest {digest}: {e}")))
-    }
-
-    fn put_manifest(&mut self, manifest: &Manifest) -> Result<Digest, ContextError> {
-        for (name, entry) in &manifest.files {
-            let blob = self.blobs.get(entry.digest);
-            let blob = blob.map_err(|e| ContextError::Corrupt(format!("file `{name}` of a manifest: {e}")))?;
-            if blob.len() as u64 != entry.bytes {
-                return Err(ContextError::Corrupt(format!(
-                    "file `{name}` has {} bytes, its manifest says {}",
-                    blob.len(),
-                    entry.bytes
-                )));
-            }
-        }
-        self.blobs.put(manifest.to_bytes()).map_err(|e| ContextError::Storage(e.to_string()))
-    }
-
-    fn progress(&mut self, done: u64, total: u64, unit: &str, _metrics: &[(&str, f64)]) {
-        self.told.progress = Some((done, total, unit.to_owned()));
-    }
-
-    fn record(&mut self, step: u64, metrics: &[(&str, f64)]) {
-        self.told.records.extend(metrics.iter().map(|(name, value)| (step, (*name).to_owned(), *value)));
-    }
-
-    fn log(&mut self, line: &str) {
-        self.told.log.push(line.to_owned());
-    }
-
-    fn interrupted(&self) -> bool {
-        self.stop.load(Ordering::Relaxed)
-    }
-}
-
-/// What a stage gave.
-#[derive(Debug, Clone)]
-pub struct Ran {
-    /// How it ended.
-    pub outcome: Outcome,
-    /// What it told: of a map stage its merge, of a gang its last leader.
-    pub told: Told,
-}
-
-impl Ran {
-    /// The output's manifest.
-    ///
-    /// # Panics
-    /// If the stage yielded.
-    pub fn output(&self) -> Digest {
-        match &self.outcome {
-            Outcome::Finished { output, .. } => *output,
-            Outcome::Yielded { at } => panic!("the stage yielded at step {at}"),
-        }
-    }
-
-    /// The final values.
-    ///
-    /// # Panics
-    /// If the stage yielded.
-    pub fn metrics(&self) -> &BTreeMap<String, f64> {
-        match &self.outcome {
-            Outcome::Finished { metrics, .. } => metrics,
-            Outcome::Yielded { at } => panic!("the stage yielded at step {at}"),
-        }
-    }
-}
 
 /// Runs stages one after the other, with what they make kept in memory.
 #[derive(Debug)]

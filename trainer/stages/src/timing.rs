@@ -15,26 +15,10 @@ use protocol::stage::{DataSynthetic, Sampler};
 use crate::context::StageError;
 use crate::generate::Generator;
 
+pub use crate::generate::Timing;
+
 /// Sentences of each model that are not counted.
 pub const WARM_UP: usize = 5;
-
-/// Where the time of one sentence went.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Timing {
-    /// Embedding the sentence.
-    pub text: Duration,
-    /// Drawing the latent.
-    pub sampling: Duration,
-    /// Decoding it, to features in the data's own scale.
-    pub decoding: Duration,
-}
-
-impl Timing {
-    /// All three.
-    pub fn total(&self) -> Duration {
-        self.text + self.sampling + self.decoding
-    }
-}
 
 /// What the times of many sentences come to, in seconds.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -13,16 +13,26 @@ use std::time::{Duration, Instant};
 
 use protocol::{Generation, TaskId};
 
-use super::handshake::{self, HandshakeError, Hurried};
-use super::mesh::{Mesh, Timing, spawn};
+use super::handshake::{self, HandshakeError, Hurried, Session};
+use super::member::{MeshConfig, Timing, spawn};
 use crate::event_count::lock;
+
+/// A gang of this process, as those see it who dial.
+pub(super) trait Gang: std::fmt::Debug + Send + Sync {
+    /// Which gang it is, and who belongs to it.
+    fn config(&self) -> &MeshConfig;
+    /// Whether nobody is let in any more.
+    fn is_closed(&self) -> bool;
+    /// Takes in a peer that has proved itself.
+    fn attach(self: Arc<Self>, rank: usize, stream: TcpStream, session: Session);
+}
 
 /// Where this process is dialled, for all its gangs.
 #[derive(Debug)]
 pub(crate) struct Endpoint {
     address: SocketAddr,
     pub(super) timing: Timing,
-    meshes: Mutex<HashMap<(TaskId, Generation), Weak<Mesh>>>,
+    gangs: Mutex<HashMap<(TaskId, Generation), Weak<dyn Gang>>>,
     strangers: Mutex<Strangers>,
 }
 
@@ -64,7 +74,7 @@ impl Endpoint {
     pub(crate) fn open(address: SocketAddr, timing: Timing) -> io::Result<Arc<Self>> {
         let listener = TcpListener::bind(address)?;
         let address = listener.local_addr()?;
-        let endpoint = Arc::new(Self { address, timing, meshes: Mutex::default(), strangers: Mutex::default() });
+        let endpoint = Arc::new(Self { address, timing, gangs: Mutex::default(), strangers: Mutex::default() });
         let weak = Arc::downgrade(&endpoint);
         spawn("gang-accept", move || accept(&weak, &listener));
         Ok(endpoint)
@@ -75,10 +85,10 @@ impl Endpoint {
         self.address
     }
 
-    pub(super) fn announce(&self, mesh: &Arc<Mesh>) {
-        let mut meshes = lock(&self.meshes);
-        meshes.retain(|_, mesh| mesh.strong_count() > 0);
-        meshes.insert((mesh.config.task.clone(), mesh.config.generation), Arc::downgrade(mesh));
+    pub(super) fn announce(&self, config: &MeshConfig, gang: Weak<dyn Gang>) {
+        let mut gangs = lock(&self.gangs);
+        gangs.retain(|_, gang| gang.strong_count() > 0);
+        gangs.insert((config.task.clone(), config.generation), gang);
     }
 
     fn welcome(&self, number: u64, stream: TcpStream, since: Instant) -> Result<(), HandshakeError> {
@@ -86,17 +96,18 @@ impl Endpoint {
         let dial = handshake::wanted(hurried)?;
         let unknown = || HandshakeError::Unknown { task: dial.task.clone(), generation: dial.generation };
         let key = (dial.task.clone(), dial.generation);
-        let mesh =
-            lock(&self.meshes).get(&key).and_then(Weak::upgrade).filter(|m| !m.is_closed()).ok_or_else(unknown)?;
-        if dial.to != mesh.config.rank || dial.from <= dial.to || dial.from >= mesh.size() {
+        let gang = lock(&self.gangs).get(&key).and_then(Weak::upgrade);
+        let gang = gang.filter(|gang| !gang.is_closed()).ok_or_else(unknown)?;
+        let config = gang.config();
+        if dial.to != config.rank || dial.from <= dial.to || dial.from >= config.members.len() {
             return Err(HandshakeError::Ranks { from: dial.from, to: dial.to });
         }
-        let session = handshake::accept(hurried, &dial, &mesh.config.secret)?;
+        let session = handshake::accept(hurried, &dial, &config.secret)?;
         // From here on it is a peer's, and stays when there are too many strangers.
         if !lock(&self.strangers).dismiss(number) {
             return Err(HandshakeError::Crowded);
         }
-        mesh.attach(dial.from, stream, session);
+        gang.attach(dial.from, stream, session);
         Ok(())
     }
 }

@@ -48,7 +48,7 @@ pub(crate) enum Kind {
     Proof = 3,
     /// Handshake: the proof is accepted.
     Welcome = 4,
-    /// Nothing new, but alive; `a` is what the sender is busy with ([`Phase`](super::mesh::Phase)).
+    /// Nothing new, but alive; `a` is what the sender is busy with ([`Phase`](super::member::Phase)).
     KeepAlive = 5,
     /// The sender is done with this generation; `step` is the generation it moves on to, 0 if it leaves the gang.
     Bye = 6,

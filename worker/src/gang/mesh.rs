@@ -10,86 +10,24 @@
 use std::collections::{BTreeSet, VecDeque};
 use std::io;
 use std::net::{Shutdown, TcpStream, ToSocketAddrs};
-use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, Weak};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use protocol::message::Member;
-use protocol::{Generation, TaskId, WorkerId};
+use protocol::{Generation, WorkerId};
 use tokio::sync::Notify;
 
-use super::endpoint::Endpoint;
+use super::endpoint::{Endpoint, Gang};
 use super::frame::{self, Frame, FrameError, Head, Kind, MAX_PAYLOAD, Seal};
 use super::handshake::{self, HandshakeError, Session};
 use super::link::{BLINK, Link, Writer};
+use super::member::{MeshConfig, Phase, Timing, spawn};
 use crate::event_count::{EventCount, lock};
 
 /// Frames of a state that are queued for a member that takes them more slowly than they come, each of a megabyte at most.
 const STATE_FRAMES: usize = 16;
-
-/// How patient members are with each other.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Timing {
-    /// A peer that is waited for and silent for so long is lost.
-    pub(crate) patience: Duration,
-    /// A sign of life goes out so often.
-    pub(crate) keep_alive: Duration,
-    /// A peer that shows signs of life but does not take its turn for so long is lost.
-    pub(crate) stall: Duration,
-    /// The same for a peer that has only begun: so long it may take to read its inputs, which it fetched before it became a member,
-    /// to initialise itself, and to take over a state.
-    pub(crate) start: Duration,
-    /// A peer at whose address nothing listens for so long is lost.
-    pub(crate) refused: Duration,
-}
-
-impl Default for Timing {
-    fn default() -> Self {
-        Self {
-            patience: Duration::from_secs(20),
-            keep_alive: Duration::from_secs(3),
-            stall: Duration::from_secs(30 * 60),
-            start: Duration::from_secs(5 * 60),
-            refused: Duration::from_secs(3),
-        }
-    }
-}
-
-/// What a member is busy with. It says so with its signs of life, for the others to know how long to wait for it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Phase {
-    /// Reads its inputs; was at no rendezvous of this attempt yet.
-    Starting,
-    /// Computes, or waits for others.
-    Working,
-    /// Saves or reports: as long as the coordinator takes.
-    Saving,
-}
-
-impl Phase {
-    fn read(number: u32) -> Self {
-        match number {
-            0 => Self::Starting,
-            2 => Self::Saving,
-            _ => Self::Working,
-        }
-    }
-}
-
-/// The phase of a member, which the stage sets and all meshes of the attempt tell.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct Busy(Arc<AtomicU8>);
-
-impl Busy {
-    pub(crate) fn set(&self, phase: Phase) {
-        self.0.store(phase as u8, Ordering::SeqCst);
-    }
-
-    pub(crate) fn phase(&self) -> Phase {
-        Phase::read(self.0.load(Ordering::SeqCst).into())
-    }
-}
 
 /// Why a wait ended without what was waited for.
 #[derive(Debug, Clone, PartialEq)]
@@ -125,18 +63,6 @@ struct Peer {
     phase: Phase,
 }
 
-/// All that a mesh needs to know.
-#[derive(Debug, Clone)]
-pub(crate) struct MeshConfig {
-    pub(crate) task: TaskId,
-    pub(crate) generation: Generation,
-    pub(crate) rank: usize,
-    pub(crate) members: Vec<Member>,
-    pub(crate) secret: String,
-    /// What this member tells the others about itself.
-    pub(crate) busy: Busy,
-}
-
 /// The connections of one generation.
 #[derive(Debug)]
 pub(crate) struct Mesh {
@@ -168,7 +94,8 @@ impl Mesh {
         let timing = endpoint.timing;
         let mesh = Arc::new(Self { config, timing, peers, event_count, wake, closed: AtomicBool::new(false) });
         if mesh.size() > 1 {
-            endpoint.announce(&mesh);
+            let gang: Arc<dyn Gang> = mesh.clone();
+            endpoint.announce(&mesh.config, Arc::downgrade(&gang));
             for rank in 0..mesh.config.rank {
                 let mesh = mesh.clone();
                 spawn("gang-dial", move || mesh.dial(rank));
@@ -241,7 +168,7 @@ impl Mesh {
         }
     }
 
-    pub(super) fn is_closed(&self) -> bool {
+    fn is_closed(&self) -> bool {
         self.closed.load(Ordering::SeqCst)
     }
 
@@ -335,7 +262,7 @@ impl Mesh {
     }
 
     /// Takes a connection whose other side has proved to be `rank`.
-    pub(super) fn attach(self: &Arc<Self>, rank: usize, stream: TcpStream, session: Session) {
+    fn attach(self: &Arc<Self>, rank: usize, stream: TcpStream, session: Session) {
         let Session { sends, receives } = session;
         let both = stream.try_clone().and_then(|reader| {
             // Signs of life come far more often than this; it only keeps a reader from outliving everything.
@@ -572,7 +499,16 @@ fn keep_alive(mesh: &Weak<Mesh>, timing: Timing) {
     }
 }
 
-pub(super) fn spawn(name: &str, work: impl FnOnce() + Send + 'static) {
-    // Without threads there is no worker either.
-    thread::Builder::new().name(name.to_owned()).stack_size(512 << 10).spawn(work).expect("a thread can be started");
+impl Gang for Mesh {
+    fn config(&self) -> &MeshConfig {
+        &self.config
+    }
+
+    fn is_closed(&self) -> bool {
+        self.is_closed()
+    }
+
+    fn attach(self: Arc<Self>, rank: usize, stream: TcpStream, session: Session) {
+        Self::attach(&self, rank, stream, session);
+    }
 }

@@ -5,6 +5,7 @@ pub(crate) mod exchange;
 mod frame;
 mod handshake;
 mod link;
+pub(crate) mod member;
 pub(crate) mod mesh;
 pub(crate) mod tree;
 

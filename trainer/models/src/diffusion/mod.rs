@@ -12,6 +12,7 @@ pub mod consistency;
 pub mod ddim;
 pub mod pcm;
 mod schedule;
+mod timesteps;
 
 pub use consistency::{Grid, LcmTimesteps, boundary, consistency, lcm_sample, lcm_timesteps};
 pub use ddim::{ddim_sample, ddim_timesteps};

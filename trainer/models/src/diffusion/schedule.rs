@@ -12,10 +12,9 @@
 use burn::tensor::Tensor;
 use protocol::stage::{Diffusion, NoiseSchedule, Prediction};
 
+pub use super::timesteps::TIMESTEPS;
+use super::timesteps::{ddim_previous, ddim_timesteps};
 use super::{affine, unzip};
-
-/// Timesteps of the published latent models.
-pub const TIMESTEPS: usize = 1000;
 
 /// A noise schedule, and what the network predicts along it.
 #[derive(Debug, Clone, PartialEq)]
@@ -207,7 +206,7 @@ impl Schedule {
             let at = |j: usize| (last * (steps - j) + steps / 2) / steps;
             return (0..steps).map(|j| (at(j), at(j + 1))).collect();
         }
-        super::ddim_timesteps(steps).into_iter().map(|t| (t, super::ddim::ddim_previous(steps, t))).collect()
+        ddim_timesteps(steps).into_iter().map(|t| (t, ddim_previous(steps, t))).collect()
     }
 }
 

@@ -3,6 +3,7 @@
 //! A model is opened from its artifact alone, by the generator that its manifest names; which parts there are and what they are is the
 //! generator's own matter. To add one: a file here that implements [`MotionGenerator`], and a line in the table of [`open`].
 
+mod interface;
 mod latent_diffusion;
 mod tokens;
 
@@ -13,91 +14,15 @@ use std::rc::Rc;
 use burn::tensor::Device;
 use checkpoint::Blobs;
 use checkpoint::model::Model;
-use motion::Stream;
-use protocol::stage::{DataFormat, Family, LatentShape, Sampler};
-use protocol::{Digest, Manifest};
+use protocol::Manifest;
+use protocol::stage::Sampler;
 
 use crate::context::StageError;
 use crate::parts::model_error;
-use crate::text::TextEncoder;
 
+pub use interface::{Batch, Lap, LatentGenerator, MotionGenerator, Seeds, Text};
 pub(crate) use latent_diffusion::NAME as LATENT_DIFFUSION;
 pub(crate) use tokens::{GeneratorMeta, MASKED_PREFIX, NAME as TOKENS, RESIDUAL_PREFIX};
-
-/// A caption as a generator wants it: what it asked its text encoder for.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Text {
-    /// The caption's one vector, or a vector for each of its tokens.
-    pub values: Vec<f32>,
-}
-
-/// The `k`-th stream of random numbers of motion `b` of a batch. Stream 0 is the noise that a motion starts from.
-pub type Seeds<'a> = dyn Fn(usize, usize) -> Stream + 'a;
-
-/// What motions are drawn for, one of each for every motion.
-#[derive(Clone, Copy)]
-pub struct Batch<'a> {
-    /// Captions.
-    pub texts: &'a [Rc<Text>],
-    /// Frames.
-    pub lengths: &'a [usize],
-    /// What keys the draws: motions depend on nothing else that is random.
-    pub seeds: &'a Seeds<'a>,
-}
-
-impl std::fmt::Debug for Batch<'_> {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Batch").field("lengths", &self.lengths).finish_non_exhaustive()
-    }
-}
-
-/// What has just been done, for whoever takes the time.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Lap {
-    /// The sampler is through.
-    Sampled,
-    /// What it drew is motion.
-    Decoded,
-}
-
-/// A model that is ready to draw motions.
-pub trait MotionGenerator: std::fmt::Debug {
-    /// The skeleton of its motions.
-    fn format(&self) -> DataFormat;
-
-    /// Frames of the longest motion that it draws.
-    fn longest(&self) -> usize;
-
-    /// What it was trained to do, and so which samplers it has.
-    fn family(&self) -> &Family;
-
-    /// What its captions are embedded with.
-    fn text(&self) -> &dyn TextEncoder;
-
-    /// Captions as it wants them.
-    fn embed(&self, captions: &[&str]) -> Result<Vec<Text>, StageError>;
-
-    /// A motion for each of the batch, feature rows `[frames, features]` in the data's own scale, of the length asked for unless the model
-    /// decides on its own. The lengths and the sampler are ones that it has; [`motions`] sees to that.
-    fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError>;
-
-    /// The way to its latents, if it draws motion from such.
-    fn latents(&self) -> Option<&dyn LatentGenerator> {
-        None
-    }
-}
-
-/// A generator that draws latents and decodes them.
-pub trait LatentGenerator {
-    /// The shape of a latent.
-    fn shape(&self) -> LatentShape;
-
-    /// The VAE whose latents they are.
-    fn vae(&self) -> Digest;
-
-    /// Latents `[batch, N, d]`.
-    fn sample(&self, texts: &[Rc<Text>], seeds: &Seeds<'_>, sampler: &Sampler) -> Result<Vec<f32>, StageError>;
-}
 
 /// Opens a generator with the parts of a model.
 type Open = fn(&Model, &dyn Blobs, &Device) -> Result<Box<dyn MotionGenerator>, StageError>;

@@ -12,7 +12,7 @@ use checkpoint::Blobs;
 use protocol::message::StageTask;
 use protocol::{Digest, Manifest};
 
-use super::{MemoryAttempt, Ran, Told, lock};
+use super::attempt::{MemoryAttempt, Ran, Told, lock};
 use crate::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Outcome, Rendezvous, StageError};
 use crate::train::tree_sum;
 
