@@ -1,7 +1,7 @@
 //! A coordinator and workers as processes of their own, as on several machines: `trainer serve` and `trainer worker join`.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File};
+use std::fs;
 use std::io::{self, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
@@ -318,10 +318,4 @@ impl Drop for Cluster {
 pub fn stage_of(view: &Value, stage: &str) -> Value {
     let stages = view["stages"].as_array().expect("`stages` is a list");
     stages.iter().find(|s| s["name"] == stage).unwrap_or_else(|| panic!("no stage {stage} in {view:#}")).clone()
-}
-
-/// Opens a log that is written on.
-pub(crate) fn append(path: &Path) -> File {
-    let file = fs::OpenOptions::new().create(true).append(true).open(path);
-    file.unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }

@@ -6,11 +6,12 @@
 pub mod cluster;
 pub mod disk;
 pub mod documented;
+pub mod imports;
 pub mod mounted;
 pub mod network;
 
 use std::collections::BTreeMap;
-use std::fs;
+use std::fs::{self, File};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -151,7 +152,7 @@ impl Running {
 
     /// Starts `command`, whose every word goes to the end of a file.
     pub fn logged(command: &mut Command, log: &Path) -> Self {
-        let file = cluster::append(log);
+        let file = append(log);
         let both = file.try_clone().expect("one file twice");
         let child = command.stdout(file).stderr(both).spawn().unwrap_or_else(|e| panic!("{command:?}: {e}"));
         Self { child, stdout: None, stderr: None, since: Instant::now() }
@@ -242,6 +243,12 @@ fn collect(mut pipe: impl Read + Send + 'static) -> JoinHandle<String> {
         drop(pipe.read_to_end(&mut bytes));
         String::from_utf8_lossy(&bytes).into_owned()
     })
+}
+
+/// Opens a log that is written on.
+pub(crate) fn append(path: &Path) -> File {
+    let file = fs::OpenOptions::new().create(true).append(true).open(path);
+    file.unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
 /// Sends a signal; a process that is gone already is fine.

@@ -1,9 +1,24 @@
-//! Dependencies point one way: the control plane builds without Burn, the training library without a database.
+//! Dependencies point one way: the control plane builds without Burn, the training library without a database, and no two files of a crate
+//! need each other.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 use std::process::Command;
 
+use cluster_tests::{Bench, imports};
 use serde_json::Value;
+
+/// What `cargo metadata` says of the workspace.
+fn metadata(options: &[&str]) -> Value {
+    let output = Command::new(env!("CARGO"))
+        .args(["metadata", "--format-version", "1", "--locked", "--offline"])
+        .args(options)
+        .current_dir(Bench::repository())
+        .output()
+        .expect("cargo metadata runs");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).expect("JSON")
+}
 
 fn closure(metadata: &Value) -> BTreeMap<String, BTreeSet<String>> {
     let nodes = metadata["resolve"]["nodes"].as_array().expect("nodes");
@@ -40,19 +55,11 @@ fn closure(metadata: &Value) -> BTreeMap<String, BTreeSet<String>> {
 
 #[test]
 fn dependencies_point_one_way() {
-    let root = cluster_tests::Bench::repository();
     // What this machine would build: other platforms' dependencies (wasm pulls in an async runtime) say nothing here.
     let version = Command::new("rustc").arg("-vV").output().expect("rustc -vV runs");
     let version = String::from_utf8_lossy(&version.stdout).into_owned();
     let host = version.lines().find_map(|line| line.strip_prefix("host: ")).expect("rustc names its host");
-    let output = Command::new(env!("CARGO"))
-        .args(["metadata", "--format-version", "1", "--locked", "--offline", "--filter-platform", host])
-        .current_dir(root)
-        .output()
-        .expect("cargo metadata runs");
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let metadata: Value = serde_json::from_slice(&output.stdout).expect("JSON");
-    let needs = closure(&metadata);
+    let needs = closure(&metadata(&["--filter-platform", host]));
 
     let never = |package: &str, forbidden: &[&str]| {
         for name in &needs[package] {
@@ -68,4 +75,23 @@ fn dependencies_point_one_way() {
     never("models", &["tokio", "sqlx", "axum", "reqwest", "registry", "checkpoint", "stages"]);
     never("stages", &["sqlx", "axum", "reqwest", "registry", "coordinator", "worker"]);
     never("worker", &["sqlx", "coordinator", "registry"]);
+}
+
+#[test]
+fn no_files_import_each_other_in_a_loop() {
+    let metadata = metadata(&["--no-deps"]);
+    let targets = metadata["packages"]
+        .as_array()
+        .expect("packages")
+        .iter()
+        .flat_map(|p| p["targets"].as_array().expect("targets"));
+    let roots = targets.filter(|target| target["kind"][0] == "lib" || target["kind"][0] == "bin");
+    let roots: Vec<&Path> = roots.map(|target| Path::new(target["src_path"].as_str().expect("src_path"))).collect();
+    assert!(roots.len() >= 11, "{roots:?}");
+    let loops: Vec<String> = roots.iter().flat_map(|root| imports::loops(root)).collect();
+    assert!(
+        loops.is_empty(),
+        "files that import each other are read as one; move what both need into a file of its own:\n{}",
+        loops.join("\n")
+    );
 }

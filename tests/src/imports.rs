@@ -1,0 +1,172 @@
+//! Which files of a crate import each other in a loop, read from their text as `rustfmt` leaves it.
+//!
+//! `mod x;` gives the tree of modules. Every path that begins with `crate`, `super`, `self` or a child module is followed through `use`
+//! declarations to the file that defines its item. Handing a name on (`pub use`) is not counted as using it, nor is anything behind
+//! `#[cfg(test)]`. Not seen: methods, names from a glob, modules written inside a file, what a macro writes.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+type Names = Vec<String>;
+
+/// The files that each file needs, with an item that it takes from there.
+type Needs = BTreeMap<PathBuf, BTreeMap<PathBuf, String>>;
+
+#[derive(Debug)]
+struct Module {
+    file: PathBuf,
+    /// What a `use` calls something, and the path that the name stands for.
+    names: BTreeMap<String, Names>,
+    /// The paths that are used in it.
+    paths: Vec<Names>,
+}
+
+/// The imports that close loops in the crate whose root is `root` (`lib.rs` or `main.rs`), each as `FILE -> FILE: NAME`.
+///
+/// # Panics
+///
+/// If a file of the crate cannot be read.
+pub fn loops(root: &Path) -> Vec<String> {
+    let mut modules = BTreeMap::new();
+    read(&mut modules, root, &[], &root.with_file_name(""));
+    let mut needs = Needs::new();
+    for (at, module) in &modules {
+        let items = module.paths.iter().filter_map(|path| item(&modules, at, path, 0));
+        for (file, name) in items.filter(|(file, _)| *file != module.file) {
+            needs.entry(module.file.clone()).or_default().insert(file, name);
+        }
+    }
+    let imports = needs.iter().flat_map(|(from, all)| all.iter().map(move |(to, name)| (from, to, name)));
+    let closing = imports.filter(|(from, to, _)| reached(&needs, to).contains(from));
+    closing.map(|(from, to, name)| format!("{} -> {}: {name}", from.display(), to.display())).collect()
+}
+
+/// All files that `from` needs, directly or not.
+fn reached<'a>(needs: &'a Needs, from: &'a PathBuf) -> BTreeSet<&'a PathBuf> {
+    let (mut seen, mut next) = (BTreeSet::new(), vec![from]);
+    while let Some(file) = next.pop() {
+        next.extend(needs.get(file).into_iter().flat_map(BTreeMap::keys).filter(|to| seen.insert(*to)));
+    }
+    seen
+}
+
+/// Reads the file of the module `at`, and those of its child modules, which lie in `folder`.
+fn read(modules: &mut BTreeMap<Names, Module>, file: &Path, at: &[String], folder: &Path) {
+    let text = fs::read_to_string(file).unwrap_or_else(|e| panic!("{}: {e}", file.display()));
+    let mut module = Module { file: file.to_owned(), names: BTreeMap::new(), paths: Vec::new() };
+    let mut children = Names::new();
+    let mut lines = text.lines().filter(|line| !line.trim_start().starts_with("//"));
+    while let Some(line) = lines.next() {
+        let (code, indent) = (line.trim_start(), line.len() - line.trim_start().len());
+        let ends = |line: &str| line.len() - line.trim_start().len() == indent && line.ends_with(['}', ';']);
+        let bare = code.strip_prefix("pub").map_or(code, |rest| rest.trim_start_matches(|c| c != ' ').trim_start());
+        if code == "#[cfg(test)]" || (bare.starts_with("mod ") && bare.ends_with('{')) {
+            lines.find(|line| ends(line));
+        } else if let Some(name) = bare.strip_prefix("mod ").and_then(|rest| rest.strip_suffix(';')) {
+            children.push(name.to_owned());
+        } else if let Some(tree) = bare.strip_prefix("use ") {
+            let mut tree = tree.to_owned();
+            while !tree.ends_with(';') {
+                tree.push_str(lines.next().expect("a `use` ends with `;`").trim());
+            }
+            let mut paths = Vec::new();
+            unfold(tree.trim_end_matches(';'), &[], &mut paths);
+            for (path, name) in paths {
+                if bare == code {
+                    module.paths.push(path.clone());
+                }
+                module.names.insert(name, path);
+            }
+        } else {
+            let words = code.split(|c: char| !(c.is_alphanumeric() || "_:".contains(c)));
+            let paths = words.filter(|word| word.contains("::"));
+            module.paths.extend(paths.map(|path| path.split("::").map(str::to_owned).collect::<Names>()));
+        }
+    }
+    modules.insert(at.to_vec(), module);
+    for name in children {
+        let (flat, beneath) = (folder.join(format!("{name}.rs")), folder.join(&name));
+        let file = if flat.is_file() { flat } else { beneath.join("mod.rs") };
+        read(modules, &file, &[at, &[name]].concat(), &beneath);
+    }
+}
+
+/// The paths of a `use` tree below `prefix`, each with the name that it brings.
+fn unfold(tree: &str, prefix: &[String], paths: &mut Vec<(Names, String)>) {
+    let tree = tree.trim();
+    if let Some((head, rest)) = tree.split_once('{') {
+        let prefix: Names = prefix.iter().cloned().chain(head.split_terminator("::").map(str::to_owned)).collect();
+        let (mut depth, mut begun) = (0, 0);
+        for (i, c) in rest.char_indices() {
+            match c {
+                '{' => depth += 1,
+                ',' | '}' if depth == 0 => {
+                    unfold(&rest[begun..i], &prefix, paths);
+                    begun = i + 1;
+                }
+                '}' => depth -= 1,
+                _ => {}
+            }
+        }
+    } else if !tree.is_empty() && !tree.ends_with('*') {
+        let (path, alias) = tree.split_once(" as ").map_or((tree, None), |(path, alias)| (path, Some(alias)));
+        let mut path: Names = prefix.iter().cloned().chain(path.split("::").map(str::to_owned)).collect();
+        path.pop_if(|last| last == "self");
+        let name = alias.map(str::to_owned).or_else(|| path.last().cloned()).unwrap_or_default();
+        paths.push((path, name));
+    }
+}
+
+/// The file that defines the item that `path` names in the module `at`, and the item's name. `None` for what is not of this crate.
+fn item(modules: &BTreeMap<Names, Module>, at: &[String], path: &[String], depth: usize) -> Option<(PathBuf, String)> {
+    let mut module = at.to_vec();
+    for (i, word) in path.iter().enumerate() {
+        let child = [module.as_slice(), std::slice::from_ref(word)].concat();
+        match word.as_str() {
+            "crate" => module.clear(),
+            "self" => {}
+            "super" => drop(module.pop()?),
+            _ if modules.contains_key(&child) => module = child,
+            name => {
+                let here = &modules[&module];
+                return match here.names.get(name) {
+                    Some(stands_for) if depth < 16 => {
+                        item(modules, &module, &[stands_for, &path[i + 1..]].concat(), depth + 1)
+                    }
+                    // A path that begins with a name that nothing here has is another crate's.
+                    _ => (i > 0).then(|| (here.file.clone(), name.to_owned())),
+                };
+            }
+        }
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn loops_are_found_through_what_hands_names_on() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let file = |name: &str, text: &str| {
+            let path = dir.path().join(name);
+            fs::create_dir_all(path.parent().expect("a folder")).expect("a folder");
+            fs::write(path, text).expect("a file");
+        };
+        file("lib.rs", "mod a;\nmod b;\nmod c;\npub use a::Apple;\n");
+        file("a.rs", "use crate::b::{self, nested::Deep as D};\npub struct Apple;\n");
+        file("b/mod.rs", "pub mod nested;\n#[cfg(test)]\nmod tests {\n    use crate::c::C;\n}\n");
+        file("b/nested.rs", "pub struct Deep;\n");
+        file("c.rs", "fn f() -> u8 {\n    crate::b::nested::make();\n    super::Apple::new()\n}\n");
+        let root = dir.path().join("lib.rs");
+        assert!(loops(&root).is_empty(), "{:?}", loops(&root));
+        file("b/nested.rs", "use std::fs;\nuse crate::Apple;\npub struct Deep;\n");
+        let found = loops(&root);
+        assert!(
+            found.len() == 2 && found[0].ends_with("nested.rs: Deep") && found[1].ends_with("a.rs: Apple"),
+            "{found:?}"
+        );
+    }
+}
