@@ -13,7 +13,6 @@ use serde::{Deserialize, Serialize};
 pub struct Point {
     /// After which step.
     pub step: u64,
-    /// The value.
     #[serde(deserialize_with = "null_is_nan")]
     pub value: f64,
 }

@@ -28,7 +28,6 @@ pub enum WriteError {
     /// Somebody else holds the task now.
     #[error("stale fence: task `{task}` is at fence {current}, the write carries {carried}")]
     StaleFence {
-        /// The task.
         task: TaskId,
         /// The fence in the store.
         current: Fence,

@@ -22,7 +22,6 @@ pub struct Forgotten {
     pub values: u64,
     /// Log lines.
     pub lines: u64,
-    /// Checkpoints.
     pub checkpoints: u64,
     /// Values of stages; their artifacts are collected next.
     pub results: u64,

@@ -8,7 +8,7 @@
 //! was there. Without this an emptied database file would be a new store in which nothing needs any blob.
 //!
 //! Blobs in a bucket can be reached by two copies of a database, each of which would collect what only the other needs. So
-//! the marker also holds the database's epoch, the number of its openings; whoever opens the store raises both, the marker by
+//! the marker also holds the database's epoch, the number of its openings; opening the store raises both, the marker by
 //! a compare-and-set. A database that was opened less often than the marker says is a copy, and a holder whose epoch the marker
 //! has left behind collects nothing.
 //!
@@ -54,7 +54,6 @@ pub enum Mismatch {
     /// The blobs are missing.
     #[error("the blobs of the database `{}` are missing: `{marker}` does not exist", database.display())]
     NoBlobs {
-        /// The database.
         database: PathBuf,
         /// Where the marker should be that stands beside the blobs.
         marker: String,
@@ -78,7 +77,6 @@ pub enum Mismatch {
         database.display()
     )]
     WentBack {
-        /// The database.
         database: PathBuf,
         /// Transactions in it.
         found: u64,
@@ -92,7 +90,6 @@ pub enum Mismatch {
         database.display()
     )]
     Copied {
-        /// The database.
         database: PathBuf,
         /// How often it was opened.
         found: u64,

@@ -94,7 +94,7 @@ pub(crate) fn holder(path: &Path) -> io::Result<Option<Holder>> {
     }
 }
 
-/// Kept by whoever collects, alone, and by those who copy what a collection could take from under them.
+/// Kept by a process that collects, alone, and by those who copy what a collection could take from under them.
 #[derive(Debug)]
 pub(crate) struct CollectionLock(#[expect(dead_code, reason = "the lock lasts as long as the file is open")] File);
 

@@ -90,7 +90,7 @@ pub enum OpenError {
         /// The newest that this build knows.
         known: i64,
     },
-    /// An older build made it, and whoever only reads does not change it.
+    /// An older build made it, and a process that only reads does not change it.
     #[error("database `{}` has schema {found}, this build reads {known}", path.display())]
     OlderSchema {
         /// The database.

@@ -343,7 +343,7 @@ impl Store {
     }
 }
 
-/// Takes the folder from everybody but its user; whoever cannot reach it reaches nothing in it. A folder of somebody else, or
+/// Takes the folder from everybody but its user; one who cannot reach it reaches nothing in it. A folder of somebody else, or
 /// of a group that was let in by hand, stays as it is.
 fn close_to_others(dir: &Path) -> io::Result<()> {
     let metadata = fs::metadata(dir)?;

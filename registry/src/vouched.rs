@@ -45,7 +45,7 @@ impl Named {
         *self.lock() = None;
     }
 
-    /// Notes what a row is about to name. To be called before it is checked that the blob is there: whoever finds it there
+    /// Notes what a row is about to name. To be called before it is checked that the blob is there: one who finds it there
     /// keeps it.
     pub(crate) fn note(&self, digests: impl IntoIterator<Item = Digest>) {
         if let Some(named) = &mut *self.lock() {

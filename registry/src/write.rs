@@ -29,7 +29,6 @@ pub enum Write {
     },
     /// Sets a task's fence; it must be larger than the one stored.
     Fence {
-        /// The task.
         task: TaskId,
         /// Its new fence.
         fence: Fence,
@@ -81,7 +80,6 @@ pub enum Write {
     Metrics {
         /// Checked.
         grant: Grant,
-        /// Rows.
         rows: Vec<MetricRow>,
     },
     /// Log lines; stored once per (task, attempt, worker, line number).
@@ -90,7 +88,6 @@ pub enum Write {
         grant: Grant,
         /// Number of the first line.
         first: u64,
-        /// Lines.
         lines: Vec<String>,
     },
     /// Makes a manifest whose blobs are stored the task's newest checkpoint.
@@ -99,7 +96,6 @@ pub enum Write {
         grant: Grant,
         /// Steps applied.
         step: u64,
-        /// The manifest.
         manifest: Digest,
         /// Values that retention may rank by.
         metrics: BTreeMap<String, f64>,
@@ -122,7 +118,6 @@ pub enum Write {
         run: RunId,
         /// Which stage.
         stage: StageName,
-        /// Its kind.
         kind: String,
         /// Outputs by name.
         outputs: BTreeMap<String, Digest>,
@@ -135,7 +130,6 @@ pub enum Write {
     },
     /// A model version. Registering the same artifact for the same model again adds its metrics and makes no new version.
     Version {
-        /// Model.
         model: ModelName,
         /// What is registered: a manifest of kind `model`.
         artifact: Digest,
@@ -146,9 +140,7 @@ pub enum Write {
     },
     /// Moves an alias to the version of `artifact`, and logs it.
     Promote {
-        /// Model.
         model: ModelName,
-        /// Alias.
         alias: Alias,
         /// The registered artifact.
         artifact: Digest,

@@ -221,7 +221,7 @@ async fn no_store_is_made_among_other_files() {
     drop(open(&store).await);
 }
 
-/// Whoever opened a store before cannot write to it any more, even if the file lock did not keep the second one out.
+/// A process that opened a store before cannot write to it any more, even if the file lock did not keep the second one out.
 #[tokio::test]
 async fn the_second_to_open_fences_the_first() {
     let dir = tempfile::tempdir().unwrap();

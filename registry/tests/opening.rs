@@ -1,4 +1,4 @@
-//! Opening a store: who may, what is refused and why, and reading beside whoever holds it.
+//! Opening a store: who may, what is refused and why, and reading beside its holder.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;
@@ -81,7 +81,7 @@ async fn p16_a_newer_schema_is_refused() {
     assert!(matches!(error, OpenError::NewerSchema { found: 9999, .. }), "{error}");
 }
 
-/// A folder that the kernel refuses to write to, whoever asks.
+/// A folder that the kernel refuses to write to, even for root.
 #[cfg(target_os = "linux")]
 #[tokio::test]
 async fn a_read_only_place_is_refused_as_such() {

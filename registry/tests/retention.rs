@@ -164,7 +164,7 @@ async fn what_no_row_names_yet_stays_as_long_as_somebody_may_name_it() {
     assert_eq!(store.gc(-1000).await.unwrap().remove.len(), 3);
 }
 
-/// Whoever puts a blob has time to name it, however often a collection comes in between.
+/// The writer of a blob has time to name it, however often a collection comes in between.
 #[tokio::test]
 async fn a_fresh_blob_outlives_a_collection_with_the_usual_grace() {
     let dir = tempfile::tempdir().unwrap();

@@ -101,7 +101,7 @@ enum Step {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
 
-    /// However grants and writes interleave, and whoever writes late: what is stored was written under the fence that was
+    /// However grants and writes interleave, and no matter who writes late: what is stored was written under the fence that was
     /// the newest at that point of the one order in which the store took them. Sampled:
     /// 24 random interleavings of up to 40 grants and writes.
     #[test]

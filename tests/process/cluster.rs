@@ -373,7 +373,7 @@ fn p14_pause_resume_cancel_and_sigterm_end_with_saved_work() {
     cluster.signal("w2", Signal::SIGTERM);
     assert_eq!(cluster.ended("w2"), Some(0));
     let before = at(&cluster);
-    // The last one leaves: it saves, and whoever comes goes on.
+    // The last one leaves: it saves, and the next one to come goes on.
     cluster.signal("w1", Signal::SIGTERM);
     assert_eq!(cluster.ended("w1"), Some(0));
     cluster.join("w3");

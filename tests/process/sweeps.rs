@@ -1,4 +1,4 @@
-//! Promise 19: a sweep decides the same whoever works on it and whoever is killed, and its best trial is the stage with the trial's values.
+//! Promise 19: a sweep decides the same no matter which workers it has and which processes are killed, and its best trial is the stage with the trial's values.
 
 use std::collections::BTreeSet;
 

@@ -82,7 +82,7 @@ impl Disk {
         }
     }
 
-    /// Every write waits from now on, and so does whoever asked for it: such a process takes no signal, not even `SIGKILL`.
+    /// Every write waits from now on, and so does the process that asked for it: such a process takes no signal, not even `SIGKILL`.
     pub fn pause(&mut self) {
         tool("fsfreeze", &["-f"], &self.root()).unwrap_or_else(|e| panic!("{e}"));
         self.frozen = true;

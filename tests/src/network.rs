@@ -120,7 +120,7 @@ impl SlowLine {
         let shared = rate.clone();
         thread::spawn(move || {
             for client in listener.incoming().flatten() {
-                // Whoever calls while the server is away finds the connection closed.
+                // A caller that comes while the server is away finds the connection closed.
                 let Ok(server) = TcpStream::connect(server) else { continue };
                 let (there, back) = (pair(&client, &server), pair(&server, &client));
                 let rate = shared.clone();

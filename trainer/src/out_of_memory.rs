@@ -1,7 +1,7 @@
 //! Whether a worker died for want of memory.
 //!
 //! Such a death is final: the next try would need as much. It is known in two cases. The worker was aborted because an allocation was
-//! refused, which its log says; or it was killed, and the kernel's count of kills for want of memory has just risen. Only whoever started
+//! refused, which its log says; or it was killed, and the kernel's count of kills for want of memory has just risen. Only the process that started
 //! the process can tell; a worker on another machine that dies so is a lost worker like any other.
 
 use std::fs;

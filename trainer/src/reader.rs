@@ -1,4 +1,4 @@
-//! Commands that only read ask whoever knows best: the server that is named, the coordinator that holds the store, or, where nobody
+//! Commands that only read ask the best source: the server that is named, the coordinator that holds the store, or, where nobody
 //! holds it, the store itself. They start nothing and leave the store as it is.
 
 use coordinator::{Records, WorkerView};

@@ -21,7 +21,7 @@ use crate::{client, pipeline_file};
 
 /// How often workers and progress are looked at.
 const BEAT: Duration = Duration::from_millis(200);
-/// How long winding down may take before workers are ended.
+/// How long draining may take before workers are ended.
 const PATIENCE: Duration = Duration::from_secs(45);
 
 /// What to run, and how.
@@ -38,9 +38,9 @@ pub(crate) struct Options {
 
 /// A pipeline, or a run of the store to take up again.
 #[derive(Debug)]
-pub(crate) enum Work {
-    Pipeline { file: Box<PipelineFile>, until: Option<StageName> },
-    Run(RunId),
+pub(crate) enum Request {
+    Submit { file: Box<PipelineFile>, until: Option<StageName> },
+    Resume(RunId),
 }
 
 /// Ctrl-C and SIGTERM.
@@ -72,26 +72,26 @@ enum End {
 }
 
 /// Runs to the end and gives the exit code.
-pub(crate) async fn run(work: Work, options: Options) -> Result<u8> {
+pub(crate) async fn run(request: Request, options: Options) -> Result<u8> {
     let mut stop = Stop::new()?;
     if options.workers == Some(0) {
         return Err(Problem::usage("`--workers` is 0; expected at least 1").hint("leave it out for one a core"));
     }
-    if let Work::Pipeline { file, until } = &work {
+    if let Request::Submit { file, until } = &request {
         pipeline_file::check_stage(&file.pipeline, until.as_ref())?;
         pipeline_file::check_data(&file.pipeline, &options.store)?;
     }
     let holder = Holder::this_process(&*options.command);
-    let store = match &work {
-        Work::Pipeline { .. } => Store::open_with(&options.store, options.blobs.as_ref(), holder).await?,
-        Work::Run(_) => Store::open_existing(&options.store, holder).await?,
+    let store = match &request {
+        Request::Submit { .. } => Store::open_with(&options.store, options.blobs.as_ref(), holder).await?,
+        Request::Resume(_) => Store::open_existing(&options.store, holder).await?,
     };
     let dir = store.dir().to_owned();
     raise_descriptor_limit();
     let handle = Coordinator::start(store.clone(), Config::embedded()).await?;
     let _announced = client::announce(&store, &handle)?;
 
-    let (run, pipeline) = begin(&handle, &store, work).await?;
+    let (run, pipeline) = begin(&handle, &store, request).await?;
     pipeline_file::remember_data(&pipeline, &dir);
     let bars = options.output == Output::Table && print::on_terminal();
     let mut progress = Progress::new(bars);
@@ -110,15 +110,15 @@ pub(crate) async fn run(work: Work, options: Options) -> Result<u8> {
     Ok(report(&view, &pipeline, &end, &options))
 }
 
-async fn begin(handle: &Handle, store: &Store, work: Work) -> Result<(RunId, Pipeline)> {
-    match work {
-        Work::Pipeline { file, until } => {
+async fn begin(handle: &Handle, store: &Store, request: Request) -> Result<(RunId, Pipeline)> {
+    match request {
+        Request::Submit { file, until } => {
             let PipelineFile { pipeline, source } = *file;
             let json = serde_json::to_value(&pipeline).map_err(|error| Problem::new(exit::FAULT, error))?;
             let run = handle.submit(Submit { pipeline: json, source, idempotency_key: None, until }).await?;
             Ok((run, pipeline))
         }
-        Work::Run(run) => {
+        Request::Resume(run) => {
             let row = store.run(&run).await?.ok_or_else(|| {
                 Problem::new(exit::NOT_FOUND, anyhow::anyhow!("there is no run `{run}` in this store"))
                     .hint("`trainer status --all` lists runs")

@@ -93,7 +93,7 @@ pub fn init_logging() {
 /// Works for a coordinator until that says to leave or the process is asked to end.
 ///
 /// To be called from `main` before other threads are started, after [`tune_allocator`](process::tune_allocator).
-/// SIGTERM, and SIGINT unless a parent takes care of it, winds down: what runs saves a checkpoint and is released. If that is not over
+/// SIGTERM, and SIGINT unless a parent takes care of it, drains it: what runs saves a checkpoint and is released. If that is not over
 /// after [`Options::leave_within`], be it that no coordinator is there to take the checkpoint, the process ends as it is with exit code 1:
 /// what was acknowledged is stored, and the task goes on from there.
 pub fn join(options: Options) -> Result<(), JoinError> {
@@ -219,7 +219,7 @@ fn watch_signals(shared: Arc<Shared>, owned: bool, leave_within: Duration) -> st
                 }
             }
             if !shared.is_leaving() {
-                tracing::info!("winding down: what runs is saved and released");
+                tracing::info!("draining: what runs is saved and released");
                 shared.leave();
                 // A thread, so that nothing that waits on the runtime or for the coordinator puts it off.
                 thread::spawn(move || {

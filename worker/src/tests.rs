@@ -474,7 +474,7 @@ fn finished(context: &mut dyn GangContext) -> Result<Outcome, StageError> {
     Ok(Outcome::Finished { output, metrics: BTreeMap::from([("loss".to_owned(), 0.5)]) })
 }
 
-/// Trains `steps` steps as a gang of whoever there is; a checkpoint every tenth.
+/// Trains `steps` steps as a gang of the workers that there are; a checkpoint every tenth.
 fn train(context: &mut dyn GangContext, steps: u64, pause: Duration) -> Result<Outcome, StageError> {
     context.rendezvous(None, &[])?;
     let mut step = 0;

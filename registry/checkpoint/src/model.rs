@@ -2,7 +2,7 @@
 //!
 //! A part is an artifact by itself, in a role: a denoiser, the VAE whose latents it makes, the text encoder that it was trained with. The
 //! model's manifest lists the files of all its parts, each in a folder of its role, with the part's own manifest beside them:
-//! `denoiser/manifest.json`, `denoiser/model.safetensors`, `vae/manifest.json`. So whoever keeps, checks, copies or removes artifacts needs
+//! `denoiser/manifest.json`, `denoiser/model.safetensors`, `vae/manifest.json`. So what keeps, checks, copies or removes artifacts needs
 //! to know nothing of models, and weights that ten students share are stored once.
 //!
 //! Meta: `generator`, which names what draws; `format`, the skeleton of its motions; `parts`, role to the digest of the part's manifest;

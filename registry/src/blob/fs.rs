@@ -145,7 +145,7 @@ impl Backend for Folder {
         let touch = || -> io::Result<()> {
             let mut file = self.0.disk.open(&path)?;
             file.set_modified(SystemTime::now())?;
-            // Whoever wrote it may have been killed between the rename and the sync.
+            // Its writer may have been killed between the rename and the sync.
             file.sync()?;
             self.0.disk.sync_dir(path.parent().unwrap_or(&self.0.blobs))
         };

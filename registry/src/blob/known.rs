@@ -2,7 +2,7 @@
 //!
 //! A stamp changes with every write to a blob, so what was found holds until then; it spares a run the hashing of gigabytes at
 //! each start. The file `verified` is a cache: each line is a digest and a stamp, a line that does not read is skipped, and
-//! the file may be deleted. Bytes that rot without a write keep their stamp; they are noticed by whoever reads them, for
+//! the file may be deleted. Bytes that rot without a write keep their stamp; they are noticed by their next reader, for
 //! every read hashes.
 
 use std::collections::HashMap;

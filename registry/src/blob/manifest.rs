@@ -37,7 +37,6 @@ pub enum ManifestError {
         digest: Digest,
         /// The file's name in it.
         file: String,
-        /// The blob.
         blob: Digest,
         /// Bytes by the manifest.
         expected: u64,

@@ -12,10 +12,10 @@ use crate::clock;
 
 /// Blobs in memory.
 #[derive(Debug, Default)]
-pub struct Memory(Arc<Mutex<Held>>);
+pub struct Memory(Arc<Mutex<Contents>>);
 
 #[derive(Debug, Default)]
-struct Held {
+struct Contents {
     blobs: HashMap<Digest, Blob>,
     aside: Vec<String>,
     marker: Option<String>,
@@ -37,7 +37,7 @@ impl Blob {
 }
 
 impl Memory {
-    fn lock(&self) -> MutexGuard<'_, Held> {
+    fn lock(&self) -> MutexGuard<'_, Contents> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -128,7 +128,7 @@ impl Backend for Memory {
 #[derive(Debug)]
 struct StagedBytes {
     bytes: Vec<u8>,
-    memory: Arc<Mutex<Held>>,
+    memory: Arc<Mutex<Contents>>,
 }
 
 impl Staged for StagedBytes {

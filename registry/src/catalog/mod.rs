@@ -192,7 +192,6 @@ pub enum Order {
 /// A promotion to be made.
 #[derive(Debug, Clone)]
 pub struct PromoteOrder {
-    /// The model.
     pub model: ModelName,
     /// The alias that moves.
     pub alias: Alias,
@@ -211,7 +210,6 @@ pub struct PromoteOrder {
 /// A rollback to be made.
 #[derive(Debug, Clone)]
 pub struct RollbackOrder {
-    /// The model.
     pub model: ModelName,
     /// The alias that moves.
     pub alias: Alias,

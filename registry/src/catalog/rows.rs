@@ -52,7 +52,6 @@ pub struct StageResultRow {
     pub run: RunId,
     /// Which stage.
     pub stage: StageName,
-    /// Its kind.
     pub kind: String,
     /// Outputs by name.
     pub outputs: BTreeMap<String, Digest>,
@@ -69,13 +68,11 @@ pub struct StageResultRow {
 /// A committed checkpoint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CheckpointRow {
-    /// The task.
     pub task: TaskId,
     /// Which attempt saved it.
     pub attempt: Attempt,
     /// Steps applied.
     pub step: u64,
-    /// The manifest.
     pub manifest: Digest,
     /// Values that retention may rank by.
     pub metrics: BTreeMap<String, f64>,
@@ -88,7 +85,6 @@ pub struct CheckpointRow {
 pub struct LogRow {
     /// Grows; ask for what comes after the last one seen.
     pub id: i64,
-    /// The task.
     pub task: TaskId,
     /// The try.
     pub attempt: Attempt,

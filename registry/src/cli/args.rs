@@ -156,7 +156,7 @@ pub enum Verb {
 /// What a verb comes to.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Asked {
-    /// A command for whoever holds the store.
+    /// A command for the holder of the store.
     Command(Command),
     /// Something that ends in this machine's files.
     Export { model: String, dir: PathBuf },

@@ -41,7 +41,6 @@ pub enum Command {
     },
     /// The moves of a model's aliases.
     History {
-        /// The model.
         model: String,
         /// Only of this alias.
         alias: Option<String>,
@@ -61,9 +60,7 @@ pub enum Command {
     },
     /// Moves an alias back.
     Rollback {
-        /// The model.
         model: String,
-        /// The alias.
         alias: String,
         /// To this version; otherwise to the one before the last promotion.
         to: Option<u64>,

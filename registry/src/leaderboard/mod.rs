@@ -116,7 +116,6 @@ pub enum Verdict {
 /// One metric of two rows.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Difference {
-    /// The metric.
     pub metric: String,
     /// Of the left one.
     pub left: Option<Measure>,

@@ -125,7 +125,7 @@ async fn name(path: &Path, conn: &mut SqliteConnection) -> Result<StoreId, OpenE
     Ok(id)
 }
 
-/// Raises the database's epoch: from here on whoever opened it before cannot write to it.
+/// Raises the database's epoch: from here on a process that opened it before cannot write to it.
 pub(crate) async fn raise_epoch(dir: &Path, conn: &mut SqliteConnection) -> Result<Stored, OpenError> {
     let failed = |e: &sqlx::Error| open_error(&folder::database(dir), e);
     let raise = "UPDATE store SET epoch = epoch + 1, commits = commits + 1";

@@ -66,7 +66,7 @@ impl Writer {
 }
 
 impl Drop for Writer {
-    /// Waits for the last commit, so that whoever opens the store next finds it free and whole.
+    /// Waits for the last commit, so that the next process to open the store finds it free and whole.
     fn drop(&mut self) {
         self.queue = None;
         if let Some(thread) = self.thread.take() {

@@ -44,7 +44,6 @@ pub struct Model {
 /// A registered artifact. Never edited, except that metrics are added.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Version {
-    /// The model.
     pub model: ModelName,
     /// Its number, from 1.
     pub version: u64,
@@ -77,9 +76,7 @@ pub struct Promotion {
     pub id: i64,
     /// When, in milliseconds since 1970.
     pub at_ms: i64,
-    /// The model.
     pub model: ModelName,
-    /// The alias.
     pub alias: Alias,
     /// Which way.
     pub action: Action,
@@ -142,7 +139,6 @@ impl fmt::Display for Expect {
 /// How users point at a model version: `quickstart@staging`, `quickstart@best`, `quickstart:3`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ModelRef {
-    /// The model.
     pub model: ModelName,
     /// Which of its versions; `None` means the model as a whole.
     pub pick: Option<Pick>,

@@ -44,7 +44,7 @@ impl fmt::Display for Scope {
     }
 }
 
-/// The scopes of one token. `admin` holds all others; whoever submits or promotes may also read what came of it.
+/// The scopes of one token. `admin` holds all others; one who submits or promotes may also read what came of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Scopes(u8);
 

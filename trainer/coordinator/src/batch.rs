@@ -44,7 +44,7 @@ pub enum Refused {
     Failed(String),
 }
 
-/// What is asked of whoever decides.
+/// What the decider is asked.
 #[derive(Debug, Clone)]
 pub enum Ask {
     /// To decide it.
@@ -85,7 +85,7 @@ impl Front {
     }
 }
 
-/// What whoever drives the batches does next.
+/// What the driver of the batches does next.
 #[derive(Debug)]
 pub enum Turn<T> {
     /// Nothing waits.
@@ -108,7 +108,7 @@ pub struct Done<T> {
     pub effects: Vec<Effect>,
 }
 
-/// Asks in batches. `T` is the ticket by which an answer finds whoever asked.
+/// Asks in batches. `T` is the ticket by which an answer finds its asker.
 #[derive(Debug)]
 pub struct Batches<T> {
     front: Arc<Front>,

@@ -26,7 +26,6 @@ pub enum Event {
     },
     /// A client submitted a pipeline.
     Submit {
-        /// The pipeline.
         pipeline: Box<Pipeline>,
         /// The YAML as written.
         source: String,
@@ -61,7 +60,7 @@ pub enum Event {
         /// Which process.
         incarnation: Incarnation,
     },
-    /// Whoever launched the process saw it exit: certain, unlike an expired lease.
+    /// The launcher of the process saw it exit: certain, unlike an expired lease.
     WorkerGone {
         /// Who.
         worker: WorkerId,
@@ -106,7 +105,7 @@ pub enum Event {
         /// Whose.
         task: TaskId,
     },
-    /// A worker that was asked to wind down did not within the grace period.
+    /// A worker that was asked to drain did not within the grace period.
     GraceOver {
         /// Of which task.
         task: TaskId,
@@ -133,7 +132,6 @@ pub enum Event {
     },
     /// A register stage was refused: a bundle that cannot be made, or a gate that does not hold.
     RegisterRefused {
-        /// Its key.
         key: Digest,
         /// Why, for the user.
         message: String,
@@ -177,7 +175,6 @@ pub enum Effect {
     },
     /// Forget a task's checkpoints but those to keep. Never before the newer one is stored.
     Prune {
-        /// The task.
         task: TaskId,
         /// Which stay.
         keep: Keep,
@@ -186,6 +183,6 @@ pub enum Effect {
     Submitted(RunId),
     /// Which process a joining worker is.
     Joined(Incarnation),
-    /// Somebody's orders or a run's state may have changed: waiting polls look again.
+    /// Somebody's desired assignments or a run's state may have changed: waiting polls look again.
     Wake,
 }

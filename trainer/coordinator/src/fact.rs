@@ -49,7 +49,6 @@ pub enum Fact {
     StagesAdded {
         /// The run's number.
         run: u64,
-        /// The stages.
         stages: Vec<PipelineStage>,
     },
     /// A sweep began.
@@ -84,30 +83,20 @@ pub enum Fact {
     },
     /// How far an execution is.
     ExecutionState {
-        /// Its key.
         key: Digest,
         /// How far.
         state: ExecutionState,
     },
     /// How many workers and how many checkpoints the run that wants it now asks for.
     ExecutionPlacement {
-        /// Its key.
         key: Digest,
         /// What is asked for.
         placement: Placement,
     },
     /// Under whose names its logs and values are, and its tasks if there will be any.
-    ExecutionSource {
-        /// Its key.
-        key: Digest,
-        /// The run.
-        run: RunId,
-        /// The stage.
-        stage: StageName,
-    },
+    ExecutionSource { key: Digest, run: RunId, stage: StageName },
     /// Its seconds of work.
     ExecutionTime {
-        /// Its key.
         key: Digest,
         /// Milliseconds up to `busy_since`.
         wall_ms: u64,
@@ -115,24 +104,15 @@ pub enum Fact {
         busy_since: Option<Millis>,
     },
     /// It goes on from something that an earlier try has saved.
-    ExecutionResumed {
-        /// Its key.
-        key: Digest,
-    },
+    ExecutionResumed { key: Digest },
     /// The instruction set of all that work on it.
     ExecutionInstructions {
-        /// Its key.
         key: Digest,
         /// What their kernels dispatch to.
         instruction_set: String,
     },
     /// It has tasks: new ones, or those that an earlier try left.
-    Tasks {
-        /// Its key.
-        key: Digest,
-        /// The tasks.
-        tasks: Vec<Task>,
-    },
+    Tasks { key: Digest, tasks: Vec<Task> },
     /// How a task is.
     Task {
         /// The key of its execution.
@@ -143,10 +123,7 @@ pub enum Fact {
         change: Box<TaskChange>,
     },
     /// Nobody waits for an execution or works on it; what there is of it is in the tables.
-    ExecutionForgotten {
-        /// Its key.
-        key: Digest,
-    },
+    ExecutionForgotten { key: Digest },
     /// A worker process joined, or whether it can be given work is another matter now.
     Worker {
         /// Who.

@@ -4,13 +4,13 @@
 //! | | holds |
 //! |---|---|
 //! | C1 | A worker holds at most one task. |
-//! | C2 | Whoever holds a task is the newest process of its name, is here, and computes on the work's backend, with the others' instruction set. |
+//! | C2 | The holder of a task is the newest process of its name, is here, and computes on the work's backend, with the others' instruction set. |
 //! | C3 | Only tasks of open works are held; a held task has an attempt and a fence. |
 //! | C4 | A gang has at least `min` and at most `max` members, each once; other tasks have one holder. |
-//! | C5 | Fences, attempts and incarnations never go down; whoever gains or loses a task sees the fence go up. |
+//! | C5 | Fences, attempts and incarnations never go down; a worker that gains or loses a task sees the fence go up. |
 //! | C6 | An accepted artifact of a task, and a done stage of a run, never change. |
 //! | C7 | A merge is held only once all shards are there. |
-//! | C8 | What no running run waits for is asked to wind down. |
+//! | C8 | What no running run waits for is asked to drain. |
 //! | C9 | A stage is active or done only if everything it reads is done; an active stage has work that is not over. |
 //! | C10 | A run is finished exactly if all that was asked for is done, and failed only with a failed stage. |
 //! | C11 | While a small task is ready and not backing off, no worker of its backend is idle. |
@@ -170,7 +170,7 @@ fn check_task(state: &State, execution: &StageExecution, task: &Task, broken: &m
     let names: BTreeSet<_> = holders.iter().map(|member| &member.worker).collect();
     let range = execution.range();
     let fits = match task.part {
-        // Who winds down keeps its members, even if the run that asks has changed, and with it the bounds.
+        // A gang that drains keeps its members, even if the run that asks has changed, and with it the bounds.
         Part::Gang => {
             let drain_by = matches!(task.lease, Lease::Held { drain_by: Some(_), .. });
             let fits = holders.len() <= range.max;

@@ -18,7 +18,7 @@ pub struct Policy {
     pub tick_ms: u64,
     /// How long a poll waits for news. Milliseconds.
     pub poll_ms: u64,
-    /// How long work that was asked to wind down may take before it is released. Milliseconds.
+    /// How long work that was asked to drain may take before it is released. Milliseconds.
     pub grace_ms: u64,
     /// How long a worker whose peers could not reach it stays out. Milliseconds.
     pub penalty_ms: u64,

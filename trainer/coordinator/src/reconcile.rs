@@ -1,5 +1,5 @@
 //! The part of `decide` that follows every event, for what the event touched: stages take over what their work gave, stages whose inputs are there
-//! begin, and work that nobody waits for is asked to wind down.
+//! begin, and work that nobody waits for is asked to drain.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -20,7 +20,7 @@ use crate::time::Millis;
 impl Deciding<'_> {
     /// Brings every run that was touched up to date with its executions, until nothing moves.
     pub(crate) fn reconcile(&mut self) {
-        while let Some(number) = self.unsettled.pop_first() {
+        while let Some(number) = self.unreconciled.pop_first() {
             if !self.state.runs.contains_key(&number) {
                 continue;
             }
@@ -29,13 +29,13 @@ impl Deciding<'_> {
             self.take_over_results(number);
             self.sweep(number);
             let run = &self.state.runs[&number];
-            let (settled, parked) = (run.settled(), run.parked);
-            if settled != run.state {
-                if settled == RunState::Failed {
+            let (state, parked) = (run.state_by_stages(), run.parked);
+            if state != run.state {
+                if state == RunState::Failed {
                     let name = run.failed().map(|j| run.pipeline.stages[j].name.to_string()).unwrap_or_default();
                     self.change_run(number, |run| run.skip_rest(&format!("stage `{name}` failed")));
                 }
-                self.set_run_state(number, settled, parked);
+                self.set_run_state(number, state, parked);
             }
             self.attach_ready(number);
             // Whatever moved has touched the run, so it is looked at again.
@@ -167,7 +167,7 @@ impl Deciding<'_> {
         self.record(Fact::ExecutionState { key, state: ExecutionState::Looking });
     }
 
-    /// What no running run waits for is asked to wind down; what one waits for again carries on.
+    /// What no running run waits for is asked to drain; what one waits for again carries on.
     pub(crate) fn drain(&mut self) {
         let deadline = self.now().after(self.state.policy.grace_ms);
         for key in self.touched.clone() {

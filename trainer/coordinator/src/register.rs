@@ -27,7 +27,6 @@ pub struct Registration {
     pub keys: Vec<Digest>,
     /// Which of them is best.
     pub best: usize,
-    /// The model.
     pub model: ModelName,
     /// The metric that decides which version is best, and its direction.
     pub by: (String, Mode),

@@ -8,7 +8,6 @@ pub enum Rejected {
     /// The grant has been superseded.
     #[error("stale fence: task `{task}` is at fence {current}, the call carries {carried}")]
     StaleFence {
-        /// The task.
         task: TaskId,
         /// Its fence now.
         current: Fence,

@@ -2,10 +2,10 @@
 //!
 //! Executions are served in the order of [`State::wanted`](crate::state::State::wanted). Gangs that have become
 //! too large give up members. Then plain tasks, shards and merges
-//! that are ready, one worker each: they are short, and much waits for them. Then gangs that are under way take in whoever
+//! that are ready, one worker each: they are short, and much waits for them. Then gangs that are under way take in those who
 //! is left, up to their `max`; then gangs that wait start with everybody who is left. A gang takes only workers that have said that they
 //! have its inputs: [`State::open_gangs`] says to those who are left for what they should fetch them, and nobody waits for who is slow
-//! at that. Whoever works on an execution has the instruction set of the others. A gang does not start while a map
+//! at that. All who work on an execution have the same instruction set. A gang does not start while a map
 //! stage that its workers could merge is almost done (its last shards are out), or the merge would wait for the whole
 //! training; one that takes a single worker leaves the others to it.
 

@@ -2,7 +2,7 @@
 //!
 //! A rung of a trial is two ordinary stages behind those of the pipeline: one that trains, and one that evaluates what it gave. They have
 //! keys like every stage, so whatever was computed before is found, by this run or another. When the searcher has nothing left to ask, the
-//! swept stage is done with the value of its best trial, and whoever reads it goes on.
+//! swept stage is done with the value of its best trial, and the stages that read it go on.
 //!
 //! | a trial's stage ends with | becomes |
 //! |---|---|

@@ -66,7 +66,7 @@ impl State {
         let assignments: Vec<Assignment> = held.into_iter().collect();
         let held_nothing = assignments.is_empty();
         let leave = self.draining && assignments.is_empty();
-        // A new checkpoint is not news for whoever made it, so it does not end a wait.
+        // A new checkpoint is not news for the worker that made it, so it does not end a wait.
         let news: Vec<Assignment> =
             assignments.iter().map(|assignment| Assignment { resume: None, ..assignment.clone() }).collect();
         let prepare = if held_nothing && !self.draining { self.to_prepare(known) } else { Vec::new() };
@@ -86,7 +86,7 @@ impl State {
         let open = self.open_gangs.iter().filter_map(|(key, i)| {
             let execution = self.executions.get(key).filter(|execution| execution.takes(worker))?;
             let task = execution.tasks.get(*i)?;
-            // Whoever joins others is handed their state.
+            // A member that joins others is handed their state.
             let resume = if task.is_held() { None } else { task.newest().map(|saved| saved.manifest) };
             Some(Prepare { task: task.id.clone(), inputs: execution.inputs.clone(), resume })
         });

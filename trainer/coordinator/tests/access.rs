@@ -89,7 +89,7 @@ async fn every_route_is_open_to_its_scopes_and_to_nobody_else() {
             assert_eq!(call(address, route.method, &path, headers, "").0, 401, "{} {path} {headers}", route.method);
         }
         for scope in Scope::ALL {
-            // Nothing that parses: whoever is let in is told so.
+            // Nothing that parses: a caller who is let in is told so.
             let (status, body) = call(address, route.method, &path, &bearer(&token(scope)), "?");
             let may = needed.iter().any(|needed| Scopes::of(&[scope]).allow(*needed));
             let shown = format!("{} {path} as {scope}: {status} {}", route.method, String::from_utf8_lossy(&body));

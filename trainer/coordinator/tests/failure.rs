@@ -1,4 +1,4 @@
-//! A panic in the actor: whoever waits and whoever comes is told at once, and the next coordinator goes on from what was acknowledged.
+//! A panic in the actor: those who wait and those who come are told at once, and the next coordinator goes on from what was acknowledged.
 
 use std::time::Duration;
 
@@ -80,7 +80,7 @@ async fn a_panic_of_the_actor_is_told_to_everybody_at_once() -> TestResult {
         is_refused(server.request(Method::POST, path).json(&poll(version)).send().await, "the next poll").await?;
         is_refused(server.request(Method::POST, "/v1/runs").json(&submission()?).send().await, "a submission").await?;
         is_refused(server.request(Method::GET, "/v1/runs").send().await, "a look").await?;
-        is_refused(server.request(Method::GET, "/v1/health").send().await, "whoever asks how it is").await?;
+        is_refused(server.request(Method::GET, "/v1/health").send().await, "a question how it is").await?;
         TestResult::Ok(handle.failed().await)
     });
     let why = told.await.map_err(|_| "somebody was left waiting")??;

@@ -268,7 +268,7 @@ fn submit(actor_handle: &mut ActorHandle, seed: u64) -> RunId {
     run.expect("a submission gives a run")
 }
 
-/// Cancelled, failed and resumed runs: what an unfinished stage has comes back with whoever wants it, under numbers that were never used.
+/// Cancelled, failed and resumed runs: what an unfinished stage has comes back with the run that wants it, under numbers that were never used.
 #[test]
 fn an_ended_run_leaves_memory_and_is_taken_up_where_it_was() {
     let mut actor_handle = ActorHandle::new(Policy::default());

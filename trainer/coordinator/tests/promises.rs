@@ -383,7 +383,7 @@ fn p4_a_gang_waits_for_nobody_who_fetches_its_inputs() {
     actor_handle.prepare("a");
     assert_eq!(members(&actor_handle), ["b", "a"]);
     assert_eq!(actor_handle.assignment("b").expect("it trains").grant.attempt, held.grant.attempt);
-    // With nobody left to hand it over, whoever begins needs the checkpoint too.
+    // With nobody left to hand it over, a worker that begins needs the checkpoint too.
     for name in ["a", "b"] {
         actor_handle.happen(Event::WorkerGone { worker: name.into() }).expect("gone");
     }

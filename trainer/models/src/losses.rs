@@ -1,6 +1,6 @@
 //! The training losses, in a form that adds up over slices of a batch.
 //!
-//! Every function returns the *sum over the examples* of per-example means, shape [1]: whoever adds the slices divides
+//! Every function returns the *sum over the examples* of per-example means, shape [1]: the caller that adds the slices divides
 //! by the global batch, and gets the mean over the batch however it was cut.
 //!
 //! Source: MLD and MotionLCM (VAE terms, noise loss), Luo et al. (pseudo-Huber), Lim and Ye, arXiv:1705.02894 (hinge).

@@ -1,7 +1,7 @@
 //! AdamW, the moving average, clipping and the learning rate, on flat buffers (see [`crate::flat`]).
 //!
 //! Source: Loshchilov and Hutter, arXiv:1711.05101, in the arithmetic of PyTorch: decay first, `eps` added outside the
-//! bias-corrected root. Burn's optimizers are not used: their state hangs on random parameter ids and they clip each
+//! bias-corrected root. Burn's optimizers are not used: their state depends on random parameter ids and they clip each
 //! tensor by itself.
 //!
 //! Every element's result depends on that element alone, and sums run in one fixed order, so the bits do not depend on

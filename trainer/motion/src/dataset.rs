@@ -1,7 +1,7 @@
 //! A dataset: clips, captions, and the entries that examples are drawn from.
 //!
 //! An entry is a clip, or the part of a clip that one time-tagged caption describes, in one split. Features are stored
-//! as they are in the files; whoever needs the network's scale calls [`Dataset::normalise`] on a copy.
+//! as they are in the files; a caller that needs the network's scale calls [`Dataset::normalise`] on a copy.
 //!
 //! Reading a folder is in [`open`](Dataset::open), the artifact's files in [`Dataset::to_files`].
 

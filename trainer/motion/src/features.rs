@@ -6,7 +6,7 @@
 //!
 //! Two oddities of the published data are part of the definition. The heading comes from (right - left shoulder)
 //! *minus* (right - left hip), smoothed over time and forced to the identity in frame 0. And every kinematic chain starts
-//! from the heading, also the arms, not from the rotation of the joint that they hang on.
+//! from the heading, also the arms, not from the rotation of the joint that they are attached to.
 //!
 //! Departs: f64 throughout, where the published code mixes f32 and f64 (worst difference over 301 clips: 2.2e-4, in
 //! rotations of nearly opposite bones).
@@ -42,21 +42,13 @@ pub enum FeatureError {
     },
     /// NaN or infinity among the joints.
     #[error("joint {joint} of frame {frame} is not finite")]
-    NotFinite {
-        /// Frame.
-        frame: usize,
-        /// Joint.
-        joint: usize,
-    },
+    NotFinite { frame: usize, joint: usize },
     /// A direction that the definition needs does not exist.
     #[error(
         "frame {frame}: a rotation is undefined; two joints of a bone coincide, or the body faces exactly away from +z \
          after frame 0 or has a bone exactly opposite to its rest direction"
     )]
-    Undefined {
-        /// Frame.
-        frame: usize,
-    },
+    Undefined { frame: usize },
     /// No target skeleton is known for the format.
     #[error("the uniform skeleton of this format is not public: give the bone lengths of the target skeleton")]
     NoTarget,

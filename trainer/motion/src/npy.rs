@@ -27,7 +27,6 @@ pub enum NpyError {
     /// The file system refused.
     #[error("{}: {source}", file.display())]
     Io {
-        /// The file.
         file: PathBuf,
         /// What it said.
         source: std::io::Error,
@@ -35,7 +34,6 @@ pub enum NpyError {
     /// The header is not that of a `.npy` file.
     #[error("{}: not a .npy file ({source})", file.display())]
     Header {
-        /// The file.
         file: PathBuf,
         /// What is wrong with it.
         source: std::io::Error,
@@ -43,7 +41,6 @@ pub enum NpyError {
     /// The element type is another.
     #[error("{}: holds {found}, expected {expected}; save it with numpy.save(..., x.astype(numpy.float32))", file.display())]
     Type {
-        /// The file.
         file: PathBuf,
         /// Type in the header.
         found: String,
@@ -52,15 +49,11 @@ pub enum NpyError {
     },
     /// The array is column-major.
     #[error("{}: stored column by column (fortran_order), expected rows; save numpy.ascontiguousarray(x)", file.display())]
-    Order {
-        /// The file.
-        file: PathBuf,
-    },
+    Order { file: PathBuf },
     /// The file is shorter or longer than its header says.
     #[error("{}: {} bytes of data for shape {shape:?}, expected {expected}; the file is {}", file.display(), found,
         if found < expected { "truncated: copy or download it again" } else { "longer than its header says" })]
     Size {
-        /// The file.
         file: PathBuf,
         /// Shape in the header.
         shape: Vec<u64>,

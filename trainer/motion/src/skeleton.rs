@@ -1,8 +1,8 @@
-//! The two skeletons and the numbers that hang on them.
+//! The two skeletons and the numbers that depend on them.
 //!
 //! Source: the public HumanML3D and KIT-ML feature definitions (joint order, chains, raw bone directions, contact
 //! thresholds). The bone lengths are those of HumanML3D's uniform skeleton, rounded to 10 micrometres; the length table
-//! of KIT-ML's uniform skeleton (clip `03950`) is not public, so whoever extracts KIT features hands one over.
+//! of KIT-ML's uniform skeleton (clip `03950`) is not public, so a caller that extracts KIT features hands one over.
 
 use protocol::stage::DataFormat;
 
@@ -60,7 +60,6 @@ pub struct Layout {
     pub yaw: std::ops::Range<usize>,
     /// Root displacement along x and z in the heading frame.
     pub root_velocity: std::ops::Range<usize>,
-    /// Root height.
     pub root_height: std::ops::Range<usize>,
     /// Positions of joints 1..J in the heading frame.
     pub positions: std::ops::Range<usize>,

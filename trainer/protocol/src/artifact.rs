@@ -75,7 +75,7 @@ impl ArtifactKind {
 
 /// What an artifact is for in a model: `denoiser`, `vae`, `text`, `length`.
 ///
-/// A role is a text, not a list of those there are: whoever stores, registers, exports and shows models handles each alike. Files of a
+/// A role is a text, not a list of those there are: storing, registering, exporting and showing models handle each alike. Files of a
 /// model bear it as a folder's name, so it consists of small letters, digits and `-`.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]

@@ -1,5 +1,5 @@
 //! One byte string per JSON value: keys sorted, no white space. Digests of settings and manifests rest on it, so it
-//! must not hang on the key order of a map type that a dependency's feature flag could change.
+//! must not depend on the key order of a map type that a dependency's feature flag could change.
 
 use serde::Serialize;
 use serde_json::Value;

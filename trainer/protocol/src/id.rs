@@ -124,7 +124,6 @@ impl TaskId {
 pub struct ParseNameError {
     /// What the text was meant to be.
     pub what: &'static str,
-    /// The text.
     pub text: String,
 }
 

@@ -21,7 +21,7 @@ pub const CALLS_BYTES: usize = 32 << 20;
 pub const CLIENTS_WAITING: usize = 64;
 /// Batches of values and log lines that wait to be stored; one more is told to come again.
 pub const BATCHES_WAITING: usize = 64;
-/// After how many seconds whoever is told so should come again.
+/// After how many seconds a caller that is told so should come again.
 pub const COME_AGAIN_S: u32 = 1;
 
 // Pipelines. The range of each numeric setting of a stage stands beside its name, in `pipeline::ranges`.

@@ -102,7 +102,6 @@ pub struct DesiredAssignments {
 /// What a worker fetches before it is given a task.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Prepare {
-    /// The task.
     pub task: TaskId,
     /// Artifacts by the field that names them, as in [`StageTask::inputs`].
     pub inputs: BTreeMap<String, Digest>,
@@ -113,13 +112,11 @@ pub struct Prepare {
 /// The right to write about a task.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Grant {
-    /// The task.
     pub task: TaskId,
     /// The try.
     pub attempt: Attempt,
     /// The fence. For a gang it is the generation.
     pub fence: Fence,
-    /// The worker.
     pub worker: WorkerId,
     /// Its process.
     pub incarnation: Incarnation,
@@ -143,11 +140,9 @@ pub struct Assignment {
 /// A stage's work as a worker sees it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageTask {
-    /// The run.
     pub run: RunId,
     /// The stage.
     pub name: StageName,
-    /// Its settings.
     pub settings: StageSettings,
     /// Artifacts by the field that names them.
     pub inputs: BTreeMap<String, Digest>,
@@ -202,7 +197,6 @@ pub struct Member {
 pub struct MetricBatch {
     /// The right to write.
     pub grant: Grant,
-    /// Rows.
     pub rows: Vec<MetricRow>,
 }
 
@@ -213,7 +207,6 @@ pub struct MetricRow {
     pub step: u64,
     /// Name.
     pub key: String,
-    /// Value.
     pub value: f64,
 }
 
@@ -224,7 +217,6 @@ pub struct LogBatch {
     pub grant: Grant,
     /// Number of the first line within the attempt and worker; a batch sent twice is stored once.
     pub first: u64,
-    /// Lines.
     pub lines: Vec<String>,
 }
 
@@ -256,7 +248,6 @@ pub struct ReportOutcome {
 pub enum TaskOutcome {
     /// The output's manifest is uploaded with all it lists.
     Finished {
-        /// The output.
         output: Digest,
         /// Final values.
         metrics: BTreeMap<String, f64>,

@@ -270,7 +270,7 @@ async fn run_pipeline(args: RunArgs) -> Result<u8> {
         output: args.output,
         command: command_line(),
     };
-    run::run(run::Work::Pipeline { file: Box::new(file), until }, options).await
+    run::run(run::Request::Submit { file: Box::new(file), until }, options).await
 }
 
 async fn show_plan(args: PlanArgs) -> Result<u8> {
@@ -304,7 +304,7 @@ async fn resume(args: ResumeArgs) -> Result<u8> {
                 output: args.output,
                 command: command_line(),
             };
-            return run::run(run::Work::Run(found.run), options).await;
+            return run::run(run::Request::Resume(found.run), options).await;
         }
     };
     let view = client.control(&found.run, "resume").await?;

@@ -31,7 +31,7 @@ pub(crate) struct ServeArgs {
     /// Its private key (PEM), closed to other users
     #[arg(long, env = "STRIDE_TLS_KEY", value_name = "FILE", requires = "tls_cert")]
     tls_key: Option<PathBuf>,
-    /// Listen beyond this machine without TLS: whoever sees the traffic has the tokens
+    /// Listen beyond this machine without TLS: anybody who sees the traffic has the tokens
     #[arg(long)]
     insecure: bool,
     /// A name by which callers know this server, besides the machine's own; may be repeated

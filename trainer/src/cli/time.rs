@@ -127,7 +127,7 @@ fn samplers(
     Ok(fits)
 }
 
-/// What times hang on besides the models.
+/// What times depend on besides the models.
 struct Machine {
     backend: &'static str,
     device: String,

@@ -31,7 +31,7 @@ pub enum ContextError {
     Damaged(String),
 }
 
-/// Why a stage failed. The message does not name the stage: whoever shows it knows which one it was.
+/// Why a stage failed. The message does not name the stage: its caller knows which one it was.
 #[derive(Debug, thiserror::Error)]
 pub enum StageError {
     /// The user's data or settings; the message names file, line or field, what was expected and what to do.
@@ -160,7 +160,7 @@ pub trait GangContext: AttemptContext {
     /// [`rendezvous`](Self::rendezvous).
     fn share(&self, slices: usize) -> Range<usize>;
 
-    /// Sums `parts` over all slices of `step`, whoever computed them, along the fixed binary tree over `0..slices`.
+    /// Sums `parts` over all slices of `step`, no matter which member computed them, along the fixed binary tree over `0..slices`.
     /// `parts` are this worker's slices in order: all vectors of one length.
     fn exchange(&mut self, step: u64, slices: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError>;
 

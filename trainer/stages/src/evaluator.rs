@@ -1,7 +1,7 @@
 //! A trained evaluator out of its artifact: captions and motions in, embeddings out.
 //!
 //! Motions come in the data's own scale and are normalised with the evaluator's statistics, whatever the model was trained with. Padding
-//! is zero in that space, and a motion always has a movement of it behind its end, so that an embedding does not hang on the batch.
+//! is zero in that space, and a motion always has a movement of it behind its end, so that an embedding does not depend on the batch.
 //! Source: Guo et al.'s own loader, which pads to 196 frames. Departs: a motion of 196 frames, too, has padding behind it.
 
 use burn::tensor::{Device, Tensor, TensorData};

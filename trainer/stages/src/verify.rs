@@ -1,7 +1,7 @@
 //! Re-runs steps of a training stage from a committed checkpoint and keeps what came out, to be compared with what was
 //! stored when the stage ran.
 //!
-//! The whole gang is this thread: a sum along the fixed tree does not hang on who computed its leaves. What is computed is
+//! The whole gang is this thread: a sum along the fixed tree does not depend on who computed its leaves. What is computed is
 //! written to memory only; the store is read and never changed.
 
 use std::collections::{BTreeMap, HashMap};

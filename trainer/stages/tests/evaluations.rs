@@ -1,4 +1,4 @@
-//! Map stages on untrained networks: what they give must not hang on how the work was cut, and misfits are refused.
+//! Map stages on untrained networks: what they give must not depend on how the work was cut, and misfits are refused.
 
 use std::collections::BTreeMap;
 
@@ -255,7 +255,7 @@ fn an_empty_split_is_refused_by_its_name() {
     for settings in [StageSettings::EvaluateReconstruction(reconstruction), StageSettings::EvaluateLatentFid(fid)] {
         let refused = bench.run("eval", &settings, &inputs).unwrap_err();
         assert!(refused.to_string().contains("the split `val` has no entries; set `split`"), "{refused}");
-        assert!(!refused.to_string().contains("stage `"), "whoever shows it names the stage: {refused}");
+        assert!(!refused.to_string().contains("stage `"), "its caller names the stage: {refused}");
         assert_eq!(refused.class(), protocol::message::FailureClass::Input, "{refused}");
     }
 }

@@ -325,13 +325,13 @@ fn what_an_evaluator_does_not_fit_is_refused_with_the_reason() {
         let inputs = [("dataset", data), ("evaluator", evaluator)];
         let refused = bench.run("eval", &evaluate(2, settings.clone()), &inputs).expect_err(reason);
         assert!(refused.to_string().contains(reason), "{refused}");
-        assert!(!refused.to_string().contains("stage `"), "whoever shows it names the stage: {refused}");
+        assert!(!refused.to_string().contains("stage `"), "its caller names the stage: {refused}");
         assert_eq!(refused.class(), FailureClass::Input, "{refused}");
     }
     let inputs = [("dataset", data), ("evaluator", evaluator)];
     bench.run("eval", &evaluate(2, test), &inputs).expect("the data that it was trained on is fine");
-    let widened = EvaluateT2m { widen: true, ..few };
-    let ran = bench.run("eval", &evaluate(2, widened), &inputs).expect("a small split is widened if asked for");
+    let all = EvaluateT2m { all_if_small: true, ..few };
+    let ran = bench.run("eval", &evaluate(2, all), &inputs).expect("all clips stand in for a small split if asked for");
     assert_eq!(bench.manifest(ran.output()).unwrap().meta["split"], "all", "and the report says so");
 }
 

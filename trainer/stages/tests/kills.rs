@@ -115,7 +115,7 @@ fn p6_members_1_to_3_to_2_to_1_change_no_byte() {
 }
 
 /// Sampled: the VAE with two and three members, and no checkpoint but the last. The leader is lost in that save, and with three members
-/// the one that takes over is lost there too: whoever is left still has the state, and nothing is computed again.
+/// the one that takes over is lost there too: those that are left still have the state, and nothing is computed again.
 #[test]
 fn p4_a_leader_that_is_lost_in_its_last_save_costs_nothing() {
     let mut case = case("vae", [20; 4]);

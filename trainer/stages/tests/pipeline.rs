@@ -1,4 +1,4 @@
-//! The whole chain in memory, small: its value must not hang on who computed what.
+//! The whole chain in memory, small: its value must not depend on who computed what.
 
 mod common;
 

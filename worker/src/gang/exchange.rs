@@ -1,6 +1,6 @@
 //! What members do together: agree on whose state is newest, and sum gradients.
 //!
-//! **Rendezvous.** Everybody tells everybody how many updates its state has seen. Whoever is behind the largest number
+//! **Rendezvous.** Everybody tells everybody how many updates its state has seen. A member that is behind the largest number
 //! takes the state of the lowest rank that has it. Members differ by one step at most: a sum is complete for nobody
 //! before everybody has sent its part, so the one that applied it last is at most one ahead of the one that lost a peer
 //! before it had the whole sum. If all have only initialised themselves there is nothing to take: they are equal.
@@ -10,7 +10,7 @@
 //! the root, and sends the result to all. Nothing is added in order of arrival. Partial sums are made piece by piece
 //! while they are sent, so the buffer exists once per slice and once for the sum.
 //!
-//! The wish to wind down travels in front of the parts and is ORed by everybody over the same messages, so that all
+//! The wish to drain travels in front of the parts and is ORed by everybody over the same messages, so that all
 //! members stop after the same step.
 
 use std::ops::Range;
@@ -22,7 +22,7 @@ use super::frame::{Frame, Head, Kind, MAX_PAYLOAD, PIECE, Payload};
 use super::mesh::{Halt, Mesh};
 use super::tree::{self, Node};
 
-const WIND_DOWN: u32 = 1;
+const DRAIN: u32 = 1;
 
 /// What travels behind a state, namely recorded values that are not known to be stored, is refused if it is larger than this.
 const MAX_BEHIND_STATE: u64 = 256 << 20;
@@ -198,7 +198,7 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
     };
 
     // Reduce-scatter, our half: everybody's chunk of our nodes.
-    let flags = if contribution.drain { WIND_DOWN } else { 0 };
+    let flags = if contribution.drain { DRAIN } else { 0 };
     let own_nodes = tree::cover(contribution.slices, &tree::share(contribution.slices, own, size));
     let mut piece = vec![0.0f32; PIECE];
     for peer in mesh.others() {
@@ -235,7 +235,7 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
             ));
         }
         let (at, stored) = numbers(&begin).ok_or_else(|| disagree(peer, "sends a malformed greeting".to_owned()))?;
-        drain |= begin.b & WIND_DOWN != 0;
+        drain |= begin.b & DRAIN != 0;
         if peer == 0 {
             durable = stored;
         }

@@ -184,7 +184,7 @@ impl Mesh {
         self.closed.store(true, Ordering::SeqCst);
         for peer in lock(&self.peers).iter_mut() {
             if let Some(link) = peer.link.take() {
-                // The writer may be held by whoever is blocked on it; a clone of the socket ends that too.
+                // The writer may be held by a thread that is blocked on it; a clone of the socket ends that too.
                 let _ = link.socket.shutdown(Shutdown::Both);
             }
         }

@@ -372,7 +372,7 @@ fn a_joiner_takes_the_state_of_a_peer() {
 }
 
 #[test]
-fn one_wish_to_wind_down_is_heard_by_all_after_the_same_step() {
+fn one_wish_to_drain_is_heard_by_all_after_the_same_step() {
     let gang = Gang::new(3, QUICK);
     gang.regroup(&[0, 1, 2], false);
     let contexts: Vec<HttpContext> = (0..3).map(|i| gang.context(i)).collect();

@@ -2,7 +2,7 @@
 //!
 //! A node is a range of slices; the root is `0..slices`. A node of more than one slice splits where its left part is the
 //! largest power of two smaller than it. Floating-point addition is not associative, so the tree and not the
-//! membership decides which two numbers meet: whoever holds the sums of any set of disjoint nodes that cover a node gets
+//! membership decides which two numbers meet: a member that holds the sums of any set of disjoint nodes that cover a node gets
 //! the same bits for it.
 
 use std::ops::Range;

@@ -18,7 +18,7 @@ use tokio::runtime::Runtime;
 const CONNECT: &str = "5 seconds";
 /// How long one request may take: a part of 8 MiB at 1.1 Mbit/s.
 const REQUEST: &str = "60 seconds";
-/// For how long a request is tried again. Whoever asked is told then, and decides.
+/// For how long a request is tried again. The caller is told then, and decides.
 const RETRY: Duration = Duration::from_secs(30);
 const RETRIES: usize = 6;
 

@@ -66,7 +66,7 @@ impl Deciding<'_> {
 
     pub(crate) fn fail_execution(&mut self, key: Digest, message: String, own: bool) {
         self.record(Fact::ExecutionState { key, state: ExecutionState::Failed { message, own } });
-        // Whoever still works on it can write no more.
+        // A worker that is still busy with it can write no more.
         let held: Vec<usize> = self.state.executions[&key].tasks.held().collect();
         for i in held {
             let fence = self.change(key, i, |task| task.release(None));

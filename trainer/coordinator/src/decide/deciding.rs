@@ -25,7 +25,7 @@ pub(crate) struct Deciding<'a> {
     pub(crate) fences: Vec<Write>,
     pub(crate) effects: Vec<Effect>,
     /// Runs that were touched and are not reconciled yet.
-    pub(crate) unsettled: BTreeSet<u64>,
+    pub(crate) unreconciled: BTreeSet<u64>,
     /// Runs that were touched.
     pub(crate) runs: BTreeSet<u64>,
     /// Executions that were touched, or whose users were.
@@ -41,7 +41,7 @@ impl<'a> Deciding<'a> {
             writes: Vec::new(),
             fences: Vec::new(),
             effects: Vec::new(),
-            unsettled: BTreeSet::new(),
+            unreconciled: BTreeSet::new(),
             runs: BTreeSet::new(),
             touched: BTreeSet::new(),
         }
@@ -103,7 +103,7 @@ impl<'a> Deciding<'a> {
             }
             Fact::ExecutionForgotten { .. } | Fact::Worker { .. } | Fact::WorkerForgotten { .. } => {}
         }
-        self.unsettled.extend(&runs);
+        self.unreconciled.extend(&runs);
         self.runs.extend(runs);
     }
 

@@ -3,7 +3,7 @@
 //! Nothing here reads a clock, a socket or a generator. What is decided is a list of facts; `Deciding::record` is the one way to
 //! change the state, and keeps each fact. They are stored in the same transaction as the rows that they imply, before any other effect;
 //! recovery applies them and decides nothing again. After the event itself, every run that it touched is reconciled (stages whose work is
-//! over, stages whose inputs are there), work that nobody wants is asked to wind down, idle workers are given what is ready, and what has
+//! over, stages whose inputs are there), work that nobody wants is asked to drain, idle workers are given what is ready, and what has
 //! ended leaves memory for the tables.
 //!
 //! A decision looks at what its facts touch, and at no other run or execution: what it costs does not grow with what there ever was.
@@ -35,7 +35,7 @@ use crate::state::worker::Sign;
 use crate::time::Moment;
 
 /// Decides what `event` does. `state` is changed only by an accepted event; an event that changes nothing has no effect
-/// but the answer to whoever sent it.
+/// but the answer to its sender.
 pub fn decide(state: &mut State, moment: Moment, event: Event) -> Result<Vec<Effect>, Rejected> {
     let moment = Moment { now: moment.now.max(state.now), ..moment };
     let mut cx = Deciding::new(state, moment);

@@ -24,7 +24,7 @@ impl Deciding<'_> {
                 let wall_ms = execution.wall_ms + before.since(since);
                 self.record(Fact::ExecutionTime { key, wall_ms, busy_since: None });
             }
-            // Whoever is still at work goes on as if nothing had been.
+            // Workers that are still busy go on as if nothing had been.
             if execution.state == ExecutionState::Open && execution.has_something() && (alone || !execution.is_busy()) {
                 self.resumed(key);
             }

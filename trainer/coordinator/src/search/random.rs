@@ -1,4 +1,4 @@
-//! Points drawn at random, all different. A number hangs on the seed, the stage, the trial and the setting alone, so that one more setting
+//! Points drawn at random, all different. A number depends on the seed, the stage, the trial and the setting alone, so that one more setting
 //! or trial changes no other.
 //!
 //! A space of choices is drawn from without putting back. Drawn numbers are rounded to five digits: they are read by people, and the last
@@ -38,7 +38,7 @@ pub(super) fn points(sweep: &Sweep, settings: &StageSettings, name: &StageName, 
     points
 }
 
-/// 64 bits that hang on their key alone.
+/// 64 bits that depend on their key alone.
 fn bits(seed: Seed, name: &StageName, trial: u64, again: u64, path: &str) -> u64 {
     let digest = Digest::of(format!("stride/sweep/1 {seed} {name} {trial} {again} {path}").as_bytes());
     digest.as_bytes()[..8].iter().fold(0, |number, byte| number << 8 | u64::from(*byte))

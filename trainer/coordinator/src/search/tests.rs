@@ -53,7 +53,7 @@ impl Dice {
     }
 }
 
-/// What a rung of a trial gives, whoever computes it: better with each rung, and now and then a failure.
+/// What a rung of a trial gives, no matter which worker computes it: better with each rung, and now and then a failure.
 fn truth(world: u64, ticket: Ticket) -> Score {
     let Ticket::Rung { trial, rung } = ticket else { panic!("nobody executions on {ticket:?}") };
     let mut dice = Dice(1 + world * 7919 + trial as u64 * 104_729);
@@ -72,7 +72,7 @@ fn open(search: &Search) -> Vec<usize> {
     (0..search.tickets().len()).filter(|ticket| search.score(*ticket).is_none()).collect()
 }
 
-/// Works off a sweep with `workers`, whoever is done first; at each result a crash may come, after which all is folded again.
+/// Works off a sweep with `workers`, in whatever order they finish; at each result a crash may come, after which all is folded again.
 fn execution(sweep: &Sweep, world: u64, workers: usize, dice: &mut Dice, crashes: bool) -> Search {
     let mut at = search(sweep);
     for _ in 0..10_000 {
@@ -183,7 +183,7 @@ fn equal_points_are_not_tried_twice() {
             protocol::sweep::with_values(&settings(), point).unwrap();
         }
     }
-    // A space with 24 points has no more, whoever asks.
+    // A space with 24 points has no more, no matter how often one asks.
     let small = Sweep { search: SearchKind::Asha, trials: 1000, ..sweep(SearchKind::Grid, 0) };
     let points: BTreeSet<String> = search(&small).trials().iter().map(text).collect();
     assert_eq!(points.len(), 24);

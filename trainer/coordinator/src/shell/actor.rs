@@ -2,7 +2,7 @@
 //! says what to store and does no more than that. This file brings the queue, the clock and the disk.
 //!
 //! If a part without which nothing goes on panics, the coordinator has failed: everybody who waits and everybody who comes is told so
-//! at once, and [`Handle::trouble`](super::Handle::trouble) says it to whoever runs the process. What was acknowledged is stored.
+//! at once, and [`Handle::trouble`](super::Handle::trouble) says it to the process around it. What was acknowledged is stored.
 
 use std::sync::Arc;
 
@@ -112,7 +112,7 @@ impl Actor {
             self.actor_handle.change();
         }
         for (reply, answer) in done.answers {
-            // Whoever asked may have gone away meanwhile; what was decided stands.
+            // The asker may have gone away meanwhile; what was decided stands.
             let _ = reply.send(answer);
         }
         for effect in &done.effects {

@@ -25,7 +25,7 @@ const COLLECT_EVERY: Duration = Duration::from_secs(15 * 60);
 pub(crate) fn perform(actor_handle: &Arc<ActorHandle>, effect: &Effect) {
     let actor_handle = Arc::clone(actor_handle);
     match effect.clone() {
-        // Done already, or an answer to whoever sent the event.
+        // Done already, or an answer to the sender of the event.
         Effect::Store(_) | Effect::Submitted(_) | Effect::Joined(_) | Effect::Wake => {}
         Effect::Lookup { key } => {
             let looking = look_up(Arc::clone(&actor_handle), key);

@@ -35,7 +35,7 @@ const HEAD_BYTES: usize = 64 << 10;
 const HANDSHAKE: Duration = Duration::from_secs(10);
 /// How long to wait when there is no descriptor for another connection.
 const PAUSE: Duration = Duration::from_millis(20);
-/// So long a stranger may stay whoever comes: time to show a token. A flood of newcomers waits meanwhile.
+/// So long a stranger may stay however many come: time to show a token. A flood of newcomers waits meanwhile.
 const GRACE: Duration = Duration::from_millis(50);
 
 /// How many connections there may be, and how long one may say nothing.

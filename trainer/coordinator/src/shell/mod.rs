@@ -241,7 +241,7 @@ impl Handle {
         self.actor_handle.changes()
     }
 
-    /// Why nothing goes on, if that is so: whoever runs the coordinator should say it and stop.
+    /// Why nothing goes on, if that is so: the process around the coordinator should say it and stop.
     pub fn trouble(&self) -> Option<Trouble> {
         let failure = self.actor_handle.failure().map(|failure| Trouble::Failed(failure.to_owned()));
         failure.or_else(|| self.actor_handle.trouble().map(Trouble::Store))

@@ -35,7 +35,7 @@ pub(crate) async fn join(
     Ok(Json(Joined { incarnation, lease_ms: policy.lease_ms, poll_ms: policy.poll_ms }))
 }
 
-/// Answers at once when the worker's orders are not those it knows, else within `poll_ms`.
+/// Answers at once when the worker's desired assignments are not those it knows, else within `poll_ms`.
 pub(crate) async fn poll(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(worker): Path<WorkerId>,

@@ -14,8 +14,8 @@ pub enum StartError {
     /// Nobody could call it.
     #[error("refusing to listen on {0} without a token: nobody beyond this machine could be let in")]
     NoToken(SocketAddr),
-    /// Whoever listens on the network would have the tokens.
-    #[error("refusing to listen on {0} without TLS: whoever sees the traffic has the tokens")]
+    /// Anybody who listens on the network would have the tokens.
+    #[error("refusing to listen on {0} without TLS: anybody who sees the traffic has the tokens")]
     NoTls(SocketAddr),
     /// The address is taken, or not ours.
     #[error("cannot listen on {address}: {cause}")]

@@ -67,7 +67,6 @@ pub struct StageExecution {
     pub key: Digest,
     /// The run that wanted it first; tasks bear its name.
     pub run: RunId,
-    /// The stage.
     pub stage: StageName,
     /// What keys its randomness: its name, but for a trial of a sweep.
     pub keyed_as: StageName,
@@ -75,7 +74,6 @@ pub struct StageExecution {
     pub settings: StageSettings,
     /// Artifacts by the field that names them.
     pub inputs: BTreeMap<String, Digest>,
-    /// The seed.
     pub seed: Seed,
     /// Where it must be computed.
     pub backend: Backend,

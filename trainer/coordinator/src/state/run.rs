@@ -43,13 +43,9 @@ pub enum Status {
     /// Its trials are under way; the searcher is in [`Run::sweeps`].
     Sweeping,
     /// Its work is under way, under the stage's key.
-    Active {
-        /// The key.
-        key: Digest,
-    },
+    Active { key: Digest },
     /// It has its value.
     Done {
-        /// The key.
         key: Digest,
         /// `Ran`, `Cached` or `Resumed`.
         how: StageState,
@@ -63,7 +59,6 @@ pub enum Status {
     },
     /// It failed for good.
     Failed {
-        /// The key.
         key: Digest,
         /// Why.
         message: String,
@@ -318,7 +313,7 @@ impl Run {
     }
 
     /// What the stages make of the run's state.
-    pub fn settled(&self) -> RunState {
+    pub fn state_by_stages(&self) -> RunState {
         match self.state {
             RunState::Running | RunState::Paused => {
                 let not_asked_for = not_asked_for();
@@ -447,7 +442,7 @@ mod tests {
         for state in [RunState::Running, RunState::Paused, RunState::Finished, RunState::Failed, RunState::Cancelled] {
             let asked = |action| Run { state, ..run() }.after(action).map_or("-".to_owned(), |s| format!("{s:?}"));
             let becomes = |status: &Status| {
-                let after = Run { state, stages: vec![status.clone()], ..run() }.settled();
+                let after = Run { state, stages: vec![status.clone()], ..run() }.state_by_stages();
                 if after == state { "-".to_owned() } else { format!("{after:?}") }
             };
             let row = format!(

@@ -1,6 +1,6 @@
 //! One task: the right to do it, its tries, its newest checkpoints.
 //!
-//! | hold \ event | grant | regroup | release | finish | back-off over | wind down |
+//! | hold \ event | grant | regroup | release | finish | back-off over | drain |
 //! |---|---|---|---|---|---|---|
 //! | Waiting | Held | - | - | - | Waiting | - |
 //! | Held | - | Held | Waiting | Done | - | Held |
@@ -55,7 +55,7 @@ pub enum Lease {
         holders: Vec<Member>,
         /// Proves to a peer that one is of this generation.
         secret: String,
-        /// Asked to wind down; released by force at this time.
+        /// Asked to drain; released by force at this time.
         drain_by: Option<Millis>,
     },
     /// Done.
@@ -70,7 +70,6 @@ pub enum Lease {
 pub struct Saved {
     /// Steps applied.
     pub step: u64,
-    /// The manifest.
     pub manifest: Digest,
     /// What retention may rank by.
     pub metrics: BTreeMap<String, f64>,
@@ -184,7 +183,7 @@ impl Task {
         fence
     }
 
-    /// Takes it away: whoever had it can write no more.
+    /// Takes it away: its holders can write no more.
     pub fn release(&mut self, not_before: Option<Millis>) -> Write {
         assert!(self.is_held(), "release of {self:?}");
         self.lease = Lease::Waiting { not_before };
@@ -220,7 +219,7 @@ impl Task {
         }
     }
 
-    /// Asks its holders to wind down until `deadline`, or (`None`) to carry on.
+    /// Asks its holders to drain until `deadline`, or (`None`) to carry on.
     pub fn drain(&mut self, deadline: Option<Millis>) {
         if let Lease::Held { drain_by, .. } = &mut self.lease {
             *drain_by = match (*drain_by, deadline) {

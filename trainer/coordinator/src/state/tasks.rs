@@ -21,7 +21,7 @@ pub struct Tasks {
 struct Index {
     held: BTreeSet<usize>,
     waiting: BTreeSet<usize>,
-    /// Of the held ones, how many are asked to wind down.
+    /// Of the held ones, how many are asked to drain.
     draining: usize,
 }
 
@@ -92,7 +92,7 @@ impl Tasks {
         self.index.held.len() + self.index.waiting.len()
     }
 
-    /// Whether all (`asked`) or none of the held ones are asked to wind down.
+    /// Whether all (`asked`) or none of the held ones are asked to drain.
     pub fn all_draining(&self, asked: bool) -> bool {
         self.index.draining == if asked { self.index.held.len() } else { 0 }
     }

@@ -7,7 +7,7 @@
 //! | Silent | Here | Here | Silent | Silent | Gone |
 //! | Gone | Here | Gone | Gone | Gone | Gone |
 //!
-//! Unknown is not dead: a silent worker may well be computing, and its next poll brings it back. Only whoever launched
+//! Unknown is not dead: a silent worker may well be computing, and its next poll brings it back. Only the launcher of
 //! the process can say that it is gone, and only a new process (a join, with the next incarnation) returns from that.
 //! Whatever a worker held it loses on leaving `Here`; that is the business of `decide`.
 

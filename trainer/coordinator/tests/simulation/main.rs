@@ -77,7 +77,7 @@ fn seeds() -> Vec<u64> {
     kept.map(|line| number(line.to_owned())).chain(1000..1000 + count).collect()
 }
 
-/// All cores take seeds from one list; a seed is a world of its own, so nothing hangs on who takes which.
+/// All cores take seeds from one list; a seed is a world of its own, so nothing depends on who takes which.
 #[test]
 fn whatever_happens_every_run_ends_and_every_task_is_done_once() {
     let (seeds, begun) = (seeds(), std::time::Instant::now());

@@ -29,7 +29,7 @@ pub(crate) struct FakeStore {
     /// How often what a task gave was found damaged: so often it may be accepted besides.
     pub(crate) remade: BTreeMap<TaskId, u64>,
     pub(crate) checkpoints: BTreeMap<(TaskId, u64), Digest>,
-    /// What was collected between its upload and the report that names it: whoever names it is refused.
+    /// What was collected between its upload and the report that names it: the report is refused.
     pub(crate) collected: BTreeSet<Digest>,
 }
 

@@ -1,4 +1,4 @@
-//! A sweep decides the same whoever works on it and wherever the coordinator is killed.
+//! A sweep decides the same no matter which workers it has and where the coordinator is killed.
 
 use coordinator::search::{Score, Ticket};
 use coordinator::state::run::Status;

@@ -310,7 +310,7 @@ impl FakeWorker {
     }
 }
 
-/// A stage is a function: whoever computes it gets this.
+/// A stage is a function: every worker that computes it gets this.
 fn finished(assignment: &Assignment) -> TaskOutcome {
     let path = within_run(&assignment.grant.task);
     // A trial is as good as its name says.

@@ -63,7 +63,7 @@ pub(crate) struct World {
     /// Who waits for an answer.
     asked: BTreeMap<u64, Ticket>,
     tickets: u64,
-    /// The answer for whoever waits in [`World::happen`].
+    /// The answer for the caller that waits in [`World::happen`].
     answered: Option<Result<Vec<Effect>, Refused>>,
     /// Snapshots on their way, and when they get there.
     snapshots: Vec<(Millis, Arc<State>)>,
@@ -191,7 +191,7 @@ impl World {
         answer
     }
 
-    /// The process is gone: what is stored is what was, and whoever waits hears nothing.
+    /// The process is gone: what is stored is what was, and a caller that waits hears nothing.
     fn crash(&mut self) {
         self.up = false;
         self.back_at = self.now.after(self.random.below(40_000));
@@ -208,14 +208,14 @@ impl World {
             Disk::Written { .. } => self.count("a crash between commit and answer"),
         }
         for ticket in std::mem::take(&mut self.asked).into_values() {
-            // Whoever cannot know whether it was taken sends it again, under a key; without one, it may count twice.
+            // A client that cannot know whether it was taken sends it again, under a key; without one, it may count twice.
             if let Ticket::Submission(event) = ticket {
                 self.submissions.push((self.now.after(500), *event));
             }
         }
     }
 
-    /// What is stored is what was; whoever comes back goes on from it.
+    /// What is stored is what was; workers that come back go on from it.
     pub(crate) fn recovered(&mut self) {
         let recovered =
             journal::recover(self.policy.clone(), &self.store.recovery).expect("what is stored can be recovered");

@@ -25,7 +25,7 @@ impl Grid {
     /// The grid with stride `skip`: 20 in MotionLCM v1, 100 in v2 and MotionPCM.
     ///
     /// # Panics
-    /// If `skip` is not a divisor of 1000; whoever reads it from a user checks that first.
+    /// If `skip` is not a divisor of 1000; a caller that has it from a user checks that first.
     pub fn new(skip: usize) -> Self {
         assert!(skip > 0 && TIMESTEPS.is_multiple_of(skip), "the solver's skip must divide 1000, not {skip}");
         Self { steps: TIMESTEPS / skip, skip }

@@ -23,7 +23,7 @@ impl Phases {
     /// Cuts `grid` into `phases` phases.
     ///
     /// # Panics
-    /// If there are no phases, or more than grid points; whoever reads the number from a user checks that first.
+    /// If there are no phases, or more than grid points; a caller that has the number from a user checks that first.
     pub fn new(grid: &Grid, phases: usize) -> Self {
         assert!((1..=grid.steps).contains(&phases), "1 to {} phases fit the grid, not {phases}", grid.steps);
         Self { edges: (0..phases).map(|j| j * grid.steps / phases).collect(), grid: *grid }

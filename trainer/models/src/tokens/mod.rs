@@ -3,7 +3,7 @@
 //! Everything but the networks runs on the host: ids are integers, and what is masked next follows from comparisons. Draws are arguments, so
 //! that a caller keys them and a test stores them.
 //!
-//! Losses are sums over the examples in a form that adds up over slices: weights are given by whoever knows the whole batch.
+//! Losses are sums over the examples in a form that adds up over slices: weights are given by a caller that knows the whole batch.
 
 pub mod autoregressive;
 pub mod masked;

@@ -35,7 +35,6 @@ const KNOWN_NOT_FINITE: [&str; 2] = ["007975", "M007975"];
 /// A folder that cannot be used, with everything that is wrong with it.
 #[derive(Debug)]
 pub struct OpenError {
-    /// The folder.
     pub folder: PathBuf,
     /// In the order of the files.
     pub problems: Vec<Problem>,
@@ -120,14 +119,12 @@ impl From<NpyError> for Problem {
 pub enum SkipReason {
     /// Fewer frames than the format's minimum.
     TooShort {
-        /// Frames.
         frames: usize,
         /// The minimum.
         min: usize,
     },
     /// As many frames as the format's bound, or more.
     TooLong {
-        /// Frames.
         frames: usize,
         /// The bound, exclusive.
         bound: usize,

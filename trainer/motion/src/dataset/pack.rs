@@ -26,7 +26,6 @@ pub enum PackError {
     /// A file could not be fetched.
     #[error("{file}: {why}")]
     Fetch {
-        /// The file.
         file: String,
         /// What the store said.
         why: String,
@@ -34,7 +33,6 @@ pub enum PackError {
     /// A file's content is not what `dataset.json` says.
     #[error("{file}: {what}")]
     Content {
-        /// The file.
         file: String,
         /// What is wrong.
         what: String,
@@ -42,7 +40,6 @@ pub enum PackError {
     /// A file could not be written.
     #[error("{file}: cannot be encoded: {what}")]
     Encode {
-        /// The file.
         file: String,
         /// What the encoder said.
         what: String,

@@ -36,7 +36,7 @@ impl std::fmt::Debug for Batch<'_> {
     }
 }
 
-/// What has just been done, for whoever takes the time.
+/// What has just been done, for a caller that takes the time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Lap {
     /// The sampler is through.

@@ -1,7 +1,7 @@
 //! `encode.latents`: posteriors of random crops, computed once for every stage that trains in the latent space.
 //!
 //! Crop `c` of entry `e` is keyed by (seed, stage, c, e). The crops of one entry that have one length are one batch, so what a
-//! clip is computed together with is a function of the entry alone and the bits do not hang on how the work was cut.
+//! clip is computed together with is a function of the entry alone and the bits do not depend on how the work was cut.
 
 use std::collections::BTreeMap;
 use std::ops::Range;

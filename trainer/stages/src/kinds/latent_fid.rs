@@ -2,7 +2,7 @@
 //!
 //! Sample `i` of a repeat is of entry `i mod n`; its caption and noise are keyed by (seed, repeat, i) and not by the stage's name, so
 //! that two models of a run are compared on the same noise. Samples are made in blocks that are cut from the sample's number alone, and
-//! blocks are dealt to shards in turn; what a sample is computed together with does not hang on the number of shards.
+//! blocks are dealt to shards in turn; what a sample is computed together with does not depend on the number of shards.
 //!
 //! `match` compares repeat 0 with the teacher's 50-step DDIM from the same noise and captions, at g = w + 1 for a student.
 //! `match_other_noise` is its yardstick: a teacher's sample against the teacher's next sample for the same entry.

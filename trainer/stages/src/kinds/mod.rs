@@ -172,7 +172,7 @@ fn misplaced(settings: &StageSettings, how: &str) -> StageError {
     StageError::Fault(format!("stage kind `{}` does not run {how}", settings.kind()))
 }
 
-/// Which model an evaluation measured, and how it drew from it; nothing of real motion. A report says this, so that whoever has the
+/// Which model an evaluation measured, and how it drew from it; nothing of real motion. A report says this, so that a reader who has the
 /// report of a model knows how to draw from the model.
 fn drawn(cx: &dyn AttemptContext) -> Result<Value, StageError> {
     let task = cx.task();

@@ -1,7 +1,7 @@
 //! `evaluate.reconstruction`: what a VAE or a tokenizer loses, clip by clip.
 //!
 //! Each clip is its entry's first frames, as many as are a multiple of the unit length; it is encoded and decoded alone, so no
-//! number hangs on the sharding. Metrics without a prefix are of a sample z of the posterior, as every later stage uses it; `mu_` of the
+//! number depends on the sharding. Metrics without a prefix are of a sample z of the posterior, as every later stage uses it; `mu_` of the
 //! posterior's mean (a tokenizer has none, and no sample: it decodes what it encodes); `clip_mean_` of no network at all: the clip's own mean feature vector, held; `real_` of the clip itself.
 //! Of a tokenizer also, as means over its codebooks, the share of codes in `used` and the `perplexity` of all clips' codes.
 //! Definitions: [`evaluation::reconstruction`](crate::evaluation::reconstruction).

@@ -6,7 +6,7 @@
 //!
 //! All draws are keyed by (seed, repeat, entry) and not by the stage's name, so that two models of a run are compared on the same captions, lengths
 //! and noise. Motions are made in blocks that are cut from the entry's number alone, and blocks are dealt to shards in turn: what a motion is computed
-//! together with does not hang on the number of shards.
+//! together with does not depend on the number of shards.
 //!
 //! Departs: Diversity takes as many pairs as there are entries where there are fewer than 300.
 
@@ -87,7 +87,7 @@ impl<'a> Plan<'a> {
         let (evaluator, manifest) = artifacts::input(cx, "evaluator", ArtifactKind::Evaluator)?;
         let trained = TrainedEvaluator::read(&*blobs, &manifest, &cx.device())?;
         let (mut entries, mut taken) = (dataset.entries_of(settings.split), settings.split);
-        if settings.widen && entries.len() < POOL {
+        if settings.all_if_small && entries.len() < POOL {
             (entries, taken) = (dataset.entries_of(Split::All), Split::All);
         }
         if entries.is_empty() {
@@ -96,8 +96,8 @@ impl<'a> Plan<'a> {
         if entries.len() < POOL {
             let instead = match taken {
                 Split::All => "there are no more in the dataset",
-                Split::Test => "set `split: all`, or `widen: true`",
-                Split::Train | Split::Val => "set `split: all`, `split: test` for a last look, or `widen: true`",
+                Split::Test => "set `split: all`, or `all_if_small: true`",
+                Split::Train | Split::Val => "set `split: all`, `split: test` for a last look, or `all_if_small: true`",
             };
             return refuse(format!(
                 "the split `{}` has {} entries, R-precision ranks a motion among {POOL}; {instead}",

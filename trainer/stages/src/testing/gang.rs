@@ -1,6 +1,6 @@
 //! A gang of threads around one lock.
 //!
-//! A change of membership starts a new generation; whoever waits in an older one is told to regroup. Contributions of an
+//! A change of membership starts a new generation; a member that waits in an older one is told to regroup. Contributions of an
 //! unfinished step are dropped with their generation, a finished sum stays readable.
 
 use std::collections::BTreeMap;

@@ -1,5 +1,5 @@
 //! The coordinator's batches on a disk that takes its time: what is asked waits in the queue while a transaction is in flight, and
-//! whoever is answered is answered what is stored.
+//! an answer says only what is stored.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -56,7 +56,7 @@ pub(super) enum Ticket {
     Effect(Box<Effect>),
     /// Its clock.
     Tick { at: Millis },
-    /// Whoever waits in [`World::happen`].
+    /// The caller that waits in [`World::happen`].
     Caller,
     /// Somebody who has gone away.
     Nobody,
@@ -256,7 +256,7 @@ impl World {
 
     /// Kills the coordinator if a test wants that after this batch.
     fn is_killed_now(&mut self, answers: &[(Ticket, Result<Vec<Effect>, Refused>)]) -> bool {
-        // Whoever never hears that it has joined joins for ever.
+        // A worker that never hears that it has joined joins for ever.
         let joins = |ticket: &Ticket| matches!(ticket, Ticket::Call { call, .. } if matches!(**call, Call::Join(_)));
         let spared = answers.iter().any(|(ticket, _)| matches!(ticket, Ticket::Caller) || joins(ticket) && !self.once);
         let Some((every, from)) = self.kills else { return false };

@@ -53,7 +53,7 @@ impl World {
         Ok(asked)
     }
 
-    /// Whoever sent the call is told what came of it.
+    /// The sender of the call is told what came of it.
     pub(super) fn answer_call(
         &mut self,
         (i, process): (usize, u32),
@@ -94,7 +94,7 @@ impl World {
                     Call::Commit(_) => "a checkpoint refused for a missing blob",
                     _ => "an outcome refused for a missing blob",
                 });
-                // Whoever tries again uploads it again.
+                // The next try uploads it again.
                 self.store.collected.clear();
                 Answer::Refused(saving)
             }

@@ -46,8 +46,9 @@ pub struct EvaluateT2m {
     pub multimodality: MultiModality,
     /// Clips. Choose on `val`; `test` is for the last look.
     pub split: Split,
-    /// Takes all clips where the split has fewer than a pool of 32, and says so in the report; otherwise that is refused.
-    pub widen: bool,
+    /// Takes all clips where the split has fewer than a pool of 32, and says so in the report; otherwise so small a split is refused.
+    #[serde(alias = "widen")]
+    pub all_if_small: bool,
     /// Shards.
     pub shards: usize,
 }
@@ -64,7 +65,7 @@ impl Default for EvaluateT2m {
             repeats: 20,
             multimodality: MultiModality::default(),
             split: Split::Val,
-            widen: false,
+            all_if_small: false,
             shards: 8,
         }
     }
