@@ -145,31 +145,28 @@ pub(crate) enum End {
     Refused(String),
 }
 
-/// Offers this process until the coordinator takes it.
-async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Option<Joined>, String> {
+/// Offers this process until the coordinator takes it, or gives how the worker ends instead.
+async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Joined, End> {
     let mut pause = Duration::from_millis(50);
     let mut said = false;
     loop {
         match client.join(join).await {
             Ok(joined) => {
                 tracing::info!(worker = %join.worker, incarnation = %joined.incarnation, peer_address = join.peer_address, "joined");
-                return Ok(Some(joined));
+                return Ok(joined);
             }
-            Err(
-                CallError::Away(message)
-                | CallError::Busy(message, _)
-                | CallError::Full(message)
-                | CallError::Fault(message),
-            ) => {
+            Err(error) if error.may_pass() => {
                 if !std::mem::replace(&mut said, true) {
-                    tracing::warn!("the coordinator cannot take this worker yet: {message}; trying again");
+                    tracing::warn!("the coordinator cannot take this worker yet: {error}; trying again");
                 }
             }
-            Err(error) => return Err(format!("the coordinator turned worker `{}` away: {error}", join.worker)),
+            Err(error) => {
+                return Err(End::Refused(format!("the coordinator turned worker `{}` away: {error}", join.worker)));
+            }
         }
         // A worker that runs nothing and is to go need not wait for a coordinator first.
         if shared.is_leaving() && shared.is_idle(false) {
-            return Ok(None);
+            return Err(End::Left);
         }
         sleep(pause).await;
         pause = (pause * 2).min(LONGEST);
@@ -185,9 +182,8 @@ fn patience(joined: &Joined) -> Duration {
 /// Joins and polls until the worker may go.
 pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> End {
     let mut joined = match join(client, offer, shared).await {
-        Ok(Some(joined)) => joined,
-        Ok(None) => return End::Left,
-        Err(reason) => return End::Refused(reason),
+        Ok(joined) => joined,
+        Err(end) => return end,
     };
     let path = format!("/v1/workers/{}/poll", offer.worker);
     let (mut version, mut pause, mut refusals, mut leave) = (0, SHORTEST, 0, false);
@@ -206,8 +202,7 @@ pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> En
             }
             answer = client.poll(&path, &poll, patience(&joined)) => answer,
         };
-        let answered =
-            !matches!(answer, Err(CallError::Away(_) | CallError::Busy(..) | CallError::Full(_) | CallError::Fault(_)));
+        let answered = !answer.as_ref().is_err_and(CallError::may_pass);
         shared.flags.away.store(!answered, Ordering::SeqCst);
         match answer {
             Ok(desired) => {
@@ -219,23 +214,17 @@ pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> En
             }
             Err(CallError::NotFound(message)) => {
                 tracing::warn!("the coordinator does not know this process: {message}; joining again");
-                joined = match self::join(client, offer, shared).await {
-                    Ok(Some(joined)) => joined,
-                    Ok(None) => return End::Left,
-                    Err(reason) => return End::Refused(reason),
+                joined = match join(client, offer, shared).await {
+                    Ok(joined) => joined,
+                    Err(end) => return end,
                 };
                 version = 0;
                 // A coordinator that forgets again at once is not asked in a tight loop.
                 pause = (pause * 2).min(LONGEST);
             }
-            Err(
-                CallError::Away(message)
-                | CallError::Busy(message, _)
-                | CallError::Full(message)
-                | CallError::Fault(message),
-            ) => {
+            Err(error) if error.may_pass() => {
                 if !std::mem::replace(&mut away, true) {
-                    tracing::warn!("the coordinator takes nothing, work goes on: {message}");
+                    tracing::warn!("the coordinator takes nothing, work goes on: {error}");
                 }
                 pause = (pause * 2).min(LONGEST);
             }

@@ -45,6 +45,13 @@ pub(crate) enum CallError {
     Refused(String),
 }
 
+impl CallError {
+    /// Whether the same call may succeed later, with nothing done about it by the caller.
+    pub(crate) fn may_pass(&self) -> bool {
+        matches!(self, Self::Away(_) | Self::Busy(..) | Self::Full(_) | Self::Fault(_))
+    }
+}
+
 /// A coordinator, and the thread that talks to it.
 #[derive(Debug, Clone)]
 pub(crate) struct Client {

@@ -51,7 +51,7 @@ pub(crate) fn until_ended<T>(
             Err(CallError::Fault(message)) if faults == FAULTS => {
                 return Err(GaveUp::Answer(CallError::Fault(message)));
             }
-            Err(error @ (CallError::Away(_) | CallError::Busy(..) | CallError::Full(_) | CallError::Fault(_))) => {
+            Err(error) if error.may_pass() => {
                 faults += u32::from(matches!(error, CallError::Fault(_)));
                 if warned == begun || warned.elapsed() > Duration::from_secs(10) {
                     tracing::warn!("{what}: {error}; trying again");

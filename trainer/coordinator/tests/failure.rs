@@ -1,35 +1,20 @@
 //! A panic in the actor: those who wait and those who come are told at once, and the next coordinator goes on from what was acknowledged.
 
+#[path = "common/shell.rs"]
+mod shell;
+
 use std::time::Duration;
 
-use access::Server;
-use coordinator::{Config, Coordinator, Handle, Refused, Trouble};
-use protocol::message::{Join, Joined, PROTOCOL_VERSION, Poll, Submit};
-use protocol::stage::Backend;
-use registry::{Holder, Store};
+use coordinator::{Refused, Trouble};
+use protocol::message::{Joined, Poll};
 use reqwest::{Method, Response};
 
-type TestResult<T = ()> = Result<T, Box<dyn std::error::Error + Send + Sync>>;
+use self::shell::{TestResult, offer, start, submission};
 
-const TEXT: &str = "name: p\nseed: 1\ndataset: {format: synthetic}\nstages: {vae: {kind: train.vae}}\n";
 /// Much shorter than any wait of the coordinator's own: a poll's is 2 s by default, here a minute.
 const AT_ONCE: Duration = Duration::from_secs(10);
-
-async fn start(dir: &std::path::Path) -> TestResult<Handle> {
-    let store = Store::open(dir, Holder::this_process("a test")).await?;
-    let mut config = Config { alone: false, park: false, ..Config::embedded() };
-    config.policy.poll_ms = 60_000;
-    Ok(Coordinator::start(store, config).await?)
-}
-
-fn submission() -> TestResult<Submit> {
-    let pipeline = protocol::pipeline::read("p.yaml", TEXT, &[]).map_err(|mistakes| mistakes.to_string())?;
-    Ok(Submit { pipeline: serde_json::to_value(pipeline)?, source: TEXT.into(), idempotency_key: None, until: None })
-}
-
-fn server(handle: &Handle) -> TestResult<Server> {
-    Ok(Server::new(&handle.url(), Some(handle.token().clone()), None)?)
-}
+/// A poll waits for so many milliseconds.
+const POLL_MS: u64 = 60_000;
 
 async fn is_refused(answer: Result<Response, reqwest::Error>, what: &str) -> TestResult {
     let answer = answer?;
@@ -43,18 +28,9 @@ async fn is_refused(answer: Result<Response, reqwest::Error>, what: &str) -> Tes
 #[tokio::test(flavor = "multi_thread")]
 async fn a_panic_of_the_actor_is_told_to_everybody_at_once() -> TestResult {
     let dir = tempfile::tempdir()?;
-    let handle = start(dir.path()).await?;
-    let server = server(&handle)?;
+    let (handle, server) = start(dir.path(), POLL_MS).await?;
     let run = handle.submit(submission()?).await?;
-    let join = Join {
-        protocol: PROTOCOL_VERSION,
-        worker: "a".into(),
-        pid: 1,
-        backend: Backend::Flex,
-        instruction_set: "avx2".into(),
-        peer_address: "a:1".into(),
-    };
-    let joined: Joined = server.request(Method::POST, "/v1/workers").json(&join).send().await?.json().await?;
+    let joined: Joined = server.request(Method::POST, "/v1/workers").json(&offer()).send().await?.json().await?;
     // The first poll knows of nothing and is answered; the next one has nothing new to hear and waits.
     let poll = |version| Poll { incarnation: joined.incarnation, doing: Vec::new(), ready: Vec::new(), version };
     let path = "/v1/workers/a/poll";
@@ -89,7 +65,7 @@ async fn a_panic_of_the_actor_is_told_to_everybody_at_once() -> TestResult {
     fail::remove("actor::decide");
     handle.shutdown().await;
 
-    let handle = start(dir.path()).await?;
+    let (handle, _) = start(dir.path(), POLL_MS).await?;
     assert_eq!(handle.run_view(&run).await?.run, run, "what was acknowledged is there");
     handle.submit(submission()?).await?;
     handle.shutdown().await;

@@ -1,20 +1,19 @@
 //! Too much at once: what does not fit into the queues is told to come again, heartbeats pass by, and what was taken is done.
 
+#[path = "common/shell.rs"]
+mod shell;
+
 use std::time::{Duration, Instant};
 
 use access::Server;
-use coordinator::{Config, Coordinator, Handle};
+use coordinator::Handle;
 use fail::FailScenario;
-use protocol::message::{Grant, Join, Joined, MetricBatch, MetricRow, PROTOCOL_VERSION, Poll, Submit};
-use protocol::stage::Backend;
+use protocol::message::{Grant, Join, Joined, MetricBatch, MetricRow, Poll};
 use protocol::{Attempt, Fence, Incarnation, limits};
-use registry::{Holder, Store};
 use reqwest::{Method, StatusCode};
 use tokio::task::JoinSet;
 
-type TestResult<T = ()> = Result<T, Box<dyn std::error::Error + Send + Sync>>;
-
-const TEXT: &str = "name: p\nseed: 1\ndataset: {format: synthetic}\nstages: {vae: {kind: train.vae}}\n";
+use self::shell::{TestResult, offer, start, submission};
 
 /// A client of a coordinator.
 struct Caller {
@@ -24,11 +23,7 @@ struct Caller {
 
 impl Caller {
     async fn start(dir: &std::path::Path) -> TestResult<Self> {
-        let store = Store::open(dir, Holder::this_process("a test")).await?;
-        let mut config = Config { alone: false, park: false, ..Config::embedded() };
-        config.policy.poll_ms = 1;
-        let handle = Coordinator::start(store, config).await?;
-        let server = Server::new(&handle.url(), Some(handle.token().clone()), None)?;
+        let (handle, server) = start(dir, 1).await?;
         Ok(Self { handle, server })
     }
 
@@ -66,18 +61,9 @@ async fn a_flood_of_submissions_fills_a_short_queue_and_delays_no_heartbeat() ->
     let scenario = FailScenario::setup();
     let dir = tempfile::tempdir()?;
     let caller = Caller::start(dir.path()).await?;
-    let join = Join {
-        protocol: PROTOCOL_VERSION,
-        worker: "a".into(),
-        pid: 1,
-        backend: Backend::Flex,
-        instruction_set: "avx2".into(),
-        peer_address: "a:1".into(),
-    };
+    let join = offer();
     let joined: Joined = caller.post("/v1/workers", &join).send().await?.json().await?;
-    let pipeline = protocol::pipeline::read("p.yaml", TEXT, &[]).map_err(|mistakes| mistakes.to_string())?;
-    let pipeline = serde_json::to_value(pipeline)?;
-    let submit = Submit { pipeline, source: TEXT.into(), idempotency_key: None, until: None };
+    let submit = submission()?;
 
     fail::cfg("actor::decide", "pause")?;
     let beats = async {

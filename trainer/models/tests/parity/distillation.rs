@@ -4,6 +4,9 @@
 //! Intermediates are computed from stored inputs, so that each line has an error of its own; loss, gradients and update
 //! come out of the whole chain.
 
+use std::ops::Deref;
+use std::path::Path;
+
 use burn::tensor::{Device, Tensor};
 use models::diffusion::{Grid, Schedule, affine, boundary, consistency, guided_by, unzip};
 use models::flat;
@@ -26,11 +29,51 @@ struct Step<'a> {
     config: &'a Value,
     expected: &'a Value,
     io: &'a Arrays,
-    teacher: Denoiser,
-    student: Denoiser,
-    target: Denoiser,
-    grid: Grid,
-    schedule: Schedule,
+    networks: Networks,
+}
+
+/// The networks of a distillation, and the grid of its solver.
+pub(crate) struct Networks {
+    pub(crate) teacher: Denoiser,
+    /// On a device that tracks gradients.
+    pub(crate) student: Denoiser,
+    pub(crate) target: Denoiser,
+    pub(crate) grid: Grid,
+    pub(crate) schedule: Schedule,
+}
+
+impl Networks {
+    /// Of a teacher's and a student's config, their weights, and the number of grid points.
+    pub(crate) fn read(teacher: &Value, student: &Value, weights: &Path, points: &Value) -> Self {
+        let (plain, tracked) = (device(), tracked());
+        Self {
+            teacher: denoiser(teacher, weights, "teacher.", &plain),
+            student: denoiser(student, weights, "student.", &tracked),
+            target: denoiser(student, weights, "target.", &plain),
+            grid: Grid::new(1000 / points.as_u64().expect("grid points") as usize),
+            schedule: Schedule::published(),
+        }
+    }
+}
+
+/// Of an optimizer's config; and its learning rate.
+pub(crate) fn adam(settings: &Value) -> (AdamW, f64) {
+    let number = |value: &Value| value.as_f64().expect("a number");
+    let adam = AdamW {
+        beta1: number(&settings["betas"][0]),
+        beta2: number(&settings["betas"][1]),
+        eps: number(&settings["eps"]),
+        weight_decay: number(&settings["weight_decay"]),
+    };
+    (adam, number(&settings["lr"]))
+}
+
+impl Deref for Step<'_> {
+    type Target = Networks;
+
+    fn deref(&self) -> &Networks {
+        &self.networks
+    }
 }
 
 #[test]
@@ -41,15 +84,9 @@ fn parity_distillation() {
         let expected = json(&folder.join("expected.json"));
         let io = Arrays::read(&folder.join("io.safetensors"));
         let weights = folder.join("weights.safetensors");
-        let (plain, tracked) = (device(), tracked());
-        let student = &config["student_and_target"];
-        let points = config["num_ddim_timesteps"].as_u64().expect("grid points") as usize;
+        let (teacher, student) = (&config["teacher"], &config["student_and_target"]);
         let step = Step {
-            teacher: denoiser(&config["teacher"], &weights, "teacher.", &plain),
-            student: denoiser(student, &weights, "student.", &tracked),
-            target: denoiser(student, &weights, "target.", &plain),
-            grid: Grid::new(1000 / points),
-            schedule: Schedule::published(),
+            networks: Networks::read(teacher, student, &weights, &config["num_ddim_timesteps"]),
             config: &config,
             expected: &expected,
             io: &io,
@@ -187,20 +224,13 @@ impl Step<'_> {
         gates.check("clip", case, relative(global_norm(&grads), norm.as_f64().expect("a norm")), 1e-4);
         let factor = clip_factor(global_norm(&grads), self.config["optimizer"]["max_grad_norm"].as_f64().expect("max"));
         grads.iter_mut().for_each(|g| *g *= factor as f32);
-        let settings = &self.config["optimizer"]["AdamW"];
-        let number = |value: &Value| value.as_f64().expect("a number");
-        let adam = AdamW {
-            beta1: number(&settings["betas"][0]),
-            beta2: number(&settings["betas"][1]),
-            eps: number(&settings["eps"]),
-            weight_decay: number(&settings["weight_decay"]),
-        };
+        let (adam, lr) = adam(&self.config["optimizer"]["AdamW"]);
         let before = flat::read(&self.student);
         let mut weights = before.clone();
         let (mut m, mut v) = (vec![0.0; weights.len()], vec![0.0; weights.len()]);
-        adam.step(1, number(&settings["lr"]), &mut weights, &grads, &mut m, &mut v);
+        adam.step(1, lr, &mut weights, &grads, &mut m, &mut v);
         let mut average = flat::read(&self.target);
-        ema(&mut average, &weights, number(&self.config["ema_decay"]));
+        ema(&mut average, &weights, self.config["ema_decay"].as_f64().expect("a number"));
 
         let change: Vec<f32> = weights.iter().zip(&before).map(|(a, b)| a - b).collect();
         let mut norms = |kind: &'static str, found: &[f32], part: &str, gate: f64| {

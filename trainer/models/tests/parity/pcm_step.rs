@@ -4,22 +4,24 @@
 //! Intermediates are computed from stored inputs, so that each line has an error of its own; losses, gradients and updates come out of
 //! the whole chain.
 
+use std::ops::Deref;
 use std::path::Path;
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use models::diffusion::{Grid, Phases, Schedule, affine, guided_by, pcm_sample, unzip};
+use models::diffusion::{Phases, affine, guided_by, pcm_sample, unzip};
 use models::flat::{self, Entry};
 use models::kernels::Dropout;
 use models::networks::{Denoiser, Discriminator, Init, guidance_embedding};
-use models::optim::{AdamW, clip_factor, ema, global_norm};
+use models::optim::{clip_factor, ema, global_norm};
 use models::{losses, names};
 use protocol::Seed;
 use protocol::stage::Positions;
 use serde_json::Value;
 
 use crate::common::{Array, Arrays, Gates, device, error, folders, json, name, relative, shared, tracked, values};
-use crate::networks::{check_gradients, denoiser, gradients, repeated, scalar, split};
+use crate::distillation::{Networks, adam};
+use crate::networks::{check_gradients, gradients, repeated, scalar, split};
 use crate::{FORWARD, LOSS};
 
 /// Jumps of the sampler, one after the other.
@@ -35,12 +37,16 @@ struct Fixture<'a> {
     config: &'a Value,
     expected: &'a Value,
     io: &'a Arrays,
-    teacher: Denoiser,
-    student: Denoiser,
-    target: Denoiser,
+    networks: Networks,
     heads: Discriminator,
-    grid: Grid,
-    schedule: Schedule,
+}
+
+impl Deref for Fixture<'_> {
+    type Target = Networks;
+
+    fn deref(&self) -> &Networks {
+        &self.networks
+    }
 }
 
 #[test]
@@ -51,18 +57,12 @@ fn parity_pcm_step() {
         let expected = json(&folder.join("expected.json"));
         let io = Arrays::read(&folder.join("io.safetensors"));
         let weights = folder.join("weights.safetensors");
-        let (plain, tracked) = (device(), tracked());
         let student = &config["denoiser"];
         let mut teacher = student.clone();
         teacher["time_cond_proj_dim"] = Value::Null;
-        let points = config["grid"].as_u64().expect("grid points") as usize;
         let fixture = Fixture {
-            teacher: denoiser(&teacher, &weights, "teacher.", &plain),
-            student: denoiser(student, &weights, "student.", &tracked),
-            target: denoiser(student, &weights, "target.", &plain),
-            heads: heads(&config, &weights, &tracked),
-            grid: Grid::new(1000 / points),
-            schedule: Schedule::published(),
+            networks: Networks::read(&teacher, student, &weights, &config["grid"]),
+            heads: heads(&config, &weights, &tracked()),
             config: &config,
             expected: &expected,
             io: &io,
@@ -121,18 +121,6 @@ impl Fixture<'_> {
 
     fn number(&self, key: &str) -> f64 {
         self.config[key].as_f64().unwrap_or_else(|| panic!("`{key}` is a number"))
-    }
-
-    fn adam(&self, part: &str) -> (AdamW, f64) {
-        let settings = &self.config["optimizer"][part]["AdamW"];
-        let number = |value: &Value| value.as_f64().expect("a number");
-        let adam = AdamW {
-            beta1: number(&settings["betas"][0]),
-            beta2: number(&settings["betas"][1]),
-            eps: number(&settings["eps"]),
-            weight_decay: number(&settings["weight_decay"]),
-        };
-        (adam, number(&settings["lr"]))
     }
 
     /// The student's jumps from pure noise.
@@ -415,7 +403,7 @@ impl<'a> Step<'a> {
         gates.check("clip", format!("{case} {network}"), relative(norm, stored), 1e-4);
         let factor = clip_factor(norm, fixture.config["optimizer"]["max_grad_norm"].as_f64().expect("a norm"));
         grads.iter_mut().for_each(|g| *g *= factor as f32);
-        let (adam, lr) = fixture.adam(network);
+        let (adam, lr) = adam(&fixture.config["optimizer"][network]["AdamW"]);
         let mut weights = before.clone();
         let (mut m, mut v) = (vec![0.0; weights.len()], vec![0.0; weights.len()]);
         adam.step(1, lr, &mut weights, &grads, &mut m, &mut v);
