@@ -1,0 +1,333 @@
+//! The coordinator: a few lines that can be told to misbehave.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use axum::Router;
+use axum::body::Bytes;
+use axum::extract::{DefaultBodyLimit, Json, Path, State};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use axum::routing::{get, post, put};
+use protocol::message::{
+    ApiError, Assignment, CommitCheckpoint, DesiredAssignments, Grant, Join, Joined, LogBatch, MetricBatch,
+    PROTOCOL_VERSION, Poll, Prepare, ReportOutcome, TaskOutcome,
+};
+use protocol::{Digest, Incarnation};
+
+use crate::event_count::lock;
+
+/// Long enough that no poll of a busy machine is given up in vain.
+pub(super) const LEASE_MS: u64 = 6000;
+
+pub(super) type Metrics = BTreeMap<(u64, String), f64>;
+
+const TOKEN: &str = "a-token-of-tests-only";
+
+/// A coordinator at `url`, who wants [`TOKEN`].
+pub(crate) fn server_at(url: &str) -> access::Server {
+    let token = TOKEN.parse().expect("a token");
+    access::Server::new(url, Some(token), None).expect("a server")
+}
+
+/// What it was told, and what it asks for.
+#[derive(Debug, Default)]
+pub(super) struct FakeState {
+    pub(super) assignments: Vec<Assignment>,
+    pub(super) prepare: Vec<Prepare>,
+    pub(super) version: u64,
+    pub(super) leave: bool,
+    pub(super) joins: u64,
+    pub(super) forget: bool,
+    pub(super) polls: Vec<Instant>,
+    pub(super) last_poll: Option<Poll>,
+    pub(super) blobs: HashMap<Digest, Vec<u8>>,
+    pub(super) staged: HashMap<Digest, Vec<u8>>,
+    pub(super) metrics: Metrics,
+    pub(super) logs: BTreeMap<u64, String>,
+    pub(super) checkpoints: Vec<CommitCheckpoint>,
+    pub(super) outcomes: Vec<ReportOutcome>,
+    /// The fence that the store has; writes with another are refused.
+    pub(super) fence: u64,
+    pub(super) calls: u64,
+    /// Blobs that were asked for.
+    pub(super) fetched: Vec<Digest>,
+    /// Ends with an artifact are refused.
+    pub(super) refuses: bool,
+}
+
+/// For how long a coordinator that has too much to do wants to be left alone: longer than any pause of ours between two tries.
+pub(super) const BUSY_S: u64 = 2;
+
+/// The coordinator.
+#[derive(Debug, Default)]
+pub(super) struct Fake {
+    pub(super) coordinator: Mutex<FakeState>,
+    /// Answers 503 to everything.
+    pub(super) away: AtomicBool,
+    /// Its disk is full: nothing can be stored.
+    pub(super) full: AtomicBool,
+    /// How often it said so.
+    pub(super) turned_down: AtomicU64,
+    /// Tells the next batch of values to come again, and when it did.
+    pub(super) busy: AtomicBool,
+    pub(super) told: Mutex<Option<Instant>>,
+    /// How much later it came.
+    pub(super) waited: Mutex<Option<Duration>>,
+    /// Every third write is done, and then its answer is lost.
+    pub(super) lossy: AtomicBool,
+    /// The next so many polls are never answered.
+    pub(super) hang: AtomicU64,
+    /// Downloads never end.
+    pub(super) stuck: AtomicBool,
+    /// The next so many downloads arrive with a flipped bit.
+    pub(super) damage: AtomicU64,
+    /// The next so many transfers of blobs break off in their middle.
+    pub(super) cut: AtomicU64,
+    /// All blobs are damaged in the store.
+    pub(super) rotten: AtomicBool,
+    /// Bytes of blobs that were transferred, or calls for damaged ones.
+    pub(super) received: AtomicU64,
+}
+
+fn refuse(status: StatusCode, code: &str) -> Response {
+    (status, Json(ApiError { code: code.to_owned(), message: format!("refused: {code}"), hint: None })).into_response()
+}
+
+impl Fake {
+    /// The answer of a full disk, if it is full.
+    fn no_room(&self) -> Option<Response> {
+        let full = self.full.load(Ordering::SeqCst);
+        full.then(|| {
+            self.turned_down.fetch_add(1, Ordering::SeqCst);
+            refuse(StatusCode::INSUFFICIENT_STORAGE, "storage")
+        })
+    }
+
+    /// The answer of one that has too much to do, if it has.
+    fn too_much(&self) -> Option<Response> {
+        if let Some(told) = lock(&self.told).take() {
+            *lock(&self.waited) = Some(told.elapsed());
+        }
+        self.busy.swap(false, Ordering::SeqCst).then(|| {
+            *lock(&self.told) = Some(Instant::now());
+            ([("retry-after", BUSY_S.to_string())], refuse(StatusCode::TOO_MANY_REQUESTS, "busy")).into_response()
+        })
+    }
+
+    pub(super) fn desired(&self, change: impl FnOnce(&mut FakeState)) {
+        let mut coordinator = lock(&self.coordinator);
+        change(&mut coordinator);
+        coordinator.version += 1;
+    }
+
+    /// A write: checked, done, and answered unless the answer is to be lost.
+    fn write(&self, grant: &Grant, work: impl FnOnce(&mut FakeState)) -> Response {
+        if self.away.load(Ordering::SeqCst) {
+            return refuse(StatusCode::SERVICE_UNAVAILABLE, "internal");
+        }
+        if let Some(response) = self.no_room() {
+            return response;
+        }
+        let mut coordinator = lock(&self.coordinator);
+        if grant.fence.0 != coordinator.fence {
+            return refuse(StatusCode::CONFLICT, "stale-fence");
+        }
+        work(&mut coordinator);
+        coordinator.calls += 1;
+        if self.lossy.load(Ordering::SeqCst) && coordinator.calls.is_multiple_of(3) {
+            return refuse(StatusCode::BAD_GATEWAY, "internal");
+        }
+        Json(()).into_response()
+    }
+}
+
+async fn join(State(fake): State<Arc<Fake>>, Json(join): Json<Join>) -> Response {
+    assert_eq!(join.protocol, PROTOCOL_VERSION);
+    if let Some(response) = fake.no_room() {
+        return response;
+    }
+    let mut coordinator = lock(&fake.coordinator);
+    coordinator.joins += 1;
+    Json(Joined { incarnation: Incarnation(coordinator.joins), lease_ms: LEASE_MS, poll_ms: 100 }).into_response()
+}
+
+async fn poll(State(fake): State<Arc<Fake>>, Path(worker): Path<String>, Json(poll): Json<Poll>) -> Response {
+    assert_eq!(worker, "w0");
+    if fake.away.load(Ordering::SeqCst) {
+        return refuse(StatusCode::SERVICE_UNAVAILABLE, "internal");
+    }
+    let version = poll.version;
+    {
+        let mut coordinator = lock(&fake.coordinator);
+        if std::mem::take(&mut coordinator.forget) {
+            return refuse(StatusCode::NOT_FOUND, "not-found");
+        }
+        coordinator.polls.push(Instant::now());
+        coordinator.last_poll = Some(poll);
+    }
+    if fake.hang.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok() {
+        std::future::pending::<()>().await;
+    }
+    for _ in 0..20 {
+        if lock(&fake.coordinator).version != version {
+            break;
+        }
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    let coordinator = lock(&fake.coordinator);
+    Json(DesiredAssignments {
+        version: coordinator.version,
+        assignments: coordinator.assignments.clone(),
+        prepare: coordinator.prepare.clone(),
+        leave: coordinator.leave,
+    })
+    .into_response()
+}
+
+async fn metrics(State(fake): State<Arc<Fake>>, Json(batch): Json<MetricBatch>) -> Response {
+    if let Some(response) = fake.too_much() {
+        return response;
+    }
+    fake.write(&batch.grant, |coordinator| {
+        for row in batch.rows {
+            let before = coordinator.metrics.insert((row.step, row.key.clone()), row.value);
+            assert!(before.is_none_or(|v| v == row.value), "a row changed its value");
+        }
+    })
+}
+
+async fn logs(State(fake): State<Arc<Fake>>, Json(batch): Json<LogBatch>) -> Response {
+    fake.write(&batch.grant, |coordinator| {
+        for (i, line) in batch.lines.into_iter().enumerate() {
+            coordinator.logs.insert(batch.first + i as u64, line);
+        }
+    })
+}
+
+async fn checkpoint(State(fake): State<Arc<Fake>>, Json(commit): Json<CommitCheckpoint>) -> Response {
+    fake.write(&commit.grant.clone(), |coordinator| {
+        assert!(coordinator.blobs.contains_key(&commit.manifest), "a manifest is uploaded before it is committed");
+        // What was recorded up to here must have arrived before.
+        assert!(
+            (1..=commit.step).all(|s| coordinator.metrics.contains_key(&(s, "loss".to_owned()))),
+            "{:?}",
+            coordinator.metrics
+        );
+        coordinator.checkpoints.push(commit);
+    })
+}
+
+async fn outcome(State(fake): State<Arc<Fake>>, Json(report): Json<ReportOutcome>) -> Response {
+    if lock(&fake.coordinator).refuses && matches!(report.outcome, TaskOutcome::Finished { .. }) {
+        return refuse(StatusCode::NOT_FOUND, "not-found");
+    }
+    fake.write(&report.grant.clone(), |coordinator| {
+        if !coordinator.outcomes.contains(&report) {
+            coordinator.assignments.retain(|a| a.grant.task != report.grant.task);
+            coordinator.version += 1;
+            coordinator.outcomes.push(report);
+        }
+    })
+}
+
+/// Takes the next part of a blob. Of a part that is to be cut it keeps half.
+async fn put_blob(
+    State(fake): State<Arc<Fake>>,
+    Path(digest): Path<Digest>,
+    headers: axum::http::HeaderMap,
+    body: Bytes,
+) -> Response {
+    let grant: Grant = serde_json::from_slice(headers["x-stride-grant"].as_bytes()).expect("a grant");
+    assert_eq!(headers["authorization"], format!("Bearer {TOKEN}"));
+    let number =
+        |name: &str| headers[name].to_str().ok().and_then(|text| text.parse::<usize>().ok()).expect("a number");
+    let (offset, bytes) = (number("x-stride-offset"), number("x-stride-bytes"));
+    fake.received.fetch_add(body.len() as u64, Ordering::SeqCst);
+    let cut = fake.cut.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok();
+    let mut answer = serde_json::Value::Null;
+    let response = fake.write(&grant, |coordinator| {
+        let staged = coordinator.staged.entry(digest).or_default();
+        if offset == 0 {
+            staged.clear();
+        }
+        assert_eq!(staged.len(), offset, "it goes on where it was cut");
+        staged.extend_from_slice(if cut { &body[..body.len() / 2] } else { &body });
+        let (staged, stored) = (staged.len(), staged.len() == bytes);
+        if stored {
+            let blob = coordinator.staged.remove(&digest).expect("it has arrived");
+            assert_eq!(Digest::of(&blob), digest);
+            coordinator.blobs.insert(digest, blob);
+        }
+        answer = serde_json::json!({ "digest": digest, "stored": stored, "staged": staged });
+    });
+    match (response.status().is_success(), cut) {
+        (true, true) => refuse(StatusCode::REQUEST_TIMEOUT, "cut"),
+        (true, false) => Json(answer).into_response(),
+        (false, _) => response,
+    }
+}
+
+async fn staged(State(fake): State<Arc<Fake>>, Path(digest): Path<Digest>) -> Response {
+    let coordinator = lock(&fake.coordinator);
+    let stored = coordinator.blobs.contains_key(&digest);
+    let staged = coordinator.staged.get(&digest).map_or(0, Vec::len);
+    Json(serde_json::json!({ "digest": digest, "stored": stored, "staged": staged })).into_response()
+}
+
+/// Sends a blob, or what follows byte N of it. An answer that is to be cut breaks off in its middle.
+async fn get_blob(
+    State(fake): State<Arc<Fake>>,
+    Path(digest): Path<Digest>,
+    headers: axum::http::HeaderMap,
+) -> Response {
+    if fake.away.load(Ordering::SeqCst) {
+        return refuse(StatusCode::SERVICE_UNAVAILABLE, "internal");
+    }
+    if fake.rotten.load(Ordering::SeqCst) {
+        fake.received.fetch_add(1, Ordering::SeqCst);
+        return refuse(StatusCode::CONFLICT, "damaged");
+    }
+    lock(&fake.coordinator).fetched.push(digest);
+    if fake.stuck.load(Ordering::SeqCst) {
+        std::future::pending::<()>().await;
+    }
+    let Some(mut bytes) = lock(&fake.coordinator).blobs.get(&digest).cloned() else {
+        return refuse(StatusCode::NOT_FOUND, "not-found");
+    };
+    if fake.damage.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok() {
+        bytes[0] ^= 1;
+    }
+    let range = headers.get("range").and_then(|range| range.to_str().ok()?.strip_prefix("bytes=")?.strip_suffix('-'));
+    let from: Option<usize> = range.map(|from| from.parse().expect("a number"));
+    let rest = bytes.split_off(from.unwrap_or_default());
+    let status = if from.is_some() { StatusCode::PARTIAL_CONTENT } else { StatusCode::OK };
+    let length = rest.len();
+    fake.received.fetch_add(length as u64, Ordering::SeqCst);
+    let cut = fake.cut.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok();
+    let body = if cut {
+        let half = Bytes::from(rest).slice(..length / 2);
+        let broken = std::io::Error::other("cut");
+        axum::body::Body::from_stream(futures::stream::iter([Ok(half), Err(broken)]))
+    } else {
+        rest.into()
+    };
+    (status, [("content-length", length.to_string())], body).into_response()
+}
+
+/// Its calls.
+pub(super) fn router(fake: Arc<Fake>) -> Router {
+    Router::new()
+        .route("/v1/workers", post(join))
+        .route("/v1/workers/{worker}/poll", post(poll))
+        .route("/v1/metrics", post(metrics))
+        .route("/v1/logs", post(logs))
+        .route("/v1/checkpoints", post(checkpoint))
+        .route("/v1/outcomes", post(outcome))
+        .route("/v1/blobs/{digest}", put(put_blob).get(get_blob))
+        .route("/v1/blobs/{digest}/staged", get(staged))
+        .layer(DefaultBodyLimit::disable())
+        .with_state(fake)
+}
