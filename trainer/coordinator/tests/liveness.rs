@@ -12,22 +12,22 @@ use protocol::stage::WorkerRange;
 use protocol::{Digest, Incarnation, RunId, WorkerId, limits};
 use registry::WriteError;
 
-use crate::common::{ActorHandle, failed, gang_of_three, pipelines};
+use crate::common::{PureCoordinator, failed, gang_of_three, pipelines};
 
 /// Two workers; `a`, which holds the only task, is never heard again. The other polls every second until it has the task, while
 /// `tick` looks at the clock. How long that took.
-fn taken_after(mut tick: impl FnMut(&mut ActorHandle, u64)) -> u64 {
-    let mut actor_handle = ActorHandle::new(Policy::default());
-    actor_handle.submit("dataset", WorkerRange::default());
-    actor_handle.join("a");
-    let b = actor_handle.join("b");
-    let begun = actor_handle.now;
+fn taken_after(mut tick: impl FnMut(&mut PureCoordinator, u64)) -> u64 {
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    coordinator.submit("dataset", WorkerRange::default());
+    coordinator.join("a");
+    let b = coordinator.join("b");
+    let begun = coordinator.now;
     for second in 1..60 {
-        actor_handle.now = begun + second * 1000;
-        actor_handle.poll("b", b);
-        tick(&mut actor_handle, second);
-        if actor_handle.assignment("b").is_some() {
-            return actor_handle.now - begun;
+        coordinator.now = begun + second * 1000;
+        coordinator.poll("b", b);
+        tick(&mut coordinator, second);
+        if coordinator.assignment("b").is_some() {
+            return coordinator.now - begun;
         }
     }
     panic!("never taken");
@@ -36,10 +36,10 @@ fn taken_after(mut tick: impl FnMut(&mut ActorHandle, u64)) -> u64 {
 /// The actor gets to no tick for 6 s, three times in a row: polls are heard meanwhile, so nobody's lease is longer for it.
 #[test]
 fn p3_a_slow_disk_stretches_no_lease() {
-    let undisturbed = taken_after(|actor_handle, _| actor_handle.tick());
-    let stalled = taken_after(|actor_handle, second| {
+    let undisturbed = taken_after(|coordinator, _| coordinator.tick());
+    let stalled = taken_after(|coordinator, second| {
         if second > 18 || second % 6 == 0 {
-            actor_handle.tick();
+            coordinator.tick();
         }
     });
     assert!((16_000..=17_000).contains(&undisturbed), "{undisturbed}");
@@ -49,10 +49,10 @@ fn p3_a_slow_disk_stretches_no_lease() {
 /// A process that slept through 6 s heard nobody in them: that much longer everybody's lease is, and no more.
 #[test]
 fn p3_leniency_is_as_long_as_the_clock_overslept() {
-    let taken = taken_after(|actor_handle, second| match second {
+    let taken = taken_after(|coordinator, second| match second {
         11..17 => {}
-        17 => actor_handle.hear(Observation::Tick { overslept: 6000 }),
-        _ => actor_handle.tick(),
+        17 => coordinator.hear(Observation::Tick { overslept: 6000 }),
+        _ => coordinator.tick(),
     });
     assert!((22_000..=23_000).contains(&taken), "15 s, 6 s, a tick and a back-off, not {taken} ms");
 }
@@ -64,43 +64,43 @@ fn back_offs_are_half_a_second_doubled_up_to_half_a_minute() {
     assert_eq!(waits, [500, 1000, 2000, 4000, 8000, 16_000, 30_000, 30_000, 30_000]);
 }
 
-fn save(actor_handle: &mut ActorHandle, assignment: &Assignment, step: u64, manifest: &str) {
+fn save(coordinator: &mut PureCoordinator, assignment: &Assignment, step: u64, manifest: &str) {
     let (grant, manifest) = (assignment.grant.clone(), Digest::of(manifest.as_bytes()));
     let commit = CommitCheckpoint { grant, step, manifest, metrics: Default::default() };
-    actor_handle.happen(Event::Checkpoint { commit }).expect("taken");
+    coordinator.happen(Event::Checkpoint { commit }).expect("taken");
 }
 
 /// A worker trains to the next checkpoint and is lost, 250 times.
 #[test]
 fn p15_a_task_that_makes_progress_survives_any_number_of_losses() {
-    let mut actor_handle = ActorHandle::new(Policy::default());
-    let (run, _) = gang_of_three(&mut actor_handle);
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let (run, _) = gang_of_three(&mut coordinator);
     for name in ["b", "c"] {
-        actor_handle.happen(Event::WorkerGone { worker: name.into() }).expect("taken");
+        coordinator.happen(Event::WorkerGone { worker: name.into() }).expect("taken");
     }
     for step in 1..=250 {
-        let assignment = actor_handle.assignment("a").expect("it trains");
-        save(&mut actor_handle, &assignment, step, &format!("step {step}"));
-        actor_handle.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
-        assert_eq!(actor_handle.run_state(&run), RunState::Running, "after loss {step}");
-        actor_handle.now += 40_000;
-        actor_handle.join("a");
-        actor_handle.tick();
+        let assignment = coordinator.assignment("a").expect("it trains");
+        save(&mut coordinator, &assignment, step, &format!("step {step}"));
+        coordinator.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
+        assert_eq!(coordinator.run_state(&run), RunState::Running, "after loss {step}");
+        coordinator.now += 40_000;
+        coordinator.join("a");
+        coordinator.tick();
     }
     // Without progress the budget is what it says.
     let budget = Policy::default().infrastructure_budget;
     for loss in 1..=budget {
-        assert_eq!(actor_handle.run_state(&run), RunState::Running, "after {loss} losses in a row");
-        actor_handle.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
-        actor_handle.now += 40_000;
-        actor_handle.join("a");
-        actor_handle.tick();
+        assert_eq!(coordinator.run_state(&run), RunState::Running, "after {loss} losses in a row");
+        coordinator.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
+        coordinator.now += 40_000;
+        coordinator.join("a");
+        coordinator.tick();
     }
-    assert_eq!(actor_handle.run_state(&run), RunState::Failed);
+    assert_eq!(coordinator.run_state(&run), RunState::Failed);
 }
 
-fn members(actor_handle: &ActorHandle, name: &str) -> Vec<WorkerId> {
-    match actor_handle.assignment(name).map(|assignment| assignment.role) {
+fn members(coordinator: &PureCoordinator, name: &str) -> Vec<WorkerId> {
+    match coordinator.assignment(name).map(|assignment| assignment.role) {
         Some(Role::Member { members, .. }) => members.into_iter().map(|member| member.worker).collect(),
         _ => Vec::new(),
     }
@@ -110,29 +110,29 @@ fn members(actor_handle: &ActorHandle, name: &str) -> Vec<WorkerId> {
 #[test]
 fn p15_a_member_out_of_memory_leaves_its_gang_to_the_others() {
     for order in [["a", "b", "c"], ["c", "a", "b"], ["b", "c", "a"]] {
-        let mut actor_handle = ActorHandle::new(Policy::default());
-        let (run, _) = gang_of_three(&mut actor_handle);
+        let mut coordinator = PureCoordinator::new(Policy::default());
+        let (run, _) = gang_of_three(&mut coordinator);
         for (i, name) in order.iter().enumerate() {
-            let assignment = actor_handle.assignment(name).expect("a member");
-            actor_handle.report(&assignment, failed(FailureClass::OutOfMemory));
+            let assignment = coordinator.assignment(name).expect("a member");
+            coordinator.report(&assignment, failed(FailureClass::OutOfMemory));
             let left: Vec<WorkerId> = order[i + 1..].iter().map(|name| WorkerId::from(*name)).collect();
             if let Some(next) = left.first() {
-                assert_eq!(actor_handle.run_state(&run), RunState::Running, "{name} of {order:?}");
-                assert!(actor_handle.assignment(name).is_none(), "not taken into it again");
+                assert_eq!(coordinator.run_state(&run), RunState::Running, "{name} of {order:?}");
+                assert!(coordinator.assignment(name).is_none(), "not taken into it again");
                 // Not when it polls, not when it joins anew.
-                let incarnation = actor_handle.join(name);
-                actor_handle.poll(name, incarnation);
-                let mut members = members(&actor_handle, next.as_str());
+                let incarnation = coordinator.join(name);
+                coordinator.poll(name, incarnation);
+                let mut members = members(&coordinator, next.as_str());
                 members.sort_unstable();
                 let mut left = left.clone();
                 left.sort_unstable();
                 assert_eq!(members, left);
             }
         }
-        assert_eq!(actor_handle.run_state(&run), RunState::Failed);
+        assert_eq!(coordinator.run_state(&run), RunState::Failed);
         // Asked for again, everybody may try.
-        actor_handle.control(&run, Control::Resume).expect("taken up");
-        assert_eq!(members(&actor_handle, "a").len(), 3);
+        coordinator.control(&run, Control::Resume).expect("taken up");
+        assert_eq!(members(&coordinator, "a").len(), 3);
     }
 }
 
@@ -141,7 +141,7 @@ fn a_gang_has_no_more_members_than_a_batch_has_slices() {
     for (slices, range) in
         [(1, WorkerRange::default()), (2, WorkerRange { min: 1, max: 3 }), (2, WorkerRange { min: 3, max: 3 })]
     {
-        let mut actor_handle = ActorHandle::new(Policy::default());
+        let mut coordinator = PureCoordinator::new(Policy::default());
         let mut pipeline = pipelines::quickstart(1, range, &[]);
         for stage in &mut pipeline.stages {
             if let Some(training) = stage.settings.training_mut() {
@@ -154,14 +154,14 @@ fn a_gang_has_no_more_members_than_a_batch_has_slices() {
             idempotency_key: None,
             until: Some("vae".into()),
         };
-        actor_handle.happen(submit).expect("submitted");
+        coordinator.happen(submit).expect("submitted");
         for name in ["a", "b", "c", "d"] {
-            actor_handle.join(name);
+            coordinator.join(name);
         }
-        let dataset = actor_handle.assignment("a").expect("granted");
+        let dataset = coordinator.assignment("a").expect("granted");
         let output = Digest::of(b"clips");
-        actor_handle.report(&dataset, TaskOutcome::Finished { output, metrics: Default::default() });
-        assert_eq!(members(&actor_handle, "a").len(), slices, "{slices} slices and {range:?}");
+        coordinator.report(&dataset, TaskOutcome::Finished { output, metrics: Default::default() });
+        assert_eq!(members(&coordinator, "a").len(), slices, "{slices} slices and {range:?}");
     }
 }
 
@@ -169,18 +169,18 @@ fn a_gang_has_no_more_members_than_a_batch_has_slices() {
 #[test]
 fn what_names_a_missing_blob_is_a_failed_try_and_is_tried_again() {
     for checkpoint in [None, Some(false), Some(true)] {
-        let mut actor_handle = ActorHandle::new(Policy::default());
+        let mut coordinator = PureCoordinator::new(Policy::default());
         let run = match checkpoint {
             None => {
-                let run = actor_handle.submit("dataset", WorkerRange::default());
-                actor_handle.join("a");
+                let run = coordinator.submit("dataset", WorkerRange::default());
+                coordinator.join("a");
                 run
             }
-            Some(_) => gang_of_three(&mut actor_handle).0,
+            Some(_) => gang_of_three(&mut coordinator).0,
         };
         let mut tries = 0;
-        while actor_handle.run_state(&run) == RunState::Running {
-            let grant = actor_handle.assignment("a").expect("granted again").grant;
+        while coordinator.run_state(&run) == RunState::Running {
+            let grant = coordinator.assignment("a").expect("granted again").grant;
             tries += 1;
             let (output, metrics) = (Digest::of(b"gone"), Default::default());
             let event = match checkpoint {
@@ -194,32 +194,32 @@ fn what_names_a_missing_blob_is_a_failed_try_and_is_tried_again() {
             };
             let error = WriteError::NotFound("blob is not in the store".into());
             let instead = refused_for_good(&event, &error).expect("something happens instead");
-            actor_handle.happen(instead).expect("taken");
-            assert!(!actor_handle.is_held(), "an idle worker would hold it for ever");
-            actor_handle.now += 40_000;
+            coordinator.happen(instead).expect("taken");
+            assert!(!coordinator.is_held(), "an idle worker would hold it for ever");
+            coordinator.now += 40_000;
             for name in ["a", "b", "c"] {
-                if let Some(worker) = actor_handle.state.workers.get(&WorkerId::from(name)) {
+                if let Some(worker) = coordinator.state.workers.get(&WorkerId::from(name)) {
                     let incarnation = worker.incarnation;
-                    actor_handle.poll(name, incarnation);
+                    coordinator.poll(name, incarnation);
                 }
             }
-            actor_handle.tick();
+            coordinator.tick();
         }
         assert_eq!(tries, Policy::default().fault_budget + 1, "within the budget");
-        assert_eq!(actor_handle.run_state(&run), RunState::Failed);
+        assert_eq!(coordinator.run_state(&run), RunState::Failed);
     }
 }
 
 #[test]
 fn two_states_of_one_step_end_the_stage_and_are_both_named() {
-    let mut actor_handle = ActorHandle::new(Policy::default());
-    let (run, _) = gang_of_three(&mut actor_handle);
-    let assignment = actor_handle.assignment("a").expect("it trains");
-    save(&mut actor_handle, &assignment, 1, "one");
-    save(&mut actor_handle, &assignment, 1, "one");
-    assert_eq!(actor_handle.run_state(&run), RunState::Running, "the same is the same");
-    save(&mut actor_handle, &assignment, 1, "another");
-    let view = actor_handle.view(&run);
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let (run, _) = gang_of_three(&mut coordinator);
+    let assignment = coordinator.assignment("a").expect("it trains");
+    save(&mut coordinator, &assignment, 1, "one");
+    save(&mut coordinator, &assignment, 1, "one");
+    assert_eq!(coordinator.run_state(&run), RunState::Running, "the same is the same");
+    save(&mut coordinator, &assignment, 1, "another");
+    let view = coordinator.view(&run);
     let stage = view.stages.iter().find(|stage| stage.state == StageState::Failed).expect("it failed");
     let message = stage.message.clone().unwrap_or_default();
     for digest in ["one", "another"] {
@@ -232,18 +232,18 @@ fn two_states_of_one_step_end_the_stage_and_are_both_named() {
 fn every_generation_has_a_secret_of_its_own() {
     let mut secrets = Vec::new();
     for entropy in ["one", "two"] {
-        let mut actor_handle = ActorHandle::new(Policy::default());
-        actor_handle.entropy = Digest::of(entropy.as_bytes());
-        gang_of_three(&mut actor_handle);
+        let mut coordinator = PureCoordinator::new(Policy::default());
+        coordinator.entropy = Digest::of(entropy.as_bytes());
+        gang_of_three(&mut coordinator);
         for next in ["b", "c", "d", "e"] {
-            match actor_handle.assignment("a").expect("it trains").role {
+            match coordinator.assignment("a").expect("it trains").role {
                 Role::Member { secret, .. } => secrets.push(secret),
                 role => panic!("{role:?}"),
             }
-            if actor_handle.state.workers.contains_key(&WorkerId::from(next)) {
-                actor_handle.happen(Event::WorkerGone { worker: next.into() }).expect("taken");
+            if coordinator.state.workers.contains_key(&WorkerId::from(next)) {
+                coordinator.happen(Event::WorkerGone { worker: next.into() }).expect("taken");
             } else {
-                actor_handle.join(next);
+                coordinator.join(next);
             }
         }
     }
@@ -253,14 +253,14 @@ fn every_generation_has_a_secret_of_its_own() {
     assert!(distinct.len() == secrets.len() && secrets.iter().all(|secret| secret.len() >= 32), "{secrets:?}");
 }
 
-fn submit(actor_handle: &mut ActorHandle, seed: u64) -> RunId {
+fn submit(coordinator: &mut PureCoordinator, seed: u64) -> RunId {
     let submit = Event::Submit {
         pipeline: Box::new(pipelines::quickstart(seed, WorkerRange::default(), &[])),
         source: String::new(),
         idempotency_key: None,
         until: None,
     };
-    let effects = actor_handle.happen(submit).expect("submitted");
+    let effects = coordinator.happen(submit).expect("submitted");
     let run = effects.into_iter().find_map(|effect| match effect {
         coordinator::Effect::Submitted(run) => Some(run),
         _ => None,
@@ -271,89 +271,89 @@ fn submit(actor_handle: &mut ActorHandle, seed: u64) -> RunId {
 /// Cancelled, failed and resumed runs: what an unfinished stage has comes back with the run that wants it, under numbers that were never used.
 #[test]
 fn an_ended_run_leaves_memory_and_is_taken_up_where_it_was() {
-    let mut actor_handle = ActorHandle::new(Policy::default());
-    let (run, _) = gang_of_three(&mut actor_handle);
-    let first = actor_handle.assignment("a").expect("it trains");
-    save(&mut actor_handle, &first, 3, "step 3");
-    actor_handle.control(&run, Control::Cancel).expect("taken");
-    assert!(actor_handle.state.runs.is_empty(), "it has ended");
-    assert!(actor_handle.is_held(), "its workers may still save");
-    actor_handle.report(&first, TaskOutcome::Yielded { at: 3 });
-    assert!(actor_handle.state.executions.is_empty() && actor_handle.state.tasks.is_empty());
-    assert_eq!(actor_handle.run_state(&run), RunState::Cancelled);
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let (run, _) = gang_of_three(&mut coordinator);
+    let first = coordinator.assignment("a").expect("it trains");
+    save(&mut coordinator, &first, 3, "step 3");
+    coordinator.control(&run, Control::Cancel).expect("taken");
+    assert!(coordinator.state.runs.is_empty(), "it has ended");
+    assert!(coordinator.is_held(), "its workers may still save");
+    coordinator.report(&first, TaskOutcome::Yielded { at: 3 });
+    assert!(coordinator.state.executions.is_empty() && coordinator.state.tasks.is_empty());
+    assert_eq!(coordinator.run_state(&run), RunState::Cancelled);
 
-    actor_handle.restart(false);
+    coordinator.restart(false);
     for name in ["a", "b", "c"] {
-        actor_handle.join(name);
+        coordinator.join(name);
     }
-    actor_handle.control(&run, Control::Resume).expect("taken up");
-    let second = actor_handle.assignment("a").expect("it trains again");
+    coordinator.control(&run, Control::Resume).expect("taken up");
+    let second = coordinator.assignment("a").expect("it trains again");
     assert_eq!(second.resume, Some(Digest::of(b"step 3")), "from where it was");
     assert_eq!(second.grant.task, first.grant.task);
     assert!(second.grant.fence > first.grant.fence && second.grant.attempt > first.grant.attempt);
-    actor_handle.control(&run, Control::Cancel).expect("taken");
-    actor_handle.report(&second, TaskOutcome::Yielded { at: 3 });
+    coordinator.control(&run, Control::Cancel).expect("taken");
+    coordinator.report(&second, TaskOutcome::Yielded { at: 3 });
 
     // Another run of the same: it finds the value of the first stage, and the checkpoint of the second.
-    let other = actor_handle.submit("vae", WorkerRange { min: 1, max: 3 });
+    let other = coordinator.submit("vae", WorkerRange { min: 1, max: 3 });
     assert_ne!(other, run);
-    let third = actor_handle.assignment("a").expect("it trains for another run");
+    let third = coordinator.assignment("a").expect("it trains for another run");
     assert_eq!(third.resume, Some(Digest::of(b"step 3")));
     assert!(third.grant.attempt > second.grant.attempt);
     let finished = TaskOutcome::Finished { output: Digest::of(b"vae"), metrics: Default::default() };
-    actor_handle.report(&third, finished);
-    let view = actor_handle.view(&other);
+    coordinator.report(&third, finished);
+    let view = coordinator.view(&other);
     assert_eq!(view.state, RunState::Finished);
     let states: Vec<StageState> = view.stages.iter().map(|stage| stage.state).take(3).collect();
     assert_eq!(states, [StageState::Cached, StageState::Skipped, StageState::Resumed]);
-    assert!(actor_handle.state.executions.is_empty());
+    assert!(coordinator.state.executions.is_empty());
 }
 
 /// What a submission costs, counted: runs, executions and workers that decisions look at, and the size of the state.
 #[test]
 fn a_submission_costs_the_same_however_many_runs_have_ended() {
-    let mut actor_handle = ActorHandle::new(Policy::default());
-    let cost = |actor_handle: &mut ActorHandle, seeds: std::ops::Range<u64>| {
-        let (before, count) = (actor_handle.state.visits, seeds.end - seeds.start);
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let cost = |coordinator: &mut PureCoordinator, seeds: std::ops::Range<u64>| {
+        let (before, count) = (coordinator.state.visits, seeds.end - seeds.start);
         for seed in seeds {
-            let run = submit(actor_handle, seed);
-            actor_handle.control(&run, Control::Cancel).expect("taken");
+            let run = submit(coordinator, seed);
+            coordinator.control(&run, Control::Cancel).expect("taken");
         }
-        ((actor_handle.state.visits - before) / count, journal::snapshot(&actor_handle.state).len())
+        ((coordinator.state.visits - before) / count, journal::snapshot(&coordinator.state).len())
     };
-    let (visits, size) = cost(&mut actor_handle, 0..10);
-    cost(&mut actor_handle, 10..150);
-    let (later_visits, later_size) = cost(&mut actor_handle, 150..160);
+    let (visits, size) = cost(&mut coordinator, 0..10);
+    cost(&mut coordinator, 10..150);
+    let (later_visits, later_size) = cost(&mut coordinator, 150..160);
     assert_eq!(visits, later_visits);
     assert!(later_size <= size + 20, "the state grew from {size} to {later_size} bytes");
 
     // Runs that wait beside it are not looked at either, while nobody is idle.
     for seed in 1000..1040 {
-        submit(&mut actor_handle, seed);
+        submit(&mut coordinator, seed);
     }
-    let (beside_visits, _) = cost(&mut actor_handle, 160..170);
+    let (beside_visits, _) = cost(&mut coordinator, 160..170);
     assert_eq!(visits, beside_visits, "with 40 runs that wait");
 }
 
 #[test]
 fn a_worker_that_is_away_for_an_hour_leaves_memory_and_comes_back_as_another_process() {
-    let mut actor_handle = ActorHandle::new(Policy::default());
-    let old = actor_handle.join("a");
-    actor_handle.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
-    actor_handle.now += 3_590_000;
-    actor_handle.tick();
-    assert!(actor_handle.state.workers.contains_key(&WorkerId::from("a")));
-    actor_handle.now += 20_000;
-    actor_handle.tick();
-    assert!(actor_handle.state.workers.is_empty());
-    actor_handle.restart(false);
-    let new: Incarnation = actor_handle.join("a");
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let old = coordinator.join("a");
+    coordinator.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
+    coordinator.now += 3_590_000;
+    coordinator.tick();
+    assert!(coordinator.state.workers.contains_key(&WorkerId::from("a")));
+    coordinator.now += 20_000;
+    coordinator.tick();
+    assert!(coordinator.state.workers.is_empty());
+    coordinator.restart(false);
+    let new: Incarnation = coordinator.join("a");
     assert!(new > old, "{new} after {old}");
 }
 
 #[test]
 fn a_pipeline_of_more_than_a_thousand_stages_is_refused() {
-    let mut actor_handle = ActorHandle::new(Policy::default());
+    let mut coordinator = PureCoordinator::new(Policy::default());
     let mut pipeline = pipelines::quickstart(1, WorkerRange::default(), &[]);
     let text = pipeline.stages.remove(1);
     pipeline.stages = (0..=limits::STAGES)
@@ -366,7 +366,7 @@ fn a_pipeline_of_more_than_a_thousand_stages_is_refused() {
             idempotency_key: None,
             until: Some("nowhere".into()),
         };
-        actor_handle.happen(event).expect_err("refused").to_string()
+        coordinator.happen(event).expect_err("refused").to_string()
     };
     pipeline.stages[0].inputs.clear();
     for stage in &mut pipeline.stages {
@@ -383,36 +383,36 @@ fn a_pipeline_of_more_than_a_thousand_stages_is_refused() {
 /// What another build wrote: a later minor version with what this one knows, one with what it does not, and another major version.
 #[test]
 fn what_is_stored_says_of_which_format_it_is() {
-    let mut actor_handle = ActorHandle::new(Policy::default());
-    let run = actor_handle.submit("dataset", WorkerRange::default());
-    actor_handle.join("a");
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let run = coordinator.submit("dataset", WorkerRange::default());
+    coordinator.join("a");
     let recover = |stored: &registry::Recovery| journal::recover(Policy::default(), stored).map_err(|e| e.to_string());
     let with = |from: &str, to: &str| {
-        let mut stored = actor_handle.store.recovery.clone();
+        let mut stored = coordinator.store.recovery.clone();
         let text = &mut stored.facts[1].1;
         assert!(text.contains(from), "{text}");
         *text = text.replace(from, to);
         recover(&stored)
     };
-    assert!(recover(&actor_handle.store.recovery).is_ok());
+    assert!(recover(&coordinator.store.recovery).is_ok());
     assert!(with("\"format\":[1,1]", "\"format\":[1,7]").is_ok());
     let refused = with("\"format\":[1,1]", "\"format\":[2,0]").expect_err("another major version");
     assert!(refused.contains("format 2.0") && refused.contains("1.x") && refused.contains("decision 2"), "{refused}");
     let refused = with("\"execution-state\"", "\"horoscope\"").expect_err("an unknown kind");
     assert!(refused.contains("horoscope") && refused.contains("decision 2"), "{refused}");
-    let mut stored = actor_handle.store.recovery.clone();
+    let mut stored = coordinator.store.recovery.clone();
     stored.facts.remove(1);
     let refused = recover(&stored).expect_err("one is missing");
     assert!(refused.contains("decision 3") && refused.contains("missing"), "{refused}");
 
     // The same through a snapshot.
-    actor_handle.store.snapshot(&actor_handle.state);
-    let whole = recover(&actor_handle.store.recovery).expect("it opens");
+    coordinator.store.snapshot(&coordinator.state);
+    let whole = recover(&coordinator.store.recovery).expect("it opens");
     assert!(
         whole.run(&run).is_ok() && whole.executions.values().all(|execution| execution.state == ExecutionState::Open)
     );
-    let (_, text) = actor_handle.store.recovery.snapshot.as_mut().expect("a snapshot");
+    let (_, text) = coordinator.store.recovery.snapshot.as_mut().expect("a snapshot");
     *text = text.replace("\"format\":[1,1]", "\"format\":[3,1]");
-    let refused = recover(&actor_handle.store.recovery).expect_err("another major version");
+    let refused = recover(&coordinator.store.recovery).expect_err("another major version");
     assert!(refused.contains("format 3.1") && refused.contains("snapshot"), "{refused}");
 }

@@ -13,7 +13,7 @@ use protocol::message::{
 use protocol::stage::WorkerRange;
 use protocol::{Digest, RunId, WorkerId};
 
-use crate::common::{ActorHandle, failed, gang_of_three};
+use crate::common::{PureCoordinator, failed, gang_of_three};
 
 /// Sampled: a worker that dies at each of 40 moments between two looks at the clock, 25 ms apart.
 #[test]
@@ -21,28 +21,28 @@ fn p3_the_task_of_a_dead_worker_is_another_s_within_16_seconds() {
     let policy = Policy::default();
     assert_eq!((policy.lease_ms, policy.tick_ms), (15_000, 1_000), "what is promised is 15 s and 1 s");
     for offset in (0..policy.tick_ms).step_by(25) {
-        let mut actor_handle = ActorHandle::new(Policy::default());
-        actor_handle.submit("dataset", WorkerRange::default());
-        let a = actor_handle.join("a");
-        let lost = actor_handle.assignment("a").expect("the only worker gets it").grant;
-        let b = actor_handle.join("b");
+        let mut coordinator = PureCoordinator::new(Policy::default());
+        coordinator.submit("dataset", WorkerRange::default());
+        let a = coordinator.join("a");
+        let lost = coordinator.assignment("a").expect("the only worker gets it").grant;
+        let b = coordinator.join("b");
         // The clock is looked at every second, from a moment that has nothing to do with when `a` was last heard.
-        let first = actor_handle.now;
-        actor_handle.now += offset;
-        actor_handle.poll("a", a);
-        let heard = actor_handle.now;
+        let first = coordinator.now;
+        coordinator.now += offset;
+        coordinator.poll("a", a);
+        let heard = coordinator.now;
         let mut tick = first;
         let taken = loop {
             tick += policy.tick_ms;
-            actor_handle.now = tick;
-            actor_handle.poll("b", b);
-            actor_handle.tick();
-            if let Some(taken) = actor_handle.assignment("b") {
+            coordinator.now = tick;
+            coordinator.poll("b", b);
+            coordinator.tick();
+            if let Some(taken) = coordinator.assignment("b") {
                 break taken.grant;
             }
             assert!(tick < heard + 60_000, "never taken");
         };
-        let after = actor_handle.now - heard;
+        let after = coordinator.now - heard;
         // The loss may be followed by a first back-off of half a second.
         let bound = policy.lease_ms + policy.tick_ms;
         assert!(after > policy.lease_ms, "a lease of {} ms ended after {after} ms", policy.lease_ms);
@@ -50,16 +50,16 @@ fn p3_the_task_of_a_dead_worker_is_another_s_within_16_seconds() {
         assert!(after <= bound + backoff, "offset {offset}: taken after {after} ms");
         assert!(taken.fence > lost.fence && taken.attempt > lost.attempt);
         let refused = ReportOutcome { grant: lost, outcome: failed(FailureClass::Fault) };
-        let refused = actor_handle.happen(Event::Outcome { report: refused });
+        let refused = coordinator.happen(Event::Outcome { report: refused });
         assert!(matches!(refused, Err(Rejected::StaleFence { .. })), "{refused:?}");
     }
 }
 
 #[test]
 fn only_the_first_member_of_a_gang_commits_and_reports_the_end() {
-    let mut actor_handle = ActorHandle::new(Policy::default());
-    let (run, _) = gang_of_three(&mut actor_handle);
-    let [first, second] = ["a", "b"].map(|name| actor_handle.assignment(name).expect("it trains").grant);
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let (run, _) = gang_of_three(&mut coordinator);
+    let [first, second] = ["a", "b"].map(|name| coordinator.assignment(name).expect("it trains").grant);
     let events = |grant: &Grant| {
         let (manifest, output) = (Digest::of(b"step 1"), Digest::of(b"vae"));
         let commit = CommitCheckpoint { grant: grant.clone(), step: 1, manifest, metrics: Default::default() };
@@ -68,98 +68,94 @@ fn only_the_first_member_of_a_gang_commits_and_reports_the_end() {
         [Event::Checkpoint { commit }, report(TaskOutcome::Yielded { at: 1 }), report(finished)]
     };
     for event in events(&second) {
-        let refused = actor_handle.happen(event.clone());
+        let refused = coordinator.happen(event.clone());
         assert!(matches!(refused, Err(Rejected::Conflict(_))), "{event:?}: {refused:?}");
     }
     let [commit, _, finished] = events(&first);
-    actor_handle.happen(commit).expect("saved");
-    actor_handle.happen(finished).expect("done");
-    assert_eq!(actor_handle.run_state(&run), RunState::Finished);
+    coordinator.happen(commit).expect("saved");
+    coordinator.happen(finished).expect("done");
+    assert_eq!(coordinator.run_state(&run), RunState::Finished);
 }
 
 /// Sampled: one gang of three. Its first member is silent past its lease, wakes with its old grant, tells its progress and that it lost the
 /// others; then the same as an event, as if it had been heard before the gang went on without it.
 #[test]
 fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
-    let mut actor_handle = ActorHandle::new(Policy::default());
-    let (run, [a, b, c]) = gang_of_three(&mut actor_handle);
-    let old = actor_handle.assignment("a").expect("it trains").grant;
-    let gang = |actor_handle: &ActorHandle| {
-        let (_, task) = actor_handle.state.task(&old.task).expect("known");
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let (run, [a, b, c]) = gang_of_three(&mut coordinator);
+    let old = coordinator.assignment("a").expect("it trains").grant;
+    let gang = |coordinator: &PureCoordinator| {
+        let (_, task) = coordinator.state.task(&old.task).expect("known");
         task.holders().iter().map(|member| member.worker.clone()).collect::<Vec<_>>()
     };
-    assert_eq!(gang(&actor_handle), ["a", "b", "c"].map(WorkerId::from));
+    assert_eq!(gang(&coordinator), ["a", "b", "c"].map(WorkerId::from));
     for _ in 0..16 {
-        actor_handle.now += 1000;
-        actor_handle.poll("b", b);
-        actor_handle.poll("c", c);
-        actor_handle.tick();
+        coordinator.now += 1000;
+        coordinator.poll("b", b);
+        coordinator.poll("c", c);
+        coordinator.tick();
     }
-    assert_eq!(gang(&actor_handle), ["b", "c"].map(WorkerId::from));
+    assert_eq!(gang(&coordinator), ["b", "c"].map(WorkerId::from));
 
     let lost = vec!["b".into(), "c".into()];
     let progress = Progress { done: 999, total: 1000, ..Progress::default() };
     let doing = vec![Doing { grant: old.clone(), progress, lost: lost.clone() }];
     let poll = Poll { incarnation: a, doing, ready: Vec::new(), version: 0 };
     let heard =
-        observe(&mut actor_handle.state, Millis(actor_handle.now), Observation::Poll { worker: "a".into(), poll });
+        observe(&mut coordinator.state, Millis(coordinator.now), Observation::Poll { worker: "a".into(), poll });
     let heard = heard.expect("it is known");
     assert!(matches!(&heard[..], [Event::WorkerBack { worker }] if worker.as_str() == "a"), "{heard:?}");
-    let view = actor_handle.view(&run);
+    let view = coordinator.view(&run);
     let told: Vec<u64> = view.stages.iter().map(|stage| stage.progress.done).collect();
     assert!(!told.contains(&999), "{told:?}");
 
-    let refused = actor_handle.happen(Event::PeersLost { grant: old.clone(), lost });
+    let refused = coordinator.happen(Event::PeersLost { grant: old.clone(), lost });
     assert!(matches!(refused, Err(Rejected::StaleFence { .. })), "{refused:?}");
-    assert_eq!(gang(&actor_handle), ["b", "c"].map(WorkerId::from));
+    assert_eq!(gang(&coordinator), ["b", "c"].map(WorkerId::from));
 }
 
 /// One gap of 8 s between two looks at the clock of a process that was stopped: who was heard in it has a lease from then on, not a lease and 8 s.
 #[test]
 fn p3_a_late_clock_gives_nobody_more_than_a_lease_from_now() {
-    let mut actor_handle = ActorHandle::new(Policy::default());
-    actor_handle.submit("dataset", WorkerRange::default());
-    let a = actor_handle.join("a");
-    actor_handle.tick();
-    actor_handle.now += 8000;
-    actor_handle.poll("a", a);
-    actor_handle.hear(Observation::Tick { overslept: 7000 });
-    let heard = actor_handle.now;
-    while actor_handle.is_held() {
-        actor_handle.now += 1000;
-        actor_handle.tick();
-        assert!(
-            actor_handle.now - heard <= 16_000,
-            "still held {} ms after it was last heard",
-            actor_handle.now - heard
-        );
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    coordinator.submit("dataset", WorkerRange::default());
+    let a = coordinator.join("a");
+    coordinator.tick();
+    coordinator.now += 8000;
+    coordinator.poll("a", a);
+    coordinator.hear(Observation::Tick { overslept: 7000 });
+    let heard = coordinator.now;
+    while coordinator.is_held() {
+        coordinator.now += 1000;
+        coordinator.tick();
+        assert!(coordinator.now - heard <= 16_000, "still held {} ms after it was last heard", coordinator.now - heard);
     }
-    assert!(actor_handle.now - heard > 15_000, "its lease was cut short");
+    assert!(coordinator.now - heard > 15_000, "its lease was cut short");
 }
 
 /// One restart after a simulated hour, with workers that come back at once, late within the lease, and never.
 #[test]
 fn p3_after_an_hour_without_a_coordinator_leases_get_one_interval_of_grace() {
     for back_after in [0, 14_000] {
-        let mut actor_handle = ActorHandle::new(Policy::default());
-        actor_handle.submit("dataset", WorkerRange::default());
-        let a = actor_handle.join("a");
-        let held = actor_handle.assignment("a").expect("held").grant;
-        actor_handle.now += 3_600_000;
-        actor_handle.restart(false);
+        let mut coordinator = PureCoordinator::new(Policy::default());
+        coordinator.submit("dataset", WorkerRange::default());
+        let a = coordinator.join("a");
+        let held = coordinator.assignment("a").expect("held").grant;
+        coordinator.now += 3_600_000;
+        coordinator.restart(false);
         for _ in 0..back_after / 1000 {
-            actor_handle.tick();
-            actor_handle.now += 1000;
+            coordinator.tick();
+            coordinator.now += 1000;
         }
-        actor_handle.poll("a", a);
-        actor_handle.tick();
-        assert_eq!(actor_handle.assignment("a").expect("still its own").grant, held, "back after {back_after} ms");
+        coordinator.poll("a", a);
+        coordinator.tick();
+        assert_eq!(coordinator.assignment("a").expect("still its own").grant, held, "back after {back_after} ms");
         // Then silent for good: nothing stays with it.
         for _ in 0..17 {
-            actor_handle.now += 1000;
-            actor_handle.tick();
+            coordinator.now += 1000;
+            coordinator.tick();
         }
-        assert!(!actor_handle.is_held(), "an orphan");
+        assert!(!coordinator.is_held(), "an orphan");
     }
 }
 
@@ -173,14 +169,14 @@ fn p15_each_budget_allows_exactly_one_try_more_than_it_says() {
                 FailureClass::Fault => (faults, losses),
                 _ => (losses, faults),
             };
-            let mut actor_handle = ActorHandle::new(policy.clone());
-            let run = actor_handle.submit("dataset", WorkerRange::default());
+            let mut coordinator = PureCoordinator::new(policy.clone());
+            let run = coordinator.submit("dataset", WorkerRange::default());
             let mut others = 0;
             let mut attempts = 0;
             let mut streak = 0;
-            let a = actor_handle.join("a");
+            let a = coordinator.join("a");
             loop {
-                let assignment = actor_handle.assignment("a").expect("granted once the back-off is over");
+                let assignment = coordinator.assignment("a").expect("granted once the back-off is over");
                 attempts += 1;
                 // The other budget is used up on the way, to its end and no further.
                 let class = if others < other && attempts % 2 == 0 {
@@ -189,24 +185,24 @@ fn p15_each_budget_allows_exactly_one_try_more_than_it_says() {
                 } else {
                     class
                 };
-                actor_handle.report(&assignment, failed(class));
+                coordinator.report(&assignment, failed(class));
                 streak += 1;
-                actor_handle.restart(false);
-                if actor_handle.run_state(&run) == RunState::Failed {
+                coordinator.restart(false);
+                if coordinator.run_state(&run) == RunState::Failed {
                     break;
                 }
                 let backoff = policy.backoff(streak);
                 assert!(backoff <= policy.backoff_max_ms);
-                actor_handle.now += backoff - 1;
-                actor_handle.poll("a", a);
-                actor_handle.tick();
-                assert!(actor_handle.assignment("a").is_none(), "granted before {backoff} ms were over");
-                actor_handle.now += 1;
-                actor_handle.tick();
+                coordinator.now += backoff - 1;
+                coordinator.poll("a", a);
+                coordinator.tick();
+                assert!(coordinator.assignment("a").is_none(), "granted before {backoff} ms were over");
+                coordinator.now += 1;
+                coordinator.tick();
                 assert!(attempts < 50, "never given up");
             }
             assert_eq!(attempts - others, own + 1, "budgets {faults} and {losses}, failing by {class:?}");
-            let view = actor_handle.view(&run);
+            let view = coordinator.view(&run);
             let message = view.stages[0].message.clone().unwrap_or_default();
             assert!(message.contains("gave up after") && message.contains("made up"), "{message}");
         }
@@ -218,54 +214,54 @@ fn p15_each_budget_allows_exactly_one_try_more_than_it_says() {
 fn p15_a_final_failure_is_not_tried_again() {
     for class in [FailureClass::Input, FailureClass::Diverged, FailureClass::OutOfMemory, FailureClass::Storage] {
         for before in [0, 2] {
-            let mut actor_handle = ActorHandle::new(Policy::default());
-            let run = actor_handle.submit("dataset", WorkerRange::default());
-            let a = actor_handle.join("a");
+            let mut coordinator = PureCoordinator::new(Policy::default());
+            let run = coordinator.submit("dataset", WorkerRange::default());
+            let a = coordinator.join("a");
             for _ in 0..before {
-                let assignment = actor_handle.assignment("a").expect("granted");
-                actor_handle.report(&assignment, failed(FailureClass::Fault));
-                actor_handle.now += actor_handle.state.policy.backoff_max_ms;
-                actor_handle.poll("a", a);
-                actor_handle.tick();
+                let assignment = coordinator.assignment("a").expect("granted");
+                coordinator.report(&assignment, failed(FailureClass::Fault));
+                coordinator.now += coordinator.state.policy.backoff_max_ms;
+                coordinator.poll("a", a);
+                coordinator.tick();
             }
-            let assignment = actor_handle.assignment("a").expect("granted");
-            actor_handle.report(&assignment, failed(class));
-            assert_eq!(actor_handle.run_state(&run), RunState::Failed, "{class:?}");
-            let view = actor_handle.view(&run);
+            let assignment = coordinator.assignment("a").expect("granted");
+            coordinator.report(&assignment, failed(class));
+            assert_eq!(coordinator.run_state(&run), RunState::Failed, "{class:?}");
+            let view = coordinator.view(&run);
             assert_eq!(view.stages[0].state, StageState::Failed);
             assert_eq!(view.stages[0].attempt.0, before + 1);
-            assert!(actor_handle.assignment("a").is_none());
+            assert!(coordinator.assignment("a").is_none());
             // Asked for again, it begins again.
-            actor_handle.control(&run, Control::Resume).expect("taken up");
-            assert!(actor_handle.assignment("a").is_some());
+            coordinator.control(&run, Control::Resume).expect("taken up");
+            assert!(coordinator.assignment("a").is_some());
         }
     }
 }
 
 /// A run in each of its states, made as a run gets there.
-fn in_state(state: RunState, held: bool) -> (ActorHandle, RunId) {
-    let mut actor_handle = ActorHandle::new(Policy::default());
-    let run = actor_handle.submit("dataset", WorkerRange::default());
-    let control = |actor_handle: &mut ActorHandle, action| actor_handle.control(&run, action).expect("taken");
+fn in_state(state: RunState, held: bool) -> (PureCoordinator, RunId) {
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let run = coordinator.submit("dataset", WorkerRange::default());
+    let control = |coordinator: &mut PureCoordinator, action| coordinator.control(&run, action).expect("taken");
     if held || matches!(state, RunState::Finished | RunState::Failed) {
-        actor_handle.join("a");
+        coordinator.join("a");
     }
     match state {
         RunState::Running => {}
-        RunState::Paused => drop(control(&mut actor_handle, Control::Pause)),
-        RunState::Cancelled => drop(control(&mut actor_handle, Control::Cancel)),
+        RunState::Paused => drop(control(&mut coordinator, Control::Pause)),
+        RunState::Cancelled => drop(control(&mut coordinator, Control::Cancel)),
         RunState::Failed => {
-            let assignment = actor_handle.assignment("a").expect("granted");
-            actor_handle.report(&assignment, failed(FailureClass::Input));
+            let assignment = coordinator.assignment("a").expect("granted");
+            coordinator.report(&assignment, failed(FailureClass::Input));
         }
         RunState::Finished => {
-            let assignment = actor_handle.assignment("a").expect("granted");
+            let assignment = coordinator.assignment("a").expect("granted");
             let output = Digest::of(b"clips");
-            actor_handle.report(&assignment, TaskOutcome::Finished { output, metrics: Default::default() });
+            coordinator.report(&assignment, TaskOutcome::Finished { output, metrics: Default::default() });
         }
     }
-    assert_eq!(actor_handle.run_state(&run), state);
-    (actor_handle, run)
+    assert_eq!(coordinator.run_state(&run), state);
+    (coordinator, run)
 }
 
 /// The whole table: each state, idle and with a worker that never answers, asked for each action, with the coordinator
@@ -286,31 +282,31 @@ fn p14_pause_resume_and_cancel_end_where_the_table_says_whoever_is_killed() {
             for held in [false, true] {
                 for killed in ["never", "before", "after"] {
                     let case = format!("{state:?}, held: {held}, {action:?}, killed {killed}");
-                    let (mut actor_handle, run) = in_state(state, held);
+                    let (mut coordinator, run) = in_state(state, held);
                     if killed == "before" {
                         // Nobody was answered, so the client asks again.
-                        actor_handle.restart(false);
+                        coordinator.restart(false);
                     }
-                    let asked = actor_handle.control(&run, action);
+                    let asked = coordinator.control(&run, action);
                     assert_eq!(asked.is_ok(), expected.is_some(), "{case}: {asked:?}");
                     if killed == "after" {
-                        actor_handle.restart(false);
+                        coordinator.restart(false);
                     }
                     let expected = expected.unwrap_or(state);
-                    assert_eq!(actor_handle.run_state(&run), expected, "{case}");
-                    let begun = actor_handle.now;
-                    let worker = actor_handle.state.workers.contains_key(&"a".into());
-                    while actor_handle.is_held() && expected != Running {
-                        actor_handle.now += 1000;
+                    assert_eq!(coordinator.run_state(&run), expected, "{case}");
+                    let begun = coordinator.now;
+                    let worker = coordinator.state.workers.contains_key(&"a".into());
+                    while coordinator.is_held() && expected != Running {
+                        coordinator.now += 1000;
                         if worker {
                             // It lives and polls, and does not do what it is told.
-                            actor_handle.poll("a", actor_handle.state.workers[&"a".into()].incarnation);
+                            coordinator.poll("a", coordinator.state.workers[&"a".into()].incarnation);
                         }
-                        actor_handle.tick();
-                        let limit = actor_handle.state.policy.grace_ms + 5000;
-                        assert!(actor_handle.now - begun <= limit, "{case}: still held after {limit} ms");
+                        coordinator.tick();
+                        let limit = coordinator.state.policy.grace_ms + 5000;
+                        assert!(coordinator.now - begun <= limit, "{case}: still held after {limit} ms");
                     }
-                    assert_eq!(actor_handle.run_state(&run), expected, "{case}");
+                    assert_eq!(coordinator.run_state(&run), expected, "{case}");
                 }
             }
         }
@@ -320,29 +316,29 @@ fn p14_pause_resume_and_cancel_end_where_the_table_says_whoever_is_killed() {
 /// Draining with a worker that does not answer; then a new start gives the work out again.
 #[test]
 fn p14_a_drain_ends_though_a_worker_ignores_it() {
-    let (mut actor_handle, run) = in_state(RunState::Running, true);
-    let a = actor_handle.state.workers[&"a".into()].incarnation;
-    actor_handle.happen(Event::Drain).expect("taken");
-    assert!(actor_handle.assignment("a").is_some_and(|assignment| assignment.drain));
-    for _ in 0..(actor_handle.state.policy.grace_ms / 1000 + 1) {
-        actor_handle.now += 1000;
-        actor_handle.poll("a", a);
-        actor_handle.tick();
+    let (mut coordinator, run) = in_state(RunState::Running, true);
+    let a = coordinator.state.workers[&"a".into()].incarnation;
+    coordinator.happen(Event::Drain).expect("taken");
+    assert!(coordinator.assignment("a").is_some_and(|assignment| assignment.drain));
+    for _ in 0..(coordinator.state.policy.grace_ms / 1000 + 1) {
+        coordinator.now += 1000;
+        coordinator.poll("a", a);
+        coordinator.tick();
     }
-    let waits = |actor_handle: &ActorHandle| {
-        let mut tasks = actor_handle.state.executions.values().flat_map(|execution| &execution.tasks);
+    let waits = |coordinator: &PureCoordinator| {
+        let mut tasks = coordinator.state.executions.values().flat_map(|execution| &execution.tasks);
         tasks.all(|task| matches!(task.lease, Lease::Waiting { .. }))
     };
-    assert!(waits(&actor_handle), "released by force");
-    assert_eq!(actor_handle.run_state(&run), RunState::Running, "the run itself was not asked to stop");
-    assert!(actor_handle.state.desired(&"a".into(), a).expect("known").leave);
-    actor_handle.restart(false);
-    actor_handle.poll("a", a);
-    assert!(actor_handle.assignment("a").is_some(), "a new start gives it out again");
+    assert!(waits(&coordinator), "released by force");
+    assert_eq!(coordinator.run_state(&run), RunState::Running, "the run itself was not asked to stop");
+    assert!(coordinator.state.desired(&"a".into(), a).expect("known").leave);
+    coordinator.restart(false);
+    coordinator.poll("a", a);
+    assert!(coordinator.assignment("a").is_some(), "a new start gives it out again");
 }
 
-fn members(actor_handle: &ActorHandle) -> Vec<String> {
-    let tasks = actor_handle.state.executions.values().flat_map(|execution| execution.tasks.iter());
+fn members(coordinator: &PureCoordinator) -> Vec<String> {
+    let tasks = coordinator.state.executions.values().flat_map(|execution| execution.tasks.iter());
     let gang = tasks.filter(|task| task.part == Part::Gang).flat_map(|task| task.holders());
     gang.map(|member| member.worker.to_string()).collect()
 }
@@ -350,82 +346,82 @@ fn members(actor_handle: &ActorHandle) -> Vec<String> {
 /// Sampled: of three workers one has the inputs when the stage begins, one gets them later, one never does.
 #[test]
 fn p4_a_gang_waits_for_nobody_who_fetches_its_inputs() {
-    let mut actor_handle = ActorHandle::new(Policy::default());
-    actor_handle.quick = false;
-    actor_handle.submit("vae", WorkerRange { min: 1, max: 3 });
-    actor_handle.join("a");
-    let dataset = actor_handle.assignment("a").expect("the only worker gets it");
-    actor_handle.report(&dataset, TaskOutcome::Finished { output: Digest::of(b"clips"), metrics: Default::default() });
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    coordinator.quick = false;
+    coordinator.submit("vae", WorkerRange { min: 1, max: 3 });
+    coordinator.join("a");
+    let dataset = coordinator.assignment("a").expect("the only worker gets it");
+    coordinator.report(&dataset, TaskOutcome::Finished { output: Digest::of(b"clips"), metrics: Default::default() });
     for name in ["b", "c"] {
-        actor_handle.join(name);
+        coordinator.join(name);
     }
-    assert_eq!(members(&actor_handle), [""; 0], "nobody has its inputs");
+    assert_eq!(members(&coordinator), [""; 0], "nobody has its inputs");
     for name in ["a", "b", "c"] {
-        let asked = actor_handle.asked(name);
+        let asked = coordinator.asked(name);
         assert_eq!(asked.len(), 1, "{name}: {asked:?}");
         assert!(asked[0].inputs.values().eq([&Digest::of(b"clips")]) && asked[0].resume.is_none(), "{asked:?}");
     }
-    actor_handle.prepare("b");
-    assert_eq!(members(&actor_handle), ["b"], "it starts with who is ready");
-    assert_eq!(actor_handle.asked("b"), []);
-    let held = actor_handle.assignment("b").expect("it trains");
-    actor_handle.poll("c", actor_handle.state.workers[&WorkerId::from("c")].incarnation);
-    actor_handle.tick();
-    assert_eq!(actor_handle.assignment("b").as_ref(), Some(&held), "and nobody disturbs it");
+    coordinator.prepare("b");
+    assert_eq!(members(&coordinator), ["b"], "it starts with who is ready");
+    assert_eq!(coordinator.asked("b"), []);
+    let held = coordinator.assignment("b").expect("it trains");
+    coordinator.poll("c", coordinator.state.workers[&WorkerId::from("c")].incarnation);
+    coordinator.tick();
+    assert_eq!(coordinator.assignment("b").as_ref(), Some(&held), "and nobody disturbs it");
     let commit = CommitCheckpoint {
         grant: held.grant.clone(),
         step: 4,
         manifest: Digest::of(b"state"),
         metrics: Default::default(),
     };
-    actor_handle.happen(Event::Checkpoint { commit }).expect("saved");
-    assert_eq!(actor_handle.asked("a")[0].resume, None, "a joiner is handed the state");
-    actor_handle.prepare("a");
-    assert_eq!(members(&actor_handle), ["b", "a"]);
-    assert_eq!(actor_handle.assignment("b").expect("it trains").grant.attempt, held.grant.attempt);
+    coordinator.happen(Event::Checkpoint { commit }).expect("saved");
+    assert_eq!(coordinator.asked("a")[0].resume, None, "a joiner is handed the state");
+    coordinator.prepare("a");
+    assert_eq!(members(&coordinator), ["b", "a"]);
+    assert_eq!(coordinator.assignment("b").expect("it trains").grant.attempt, held.grant.attempt);
     // With nobody left to hand it over, a worker that begins needs the checkpoint too.
     for name in ["a", "b"] {
-        actor_handle.happen(Event::WorkerGone { worker: name.into() }).expect("gone");
+        coordinator.happen(Event::WorkerGone { worker: name.into() }).expect("gone");
     }
-    assert_eq!(actor_handle.asked("c")[0].resume, Some(Digest::of(b"state")));
+    assert_eq!(coordinator.asked("c")[0].resume, Some(Digest::of(b"state")));
 }
 
 /// Sampled: two workers of one instruction set and one of another, before and after something is saved.
 #[test]
 fn p1_all_that_work_on_a_stage_share_an_instruction_set() {
-    let mut actor_handle = ActorHandle::new(Policy::default());
-    let run = actor_handle.submit("vae", WorkerRange { min: 1, max: 3 });
-    let vae = |actor_handle: &ActorHandle| {
-        actor_handle.view(&run).stages.into_iter().find(|stage| stage.name.as_str() == "vae").expect("a stage")
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let run = coordinator.submit("vae", WorkerRange { min: 1, max: 3 });
+    let vae = |coordinator: &PureCoordinator| {
+        coordinator.view(&run).stages.into_iter().find(|stage| stage.name.as_str() == "vae").expect("a stage")
     };
-    actor_handle.join_with("a", "avx2");
-    let dataset = actor_handle.assignment("a").expect("the only worker gets it");
-    actor_handle.report(&dataset, TaskOutcome::Finished { output: Digest::of(b"clips"), metrics: Default::default() });
-    actor_handle.join_with("b", "avx512");
-    actor_handle.join_with("c", "avx2");
-    assert_eq!(members(&actor_handle), ["a", "c"]);
-    assert_eq!(actor_handle.asked("b"), [], "it could not be taken in");
-    assert_eq!(vae(&actor_handle).instruction_set.as_deref(), Some("avx2"));
-    let over = |actor_handle: &mut ActorHandle, names: &[&str]| {
+    coordinator.join_with("a", "avx2");
+    let dataset = coordinator.assignment("a").expect("the only worker gets it");
+    coordinator.report(&dataset, TaskOutcome::Finished { output: Digest::of(b"clips"), metrics: Default::default() });
+    coordinator.join_with("b", "avx512");
+    coordinator.join_with("c", "avx2");
+    assert_eq!(members(&coordinator), ["a", "c"]);
+    assert_eq!(coordinator.asked("b"), [], "it could not be taken in");
+    assert_eq!(vae(&coordinator).instruction_set.as_deref(), Some("avx2"));
+    let over = |coordinator: &mut PureCoordinator, names: &[&str]| {
         for name in names {
-            actor_handle.happen(Event::WorkerGone { worker: (*name).into() }).expect("gone");
+            coordinator.happen(Event::WorkerGone { worker: (*name).into() }).expect("gone");
         }
         for _ in 0..5 {
-            actor_handle.now += 1_000;
-            actor_handle.tick();
+            coordinator.now += 1_000;
+            coordinator.tick();
         }
     };
-    over(&mut actor_handle, &["a", "c"]);
-    assert_eq!(members(&actor_handle), ["b"], "nothing was saved that would bind it");
-    assert_eq!(vae(&actor_handle).instruction_set.as_deref(), Some("avx512"));
-    let grant = actor_handle.assignment("b").expect("it trains").grant;
+    over(&mut coordinator, &["a", "c"]);
+    assert_eq!(members(&coordinator), ["b"], "nothing was saved that would bind it");
+    assert_eq!(vae(&coordinator).instruction_set.as_deref(), Some("avx512"));
+    let grant = coordinator.assignment("b").expect("it trains").grant;
     let commit = CommitCheckpoint { grant, step: 4, manifest: Digest::of(b"state"), metrics: Default::default() };
-    actor_handle.happen(Event::Checkpoint { commit }).expect("saved");
-    over(&mut actor_handle, &["b"]);
-    actor_handle.join_with("a", "avx2");
-    assert_eq!(members(&actor_handle), [""; 0], "its bits would be others");
-    let message = vae(&actor_handle).message.unwrap_or_default();
+    coordinator.happen(Event::Checkpoint { commit }).expect("saved");
+    over(&mut coordinator, &["b"]);
+    coordinator.join_with("a", "avx2");
+    assert_eq!(members(&coordinator), [""; 0], "its bits would be others");
+    let message = vae(&coordinator).message.unwrap_or_default();
     assert!(message.contains("avx512"), "{message}");
-    actor_handle.join_with("b", "avx512");
-    assert_eq!(members(&actor_handle), ["b"]);
+    coordinator.join_with("b", "avx512");
+    assert_eq!(members(&coordinator), ["b"]);
 }

@@ -73,7 +73,7 @@ fn open(search: &Search) -> Vec<usize> {
 }
 
 /// Works off a sweep with `workers`, in whatever order they finish; at each result a crash may come, after which all is folded again.
-fn execution(sweep: &Sweep, world: u64, workers: usize, dice: &mut Dice, crashes: bool) -> Search {
+fn work_off(sweep: &Sweep, world: u64, workers: usize, dice: &mut Dice, crashes: bool) -> Search {
     let mut at = search(sweep);
     for _ in 0..10_000 {
         if at.is_over() {
@@ -104,10 +104,10 @@ fn decisions_hang_on_nothing_but_the_results() {
     for kind in [SearchKind::Grid, SearchKind::Random, SearchKind::Asha] {
         for world in 0..40 {
             let sweep = Sweep { parallel: 1 + world as usize % 7, ..sweep(kind, 24) };
-            let reference = execution(&sweep, world, 1, &mut Dice(1), false);
+            let reference = work_off(&sweep, world, 1, &mut Dice(1), false);
             for round in 0..8 {
                 let mut dice = Dice(100 + world * 31 + round);
-                let other = execution(&sweep, world, 1 + round as usize % 5, &mut dice, round % 2 == 0);
+                let other = work_off(&sweep, world, 1 + round as usize % 5, &mut dice, round % 2 == 0);
                 assert_eq!(other, reference, "{kind:?}, world {world}, round {round}");
             }
         }
@@ -118,7 +118,7 @@ fn decisions_hang_on_nothing_but_the_results() {
 fn asha_gets_somebody_to_the_end_for_at_most_half_of_the_full_grid() {
     for trials in [1, 2, 3, 5, 8, 9, 24, 50, 81] {
         for world in 0..30 {
-            let done = execution(&sweep(SearchKind::Asha, trials), world, 3, &mut Dice(world + 1), false);
+            let done = work_off(&sweep(SearchKind::Asha, trials), world, 3, &mut Dice(world + 1), false);
             let begun = |rung| {
                 done.tickets().iter().filter(|t| matches!(t, Ticket::Rung { rung: r, .. } if *r == rung)).count()
             };
@@ -162,7 +162,7 @@ fn without_failures_asha_costs_what_was_planned_and_keeps_the_good_ones() {
 #[test]
 fn grid_and_random_try_every_point_once_for_the_whole_budget() {
     for (kind, count) in [(SearchKind::Grid, 24), (SearchKind::Random, 40)] {
-        let done = execution(&sweep(kind, 40), 3, 2, &mut Dice(5), false);
+        let done = work_off(&sweep(kind, 40), 3, 2, &mut Dice(5), false);
         let rungs: Vec<_> = done.tickets().iter().filter(|ticket| **ticket != Ticket::Idle).collect();
         assert_eq!((rungs.len(), done.rungs(), done.stop(0)), (count, &[900][..], None));
         assert!(rungs.iter().all(|ticket| matches!(ticket, Ticket::Rung { rung: 0, .. })));

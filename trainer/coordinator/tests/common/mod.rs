@@ -16,7 +16,7 @@ use protocol::stage::{Backend, WorkerRange};
 use protocol::{Digest, Incarnation, RunId, WorkerId};
 
 /// A coordinator without a shell: one call after the other, at the times that the test says.
-pub(crate) struct ActorHandle {
+pub(crate) struct PureCoordinator {
     pub(crate) state: State,
     pub(crate) store: store::FakeStore,
     pub(crate) now: u64,
@@ -25,7 +25,7 @@ pub(crate) struct ActorHandle {
     pub(crate) quick: bool,
 }
 
-impl ActorHandle {
+impl PureCoordinator {
     pub(crate) fn new(policy: Policy) -> Self {
         Self {
             state: State::new(policy),
@@ -170,11 +170,11 @@ pub(crate) fn failed(class: FailureClass) -> TaskOutcome {
 }
 
 /// A gang trains: its task's members by rank.
-pub(crate) fn gang_of_three(actor_handle: &mut ActorHandle) -> (RunId, [Incarnation; 3]) {
-    let run = actor_handle.submit("vae", WorkerRange { min: 1, max: 3 });
-    let a = actor_handle.join("a");
-    let dataset = actor_handle.assignment("a").expect("the only worker gets it");
-    actor_handle.report(&dataset, TaskOutcome::Finished { output: Digest::of(b"clips"), metrics: Default::default() });
-    let [b, c] = ["b", "c"].map(|name| actor_handle.join(name));
+pub(crate) fn gang_of_three(coordinator: &mut PureCoordinator) -> (RunId, [Incarnation; 3]) {
+    let run = coordinator.submit("vae", WorkerRange { min: 1, max: 3 });
+    let a = coordinator.join("a");
+    let dataset = coordinator.assignment("a").expect("the only worker gets it");
+    coordinator.report(&dataset, TaskOutcome::Finished { output: Digest::of(b"clips"), metrics: Default::default() });
+    let [b, c] = ["b", "c"].map(|name| coordinator.join(name));
     (run, [a, b, c])
 }

@@ -242,7 +242,7 @@ impl FakeWorker {
     }
 
     /// One unit of work. `peers` says for a gang how far the furthest member is, or `None` if not all are there.
-    pub(crate) fn execution(
+    pub(crate) fn work(
         &mut self,
         now: Millis,
         peers: Option<Option<u64>>,

@@ -386,7 +386,7 @@ impl World {
                 self.count("an input that was found damaged");
                 continue;
             }
-            self.workers[i].execution(now, furthest, saved, &mut self.random, chaos);
+            self.workers[i].work(now, furthest, saved, &mut self.random, chaos);
         }
     }
 }
