@@ -64,7 +64,7 @@ fn a_state_that_is_cut_short_takes_the_place_of_none() {
     behind.close(None);
 }
 
-/// What is not taken waits with whoever sends it, and not in memory here.
+/// What is not taken waits with its sender, and not in memory here.
 #[test]
 fn a_state_is_queued_within_bounds() {
     let gang = Gang::new(2, QUICK);
