@@ -1,6 +1,8 @@
 //! What every blob backend must do, as plain functions, and the backends that do it.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
+#[path = "conformance/bucket.rs"]
+mod bucket;
 mod common;
 
 use std::io::Read as _;

@@ -4,6 +4,7 @@
 
 mod access;
 mod bad_input;
+mod buckets;
 mod checkpoints;
 mod closed_pipes;
 mod cluster;

@@ -3,6 +3,7 @@
 //! Every test gets a folder of its own with its own store. Nothing here waits for time to pass: it waits for a condition,
 //! with a bound after which the test fails and prints what the trainer said.
 
+pub mod bucket;
 pub mod cluster;
 pub mod disk;
 pub mod documented;

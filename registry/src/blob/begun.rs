@@ -67,8 +67,10 @@ impl Uploads {
 /// An upload between its requests.
 #[derive(Debug)]
 pub(super) struct Begun {
-    /// `None` while a request writes to it.
+    /// `None` while a request writes to it, and while it waits.
     pub(super) upload: Option<Upload>,
+    /// All of it has arrived and could not be stored: the bytes are where they arrived, for the next request to take up.
+    pub(super) waits: bool,
     /// `None` if it was begun by an earlier process, which was told.
     pub(super) bytes: Option<u64>,
     pub(super) touched: Instant,

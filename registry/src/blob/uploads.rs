@@ -71,7 +71,13 @@ impl BlobStore {
     /// Takes up an upload of `bytes` bytes at byte `offset`; at 0 it begins, anew if need be. What has arrived when it is
     /// dropped waits for the holder's next request.
     pub fn take_up(&self, grant: &Grant, digest: Digest, offset: u64, bytes: u64) -> Result<Arriving, ResumeError> {
-        let arriving = |upload| Arriving { store: self.clone(), holder: holder(grant), digest, upload: Some(upload) };
+        let arriving = |upload| Arriving {
+            store: self.clone(),
+            holder: holder(grant),
+            digest,
+            upload: Some(upload),
+            waits: false,
+        };
         let place = (holder(grant), digest);
         self.recall(&place)?;
         let mut all = lock(&self.uploads().begun);
@@ -101,7 +107,7 @@ impl BlobStore {
         }
         match self.backend().stage_as(&name(&place), bytes) {
             Ok(staged) => {
-                all.insert(place, Begun { upload: None, bytes: Some(bytes), touched: Instant::now() });
+                all.insert(place, Begun { upload: None, waits: false, bytes: Some(bytes), touched: Instant::now() });
                 Ok(arriving(Upload { staged, hasher: Hasher::default(), written: 0, bytes }))
             }
             Err(error) => {
@@ -111,9 +117,9 @@ impl BlobStore {
         }
     }
 
-    /// Takes up what has arrived of an upload for an earlier process, if this one knows nothing of it.
+    /// Takes up what has arrived of an upload and waits, or what has arrived for an earlier process if this one knows nothing of it.
     fn recall(&self, place: &(Holder, Digest)) -> Result<(), BlobError> {
-        if lock(&self.uploads().begun).contains_key(place) {
+        if lock(&self.uploads().begun).get(place).is_some_and(|begun| !begun.waits) {
             return Ok(());
         }
         // Hashed without the lock, which every other upload takes.
@@ -122,11 +128,16 @@ impl BlobStore {
             hasher.update(part);
             written += part.len() as u64;
         };
-        let Some(staged) = self.backend().staged_as(&name(place), &mut read)? else { return Ok(()) };
-        let upload = Upload { staged, hasher, written, bytes: written };
+        let staged = self.backend().staged_as(&name(place), &mut read)?;
+        let mut all = lock(&self.uploads().begun);
         // Another request may have been as fast, and be writing to it.
-        let begun = || Begun { upload: Some(upload), bytes: None, touched: Instant::now() };
-        lock(&self.uploads().begun).entry(place.clone()).or_insert_with(begun);
+        if all.get(place).is_none_or(|begun| begun.waits) {
+            all.remove(place);
+            if let Some(staged) = staged {
+                let upload = Some(Upload { staged, hasher, written, bytes: written });
+                all.insert(place.clone(), Begun { upload, waits: false, bytes: None, touched: Instant::now() });
+            }
+        }
         Ok(())
     }
 
@@ -162,7 +173,8 @@ impl BlobStore {
         lock(&self.uploads().held).let_go(&is_held);
         let mut all = lock(&self.uploads().begun);
         // One that a request writes to right now ends with that request.
-        let over = |begun: &Begun, task| begun.upload.is_some() && (begun.touched.elapsed() >= idle || !is_held(task));
+        let rests = |begun: &Begun| begun.upload.is_some() || begun.waits;
+        let over = |begun: &Begun, task| rests(begun) && (begun.touched.elapsed() >= idle || !is_held(task));
         let gone = all.iter().filter(|(((task, _, _), _), begun)| over(begun, task)).map(|(place, _)| place.clone());
         for place in gone.collect::<Vec<_>>() {
             self.discard(&mut all, &place);
@@ -205,6 +217,8 @@ pub struct Arriving {
     digest: Digest,
     /// `None` once it has ended.
     upload: Option<Upload>,
+    /// It has ended, and its bytes are where they arrived.
+    waits: bool,
 }
 
 impl Arriving {
@@ -223,13 +237,15 @@ impl Arriving {
         self.upload.as_ref().map_or(0, Upload::written)
     }
 
-    /// Stores the blob if all of it has arrived, and notes it for its task; says whether it did.
+    /// Stores the blob if all of it has arrived, and notes it for its task; says whether it did. If it cannot be stored now, what has
+    /// arrived waits for the holder's next request.
     pub fn finish(mut self) -> Result<bool, BlobError> {
         let Some(upload) = self.upload.take_if(|upload| upload.is_complete()) else { return Ok(false) };
         // Before it is there: a collection in between must not take it.
         self.store.hold(&self.holder.0, self.digest);
-        self.store.commit(upload, self.digest)?;
-        Ok(true)
+        let stored = self.store.commit(upload, self.digest);
+        self.waits = matches!(stored, Err(BlobError::Unavailable(_) | BlobError::Storage(_)));
+        stored.map(|()| true)
     }
 }
 
@@ -238,9 +254,8 @@ impl Drop for Arriving {
         let mut all = lock(&self.store.uploads().begun);
         let place = (self.holder.clone(), self.digest);
         match (self.upload.take(), all.get_mut(&place)) {
-            (Some(upload), Some(begun)) => {
-                begun.upload = Some(upload);
-                begun.touched = Instant::now();
+            (upload, Some(begun)) if upload.is_some() || self.waits => {
+                *begun = Begun { upload, waits: self.waits, touched: Instant::now(), ..*begun };
             }
             _ => self.store.discard(&mut all, &place),
         }

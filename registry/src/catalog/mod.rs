@@ -5,14 +5,14 @@
 //!
 //! - **One order is all or nothing.** [`Catalog::commit`] returns once the order would survive a loss of power, or has changed
 //!   nothing. Orders that are committed together do not see each other's failures.
-//! - **Fences are checked where the write is stored**, in the same transaction ([`Write::grant`]).
+//! - **Fences are checked where the write is stored**, in the same transaction (those of a [`Write`] that carries a grant).
 //! - **One epoch writes.** Opening for writing raises the epoch; a commit under an older one is refused with
 //!   [`WriteError::Superseded`], whichever process or machine it comes from. So exclusivity needs no lock that both can see.
 //! - **Committed transactions are counted** ([`Stored::commits`]), so that a catalog that has gone back is told from the newest.
 //! - **A row names only what is whole**: manifests are checked, and noted for a collection under way, before the row is stored.
 //! - **An answer is of one moment**, and of every commit that was acknowledged before the question.
 //!
-//! Rules that no database has a say in are functions beside the types ([`crate::versions`], [`crate::curve`]): which version is
+//! Rules that no database has a say in are functions beside the types ([`crate::versions`], and `curve`): which version is
 //! the best, whether a gate holds, where a rollback goes, which attempt's values count.
 
 mod rows;

@@ -23,7 +23,7 @@ pub type Floats = Values<f32>;
 impl<T: Pod> Values<T> {
     /// Little-endian numbers in `bytes`, without a copy where they are aligned; `None` if the length is no multiple of theirs.
     pub fn view(bytes: Bytes) -> Option<Self> {
-        if bytes.len() % size_of::<T>() != 0 {
+        if !bytes.len().is_multiple_of(size_of::<T>()) {
             return None;
         }
         // Every machine that this is built for is little-endian; another one would have to swap bytes here.

@@ -229,13 +229,18 @@ impl Remote {
             let (endpoint, http) = (kind.endpoint, kind.http);
             return BlobError::Storage(format!("{what}: {endpoint} is not https; use https, or set {http}"));
         }
-        match e {
-            Error::PermissionDenied { .. } | Error::Unauthenticated { .. } => BlobError::Storage(format!(
+        // A listing that is refused comes as a failure of no kind in particular.
+        let is_refusal = matches!(e, Error::PermissionDenied { .. } | Error::Unauthenticated { .. });
+        if is_refusal || says(&["SignatureDoesNotMatch", "InvalidAccessKeyId", "AccessDenied", "AuthenticationFailed"])
+        {
+            return BlobError::Storage(format!(
                 "{what}: access was refused ({}); check {}, and that they may list, read, write and delete in `{}`",
                 told(&text),
                 kind.credentials,
                 self.url
-            )),
+            ));
+        }
+        match e {
             Error::NotImplemented { .. } | Error::NotSupported { .. } => {
                 BlobError::Storage(format!("{what}: the server does not know how ({})", told(&text)))
             }

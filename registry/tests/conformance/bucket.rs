@@ -1,0 +1,145 @@
+//! The suite over a real server of the S3 protocol, and what is said and kept when that refuses or its connections end.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use checkpoint::{BlobError, Blobs};
+use cluster_tests::bucket::{Bucket, KEY, NAME, SECRET};
+use object_store::aws::{AmazonS3Builder, S3ConditionalPut};
+use object_store::{BackoffConfig, ObjectStore, RetryConfig};
+use protocol::Digest;
+use registry::blob::objects::{Objects, Remote};
+use registry::blob::{Backend, BlobStore};
+
+use super::{common, objects};
+
+/// A client as `Remote::connect` makes it, but for its sources: patient for a second, not for half a minute.
+fn client(bucket: &Bucket, name: &str, secret: &str) -> Arc<dyn ObjectStore> {
+    let _ = rustls::crypto::ring::default_provider().install_default();
+    let backoff = BackoffConfig { max_backoff: Duration::from_millis(200), ..BackoffConfig::default() };
+    let retry = RetryConfig { backoff, max_retries: 4, retry_timeout: Duration::from_secs(1) };
+    let builder = AmazonS3Builder::new().with_endpoint(bucket.endpoint()).with_allow_http(true);
+    let builder = builder.with_region("us-east-1").with_bucket_name(name);
+    let builder = builder.with_access_key_id(KEY).with_secret_access_key(secret);
+    Arc::new(builder.with_conditional_put(S3ConditionalPut::ETagMatch).with_retry(retry).build().unwrap())
+}
+
+/// The blobs at a prefix, by a client, of a store in a folder of its own.
+fn open(store: Arc<dyn ObjectStore>) -> (tempfile::TempDir, Objects) {
+    let dir = tempfile::tempdir().unwrap();
+    let remote = Remote::over(&Bucket::url("p"), store).unwrap();
+    let objects = Objects::open(Arc::new(remote), dir.path()).unwrap();
+    (dir, objects)
+}
+
+/// All files of the bucket, but for what the server notes for itself.
+fn files(dir: &std::path::Path) -> Vec<std::path::PathBuf> {
+    let Ok(entries) = std::fs::read_dir(dir) else { return Vec::new() };
+    let paths = entries.map(|entry| entry.unwrap().path());
+    paths.flat_map(|path| if path.is_dir() { files(&path) } else { vec![path] }).collect()
+}
+
+fn bytes(length: u32) -> Vec<u8> {
+    (0..length).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect()
+}
+
+#[test]
+fn objects_on_an_s3_server() {
+    let bucket = Bucket::start();
+    // But for `a_marker_is_taken_by_one_of_many`: this server looks first and writes then, for whoever asks.
+    objects(&client(&bucket, NAME, SECRET));
+}
+
+#[test]
+fn a_wrong_key_and_a_missing_bucket_are_said() {
+    let bucket = Bucket::start();
+    let (_dir, place) = open(client(&bucket, NAME, "another word"));
+    for refused in [place.set_marker(None, "one").unwrap_err(), place.is_empty().unwrap_err()] {
+        let BlobError::Storage(said) = &refused else { panic!("{refused}") };
+        let parts = ["access was refused", "SignatureDoesNotMatch", "AWS_SECRET_ACCESS_KEY", "s3://stride-tests/p"];
+        assert!(parts.iter().all(|part| said.contains(part)), "{said}");
+    }
+    // An answer to a question about a single object has no body that would say more.
+    let refused = place.stat(Digest::of(b"x")).unwrap_err();
+    assert!(matches!(&refused, BlobError::Storage(said) if said.contains("access was refused")), "{refused}");
+
+    let (_dir, place) = open(client(&bucket, "nowhere", SECRET));
+    // Asked first by whoever opens a store; this server would make the bucket for whoever puts something there.
+    let refused = place.is_empty().unwrap_err();
+    let BlobError::Storage(said) = &refused else { panic!("{refused}") };
+    assert!(said.contains("there is no bucket") && said.contains("`--blobs`"), "{said}");
+    assert!(files(&bucket.objects()).is_empty(), "nobody has written anything");
+}
+
+/// A put that must not write over anything is not simply sent again by the client: it may have been done. The next try finds out.
+#[test]
+fn a_cut_put_is_done_once_or_not_at_all() {
+    let bucket = Bucket::start();
+    let (_dir, place) = open(client(&bucket, NAME, SECRET));
+    let store = BlobStore::new(place);
+    for (i, after) in [0, 100, 1_000, 30_000].into_iter().enumerate() {
+        let bytes = bytes(60_000 + u32::try_from(i).unwrap());
+        bucket.cut_after(after);
+        if let Err(error) = store.put(&bytes) {
+            assert!(matches!(error, BlobError::Unavailable(_)), "{error}");
+            store.put(&bytes).unwrap();
+        }
+        assert_eq!(bucket.cuts(), i as u64 + 1, "cut after {after} bytes");
+        assert!(store.get(Digest::of(&bytes)).unwrap() == bytes);
+    }
+    // A question is asked again without anybody's noticing.
+    let digest = Digest::of(&bytes(60_000));
+    bucket.cut_after(0);
+    assert_eq!(store.size(digest).unwrap(), Some(60_000));
+    bucket.cut_after(0);
+    assert_eq!(store.get(digest).unwrap().len(), 60_000);
+    assert!(store.strays().unwrap().is_empty() && store.aside().unwrap().is_empty());
+}
+
+#[test]
+fn a_part_whose_connection_is_cut_is_sent_again_by_itself() {
+    let bucket = Bucket::start();
+    let (_dir, place) = open(client(&bucket, NAME, SECRET));
+    let (store, bytes) = (BlobStore::new(place), bytes(20 << 20));
+    bucket.cut_after(10 << 20);
+    let digest = store.put(&bytes).unwrap();
+    assert_eq!(bucket.cuts(), 1);
+    let opened = Blobs::open(&store, digest).unwrap();
+    let mut read = vec![0; 9 << 20];
+    bucket.cut_after(0);
+    opened.read_at(5 << 20, &mut read).unwrap();
+    assert!(read == bytes[5 << 20..14 << 20]);
+    assert_eq!(bucket.cuts(), 2);
+}
+
+/// The server goes away in the middle of an upload in parts. Nothing is shown under the blob's name, what a worker had sent is still here,
+/// and when the server is back it goes from here alone.
+#[test]
+fn an_upload_in_parts_that_is_given_up_leaves_nothing_and_goes_on_from_here() {
+    let bucket = Bucket::start();
+    let (dir, place) = open(client(&bucket, NAME, SECRET));
+    let (store, bytes, grant) = (BlobStore::new(place), bytes(20 << 20), common::grant("r/s", 1));
+    let (digest, total) = (Digest::of(&bytes), bytes.len() as u64);
+    let mut arriving = store.take_up(&grant, digest, 0, total).unwrap();
+    arriving.write(&bytes).unwrap();
+    bucket.cut_after(9 << 20);
+    std::thread::scope(|scope| {
+        let sending = scope.spawn(|| arriving.finish());
+        while bucket.cuts() == 0 && !sending.is_finished() {
+            std::thread::yield_now();
+        }
+        bucket.close();
+        let error = sending.join().unwrap().unwrap_err();
+        let BlobError::Unavailable(said) = &error else { panic!("{error}") };
+        assert!(said.contains("AWS_ENDPOINT_URL") && said.contains("s3://stride-tests/p/sha256"), "{said}");
+    });
+    bucket.open();
+    assert_eq!(store.size(digest).unwrap(), None, "no part of it has its name");
+    assert!(store.list().unwrap().is_empty());
+
+    // Nothing comes any more: all that is missing is its name.
+    assert_eq!(store.staged(&grant, digest).unwrap(), total);
+    assert!(store.take_up(&grant, digest, total, total).unwrap().finish().unwrap());
+    assert!(store.get(digest).unwrap() == bytes);
+    assert_eq!(std::fs::read_dir(dir.path().join("staging")).unwrap().count(), 0, "it is not kept twice");
+}
