@@ -83,21 +83,30 @@ impl Drop for Group {
 #[test]
 fn p15_a_worker_that_the_kernel_kills_for_want_of_memory_is_final() {
     let Some(group) = Group::new(600 << 20) else { return };
-    let bench = Bench::new(TRAINER);
     let enter = format!("echo $$ > {}/cgroup.procs && exec \"$@\"", group.0.display());
-    // The first weights have .8 GB.
-    let said = run(&bench, 8_192, &["sh", "-c", &enter, "sh"]);
-    check(&bench, said, "the kernel killed it");
+    for _ in 0..4 {
+        let bench = Bench::new(TRAINER);
+        // The first weights have .8 GB.
+        let said = run(&bench, 8_192, &["sh", "-c", &enter, "sh"]);
+        if said.code.is_some() {
+            return check(&bench, said, "the kernel killed it");
+        }
+        eprintln!("the kernel took the command too, before the worker's memory was free; once more");
+    }
+    panic!("the kernel took the command each time");
 }
 
-/// Kilobytes that a process holds: its own, and those of files that it shares with others.
-fn resident(pid: u32) -> Option<(u64, u64)> {
+/// Kilobytes that a process holds of its own, and those of the store's blobs that it has mapped.
+fn memory(pid: u32) -> Option<(u64, u64)> {
     let status = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
-    let field = |name: &str| {
-        let line = status.lines().find(|line| line.starts_with(name))?;
-        line.split_whitespace().nth(1)?.parse::<u64>().ok()
-    };
-    Some((field("RssAnon:")?, field("RssFile:")?))
+    let own = status.lines().find(|line| line.starts_with("RssAnon:"))?.split_whitespace().nth(1)?.parse().ok()?;
+    let maps = fs::read_to_string(format!("/proc/{pid}/maps")).ok()?;
+    let blobs = maps.lines().filter(|line| line.contains("/blobs/sha256/"));
+    let bytes = blobs.filter_map(|line| {
+        let (from, to) = line.split(' ').next()?.split_once('-')?;
+        Some(u64::from_str_radix(to, 16).ok()? - u64::from_str_radix(from, 16).ok()?)
+    });
+    Some((own, bytes.sum::<u64>() >> 10))
 }
 
 /// A machine holds a dataset once, however many workers train on it. Sampled: three workers and about 50 MB of clips; sixteen and 4 GB,
@@ -126,17 +135,17 @@ fn p15_workers_of_a_machine_share_a_dataset() {
     let until = Instant::now() + if is_long { PATIENCE * 6 } else { PATIENCE };
     let all = loop {
         assert!(run.alive() && Instant::now() < until, "all workers map the dataset and go on");
-        let all: Vec<_> = run.workers().values().filter_map(|pid| resident(*pid)).collect();
+        let all: Vec<_> = run.workers().values().filter_map(|pid| memory(*pid)).collect();
         let kb = dataset_kb();
-        let is_mapped = |(_, shared): &(u64, u64)| *shared > kb / 2;
+        let is_mapped = |(_, mapped): &(u64, u64)| *mapped > kb / 2;
         if all.len() == workers && kb > 20_000 && all.iter().all(is_mapped) {
             break all;
         }
         thread::sleep(Duration::from_millis(100));
     };
     let kb = dataset_kb();
-    eprintln!("dataset {} MB; each worker's own and shared memory in MB: {:?}", kb >> 10, {
-        all.iter().map(|(own, shared)| (own >> 10, shared >> 10)).collect::<Vec<_>>()
+    eprintln!("dataset {} MB; each worker's own and mapped memory in MB: {:?}", kb >> 10, {
+        all.iter().map(|(own, mapped)| (own >> 10, mapped >> 10)).collect::<Vec<_>>()
     });
     assert!(kb >> 10 > own_mb, "the dataset is larger than what a worker may hold: {} MB", kb >> 10);
     assert!(
