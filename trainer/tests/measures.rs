@@ -60,6 +60,47 @@ fn measures_are_taken_and_misused_with_the_reason() {
     assert!(said.stderr.contains("21 joints (kit)") && said.stderr.contains("22 joints"), "{}", said.stderr);
 }
 
+/// Two models that diffuse motion itself, one of them trained with Free-T2M's losses: measured, registered, compared and drawn from as any other.
+fn models_of_motion_are_models(bench: &Bench, generate: &dyn Fn(&[&str]) -> serde_json::Value) {
+    let config = Bench::config("smoke.yaml");
+    let training = "steps: 6, batch: {global: 8, slices: 4}, checkpoint: {every: 2}, lr: 1e-3";
+    let losses = "{low_frequency: {weight: 1, from: 0.5}, semantic: {weight: 0.5, to: 0.5, evaluator: semantics}}";
+    let mdm = format!(
+        "network: {{width: 16, layers: 2, heads: 2, feed_forward: 24}}, timesteps: 8, mask_frames: true, {training}"
+    );
+    let smf = format!(
+        "network: {{width: 16, multipliers: [1, 2], time: 8, text: 8, text_layers: 1, text_heads: 2, text_feed_forward: 12}}, {training}"
+    );
+    let evaluate = |model: &str, steps: usize| {
+        format!(
+            "stages.t2m_{model}={{kind: evaluate.t2m, model: {model}, sampler: {{steps: {steps}, guidance: 2.5}}, repeats: 2, \
+             multimodality: {{captions: 0}}, split: all, shards: 2}}"
+        )
+    };
+    let register = "stages.motion_release={kind: register, model: motion, from: [free_mdm, smf], sampler: {steps: 4, guidance: 2.5}, metric: fid, mode: min, promote: {to: staging}}";
+    let sets = [
+        "stages.semantics={kind: train.evaluator, network: {movement: 16, motion: 16, text: 16, embedding: 16}, movement: {until: 0.5, window: 24, batch: 0}, steps: 4, batch: {global: 8, slices: 4}, lr: 1e-3}".to_owned(),
+        format!("stages.mdm={{kind: train.mdm, {mdm}}}"),
+        format!("stages.free_mdm={{kind: train.mdm, init: mdm, losses: {losses}, {mdm}}}"),
+        format!("stages.smf={{kind: train.stablemofusion, {smf}}}"),
+        evaluate("free_mdm", 4),
+        evaluate("smf", 4),
+        register.to_owned(),
+    ];
+    let sets: Vec<&str> = sets.iter().flat_map(|set| ["--set", set.as_str()]).collect();
+    bench.run(&[&["run", &config], &sets[..]].concat()).expect_code(0);
+    let own = generate(&["--model", "motion@staging", "--frames", "44"]);
+    assert_eq!((&own["frames"], &own["sampler"]["steps"]), (&44.into(), &4.into()), "{own}");
+    generate(&["--stage", "smf", "--frames", "44", "--steps", "3", "--solver", "ddim"]);
+    let shown = bench.run(&["registry", "show", "motion@staging"]).expect_code(0).stdout;
+    assert!(shown.contains("feature-diffusion, humanml3d") && shown.contains("denoiser="), "{shown}");
+    let time = ["time", "motion@staging", "--sentences", "2", "--frames", "40", "-o", "json"];
+    assert!(bench.run(&time).expect_code(0).json()["rows"][0]["aits_s"].is_number());
+    let flattered = ["--set", "stages.t2m_free_mdm.evaluator=semantics"];
+    let refused = bench.run(&[&["run", &config], &sets[..], &flattered[..]].concat()).expect_code(2).stderr;
+    assert!(refused.contains("would flatter it"), "{refused}");
+}
+
 /// A promoted student, and what a stage gave, are drawn with the sampler of their evaluations, which is not that of the papers.
 fn models_are_drawn_as_they_were_measured(bench: &Bench) {
     let config = Bench::config("smoke.yaml");
@@ -69,7 +110,11 @@ fn models_are_drawn_as_they_were_measured(bench: &Bench) {
     };
     let features = || std::fs::read(bench.path().join("x.npy")).expect("the motion is written");
     let own = generate(&["--model", "smoke@staging"]);
-    assert_eq!(own["sampler"], serde_json::json!({"steps": 1, "guidance": 2.5, "timesteps": []}), "{own}");
+    assert_eq!(
+        own["sampler"],
+        serde_json::json!({"steps": 1, "guidance": 2.5, "timesteps": [], "solver": "own"}),
+        "{own}"
+    );
     let drawn = features();
     generate(&["--model", "smoke@staging", "--steps", "1", "--guidance", "2.5"]);
     assert_eq!(drawn, features(), "what was measured, said again");
@@ -83,9 +128,16 @@ fn models_are_drawn_as_they_were_measured(bench: &Bench) {
     let teacher = generate(&["--stage", "mld"]);
     assert_eq!((&teacher["sampler"]["steps"], &teacher["sampler"]["guidance"]), (&4.into(), &3.0.into()), "{teacher}");
     let started = generate(&["--stage", "lcm", "--timesteps", "799"]);
-    assert_eq!(started["sampler"], serde_json::json!({"steps": 1, "guidance": 2.5, "timesteps": [799]}), "{started}");
+    assert_eq!(
+        started["sampler"],
+        serde_json::json!({"steps": 1, "guidance": 2.5, "timesteps": [799], "solver": "own"}),
+        "{started}"
+    );
     let refused = bench.run(&["generate", "x", "--stage", "pcm", "--timesteps", "799", "-o", "x.npy"]).expect_code(2);
     assert!(refused.stderr.contains("LCM students"), "{}", refused.stderr);
+    let solved = generate(&["--stage", "mld", "--solver", "dpm-solver++"]);
+    assert_eq!(solved["sampler"]["solver"], "dpm-solver++", "{solved}");
+    models_of_motion_are_models(bench, &generate);
 
     // Evaluations that differ, and the one that `register` names.
     let other = ["--set", "stages.t2m_pcm.sampler.guidance=3"];

@@ -80,10 +80,10 @@ pub fn default_sampler(denoiser: &Value) -> Result<Sampler, String> {
         let range = field(denoiser, "guidance")?;
         let (lo, hi): (f64, f64) =
             serde_json::from_value(range.clone()).map_err(|e| format!("`guidance` in the denoiser's manifest: {e}"))?;
-        Ok(Sampler { steps, guidance: lo + (hi - lo) / 3.0, timesteps: Vec::new() })
+        Ok(Sampler { steps, guidance: lo + (hi - lo) / 3.0, ..Sampler::default() })
     };
     match field(denoiser, "family")?.as_str() {
-        Some("mld") => Ok(Sampler { steps: 50, guidance: 7.5, timesteps: Vec::new() }),
+        Some("mld") => Ok(Sampler { steps: 50, guidance: 7.5, ..Sampler::default() }),
         Some("lcm") => student(1),
         Some("pcm") => {
             let phases = field(denoiser, "phases")?.as_u64().and_then(|n| usize::try_from(n).ok());

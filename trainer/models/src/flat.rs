@@ -26,8 +26,8 @@ impl Entry {
     }
 }
 
-/// Sequences whose fields are numbered: `main_3` is entry 3 of `main`.
-const SEQUENCES: [&str; 3] = ["main", "output", "output_net"];
+/// Sequences whose fields are numbered: `main_3` is entry 3 of `main`. Those of `at` have no name of their own: `at_2` is entry 2.
+const SEQUENCES: [&str; 7] = ["main", "output", "output_net", "at", "blocks", "time_embed", "time_mlp"];
 
 /// Names and shapes in declaration order. Paths are the published names, but for entries of upstream's sequences, whose others
 /// have no parameters: `emb_proj` is `emb_proj.1`, and a field `main_3` is `main.3`.
@@ -43,7 +43,11 @@ pub fn layout<M: Module>(module: &M) -> Vec<Entry> {
             let name = name.strip_prefix("r#").unwrap_or(name);
             let entry =
                 name.rsplit_once('_').filter(|(sequence, n)| SEQUENCES.contains(sequence) && n.parse::<u32>().is_ok());
-            self.0.push(entry.map_or_else(|| name.to_owned(), |(sequence, n)| format!("{sequence}.{n}")));
+            self.0.push(match entry {
+                Some(("at", n)) => n.to_owned(),
+                Some((sequence, n)) => format!("{sequence}.{n}"),
+                None => name.to_owned(),
+            });
         }
         fn exit_module(&mut self, _: &str, _: &str) {
             self.0.pop();

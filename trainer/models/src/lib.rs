@@ -6,6 +6,7 @@ pub mod device;
 pub mod diffusion;
 pub mod flat;
 pub mod flow;
+pub mod frequency;
 pub mod kernels;
 pub mod losses;
 pub mod names;

@@ -71,7 +71,7 @@ pub enum Pointwise {
 }
 
 impl Pointwise {
-    fn of(self, difference: Tensor<3>) -> Tensor<3> {
+    pub(crate) fn of(self, difference: Tensor<3>) -> Tensor<3> {
         match self {
             Self::SmoothL1 => {
                 let d = difference.abs();
@@ -138,6 +138,71 @@ impl Body {
     /// Joints [B, T, J, 3] of normalised features [B, T, D], in the data's unit.
     pub fn joints(&self, features: Tensor<3>) -> Tensor<4> {
         joints(features * self.std.clone() + self.mean.clone(), self.skeleton)
+    }
+}
+
+/// Where joints of a batch should be, to be compared with where they are. Source: MotionLCM, whose temporal setting compares normalised
+/// coordinates and whose spatial one compares metres.
+#[derive(Debug, Clone)]
+pub struct ControlTarget {
+    /// [B, T, joints x 3].
+    target: Tensor<3>,
+    /// 1 where a coordinate counts.
+    given: Tensor<3>,
+    /// Frames and joints of each sample that count.
+    entries: Vec<usize>,
+    /// Mean and deviation of each coordinate [1, 1, joints x 3], if normalised ones are compared.
+    normal: Option<(Tensor<3>, Tensor<3>)>,
+}
+
+impl ControlTarget {
+    /// Of hints [B, T, joints, 3] that `mean` and `std` [joints x 3] have normalised, of which those count that are `given`. With `metres` they are
+    /// brought back to the data's unit before anything is compared.
+    ///
+    /// # Panics
+    /// If a list has another length than its shape says.
+    pub fn new(
+        hints: &[f32],
+        given: &[bool],
+        (batch, frames, joints): (usize, usize, usize),
+        (mean, std): (&[f32], &[f32]),
+        metres: bool,
+        device: &Device,
+    ) -> Self {
+        let width = 3 * joints;
+        let shape = [batch, frames, width];
+        assert_eq!((hints.len(), given.len()), (batch * frames * width, batch * frames * width), "hints and mask");
+        let value = |(i, hint): (usize, &f32)| if metres { hint * std[i % width] + mean[i % width] } else { *hint };
+        let target: Vec<f32> = hints.iter().enumerate().map(value).collect();
+        let live: Vec<f32> = given.iter().map(|given| if *given { 1.0 } else { 0.0 }).collect();
+        let entries = given.chunks_exact((frames * width).max(1));
+        let entries = entries.map(|sample| sample.chunks_exact(3).filter(|axes| axes.contains(&true)).count());
+        let row = |values: &[f32]| Tensor::from_data(TensorData::new(values.to_vec(), [1, 1, width]), device);
+        Self {
+            target: Tensor::from_data(TensorData::new(target, shape), device),
+            given: Tensor::from_data(TensorData::new(live, shape), device),
+            entries: entries.collect(),
+            normal: (!metres).then(|| (row(mean), row(std))),
+        }
+    }
+
+    /// How many frames and joints of each sample count.
+    pub fn entries(&self) -> Vec<usize> {
+        self.entries.clone()
+    }
+
+    /// The distances of `joints` [B, T, joints, 3], in the data's unit, from where they should be: for each sample their sum over the
+    /// coordinates that count, times `weights[b]`, summed. A sample of which nothing counts adds nothing, whatever its weight.
+    pub fn loss(&self, joints: Tensor<4>, distance: Pointwise, weights: &[f32]) -> Tensor<1> {
+        let found = joints.reshape(self.target.dims());
+        let found = match &self.normal {
+            Some((mean, std)) => (found - mean.clone()) / std.clone(),
+            None => found,
+        };
+        let weights = weights.iter().zip(&self.entries).map(|(weight, own)| if *own > 0 { *weight } else { 0.0 });
+        let weights: Vec<f32> = weights.collect();
+        let weights = Tensor::<3>::from_data(TensorData::new(weights, [self.entries.len(), 1, 1]), &found.device());
+        (distance.of(found - self.target.clone()) * self.given.clone() * weights).sum()
     }
 }
 

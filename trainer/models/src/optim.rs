@@ -84,6 +84,10 @@ pub fn clip_factor(norm: f64, max: f64) -> f64 {
     if max == 0.0 { 1.0 } else { (max / (norm + 1e-6)).min(1.0) }
 }
 
+/// Updates of one step of [`Decay::Staircase`], and what the rate is multiplied by after it.
+const STAIR: u64 = 5_000;
+const STEP_DOWN: f64 = 0.9;
+
 /// The learning rate as a function of how many updates came before.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LrSchedule {
@@ -111,6 +115,7 @@ impl LrSchedule {
         }
         match self.decay {
             Decay::Constant => self.peak,
+            Decay::Staircase => self.peak * STEP_DOWN.powf(((done - self.warmup) / STAIR) as f64),
             Decay::Cosine => {
                 let length = self.steps.saturating_sub(self.warmup).max(1);
                 let progress = ((done - self.warmup) as f64 / length as f64).min(1.0);
@@ -131,6 +136,9 @@ mod tests {
         assert!((rates.at(60) - 1.0).abs() < 1e-12 && rates.at(110) < 1e-12 && rates.at(500) < 1e-12);
         let constant = LrSchedule { warmup: 0, decay: Decay::Constant, ..rates };
         assert_eq!((constant.at(0), constant.at(1000)), (2.0, 2.0));
+        let stairs = LrSchedule { decay: Decay::Staircase, ..constant };
+        assert_eq!((stairs.at(0), stairs.at(4_999)), (2.0, 2.0));
+        assert!((stairs.at(5_000) - 1.8).abs() < 1e-12 && (stairs.at(49_999) / 2.0 - 0.9_f64.powi(9)).abs() < 1e-12);
         // A run shorter than its warm-up never leaves it.
         assert_eq!(LrSchedule { warmup: 10, steps: 5, ..rates }.at(4), 0.8);
     }

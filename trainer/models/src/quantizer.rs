@@ -25,6 +25,9 @@ const LOOK_EVERY: f32 = 20.0;
 /// Fills draws for one row: layer, row, and a uniform number in [0, 1) for each code.
 pub type Uniforms<'a> = &'a mut dyn FnMut(usize, usize, &mut [f32]);
 
+/// The same of one layer: row, and a number for each code.
+pub type LayerUniforms<'a> = &'a mut dyn FnMut(usize, &mut [f32]);
+
 /// `-log(-log(u))`, with both arguments at least 1e-20.
 pub fn gumbel(uniform: f32) -> f32 {
     const LEAST: f32 = 1e-20;
@@ -41,7 +44,7 @@ pub fn assign(
     codes: &[f32],
     width: usize,
     device: &Device,
-    mut uniforms: Option<&mut dyn FnMut(usize, &mut [f32])>,
+    mut uniforms: Option<LayerUniforms<'_>>,
 ) -> Vec<usize> {
     let (n, k) = (rows.len() / width, codes.len() / width);
     assert!(k > 0, "a codebook has codes");

@@ -106,6 +106,23 @@ fn gelu_is_the_stock_gelu() {
 }
 
 #[test]
+fn mish_is_the_stock_mish() {
+    // The composed gradient is a difference of near numbers where x is large.
+    agree("mish", 1e-5, || {
+        let far: Vec<f32> = (-600..1600).map(|i| i as f32 * 0.02).collect();
+        let x = Tensor::<1>::from_data(TensorData::new(far, [2200]), &Device::flex().autodiff()).require_grad();
+        let y = kernels::mish(x.clone());
+        let gradients = weighted(y.clone()).backward();
+        vec![values(y), values(x.grad(&gradients).unwrap())]
+    });
+    let plain = |x: f32| values(kernels::mish(Tensor::<1>::from_floats([x], &Device::flex())))[0];
+    for x in [-20.0_f64, -3.0, -0.5, 0.0, 0.5, 3.0, 20.0, 500.0] {
+        let expected = x * x.exp().ln_1p().min(1e3).tanh();
+        assert!((f64::from(plain(x as f32)) - expected).abs() < 1e-6 * (1.0 + x.abs()), "mish({x})");
+    }
+}
+
+#[test]
 fn norms_are_the_stock_norms() {
     for (rows, width) in [(1, 1), (3, 5), (40, 128), (17, 263)] {
         for residual in [false, true] {
@@ -202,6 +219,12 @@ fn gradients_are_slopes() {
     let found = values(x.grad(&weighted(norm(x.clone())).backward()).unwrap());
     slopes("norm", &wave(80, 1), &found, |at| {
         sum(&values(norm(Tensor::from_data(TensorData::new(at.to_vec(), [2, 5, 8]), &plain))), &weights)
+    });
+
+    let x = leaf([2, 5, 8], 1);
+    let found = values(x.grad(&weighted(kernels::mish(x.clone())).backward()).unwrap());
+    slopes("mish", &wave(80, 1), &found, |at| {
+        sum(&values(kernels::mish(Tensor::<3>::from_data(TensorData::new(at.to_vec(), [2, 5, 8]), &plain))), &weights)
     });
 
     let x = leaf([2, 5, 8], 1);

@@ -7,7 +7,8 @@ use burn::tensor::Device;
 use models::flat::{self, layout};
 use models::names::{LoadError, Weights, load, load_from, save, to_bytes};
 use models::networks::{
-    Denoiser, DenoiserConfig, Discriminator, Evaluator, EvaluatorConfig, Init, POSITIONS, Vae, VaeConfig,
+    Denoiser, DenoiserConfig, Discriminator, Evaluator, EvaluatorConfig, Init, Mdm, MdmConfig, POSITIONS,
+    TrajectoryConfig, TrajectoryEncoder, Vae, VaeConfig,
 };
 use protocol::Seed;
 use protocol::stage::Positions;
@@ -43,6 +44,24 @@ fn denoiser_config(v2: bool, guidance_dim: Option<usize>) -> DenoiserConfig {
         guidance_dim,
         norm_eps: 1e-5,
     }
+}
+
+fn trajectory_config(v2: bool) -> TrajectoryConfig {
+    TrajectoryConfig {
+        joints: 22,
+        tokens: if v2 { 16 } else { 1 },
+        dim: if v2 { 32 } else { 256 },
+        width: 256,
+        layers: 9,
+        heads: 4,
+        feed_forward: 1024,
+        projection: v2,
+        norm_eps: 1e-5,
+    }
+}
+
+fn mdm_config(features: usize) -> MdmConfig {
+    MdmConfig { features, width: 512, layers: 8, heads: 4, feed_forward: 1024, text_dim: 512, norm_eps: 1e-5 }
 }
 
 fn small_vae() -> VaeConfig {
@@ -183,6 +202,12 @@ fn networks_have_the_published_numbers_of_parameters() {
         (with(|i| Denoiser::new(&denoiser_config(true, None), i)).num_params(), 8_237_856),
         (with(|i| Denoiser::new(&denoiser_config(true, Some(256)), i)).num_params(), 8_434_464),
         (with(|i| Discriminator::new(9, 256, i)).num_params(), 1_195_785),
+        (with(|i| Denoiser::controlnet(&denoiser_config(false, Some(256)), 256, false, i)).num_params(), 9_206_784),
+        (with(|i| Denoiser::controlnet(&denoiser_config(true, Some(256)), 256, true, i)).num_params(), 9_108_544),
+        (with(|i| TrajectoryEncoder::new(&trajectory_config(false), i)).num_params(), 7_779_072),
+        (with(|i| TrajectoryEncoder::new(&trajectory_config(true), i)).num_params(), 7_791_136),
+        (with(|i| Mdm::new(&mdm_config(263), i)).num_params(), 17_880_327),
+        (with(|i| Mdm::new(&mdm_config(251), i)).num_params(), 17_868_027),
     ] {
         assert_eq!(found, expected);
     }

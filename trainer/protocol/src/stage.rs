@@ -13,6 +13,8 @@ mod data;
 mod diffusion;
 mod distillation;
 mod evaluation;
+mod features;
+mod frequency;
 mod identity;
 mod kinds;
 mod neighbours;
@@ -29,19 +31,21 @@ pub use data::DataFormat;
 pub use diffusion::{Diffusion, NoiseSchedule, Prediction};
 pub use distillation::{Distance, Distillation};
 pub use evaluation::{Mode, Split};
+pub use frequency::{FrequencyLosses, LowFrequency, Norm, Over, Semantic};
 pub use identity::{Backend, StageIdentity};
 pub use kinds::{
     DataOpen, DataSynthetic, DistillLcm, DistillPcm, EncodeLatents, EncodeTokens, EvaluateLatentFid,
     EvaluateReconstruction, EvaluateT2m, EvaluatorNetwork, FlowBackbone, FlowNetwork, FlowProjection, FlowSolver,
-    ImportEvaluator, ModelDecoder, MovementPhase, MultiModality, Promote, Register, Resets, StageSettings, TextEmbed,
-    TextEncoder, TokenGenerator, TokenNetwork, TokenizerLoss, TokenizerNetwork, TrainDiscord, TrainEvaluator,
-    TrainLength, TrainMld, TrainTokenizer, TrainTokens, TrainVae, VaeLoss, Windows, WindowsOf,
+    ImportEvaluator, MdmNetwork, ModelDecoder, MovementPhase, MultiModality, Promote, Register, Resets,
+    StableMoFusionNetwork, StageSettings, TextEmbed, TextEncoder, TokenGenerator, TokenNetwork, TokenizerLoss,
+    TokenizerNetwork, TrainDiscord, TrainEvaluator, TrainLength, TrainMdm, TrainMld, TrainStableMoFusion,
+    TrainTokenizer, TrainTokens, TrainVae, VaeLoss, Windows, WindowsOf,
 };
 pub use neighbours::{Neighbour, Neighbours};
 pub use network::{LatentShape, Network, Positions};
 pub use placement::{CheckpointPolicy, Keep, Placement, WorkerRange};
 pub use problems::{Problem, Problems};
-pub use sampler::{Family, Sampler, measured_with};
+pub use sampler::{Family, Sampler, Solver, measured_with};
 pub use spec::{Output, Ref, Shape, StageSpec, Target};
 pub use training::{Batch, Decay, Optimizer, Training};
 

@@ -1,7 +1,7 @@
 //! How a command draws from a model: as the model was measured, but for what the user asks otherwise.
 
 use clap::Args;
-use protocol::stage::{Sampler, measured_with};
+use protocol::stage::{Sampler, Solver, measured_with};
 
 /// Parts of a sampler, besides its steps.
 #[derive(Debug, Args)]
@@ -12,6 +12,14 @@ pub(super) struct SamplerArgs {
     /// Timesteps of an LCM student, noisiest first, such as 999,499 [default: as the model was measured]
     #[arg(long, value_name = "T", value_delimiter = ',')]
     timesteps: Vec<usize>,
+    /// What follows the predictions: ddpm, ddim, dpm-solver, dpm-solver++, sde-dpm-solver++ [default: as the model was measured]
+    #[arg(long, value_name = "SOLVER", value_parser = solver)]
+    solver: Option<Solver>,
+}
+
+/// A solver by its word in settings.
+fn solver(word: &str) -> Result<Solver, String> {
+    serde_json::from_value(word.into()).map_err(|e| e.to_string())
 }
 
 impl SamplerArgs {
@@ -31,10 +39,13 @@ impl SamplerArgs {
             steps.is_none_or(|steps| steps == sampler.steps)
                 && self.guidance.is_none_or(|guidance| guidance == sampler.guidance)
                 && (self.timesteps.is_empty() || self.timesteps == sampler.timesteps)
+                && self.solver.is_none_or(|solver| solver == sampler.solver)
         };
         let meant = measured.iter().filter(|(_, sampler)| as_asked(sampler));
         let meant = measured_with(meant.map(|(name, sampler)| (name.as_str(), sampler))).map_err(|differ| {
-            format!("it was measured in several ways: {differ}; say which with --steps, --guidance or --timesteps")
+            format!(
+                "it was measured in several ways: {differ}; say which with --steps, --guidance, --timesteps or --solver"
+            )
         })?;
         // What was measured in one way only is drawn that way but for what is asked.
         let all = measured_with(measured.iter().map(|(name, sampler)| (name.as_str(), sampler)));
@@ -45,7 +56,12 @@ impl SamplerArgs {
             true if steps == base.steps => base.timesteps,
             _ => self.timesteps.clone(),
         };
-        Ok(Sampler { steps, guidance: self.guidance.unwrap_or(base.guidance), timesteps })
+        Ok(Sampler {
+            steps,
+            guidance: self.guidance.unwrap_or(base.guidance),
+            timesteps,
+            solver: self.solver.unwrap_or(base.solver),
+        })
     }
 }
 
@@ -54,18 +70,22 @@ mod tests {
     use super::*;
 
     fn sampler(steps: usize, guidance: f64, timesteps: &[usize]) -> Sampler {
-        Sampler { steps, guidance, timesteps: timesteps.to_vec() }
+        Sampler { steps, guidance, timesteps: timesteps.to_vec(), ..Sampler::default() }
     }
 
     #[test]
     fn a_model_is_drawn_as_it_was_measured_but_for_what_is_asked() {
-        let args = |guidance, timesteps: &[usize]| SamplerArgs { guidance, timesteps: timesteps.to_vec() };
+        let args =
+            |guidance, timesteps: &[usize]| SamplerArgs { guidance, timesteps: timesteps.to_vec(), solver: None };
         let own = sampler(2, 6.5, &[999, 499]);
         let of = |args: SamplerArgs, steps| args.sampler(steps, own.clone(), &[]);
         assert_eq!(of(args(None, &[]), None), Ok(own.clone()));
         assert_eq!(of(args(Some(3.0), &[]), Some(2)), Ok(sampler(2, 3.0, &[999, 499])));
         assert_eq!(of(args(None, &[]), Some(4)), Ok(sampler(4, 6.5, &[])), "timesteps are for as many steps");
         assert_eq!(of(args(None, &[699]), None), Ok(sampler(1, 6.5, &[699])), "timesteps say the steps");
+        let asked = SamplerArgs { solver: solver("ddim").ok(), ..args(None, &[]) };
+        assert_eq!(of(asked, None), Ok(Sampler { solver: Solver::Ddim, ..own.clone() }));
+        assert!(solver("euler").unwrap_err().contains("dpm-solver++"), "says which there are");
 
         let one = |name: &str, sampler| (name.to_owned(), sampler);
         let measured =

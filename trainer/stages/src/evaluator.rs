@@ -136,6 +136,27 @@ impl TrainedEvaluator {
         host(self.network.motion(rows, &lengths))
     }
 
+    /// Embeddings [B, width] of motions [B, T, F] that were normalised with `mean` and `std`, of which the first `lengths[b]` frames count.
+    /// Gradients flow to the motions; the evaluator has none. As [`motions`](Self::motions) otherwise.
+    pub fn embed_normalised(&self, x_btf: Tensor<3>, lengths: &[usize], mean: &[f32], std: &[f32]) -> Tensor<2> {
+        let [batch, have, width] = x_btf.dims();
+        let device = x_btf.device();
+        let row = |value: &dyn Fn(usize) -> f32| {
+            Tensor::<3>::from_data(TensorData::new((0..width).map(value).collect::<Vec<_>>(), [1, 1, width]), &device)
+        };
+        let own = &self.meta;
+        let scale = row(&|i| std[i] / own.std[i]);
+        let shift = row(&|i| (mean[i] - own.mean[i]) / own.std[i]);
+        let frames = lengths.iter().max().map_or(0, |most| most / UNIT * UNIT + UNIT);
+        let x = x_btf * scale + shift;
+        let x = match frames.checked_sub(have) {
+            Some(more) if more > 0 => Tensor::cat(vec![x, Tensor::zeros([batch, more, width], &device)], 1),
+            _ => x.slice([0..batch, 0..frames, 0..width]),
+        };
+        let live = lengths.iter().flat_map(|l| (0..frames).map(move |t| if t < *l { 1.0_f32 } else { 0.0 })).collect();
+        self.network.motion(x * Tensor::<3>::from_data(TensorData::new(live, [batch, frames, 1]), &device), lengths)
+    }
+
     /// Refuses data that it was not made for: another skeleton, or features on another scale.
     ///
     /// A scale is told by the deviations of positions, rotations and velocities and by how far their means are off. Another body

@@ -52,6 +52,7 @@ pub struct FlowMeta {
 
 /// The network of either backbone.
 #[derive(Debug, Clone)]
+#[expect(clippy::large_enum_variant, reason = "there is one of it")]
 pub(crate) enum Field {
     Unet(FlowUnet),
     Dit(FlowDit),

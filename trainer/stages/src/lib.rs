@@ -11,6 +11,7 @@ pub mod generate;
 pub mod generator;
 pub mod kinds;
 pub mod length;
+pub mod motion_networks;
 pub mod networks;
 pub mod parts;
 pub mod testing;

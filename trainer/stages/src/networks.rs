@@ -6,12 +6,13 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
 use models::diffusion::{
-    Grid, LcmTimesteps, Phases, Schedule, TIMESTEPS, ddim_sample, guided, lcm_sample, lcm_timesteps, pcm_sample,
+    DpmPath, Form, Grid, LcmTimesteps, Phases, Schedule, TIMESTEPS, ddim_sample, dpm_sample, guided, lcm_sample,
+    lcm_timesteps, pcm_sample,
 };
 use models::kernels::Dropout;
 use models::networks::{self, DenoiserConfig, Init, POSITIONS, Vae, VaeConfig, guidance_embedding};
 use motion::Stream;
-use protocol::stage::{DataFormat, Family, Positions, Sampler};
+use protocol::stage::{DataFormat, Family, Positions, Sampler, Solver};
 use protocol::{Manifest, Seed};
 
 use crate::artifacts::{self, DenoiserMeta, VaeMeta};
@@ -163,6 +164,12 @@ impl Autoencoder {
 }
 
 impl Autoencoder {
+    /// Clips [B, frames, D], normalised, of latents [B, N, d]; frames past `lengths[b]` are 0. Gradients flow to the latents; the VAE has none.
+    pub fn decode_tensor(&self, z_bnd: Tensor<3>, lengths: &[usize]) -> Tensor<3> {
+        let frames = lengths.iter().copied().max().unwrap_or_default();
+        self.vae.decode(z_bnd, lengths, frames, &mut Dropout::off())
+    }
+
     /// Clips of `lengths[b]` frames each, normalised, of latents `[batch, N, d]`.
     pub fn decode_ragged(&self, z: Vec<f32>, lengths: &[usize]) -> Vec<Vec<f32>> {
         let (latent, width) = (self.meta.latent, self.meta.features);
@@ -210,7 +217,7 @@ impl Denoiser {
         &self.meta
     }
 
-    /// Draws latents `[batch, N, d]`: a teacher by DDIM with guidance g, an LCM with fresh noise between its jumps, a PCM by one jump a
+    /// Draws latents `[batch, N, d]`: a teacher by DDIM or a DPM-Solver with guidance g, an LCM with fresh noise between its jumps, a PCM by one jump a
     /// phase; students embed w. `step_noise(j)` is asked for noise of the same shape after jump j of an LCM.
     pub fn sample(
         &self,
@@ -231,12 +238,25 @@ impl Denoiser {
                 text.extend(conditions.null.repeat(batch));
                 let text = on_device(text, [2 * batch, 1, text_dim]);
                 let [_, tokens, dim] = shape;
-                ddim_sample(&self.schedule, sampler.steps, z, |z, t| {
+                let out = |z: Tensor<3>, t: usize| {
                     let both = Tensor::cat(vec![z.clone(), z], 0);
                     let noise = self.network.forward(both, &vec![t; 2 * batch], text.clone(), None, off);
                     let half = |from: usize| noise.clone().slice([from..from + batch, 0..tokens, 0..dim]);
                     guided(half(0), half(batch), sampler.guidance)
-                })
+                };
+                let form = match self.meta.family.solver(sampler.solver) {
+                    Some(Solver::DpmSolver) => Some(Form::Noise),
+                    Some(Solver::DpmSolverPp) => Some(Form::Data),
+                    _ => None,
+                };
+                match form {
+                    // Deterministic forms ask for no noise.
+                    Some(form) => {
+                        let path = DpmPath::even(&self.schedule, sampler.steps);
+                        dpm_sample(&self.schedule, &path, form, z.clone(), |_| z.zeros_like(), out)
+                    }
+                    None => ddim_sample(&self.schedule, sampler.steps, z, out),
+                }
             }
             Family::Lcm { skip, .. } => {
                 let mut eps = self.student(conditions, sampler, batch);
@@ -244,8 +264,10 @@ impl Denoiser {
                 let fresh: Vec<_> = (1..timesteps.len()).map(|j| on_device(step_noise(j - 1), shape)).collect();
                 lcm_sample(&self.schedule, &timesteps, z, &fresh, &mut eps)
             }
-            Family::Autoregressive | Family::Masked => {
-                return Err(StageError::Input("the denoiser says that it draws tokens, which it does not".into()));
+            Family::Autoregressive | Family::Masked | Family::Features { .. } => {
+                return Err(StageError::Input(
+                    "the denoiser says that it draws something else than latents, which it does not".into(),
+                ));
             }
             Family::Pcm { skip, phases, .. } => {
                 let mut eps = self.student(conditions, sampler, batch);
@@ -283,7 +305,12 @@ mod tests {
 
     #[test]
     fn an_lcm_starts_at_the_noisiest_timestep_or_where_it_is_told() {
-        let sampler = |timesteps: &[usize]| Sampler { steps: 1, guidance: 2.0, timesteps: timesteps.to_vec() };
+        let sampler = |timesteps: &[usize]| Sampler {
+            steps: 1,
+            guidance: 2.0,
+            timesteps: timesteps.to_vec(),
+            ..Sampler::default()
+        };
         assert_eq!(lcm_path(100, &sampler(&[])), [999]);
         assert_eq!(lcm_path(100, &sampler(&[699])), [699]);
     }

@@ -180,7 +180,7 @@ fn latent_fid_is_the_same_however_the_samples_are_cut() {
     let pcm = untrained(&bench, vae, Family::Pcm { skip: 100, guidance, phases: 2 });
     for (model, steps) in [(teacher, 3), (lcm, 2), (pcm, 2)] {
         let inputs = [("model", model), ("latents", latents), ("dataset", dataset), ("teacher", teacher)];
-        let sampler = Sampler { steps, guidance: 2.0, timesteps: vec![] };
+        let sampler = Sampler { steps, guidance: 2.0, ..Sampler::default() };
         let mut reports = Vec::new();
         for shards in [1, 3, 8] {
             let ran = bench.run("eval", &latent_fid(shards, sampler.clone(), true), &inputs).unwrap();
@@ -207,7 +207,7 @@ fn latent_fid_is_the_same_however_the_samples_are_cut() {
     }
     // The teacher's own 50 steps match themselves exactly.
     let inputs = [("model", teacher), ("latents", latents), ("dataset", dataset), ("teacher", teacher)];
-    let own = Sampler { steps: 50, guidance: 2.0, timesteps: vec![] };
+    let own = Sampler { steps: 50, guidance: 2.0, ..Sampler::default() };
     let ran = bench.run("eval", &latent_fid(2, own.clone(), true), &inputs).unwrap();
     assert_eq!(ran.metrics()["match"], 0.0);
     let ran = bench.run("eval", &latent_fid(2, own, false), &inputs[..3]).unwrap();
@@ -222,7 +222,7 @@ fn what_does_not_fit_is_refused_with_the_reason() {
     let other_shape = untrained_model(&bench, vae, Family::Mld, LatentShape { tokens: 3, dim: 4 });
     let other_vae = untrained(&bench, other_vae(&bench), Family::Mld);
     let good = untrained(&bench, vae, Family::Mld);
-    let sampler = Sampler { steps: 3, guidance: 2.0, timesteps: vec![] };
+    let sampler = Sampler { steps: 3, guidance: 2.0, ..Sampler::default() };
     for (model, kind_of, reason) in
         [(other_shape, latents, "3x4"), (other_vae, latents, "another VAE"), (good, dataset, "kind Dataset")]
     {
@@ -248,7 +248,7 @@ fn an_empty_split_is_refused_by_its_name() {
     let latents = encode(&mut bench, 1, dataset, vae);
     let model = untrained(&bench, vae, Family::Mld);
     let reconstruction = EvaluateReconstruction { split: Split::Val, ..EvaluateReconstruction::default() };
-    let sampler = Sampler { steps: 1, guidance: 2.0, timesteps: vec![] };
+    let sampler = Sampler { steps: 1, guidance: 2.0, ..Sampler::default() };
     let StageSettings::EvaluateLatentFid(fid) = latent_fid(1, sampler, false) else { unreachable!() };
     let fid = EvaluateLatentFid { split: Split::Val, ..fid };
     let inputs = [("dataset", dataset), ("vae", vae), ("model", model), ("latents", latents)];
@@ -291,10 +291,10 @@ fn a_model_generates_as_it_was_measured_and_repeats_itself() {
     let manifest = |digest| bench.manifest(digest).unwrap();
     let load = |model: &Manifest| Generator::load(model, &*bench.blobs(), &bench.device());
     let generator = load(&manifest(pcm)).expect("it loads");
-    assert_eq!(generator.sampler(), Sampler { steps: 2, guidance: 2.0, timesteps: vec![] }, "nobody measured it");
+    assert_eq!(generator.sampler(), Sampler { steps: 2, guidance: 2.0, ..Sampler::default() }, "nobody measured it");
     // Once it is measured it is drawn from in that way, and so it gives other motions.
     let teacher = manifest(untrained(&bench, vae, Family::Mld));
-    let measured = Sampler { steps: 2, guidance: 4.5, timesteps: vec![] };
+    let measured = Sampler { steps: 2, guidance: 4.5, ..Sampler::default() };
     let registered = model::extend(&teacher, Some(&measured), &BTreeMap::new()).expect("it is a model");
     let (teacher, registered) = (load(&teacher).expect("it loads"), load(&registered).expect("it loads"));
     assert_eq!((teacher.sampler().steps, registered.sampler()), (50, measured.clone()));
@@ -313,7 +313,7 @@ fn a_model_generates_as_it_was_measured_and_repeats_itself() {
     assert_ne!(first.features[..40 * 263], other.features[..]);
     let refused = generator.generate(prompt, Some(5000), None, Seed(1)).expect_err("too long").to_string();
     assert!(refused.contains("5000 frames"), "{refused}");
-    let sampler = Sampler { steps: 1, guidance: 2.0, timesteps: vec![] };
+    let sampler = Sampler { steps: 1, guidance: 2.0, ..Sampler::default() };
     let refused = generator.generate(prompt, None, Some(&sampler), Seed(1)).expect_err("other phases").to_string();
     assert!(refused.contains("2 phase(s)"), "{refused}");
     let meta: VaeMeta = artifacts::meta(&manifest(vae), "the VAE").unwrap();
@@ -352,7 +352,7 @@ fn a_model_with_a_length_estimator_says_how_long_a_motion_is() {
     let drawn: Vec<usize> = (0..8).map(|seed| frames(&with_it, seed)).collect();
     assert!(drawn.iter().all(|frames| (4..=196).contains(frames) && frames % 4 == 0), "{drawn:?}");
     assert!(drawn.iter().any(|frames| *frames != drawn[0]), "one seed is like another: {drawn:?}");
-    let sampler = Sampler { steps: 1, guidance: 2.0, timesteps: vec![] };
+    let sampler = Sampler { steps: 1, guidance: 2.0, ..Sampler::default() };
     let motion = with_it.generate("a person walks", None, Some(&sampler), Seed(1)).expect("a motion");
     assert_eq!(motion.frames, drawn[1]);
     let motion = with_it.generate("a person walks", Some(40), Some(&sampler), Seed(1)).expect("a motion");

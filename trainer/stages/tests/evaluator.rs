@@ -137,7 +137,7 @@ fn t2m_is_the_same_however_the_motions_are_cut() {
     let model = untrained(&bench, Family::Lcm { skip: 100, guidance: (0.5, 5.0) });
     let inputs = [("dataset", data), ("evaluator", evaluator), ("model", model)];
     let settings = EvaluateT2m {
-        sampler: Sampler { steps: 2, guidance: 2.0, timesteps: vec![] },
+        sampler: Sampler { steps: 2, guidance: 2.0, ..Sampler::default() },
         repeats: 3,
         multimodality: MultiModality { captions: 2, samples: 5, pairs: 3 },
         split: Split::Test,

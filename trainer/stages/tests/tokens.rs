@@ -152,9 +152,9 @@ fn p6_tokens_and_what_draws_them_have_the_same_bytes_for_any_number_of_members_a
 fn models_of_tokens_draw_motions_as_all_others_do() {
     let world = run(1, 1);
     for (name, sampler) in [
-        ("gpt", Sampler { steps: 1, guidance: 0.0, timesteps: vec![] }),
-        ("smooth", Sampler { steps: 3, guidance: 1.0, timesteps: vec![] }),
-        ("momask", Sampler { steps: 4, guidance: 2.0, timesteps: vec![] }),
+        ("gpt", Sampler { steps: 1, guidance: 0.0, ..Sampler::default() }),
+        ("smooth", Sampler { steps: 3, guidance: 1.0, ..Sampler::default() }),
+        ("momask", Sampler { steps: 4, guidance: 2.0, ..Sampler::default() }),
     ] {
         let manifest = world.bench.manifest(world.outputs[name]).unwrap();
         let model = Generator::load(&manifest, &*world.bench.blobs(), &burn::tensor::Device::flex()).unwrap();

@@ -23,3 +23,28 @@ pub fn ddim_sample(
     }
     z
 }
+
+/// Timesteps with "leading" spacing and no offset, noisiest first: 900, 800, ..., 0 for 10 of 1000. As StableMoFusion has it.
+///
+/// # Panics
+/// If `steps` is not in `1..=schedule.steps()`.
+pub fn leading_timesteps(schedule: &Schedule, steps: usize) -> Vec<usize> {
+    let all = schedule.steps();
+    assert!((1..=all).contains(&steps), "DDIM takes 1 to {all} steps, not {steps}");
+    (0..steps).rev().map(|i| i * (all / steps)).collect()
+}
+
+/// As [`ddim_sample`] along `timesteps`, and from the last of them to the sample itself, without the noise of timestep 0.
+pub fn ddim_sample_to_data(
+    schedule: &Schedule,
+    timesteps: &[usize],
+    mut z: Tensor<3>,
+    mut out: impl FnMut(Tensor<3>, usize) -> Tensor<3>,
+) -> Tensor<3> {
+    for (j, &t) in timesteps.iter().enumerate() {
+        let predicted = out(z.clone(), t);
+        let coefficients = timesteps.get(j + 1).map_or_else(|| schedule.clean(t), |s| schedule.jump(t, *s));
+        z = affine_one(z, predicted, coefficients);
+    }
+    z
+}

@@ -1,4 +1,4 @@
-//! The noise schedule, what moves a latent along it, and the three samplers.
+//! The noise schedule, what moves a sample along it, and the samplers.
 //!
 //! Every rule here is affine in the latent and the network's output, whatever it predicts, so each module gives plain coefficients, one
 //! pair per sample, and [`affine`] applies them. Coefficients are computed in f64 (see [`Schedule`]).
@@ -10,12 +10,16 @@
 
 pub mod consistency;
 pub mod ddim;
+pub mod ddpm;
+pub mod dpm;
 pub mod pcm;
 mod schedule;
 mod timesteps;
 
 pub use consistency::{Grid, LcmTimesteps, boundary, consistency, lcm_sample, lcm_timesteps};
-pub use ddim::{ddim_sample, ddim_timesteps};
+pub use ddim::{ddim_sample, ddim_sample_to_data, ddim_timesteps, leading_timesteps};
+pub use ddpm::{ddpm_sample, ddpm_timesteps};
+pub use dpm::{DpmPath, Form, Last, dpm_sample};
 pub use pcm::{Phases, pcm_sample};
 pub use schedule::{Schedule, TIMESTEPS, flow};
 

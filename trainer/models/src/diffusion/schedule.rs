@@ -147,23 +147,21 @@ impl Schedule {
 
     /// `z_0 = A z_t + E out`: the clean sample that an output implies.
     pub fn clean(&self, t: usize) -> (f64, f64) {
-        let (alpha, sigma) = self.factors[t];
-        match self.prediction {
-            Prediction::Noise => (1.0 / alpha, -sigma / alpha),
-            Prediction::Sample => (0.0, 1.0),
-            Prediction::Velocity if self.is_flow() => (1.0, -sigma),
-            Prediction::Velocity => (alpha, -sigma),
-        }
+        self.readings_at(self.factors[t]).0
     }
 
     /// `eps = A z_t + E out`: the noise that an output implies.
     pub fn noise(&self, t: usize) -> (f64, f64) {
-        let (alpha, sigma) = self.factors[t];
+        self.readings_at(self.factors[t]).1
+    }
+
+    /// The clean sample and the noise that an output implies at a level (alpha, sigma), which may lie between timesteps.
+    pub fn readings_at(&self, (alpha, sigma): (f64, f64)) -> ((f64, f64), (f64, f64)) {
         match self.prediction {
-            Prediction::Noise => (0.0, 1.0),
-            Prediction::Sample => (1.0 / sigma, -alpha / sigma),
-            Prediction::Velocity if self.is_flow() => (1.0, alpha),
-            Prediction::Velocity => (sigma, alpha),
+            Prediction::Noise => ((1.0 / alpha, -sigma / alpha), (0.0, 1.0)),
+            Prediction::Sample => ((0.0, 1.0), (1.0 / sigma, -alpha / sigma)),
+            Prediction::Velocity if self.is_flow() => ((1.0, -sigma), (1.0, alpha)),
+            Prediction::Velocity => ((alpha, -sigma), (sigma, alpha)),
         }
     }
 

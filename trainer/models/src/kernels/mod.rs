@@ -14,6 +14,7 @@ mod dropout;
 mod gelu;
 mod gru;
 mod linear;
+mod mish;
 mod norm;
 mod raw;
 pub(crate) mod simd;
@@ -23,6 +24,7 @@ pub use dropout::{Dropout, dropout};
 pub use gelu::gelu;
 pub use gru::gru;
 pub use linear::linear;
+pub use mish::mish;
 pub use norm::{add_layer_norm, layer_norm};
 
 /// Runs `body` with Burn's operations in place of the fused kernels, on this thread: what the kernels are measured against.

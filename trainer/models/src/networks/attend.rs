@@ -54,7 +54,7 @@ pub(super) enum Sight {
     /// Everything, but for keys behind a sequence's end.
     Keys(Option<KeyMask>),
     /// As a bias on the scores says.
-    Bias(Tensor<4>),
+    Bias(Box<Tensor<4>>),
 }
 
 /// Rows of a table by id.
@@ -129,7 +129,7 @@ impl SplitAttention {
             Sight::Keys(mask) => {
                 kernels::self_attention(Tensor::cat(vec![q, k, v], 2), self.heads, mask.as_ref(), dropout)
             }
-            Sight::Bias(bias) => attend(q, k, v, self.heads, Some(bias.clone()), dropout),
+            Sight::Bias(bias) => attend(q, k, v, self.heads, Some((**bias).clone()), dropout),
         };
         kernels::dropout(self.proj.forward(attended), dropout)
     }

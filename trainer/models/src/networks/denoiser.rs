@@ -10,7 +10,7 @@ use burn::tensor::activation::{relu, silu};
 use serde::{Deserialize, Serialize};
 
 use super::vae::Positions;
-use super::{Init, Linear, SkipStack, StackConfig, time_sinusoid};
+use super::{ConditionEmbedding, Init, Linear, SkipStack, StackConfig, time_sinusoid};
 use crate::kernels::Dropout;
 
 /// Size of a denoiser.
@@ -68,6 +68,10 @@ pub struct Denoiser {
     pub query_pos: Positions,
     /// The transformer.
     pub encoder: SkipStack,
+    /// What a ControlNet's condition goes through.
+    pub controlnet_cond_embedding: Option<ConditionEmbedding>,
+    /// What a ControlNet's block outputs go through; a denoiser has none.
+    pub controlnet_down_mid_blocks: Vec<Linear>,
     tokens: usize,
     time_dim: usize,
     text_relu: bool,
@@ -96,6 +100,8 @@ impl Denoiser {
             emb_proj: Linear::new(init, text_dim, width),
             query_pos: Positions::new(init, width),
             encoder: SkipStack::new(init, &stack),
+            controlnet_cond_embedding: None,
+            controlnet_down_mid_blocks: Vec::new(),
             tokens,
             time_dim,
             text_relu: config.text_relu,
@@ -130,7 +136,7 @@ impl Denoiser {
         guidance_bg: Option<Tensor<2>>,
         dropout: &mut Dropout,
     ) -> Tensor<3> {
-        let out = self.tokens_through(latent_bnd, timesteps, text_blc, guidance_bg, dropout, |_| ());
+        let out = self.tokens_through(latent_bnd, timesteps, text_blc, guidance_bg, dropout, |_, x| x);
         match &self.latent_post {
             Some(project) => project.forward(out),
             None => out,
@@ -146,21 +152,23 @@ impl Denoiser {
         dropout: &mut Dropout,
     ) -> Vec<Tensor<3>> {
         let mut seen = Vec::new();
-        let _unused_output = self.tokens_through(latent_bnd, timesteps, text_blc, None, dropout, |x_bth| {
+        let _unused_output = self.tokens_through(latent_bnd, timesteps, text_blc, None, dropout, |_, x_bth| {
             let [batch, _, width] = x_bth.dims();
             seen.push(x_bth.clone().slice([0..batch, 0..self.tokens, 0..width]));
+            x_bth
         });
         seen
     }
 
-    fn tokens_through(
+    /// The first N outputs of the transformer [B, N, H], with the output of every block replaced by what `pass` makes of it.
+    pub(super) fn tokens_through(
         &self,
         latent_bnd: Tensor<3>,
         timesteps: &[usize],
         text_blc: Tensor<3>,
         guidance_bg: Option<Tensor<2>>,
         dropout: &mut Dropout,
-        see: impl FnMut(&Tensor<3>),
+        pass: impl FnMut(usize, Tensor<3>) -> Tensor<3>,
     ) -> Tensor<3> {
         let [batch, tokens, _] = latent_bnd.dims();
         assert_eq!(timesteps.len(), batch, "one timestep a sample");
@@ -176,6 +184,6 @@ impl Denoiser {
         let x = Tensor::cat(vec![latent, time, text], 1);
         let len = x.dims()[1];
         let x = x + self.query_pos.rows(len);
-        self.encoder.forward_blocks(x, None, None, dropout, see).slice([0..batch, 0..tokens, 0..width])
+        self.encoder.forward_blocks(x, None, None, dropout, pass).slice([0..batch, 0..tokens, 0..width])
     }
 }

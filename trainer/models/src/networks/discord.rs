@@ -254,6 +254,7 @@ impl<M: Module> Residual<M> {
 
 /// An entry of a level.
 #[derive(Module, Debug)]
+#[expect(clippy::large_enum_variant, reason = "a network has a dozen, and a box is no module")]
 pub enum LevelPart {
     /// Convolutions.
     Block(TimedBlock),
@@ -295,6 +296,7 @@ impl BatchNorm {
 
 /// An entry of the condition's projection.
 #[derive(Module, Debug)]
+#[expect(clippy::large_enum_variant, reason = "a network has a handful, and a box is no module")]
 pub enum ProjectionPart {
     /// Without parameters.
     Gap(Gap),

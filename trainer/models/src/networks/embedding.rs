@@ -41,3 +41,20 @@ pub fn guidance_embedding(guidance: &[f32], width: usize, device: &Device) -> Te
     });
     Tensor::from_data(TensorData::new(rows.collect(), [guidance.len(), 2 * half]), device)
 }
+
+/// [positions, width]: `sin(p f_i)` and `cos(p f_i)` in turns, with `f_i = 10000^(-2i / width)`: the table of Vaswani et al.,
+/// arXiv:1706.03762, as MDM and StableMoFusion have it for frames and for timesteps.
+pub fn position_sinusoid(positions: impl ExactSizeIterator<Item = usize>, width: usize, device: &Device) -> Tensor<2> {
+    #[expect(clippy::cast_precision_loss, clippy::cast_possible_truncation, reason = "f32 by definition")]
+    let step = -(10_000_f64.ln() / width as f64) as f32;
+    #[expect(clippy::cast_precision_loss, reason = "widths are small")]
+    let frequencies: Vec<f32> = (0..width.div_ceil(2)).map(|i| ((2 * i) as f32 * step).exp()).collect();
+    let rows = positions.len();
+    #[expect(clippy::cast_precision_loss, reason = "positions are small")]
+    let row = |p: usize| {
+        let angles: Vec<f32> = frequencies.iter().map(|f| p as f32 * f).collect();
+        angles.into_iter().flat_map(|a| [a.sin(), a.cos()]).take(width)
+    };
+    let values: Vec<f32> = positions.flat_map(row).collect();
+    Tensor::from_data(TensorData::new(values, [rows, width]), device)
+}

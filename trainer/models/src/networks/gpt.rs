@@ -98,7 +98,7 @@ impl Gpt {
             _ => Tensor::cat(vec![condition, self.trans_base.tok_emb.rows(ids, batch)], 1),
         };
         let x = x + sinusoids(len, width, &device);
-        let sight = Sight::Bias(causal(len, &device));
+        let sight = Sight::Bias(Box::new(causal(len, &device)));
         let x = self.trans_base.blocks.iter().fold(x, |x, block| block.forward(x, &sight, dropout));
         self.trans_head.forward(x, &sight, dropout)
     }

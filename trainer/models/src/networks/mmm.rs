@@ -86,6 +86,17 @@ pub struct Mmm {
     pub trans_head: GptHead,
 }
 
+/// What the network looks at besides the ids.
+#[derive(Debug, Clone)]
+pub struct MmmCondition {
+    /// The tokenizer's codes [K, d].
+    pub codes_kd: Tensor<2>,
+    /// Captions [B, C].
+    pub text_bc: Tensor<2>,
+    /// Words [B, W, C].
+    pub words_bnc: Tensor<3>,
+}
+
 impl Mmm {
     /// A fresh one: weights normal with deviation 0.02, biases 0.
     ///
@@ -109,18 +120,17 @@ impl Mmm {
 
     /// Logits [B, 1 + P, K] of the caption's place, which means nothing, and of each position of `ids` [B P].
     ///
-    /// `codes_kd` [K, d] are the tokenizer's; of sequence b the first `visible[b]` positions are looked at, all without; where `text_visible` is
+    /// Of sequence b the first `visible[b]` positions are looked at, all without; where `text_visible` is
     /// false the caption's place is not.
     pub fn forward(
         &self,
         ids: &[usize],
-        codes_kd: Tensor<2>,
-        text_bc: Tensor<2>,
-        words_bnc: Tensor<3>,
+        condition: &MmmCondition,
         visible: Option<&[usize]>,
         text_visible: Option<&[bool]>,
         dropout: &mut Dropout,
     ) -> Tensor<3> {
+        let MmmCondition { codes_kd, text_bc, words_bnc } = condition.clone();
         let base = &self.trans_base;
         let (batch, device) = (text_bc.dims()[0], text_bc.device());
         let positions = ids.len() / batch;
@@ -138,7 +148,7 @@ impl Mmm {
                 let seen: Vec<bool> = (0..batch)
                     .flat_map(|b| [text[b]].into_iter().chain((0..positions).map(move |p| of(b, p))))
                     .collect();
-                Sight::Bias(hiding(&seen, batch, &device))
+                Sight::Bias(Box::new(hiding(&seen, batch, &device)))
             }
             (visible, None) => Sight::Keys(visible.map(|visible| KeyMask::new(visible, 1))),
         };

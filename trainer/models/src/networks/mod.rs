@@ -3,36 +3,48 @@
 //! Notation in tensor names: b batch, t frames or tokens, h width, n latent tokens, d latent width, f features.
 
 mod attend;
+mod condition;
+mod control;
 mod conv;
 mod denoiser;
 mod discord;
 mod discriminator;
 mod dit;
 mod embedding;
+mod encoder;
 mod evaluator;
 mod gpt;
 mod init;
 mod length;
+mod mdm;
 mod mmm;
 mod momask;
+mod stablemofusion;
 mod tokenizer;
+mod trajectory;
 mod transformer;
 mod vae;
 
+pub use condition::ConditionEmbedding;
+pub use control::{Control, copied_from};
 pub use denoiser::{Denoiser, DenoiserConfig};
 pub use discord::{FlowUnet, Projection, TimeFeatures, UnetConfig};
 pub use discriminator::Discriminator;
 pub use dit::{ATTENTION_DROPOUT, DitConfig, FlowDit, falling};
-pub use embedding::{guidance_embedding, time_sinusoid, time_sinusoid_f32};
+pub use embedding::{guidance_embedding, position_sinusoid, time_sinusoid, time_sinusoid_f32};
+pub use encoder::Layers;
 pub use evaluator::{
     BiGru, Conv, Deconv, Evaluator, EvaluatorConfig, MotionEncoder, MovementDecoder, MovementEncoder, TextEncoder,
 };
 pub use gpt::{Gpt, GptConfig};
 pub use init::Init;
 pub use length::LengthEstimator;
-pub use mmm::{Mmm, MmmConfig};
+pub use mdm::{Mdm, MdmConfig};
+pub use mmm::{Mmm, MmmCondition, MmmConfig};
 pub use momask::{MaskedTransformer, MomaskConfig, ResidualTransformer};
+pub use stablemofusion::{StableMoFusion, StableMoFusionConfig, TokenCondition};
 pub use tokenizer::{Tokenizer, TokenizerConfig};
+pub use trajectory::{Hints, TrajectoryConfig, TrajectoryEncoder};
 pub use transformer::{Attention, Block, Linear, Norm, SkipStack, StackConfig};
 pub use vae::{Posterior, Vae, VaeConfig};
 

@@ -192,8 +192,8 @@ pub struct SkipStack {
     pub output_blocks: Vec<Block>,
     /// [x, skip] -> H before each block of the second half.
     pub linear_blocks: Vec<Linear>,
-    /// After the last block.
-    pub norm: Norm,
+    /// After the last block; a ControlNet has none.
+    pub norm: Option<Norm>,
     eps: f64,
 }
 
@@ -210,7 +210,7 @@ impl SkipStack {
             middle_block: Block::new(init, config),
             output_blocks: (0..half).map(|_| Block::new(init, config)).collect(),
             linear_blocks: (0..half).map(|_| Linear::xavier(init, 2 * config.width, config.width)).collect(),
-            norm: Norm::new(init, config.width),
+            norm: Some(Norm::new(init, config.width)),
             eps: config.norm_eps,
         }
     }
@@ -223,32 +223,37 @@ impl SkipStack {
         mask: Option<&KeyMask>,
         dropout: &mut Dropout,
     ) -> Tensor<3> {
-        self.forward_blocks(x_bth, memory_bnh, mask, dropout, |_| ())
+        self.forward_blocks(x_bth, memory_bnh, mask, dropout, |_, x| x)
     }
 
-    /// As [`forward`](Self::forward), and shows `see` the output of every block, in order.
+    /// As [`forward`](Self::forward), with the output of every block, in order, replaced by what `pass` makes of it; it is told the block's number.
     pub fn forward_blocks(
         &self,
         mut x_bth: Tensor<3>,
         memory_bnh: Option<&Tensor<3>>,
         mask: Option<&KeyMask>,
         dropout: &mut Dropout,
-        mut see: impl FnMut(&Tensor<3>),
+        mut pass: impl FnMut(usize, Tensor<3>) -> Tensor<3>,
     ) -> Tensor<3> {
+        let mut block_number = 0;
+        let mut pass = |x: Tensor<3>| {
+            block_number += 1;
+            pass(block_number - 1, x)
+        };
         let mut skips = Vec::with_capacity(self.input_blocks.len());
         for block in &self.input_blocks {
-            x_bth = block.forward(x_bth, memory_bnh.cloned(), mask, dropout);
-            see(&x_bth);
+            x_bth = pass(block.forward(x_bth, memory_bnh.cloned(), mask, dropout));
             skips.push(x_bth.clone());
         }
-        x_bth = self.middle_block.forward(x_bth, memory_bnh.cloned(), mask, dropout);
-        see(&x_bth);
+        x_bth = pass(self.middle_block.forward(x_bth, memory_bnh.cloned(), mask, dropout));
         for (block, merge) in self.output_blocks.iter().zip(&self.linear_blocks) {
             let skip = skips.pop().expect("as many skips as output blocks");
             x_bth = merge.forward(Tensor::cat(vec![x_bth, skip], 2));
-            x_bth = block.forward(x_bth, memory_bnh.cloned(), mask, dropout);
-            see(&x_bth);
+            x_bth = pass(block.forward(x_bth, memory_bnh.cloned(), mask, dropout));
         }
-        self.norm.forward(x_bth, self.eps)
+        match &self.norm {
+            Some(norm) => norm.forward(x_bth, self.eps),
+            None => x_bth,
+        }
     }
 }

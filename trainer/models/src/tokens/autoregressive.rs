@@ -1,4 +1,4 @@
-//! Drawing from [`Gpt`](crate::networks::Gpt) and its training examples. Source: T2M-GPT (Zhang et al., CVPR 2023).
+//! Drawing from [`Gpt`] and its training examples. Source: T2M-GPT (Zhang et al., CVPR 2023).
 
 use burn::tensor::Tensor;
 

@@ -1,24 +1,13 @@
-//! Drawing from [`Mmm`](crate::networks::Mmm) and its training examples. Source: MMM (Pinyoanuntapong et al., CVPR 2024).
+//! Drawing from [`Mmm`] and its training examples. Source: MMM (Pinyoanuntapong et al., CVPR 2024).
 
 use burn::tensor::Tensor;
 
 use super::{Uniforms, cosine, gumbel_draw, host, probability};
 use crate::kernels::Dropout;
-use crate::networks::{Mmm, MmmConfig};
+use crate::networks::{Mmm, MmmCondition, MmmConfig};
 
 /// Tokens of the longest clip, to which numbers of steps refer.
 const LONGEST: f64 = 49.0;
-
-/// What the network looks at besides the ids.
-#[derive(Debug, Clone)]
-pub struct Condition {
-    /// The tokenizer's codes [K, d].
-    pub codes_kd: Tensor<2>,
-    /// Captions [B, C].
-    pub text_bc: Tensor<2>,
-    /// Words [B, W, C].
-    pub words_bnc: Tensor<3>,
-}
 
 /// How tokens are drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -73,7 +62,7 @@ pub fn sample(
     network: &Mmm,
     config: &MmmConfig,
     sampling: &Sampling,
-    condition: &Condition,
+    condition: &MmmCondition,
     given: &[Vec<Option<usize>>],
     uniforms: Uniforms<'_>,
     mut see: impl FnMut(&Step<'_>),
@@ -140,13 +129,12 @@ fn laid_out(config: &MmmConfig, tokens: &[Option<usize>]) -> Vec<usize> {
 /// Logits [B, P, K] without the caption's place.
 pub fn logits(
     network: &Mmm,
-    condition: &Condition,
+    condition: &MmmCondition,
     ids: &[usize],
     visible: Option<&[usize]>,
     dropout: &mut Dropout,
 ) -> Tensor<3> {
-    let Condition { codes_kd, text_bc, words_bnc } = condition.clone();
-    let out = network.forward(ids, codes_kd, text_bc, words_bnc, visible, None, dropout);
+    let out = network.forward(ids, condition, visible, None, dropout);
     let [batch, len, classes] = out.dims();
     out.slice([0..batch, 1..len, 0..classes])
 }

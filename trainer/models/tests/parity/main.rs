@@ -1,23 +1,25 @@
 //! Networks, losses, one distillation step and the samplers against the published PyTorch modules.
 //!
 //! Driven by what is there: every folder of the fixtures whose name starts with a known prefix, every case its arrays
-//! name, sizes out of its `config.json`. `02_control*` and 07 hold networks that this crate does not have; their
-//! schedules it has. `06_sjpe` holds a metric, which the crate of the stages has.
+//! name, sizes out of its `config.json`. `06_sjpe` holds a metric, which the crate of the stages has.
 //! Gates are those of the fixtures' README, for CPU.
 
 mod codebooks;
 #[path = "../common/mod.rs"]
 mod common;
+mod control;
 mod denoiser;
 mod discord;
 mod distillation;
 mod evaluator;
+mod free_t2m;
 mod gpt;
 mod length;
 mod mmm;
 mod momask;
 mod networks;
 mod pcm_step;
+mod raw_diffusion;
 mod samplers;
 mod schedules;
 mod tokenizer;
@@ -31,7 +33,7 @@ const LOSS: f64 = 1e-5;
 #[test]
 fn parity_says_what_it_skips() {
     let Some(root) = common::shared("parity") else { return };
-    let covered = ["01_", "02_denoiser", "03_distill", "03_sampler", "04_evaluator", "05_", "06_", "08_pcm", "11_"];
+    let covered = ["01_", "02_", "03_distill", "03_sampler", "04_evaluator", "05_", "06_", "07_", "08_pcm", "11_"];
     let skipped: Vec<String> = std::fs::read_dir(root)
         .expect("fixtures can be listed")
         .map(|entry| entry.expect("fixtures can be listed").path())
@@ -40,7 +42,7 @@ fn parity_says_what_it_skips() {
         .filter(|name| !covered.iter().any(|prefix| name.starts_with(prefix)))
         .collect();
     eprintln!("SKIPPED: networks that are not here: {}", skipped.join(" "));
-    for group in ["03_", "04_", "05_", "06_", "11_"] {
+    for group in ["02_", "03_", "04_", "05_", "06_", "07_", "11_"] {
         assert!(!skipped.iter().any(|name| name.starts_with(group)), "every {group}* fixture has a test");
     }
 }

@@ -3,9 +3,9 @@
 use burn::tensor::Device;
 use models::flat;
 use models::kernels::Dropout;
-use models::networks::{Mmm, MmmConfig};
+use models::networks::{Mmm, MmmCondition, MmmConfig};
 use models::optim::{AdamW, global_norm};
-use models::tokens::mmm::{Condition, Corruption, Counts, Example, Sampling, Step, logits, loss, sample};
+use models::tokens::mmm::{Corruption, Counts, Example, Sampling, Step, logits, loss, sample};
 use serde_json::Value;
 
 use crate::common::{Array, Arrays, Gates, device, error, folders, json, name, relative, row, shared, tracked};
@@ -27,8 +27,8 @@ struct Loaded {
 }
 
 impl Loaded {
-    fn condition(&self, io: &Arrays, case: &str) -> Condition {
-        Condition {
+    fn condition(&self, io: &Arrays, case: &str) -> MmmCondition {
+        MmmCondition {
             codes_kd: self.codes.tensor(&self.device),
             text_bc: io.get(&format!("{case}/sentence")).tensor(&self.device),
             words_bnc: io.get(&format!("{case}/words")).tensor(&self.device),
@@ -84,8 +84,7 @@ fn forward(loaded: &Loaded, io: &Arrays, gates: &mut Gates) {
     let visible: Vec<usize> = stored("token_len").usizes().iter().map(|len| len + 1).collect();
     let hidden: Vec<bool> = stored("text_visible").values.iter().map(|v| *v == 1.0).collect();
     let pass = |visible: Option<&[usize]>, text: Option<&[bool]>| {
-        let Condition { codes_kd, text_bc, words_bnc } = loaded.condition(io, "forward");
-        loaded.network.forward(&ids, codes_kd, text_bc, words_bnc, visible, text, &mut Dropout::off())
+        loaded.network.forward(&ids, &loaded.condition(io, "forward"), visible, text, &mut Dropout::off())
     };
     gates.tensor("logits", "forward", pass(Some(&visible), None), stored("logits"), FORWARD);
     let found = pass(Some(&visible), Some(&hidden));

@@ -22,12 +22,12 @@ const GLOBAL: f64 = 1e-4;
 const PARAMETER: f64 = 1e-3;
 const ALLOWANCE: f64 = 1e-7;
 
-fn count(config: &Value, key: &str) -> usize {
+pub(crate) fn count(config: &Value, key: &str) -> usize {
     config[key].as_u64().unwrap_or_else(|| panic!("`{key}` is a number")) as usize
 }
 
 /// Refuses a configuration that asks for what our networks are not.
-fn only(config: &Value, fixed: &[(&str, Value)]) {
+pub(crate) fn only(config: &Value, fixed: &[(&str, Value)]) {
     for (key, value) in fixed {
         assert_eq!(&config[*key], value, "only this `{key}` exists here");
     }
@@ -41,12 +41,17 @@ fn sizes(config: &Value) -> (usize, usize, usize, bool) {
     (latent[0], latent[1], width, projection)
 }
 
-fn draws(device: &Device) -> Init<'_> {
+pub(crate) fn draws(device: &Device) -> Init<'_> {
     Init::new(Seed(1), "parity", Positions::Uniform, device)
 }
 
 /// A VAE of the constructor arguments, with the fixture's weights.
 pub(crate) fn vae(config: &Value, weights: &Path, device: &Device) -> Vae {
+    vae_at(config, weights, "", device)
+}
+
+/// The same with the weights under `prefix`.
+pub(crate) fn vae_at(config: &Value, weights: &Path, prefix: &str, device: &Device) -> Vae {
     only(
         config,
         &[
@@ -70,11 +75,16 @@ pub(crate) fn vae(config: &Value, weights: &Path, device: &Device) -> Vae {
         projection,
         norm_eps: config["norm_eps"].as_f64().expect("a number"),
     };
-    load(Vae::new(&config, &mut draws(device)), weights, "")
+    load(Vae::new(&config, &mut draws(device)), weights, prefix)
 }
 
 /// A denoiser of the constructor arguments, with the fixture's weights under `prefix`.
 pub(crate) fn denoiser(config: &Value, weights: &Path, prefix: &str, device: &Device) -> Denoiser {
+    load(Denoiser::new(&denoiser_config(config), &mut draws(device)), weights, prefix)
+}
+
+/// A denoiser's size out of its constructor arguments.
+pub(crate) fn denoiser_config(config: &Value) -> DenoiserConfig {
     only(
         config,
         &[
@@ -88,7 +98,6 @@ pub(crate) fn denoiser(config: &Value, weights: &Path, prefix: &str, device: &De
             ("time_act_fn", "silu".into()),
             ("time_post_act_fn", Value::Null),
             ("position_embedding", "learned".into()),
-            ("controlnet_embed_dim", Value::Null),
         ],
     );
     let (tokens, dim, width, projection) = sizes(config);
@@ -97,7 +106,7 @@ pub(crate) fn denoiser(config: &Value, weights: &Path, prefix: &str, device: &De
         Some("relu") => true,
         Some(other) => panic!("activation `{other}` on the text does not exist here"),
     };
-    let config = DenoiserConfig {
+    DenoiserConfig {
         tokens,
         dim,
         width,
@@ -110,11 +119,10 @@ pub(crate) fn denoiser(config: &Value, weights: &Path, prefix: &str, device: &De
         projection,
         guidance_dim: config["time_cond_proj_dim"].as_u64().map(|g| g as usize),
         norm_eps: config["norm_eps"].as_f64().expect("a number"),
-    };
-    load(Denoiser::new(&config, &mut draws(device)), weights, prefix)
+    }
 }
 
-fn load<M: Module>(module: M, weights: &Path, prefix: &str) -> M {
+pub(crate) fn load<M: Module>(module: M, weights: &Path, prefix: &str) -> M {
     let bytes = std::fs::read(weights).unwrap_or_else(|e| panic!("cannot read {}: {e}", weights.display()));
     names::load(module, &bytes, prefix).unwrap_or_else(|e| panic!("{}: {e}", weights.display()))
 }

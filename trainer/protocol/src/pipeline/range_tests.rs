@@ -23,7 +23,7 @@ const NUMBERS: &[&str] = &[
 
 /// A stage of each kind, with a value for each numeric setting, so that all fit together.
 fn stages() -> Vec<(String, StageSettings)> {
-    let sampler = Sampler { steps: 1, guidance: 7.5, timesteps: vec![999] };
+    let sampler = Sampler { steps: 1, guidance: 7.5, timesteps: vec![999], ..Sampler::default() };
     let mut stages = vec![
         ("folder", StageSettings::DataOpen(DataOpen { path: "data".into(), ..DataOpen::default() })),
         ("made", StageSettings::DataSynthetic(DataSynthetic::default())),

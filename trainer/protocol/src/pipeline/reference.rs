@@ -84,7 +84,8 @@ fn described_kind(settings: &StageSettings) -> Value {
             }
             Target::Dataset(_) | Target::Folder => "A folder".to_owned(),
         };
-        schema["properties"][key]["x-refers-to"] = lead.into();
+        let inner = key.split('.').fold(&mut schema, |schema, part| &mut schema["properties"][part]);
+        inner["x-refers-to"] = lead.into();
     }
     schema
 }

@@ -175,21 +175,26 @@ impl<'a> Neighbours<'a> {
         }
     }
 
-    /// Refuses a student where a teacher is needed.
+    /// The evaluator against whose embeddings a model was trained, if there is one.
+    pub(crate) fn evaluator_of_model(&self, model: &str) -> Option<&str> {
+        self.of_model(model, &|name| self.read_by(name, ArtifactKind::Evaluator))
+    }
+
+    /// Refuses anything but a latent teacher where one is needed.
     pub(crate) fn is_teacher(&self, p: &mut Problems, teacher: &str) {
-        if let Some(settings) = self.stage(teacher)
-            && let Some(family) = self.family(teacher)
-            && family != Family::Mld
-        {
-            let kind = settings.kind();
-            let (what, why) = if family.is_student() {
+        let (Some(settings), Some(family)) = (self.stage(teacher), self.family(teacher)) else { return };
+        let (what, why) = match family {
+            Family::Mld => return,
+            Family::Lcm { .. } | Family::Pcm { .. } => {
                 ("a student", "a student has guidance built in, and cannot be asked without it")
-            } else {
+            }
+            Family::Autoregressive | Family::Masked | Family::Features { .. } => {
                 ("no latent diffusion", "only such a model gives latents to learn from")
-            };
-            let message = format!("`{teacher}` is {what} ({kind}), but `teacher` needs a `train.mld` stage");
-            p.add("teacher", message, why);
-        }
+            }
+        };
+        let kind = settings.kind();
+        let message = format!("`{teacher}` is {what} ({kind}), but `teacher` needs a `train.mld` stage");
+        p.add("teacher", message, why);
     }
 
     /// Refuses steps and timesteps that the model does not have.

@@ -8,6 +8,49 @@ use super::Problems;
 /// Timesteps of every published noise schedule.
 const TIMESTEPS: usize = 1000;
 
+/// What follows a model's predictions from noise to a motion.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub enum Solver {
+    /// The one that the model's paper draws with: DDIM (MLD), ancestral sampling (MDM), the stochastic DPM-Solver++ (StableMoFusion), jumps
+    /// (students).
+    #[default]
+    #[serde(rename = "own")]
+    Own,
+    /// Ancestral sampling: fresh noise in every step.
+    #[serde(rename = "ddpm")]
+    Ddpm,
+    /// Deterministic; as MLD spaces it in latent space, as StableMoFusion does among features.
+    #[serde(rename = "ddim")]
+    Ddim,
+    /// Deterministic, of order two, on the predicted noise.
+    #[serde(rename = "dpm-solver")]
+    DpmSolver,
+    /// Deterministic, of order two, on the predicted sample.
+    #[serde(rename = "dpm-solver++")]
+    DpmSolverPp,
+    /// The same with fresh noise, on the noise levels of Karras et al.; the last step gives the sample.
+    #[serde(rename = "sde-dpm-solver++")]
+    SdeDpmSolverPp,
+    /// The same as libraries of 2023 have it: the last noise level stands twice, so that the last step changes nothing.
+    #[serde(rename = "sde-dpm-solver++-2023")]
+    SdeDpmSolverPp2023,
+}
+
+impl Solver {
+    /// Its word in settings and on command lines.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Own => "own",
+            Self::Ddpm => "ddpm",
+            Self::Ddim => "ddim",
+            Self::DpmSolver => "dpm-solver",
+            Self::DpmSolverPp => "dpm-solver++",
+            Self::SdeDpmSolverPp => "sde-dpm-solver++",
+            Self::SdeDpmSolverPp2023 => "sde-dpm-solver++-2023",
+        }
+    }
+}
+
 /// How motions are drawn from a model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
@@ -20,17 +63,22 @@ pub struct Sampler {
     pub guidance: f64,
     /// LCM only: timesteps, first to last; empty takes evenly spaced points of the training grid from 999 down.
     pub timesteps: Vec<usize>,
+    /// What follows the predictions.
+    pub solver: Solver,
 }
 
 impl Default for Sampler {
     fn default() -> Self {
-        Self { steps: 1, guidance: 7.5, timesteps: Vec::new() }
+        Self { steps: 1, guidance: 7.5, timesteps: Vec::new(), solver: Solver::Own }
     }
 }
 
 impl std::fmt::Display for Sampler {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{} step(s), guidance {}", self.steps, self.guidance)?;
+        if self.solver != Solver::Own {
+            write!(f, ", {}", self.solver.name())?;
+        }
         match self.timesteps.is_empty() {
             true => Ok(()),
             false => write!(f, ", timesteps {:?}", self.timesteps),
@@ -86,6 +134,13 @@ pub enum Family {
     Autoregressive,
     /// Fills in all tokens at once, again and again, with classifier-free guidance.
     Masked,
+    /// Diffuses motion itself, without latents; classifier-free guidance.
+    Features {
+        /// Timesteps of its noise schedule.
+        timesteps: usize,
+        /// The published solver.
+        solver: Solver,
+    },
 }
 
 impl Family {
@@ -94,12 +149,35 @@ impl Family {
         matches!(self, Self::Lcm { .. } | Self::Pcm { .. })
     }
 
+    /// What of `solver` it is that a model of this family draws with; `None` for one that it does not have.
+    pub fn solver(&self, solver: Solver) -> Option<Solver> {
+        match (self, solver) {
+            (Self::Lcm { .. } | Self::Pcm { .. } | Self::Autoregressive | Self::Masked, solver) => {
+                (solver == Solver::Own).then_some(Solver::Own)
+            }
+            (Self::Mld, Solver::Own) => Some(Solver::Ddim),
+            (Self::Mld, Solver::Ddim | Solver::DpmSolver | Solver::DpmSolverPp) => Some(solver),
+            (Self::Mld, _) => None,
+            (Self::Features { solver: own, .. }, Solver::Own) => Some(*own),
+            (Self::Features { .. }, solver) => Some(solver),
+        }
+    }
+
     /// What must hold of a sampler for a model of this family; `model` is what messages call it.
     pub(super) fn check(&self, model: &str, sampler: &Sampler, p: &mut Problems) {
         let steps = sampler.steps;
         if !sampler.timesteps.is_empty() && !matches!(self, Self::Lcm { .. }) {
             let message = format!("`sampler.timesteps` are for LCM students, and {model} is none");
             p.add("sampler.timesteps", message, "leave them out");
+        }
+        if self.solver(sampler.solver).is_none() {
+            let message = format!("`sampler.solver` is `{}`, which {model} does not have", sampler.solver.name());
+            let help = match self {
+                Self::Mld => "take `ddim`, `dpm-solver` or `dpm-solver++`",
+                Self::Autoregressive | Self::Masked => "tokens are drawn, not solved for; leave the solver out",
+                _ => "a student draws by its own jumps; leave the solver out",
+            };
+            p.add("sampler.solver", message, help);
         }
         let mut at_most = |most: usize, what: &str| {
             if steps > most {
@@ -113,6 +191,12 @@ impl Family {
                 at_most(points, &format!("the grid of {model} has {points} points"));
             }
             Self::Lcm { .. } | Self::Masked => {}
+            Self::Features { timesteps, solver } => {
+                let solver = if sampler.solver == Solver::Own { *solver } else { sampler.solver };
+                // A deterministic path has one level more than moves.
+                let even = matches!(solver, Solver::DpmSolver | Solver::DpmSolverPp);
+                at_most(timesteps - usize::from(even && *timesteps > 1), &format!("{model} has {timesteps} timesteps"));
+            }
             Self::Autoregressive => {
                 at_most(1, &format!("{model} draws a token after the other until it ends"));
                 if sampler.guidance != 0.0 {
@@ -143,20 +227,25 @@ impl Family {
     }
 
     /// How the papers draw: a teacher with 50 steps at its published guidance, a student with as many steps as it has phases (an LCM with
-    /// one), at a third of the range of guidance scales that it was trained for; MoMask in ten steps at 4. The published range 5 to 15 gives w = 8.3, near
+    /// one), at a third of the range of guidance scales that it was trained for; MoMask in ten steps at 4; MDM over all its timesteps and
+    /// StableMoFusion in ten steps, both at 2.5. The published range 5 to 15 gives w = 8.3, near
     /// MotionLCM's 7 to 12.5. For models that nobody has measured; a measured one has its own.
     pub fn published(&self) -> Sampler {
         let student = |steps: usize, (low, high): (f64, f64)| Sampler {
             steps,
             guidance: low + (high - low) / 3.0,
-            timesteps: Vec::new(),
+            ..Sampler::default()
         };
         match self {
-            Self::Mld => Sampler { steps: 50, guidance: 7.5, timesteps: Vec::new() },
-            Self::Autoregressive => Sampler { steps: 1, guidance: 0.0, timesteps: Vec::new() },
-            Self::Masked => Sampler { steps: 10, guidance: 4.0, timesteps: Vec::new() },
+            Self::Mld => Sampler { steps: 50, guidance: 7.5, ..Sampler::default() },
+            Self::Autoregressive => Sampler { steps: 1, guidance: 0.0, ..Sampler::default() },
+            Self::Masked => Sampler { steps: 10, guidance: 4.0, ..Sampler::default() },
             Self::Lcm { guidance, .. } => student(1, *guidance),
             Self::Pcm { guidance, phases, .. } => student(*phases, *guidance),
+            Self::Features { timesteps, solver } => {
+                let steps = if *solver == Solver::Ddpm { *timesteps } else { 10.min(*timesteps) };
+                Sampler { steps, guidance: 2.5, ..Sampler::default() }
+            }
         }
     }
 }
@@ -187,7 +276,7 @@ mod tests {
     use super::*;
 
     fn sampler(steps: usize, timesteps: &[usize]) -> Sampler {
-        Sampler { steps, guidance: 2.0, timesteps: timesteps.to_vec() }
+        Sampler { steps, guidance: 2.0, timesteps: timesteps.to_vec(), ..Sampler::default() }
     }
 
     #[test]
@@ -208,11 +297,27 @@ mod tests {
             let refused = family.accepts(&sampler).unwrap_err();
             assert!(refused.contains(word), "{refused}");
         }
+        let mdm = Family::Features { timesteps: 50, solver: Solver::Ddpm };
+        let solved = |solver, steps| Sampler { solver, ..sampler(steps, &[]) };
+        for (family, sampler, word) in [
+            (&lcm, solved(Solver::Ddim, 1), "its own jumps"),
+            (&Family::Mld, solved(Solver::SdeDpmSolverPp, 10), "`sde-dpm-solver++`"),
+            (&mdm, sampler(51, &[]), "1 to 50"),
+            (&mdm, solved(Solver::DpmSolverPp, 50), "1 to 49"),
+            (&mdm, sampler(1, &[49]), "timesteps"),
+        ] {
+            let mut problems = Problems::default();
+            family.check("the model", &sampler, &mut problems);
+            let said = format!("{:?}", problems.0);
+            assert!(said.contains(word), "{said}");
+        }
+        assert_eq!(mdm.accepts(&solved(Solver::Ddim, 50)), Ok(()));
+        assert_eq!(Family::Mld.accepts(&solved(Solver::DpmSolverPp, 10)), Ok(()));
         assert_eq!(Family::Mld.accepts(&sampler(50, &[])), Ok(()));
         assert_eq!(lcm.accepts(&sampler(2, &[699, 299])), Ok(()));
         assert_eq!(pcm.accepts(&sampler(2, &[])), Ok(()));
         assert!(Family::Autoregressive.accepts(&sampler(1, &[])).unwrap_err().contains("has none"));
-        for family in [Family::Mld, lcm, pcm, Family::Autoregressive, Family::Masked] {
+        for family in [Family::Mld, lcm, pcm, mdm, Family::Autoregressive, Family::Masked] {
             assert_eq!(family.accepts(&family.published()), Ok(()), "{family:?}");
         }
     }

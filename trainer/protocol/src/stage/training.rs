@@ -33,6 +33,8 @@ pub enum Decay {
     Cosine,
     /// Stays.
     Constant,
+    /// Times 0.9 after every 5,000 updates. StableMoFusion.
+    Staircase,
 }
 
 /// AdamW. Defaults are the papers' (betas 0.9/0.999, eps 1e-8, weight decay 0), not a library's.

@@ -3,6 +3,7 @@
 //! A model is opened from its artifact alone, by the generator that its manifest names; which parts there are and what they are is the
 //! generator's own matter. To add one: a file here that implements [`MotionGenerator`], and a line in the table of [`open`].
 
+mod feature_diffusion;
 mod interface;
 mod latent_diffusion;
 mod tokens;
@@ -20,6 +21,7 @@ use protocol::stage::Sampler;
 use crate::context::StageError;
 use crate::parts::model_error;
 
+pub(crate) use feature_diffusion::NAME as FEATURE_DIFFUSION;
 pub use interface::{Batch, Lap, LatentGenerator, MotionGenerator, Seeds, Text};
 pub(crate) use latent_diffusion::NAME as LATENT_DIFFUSION;
 pub(crate) use tokens::{GeneratorMeta, MASKED_PREFIX, NAME as TOKENS, RESIDUAL_PREFIX};
@@ -28,7 +30,8 @@ pub(crate) use tokens::{GeneratorMeta, MASKED_PREFIX, NAME as TOKENS, RESIDUAL_P
 type Open = fn(&Model, &dyn Blobs, &Device) -> Result<Box<dyn MotionGenerator>, StageError>;
 
 /// Every generator by its name in manifests.
-const GENERATORS: [(&str, Open); 2] = [(LATENT_DIFFUSION, latent_diffusion::open), (TOKENS, tokens::open)];
+const GENERATORS: [(&str, Open); 3] =
+    [(LATENT_DIFFUSION, latent_diffusion::open), (FEATURE_DIFFUSION, feature_diffusion::open), (TOKENS, tokens::open)];
 
 /// The generator of an artifact of kind `model`.
 pub fn open(manifest: &Manifest, blobs: &dyn Blobs, device: &Device) -> Result<Box<dyn MotionGenerator>, StageError> {

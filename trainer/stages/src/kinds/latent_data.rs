@@ -36,11 +36,7 @@ pub(super) struct LatentData {
 pub(super) struct LatentSlice {
     /// Keys of all draws.
     pub(super) picks: Vec<Pick>,
-    /// Frames of the motion behind each latent: a condition, as the caption is.
-    #[expect(
-        dead_code,
-        reason = "denoisers that take the length are to come; those here leave it to the VAE's decoder"
-    )]
+    /// Frames of the motion behind each latent.
     pub(super) lengths: Vec<usize>,
     /// Latents [B, N, d], drawn from their posteriors.
     pub(super) clean_bnd: Tensor<3>,
@@ -111,10 +107,15 @@ impl LatentData {
         Tensor::from_data(TensorData::new(values, [picks.len(), latent.tokens, latent.dim]), &self.device)
     }
 
+    /// The whole batch of `step`.
+    pub(super) fn picks(&mut self, step: u64) -> Vec<Pick> {
+        self.order.batch(step, |_| 0)
+    }
+
     /// Slice `slice` of the batch of `step`. With probability `drop` a caption is replaced by the empty one.
     pub(super) fn slice(&mut self, step: u64, slice: usize, drop: f64) -> LatentSlice {
         let range = self.order.slice(slice, self.slices);
-        let picks: Vec<Pick> = self.order.batch(step, |_| 0)[range].to_vec();
+        let picks: Vec<Pick> = self.picks(step)[range].to_vec();
         let latent = self.latents.meta.latent;
         let (size, crops) = (latent.tokens * latent.dim, self.latents.meta.crops);
         let (mut clean, mut text, mut lengths) = (Vec::new(), Vec::new(), Vec::new());

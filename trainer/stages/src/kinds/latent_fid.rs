@@ -173,7 +173,7 @@ impl<'a> Plan<'a> {
     /// The sampler of the teacher that `match` compares with.
     fn teacher_sampler(&self) -> Sampler {
         let shift = if self.model.family().is_student() { 1.0 } else { 0.0 };
-        Sampler { steps: TEACHER_STEPS, guidance: self.settings.sampler.guidance + shift, timesteps: Vec::new() }
+        Sampler { steps: TEACHER_STEPS, guidance: self.settings.sampler.guidance + shift, ..Sampler::default() }
     }
 }
 

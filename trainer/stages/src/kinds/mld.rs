@@ -2,9 +2,13 @@
 //!
 //! `t ~ U{0..999}`, `z_t = alpha_t z_0 + sigma_t eps`, loss `mean (eps_hat(z_t, t, c) - eps)^2` (of the sample or the velocity where `diffusion`
 //! says so), the caption replaced by the empty one with probability `guidance_dropout`. Latents are samples of their posteriors, unscaled.
+//!
+//! With Free-T2M's losses, which look at motion: of a part of the batch the clean latent that is predicted goes through the frozen decoder, and is
+//! compared with what the decoder makes of the true one. Departs: the paper has no latent host; what the VAE itself loses is not charged here.
 
 use std::collections::BTreeMap;
 
+use burn::tensor::{Int, Tensor, TensorData};
 use checkpoint::model::Parts;
 use models::diffusion::{Schedule, TIMESTEPS, affine, unzip};
 use models::flat;
@@ -15,17 +19,27 @@ use protocol::ArtifactKind;
 use protocol::artifact::Role;
 use protocol::stage::{Family, TrainMld};
 
+use super::features::{init_part, unfit, with_weights};
+use super::frequency::{FrequencyTerms, LOW_FREQUENCY, Predicted, SEMANTIC, clean};
 use super::latent_data::{self, LatentData};
 use super::{Gang, group, slice_result};
 use crate::artifacts::{self, DenoiserMeta, VaeMeta};
 use crate::context::{GangContext, Outcome, StageError};
-use crate::train::{GroupPlan, Losses, Objective, SliceResult, TrainState, Trained, train};
+use crate::networks::Autoencoder;
+use crate::train::{GroupPlan, Losses, Objective, Pick, SliceResult, TrainState, Trained, train};
 
 /// The term of the loss that every latent diffusion has.
 const DENOISING: &str = "denoising";
 
+/// Free-T2M's terms, and the decoder that they look through.
+struct Decoded {
+    terms: FrequencyTerms,
+    vae: Autoencoder,
+}
+
 struct Mld {
     settings: TrainMld,
+    decoded: Option<Decoded>,
     data: LatentData,
     network: Denoiser,
     noise: Schedule,
@@ -38,7 +52,11 @@ impl Objective for Mld {
     }
 
     fn terms(&self) -> Vec<&'static str> {
-        vec![Losses::TOTAL]
+        let mut terms = vec![Losses::TOTAL];
+        if self.decoded.is_some() {
+            terms.extend([DENOISING, LOW_FREQUENCY, SEMANTIC]);
+        }
+        terms
     }
 
     fn load(&mut self, state: &TrainState) {
@@ -47,17 +65,73 @@ impl Objective for Mld {
 
     fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
         let batch = self.data.slice(step, slice, self.settings.guidance_dropout);
-        let timesteps: Vec<usize> =
-            batch.picks.iter().map(|pick| self.data.stream("timestep", *pick).below(TIMESTEPS)).collect();
+        let timesteps: Vec<usize> = batch.picks.iter().map(|pick| self.timestep(*pick)).collect();
         let noise = self.data.noise("noise", &batch.picks);
         let (a, e) = unzip(timesteps.iter().map(|t| self.noise.add_noise(*t)));
         let noisy = affine(batch.clean_bnd.clone(), noise.clone(), &a, &e);
-        let target = self.noise.target(batch.clean_bnd, noise, &timesteps);
+        let target = self.noise.target(batch.clean_bnd.clone(), noise, &timesteps);
         let mut dropout = Dropout::new(self.settings.network.dropout, self.seed, step, slice as u64);
-        let predicted = self.network.forward(noisy, &timesteps, batch.text_blc, None, &mut dropout);
+        let predicted = self.network.forward(noisy.clone(), &timesteps, batch.text_blc, None, &mut dropout);
         let mut all = Losses::new(self.settings.training.batch.global);
-        all.add(DENOISING, losses::mse(predicted, target), 1.0);
+        all.add(DENOISING, losses::mse(predicted.clone(), target), 1.0);
+        let whole = self.data.picks(step);
+        if let Some(decoded) = &self.decoded {
+            let found = clean(&self.noise, noisy, predicted, &timesteps);
+            let chosen = self.chosen(decoded, &whole);
+            decoded.add(&mut all, &chosen, (&batch.picks, &batch.lengths), found, batch.clean_bnd);
+        }
         slice_result(&self.network, &all, &self.terms())
+    }
+}
+
+impl Mld {
+    fn timestep(&self, pick: Pick) -> usize {
+        self.data.stream("timestep", pick).below(TIMESTEPS)
+    }
+
+    /// Places of the batch whose latents are decoded, with their timesteps, and how many samples the batch has.
+    fn chosen(&self, decoded: &Decoded, batch: &[Pick]) -> Chosen {
+        let drawn = |pick: &&Pick| self.data.stream("decoded", **pick).chance(self.settings.decoded);
+        let timed = batch.iter().filter(drawn).map(|pick| (pick.place, self.timestep(*pick)));
+        Chosen { timesteps: timed.filter(|(_, t)| decoded.terms.acts(*t)).collect(), global: batch.len() }
+    }
+}
+
+/// What of a batch is decoded.
+struct Chosen {
+    timesteps: BTreeMap<u64, usize>,
+    global: usize,
+}
+
+impl Decoded {
+    fn add(
+        &self,
+        losses: &mut Losses,
+        chosen: &Chosen,
+        (picks, lengths): (&[Pick], &[usize]),
+        found_bnd: Tensor<3>,
+        clean_bnd: Tensor<3>,
+    ) {
+        let rows: Vec<usize> = (0..picks.len()).filter(|b| chosen.timesteps.contains_key(&picks[*b].place)).collect();
+        if rows.is_empty() {
+            return;
+        }
+        let indices: Vec<i64> = rows.iter().map(|b| *b as i64).collect();
+        let lengths: Vec<usize> = rows.iter().map(|b| lengths[*b]).collect();
+        let decode = |z: Tensor<3>| {
+            let indices = Tensor::<1, Int>::from_data(TensorData::new(indices.clone(), [rows.len()]), &z.device());
+            self.vae.decode_tensor(z.select(0, indices), &lengths)
+        };
+        let timesteps: Vec<usize> = rows.iter().map(|b| chosen.timesteps[&picks[*b].place]).collect();
+        let batch_timesteps: Vec<usize> = chosen.timesteps.values().copied().collect();
+        let predicted = Predicted {
+            found: decode(found_bnd),
+            target: decode(clean_bnd),
+            lengths: &lengths,
+            timesteps: &timesteps,
+            batch_timesteps: &batch_timesteps,
+        };
+        self.terms.add(losses, &predicted, chosen.global);
     }
 }
 
@@ -90,9 +164,25 @@ impl Gang for TrainMld {
         let purpose = format!("{}/init", cx.task().name);
         let mut init = Init::new(cx.task().seed, &purpose, self.network.positions, &device);
         let network = Denoiser::new(&meta.config(), &mut init);
+        let network = match init_part(cx)? {
+            Some(denoiser) => {
+                let theirs: DenoiserMeta = artifacts::meta(&denoiser, "the denoiser of `init`")?;
+                if theirs != meta {
+                    return Err(unfit("another size, noise schedule, VAE or text encoder"));
+                }
+                with_weights(cx, network, &denoiser)?
+            }
+            None => network,
+        };
         let seed = super::dropout_seed(cx);
         let noise = Schedule::new(&self.diffusion, TIMESTEPS);
-        let mut objective = Mld { settings: self.clone(), data, network, noise, seed };
+        let statistics = (&vae.mean[..], &vae.std[..]);
+        let terms = FrequencyTerms::read(cx, &self.losses, &noise, vae.format, statistics)?;
+        let decoded = match terms {
+            Some(terms) => Some(Decoded { terms, vae: Autoencoder::read(&*cx.blobs(), &vae_part, &cx.device())? }),
+            None => None,
+        };
+        let mut objective = Mld { settings: self.clone(), decoded, data, network, noise, seed };
         match train(&mut objective, &self.training, cx)? {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {

@@ -7,6 +7,9 @@ mod discord;
 mod encode;
 mod encode_tokens;
 mod evaluator;
+mod feature_data;
+mod features;
+mod frequency;
 mod import;
 mod latent_data;
 mod latent_fid;
@@ -85,7 +88,8 @@ macro_rules! runners {
 runners! {
     Plain: DataOpen, DataSynthetic, TextEmbed, ImportEvaluator, ModelDecoder;
     Map: EncodeLatents, EncodeTokens, EvaluateReconstruction, EvaluateLatentFid, EvaluateT2m;
-    Gang: TrainVae, TrainMld, DistillLcm, DistillPcm, TrainEvaluator, TrainLength, TrainTokenizer, TrainTokens, TrainDiscord;
+    Gang: TrainVae, TrainMld, DistillLcm, DistillPcm, TrainEvaluator, TrainLength, TrainTokenizer, TrainTokens, TrainDiscord,
+        TrainMdm, TrainStableMoFusion;
 }
 
 /// Runs a plain stage.

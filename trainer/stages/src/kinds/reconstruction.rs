@@ -2,7 +2,8 @@
 //!
 //! Each clip is its entry's first frames, as many as are a multiple of the unit length; it is encoded and decoded alone, so no
 //! number depends on the sharding. Metrics without a prefix are of a sample z of the posterior, as every later stage uses it; `mu_` of the
-//! posterior's mean (a tokenizer has none, and no sample: it decodes what it encodes); `clip_mean_` of no network at all: the clip's own mean feature vector, held; `real_` of the clip itself.
+//! posterior's mean (a tokenizer has none, and no sample: it decodes what it encodes); `clip_mean_` of no network at all: the clip's own
+//! mean feature vector, held; `real_` of the clip itself.
 //! Of a tokenizer also, as means over its codebooks, the share of codes in `used` and the `perplexity` of all clips' codes.
 //! Definitions: [`evaluation::reconstruction`](crate::evaluation::reconstruction).
 
@@ -45,6 +46,7 @@ struct Rows {
 }
 
 /// What is measured.
+#[expect(clippy::large_enum_variant, reason = "there is one of it")]
 enum Measured {
     Vae(Autoencoder),
     Tokenizer(TrainedTokenizer, Option<FlowDecoder>),

@@ -55,7 +55,7 @@ pub(crate) fn chain(shards: usize, steps: Steps4) -> Vec<Link> {
         StageSettings::EvaluateLatentFid(EvaluateLatentFid {
             model: model.into(),
             teacher: teacher.into(),
-            sampler: Sampler { steps, guidance, timesteps: vec![] },
+            sampler: Sampler { steps, guidance, ..Sampler::default() },
             repeats: 2,
             samples: 2,
             components: 4,

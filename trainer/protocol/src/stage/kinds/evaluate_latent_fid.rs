@@ -4,7 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
-use crate::stage::{Neighbours, Output, Problems, Ref, Sampler, Shape, Split, StageSpec};
+use crate::stage::{Family, Neighbours, Output, Problems, Ref, Sampler, Shape, Split, StageSpec};
 
 /// `evaluate.latent_fid`: Frechet distance between sampled and real latents, as a share of the real variance.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -87,6 +87,10 @@ impl StageSpec for EvaluateLatentFid {
                 let message = format!("`components` is {}, but a latent has only {size} numbers", self.components);
                 p.add("components", message, "");
             }
+        }
+        if matches!(stages.family(&self.model), Some(Family::Features { .. })) {
+            let message = format!("`{}` diffuses motion itself and has no latents", self.model);
+            p.add("model", message, "measure it with `evaluate.t2m`");
         }
         stages.check_sampler(p, &self.model, &self.sampler);
     }

@@ -47,7 +47,6 @@ pub struct EvaluateT2m {
     /// Clips. Choose on `val`; `test` is for the last look.
     pub split: Split,
     /// Takes all clips where the split has fewer than a pool of 32, and says so in the report; otherwise so small a split is refused.
-    #[serde(alias = "widen")]
     pub all_if_small: bool,
     /// Shards.
     pub shards: usize,
@@ -124,6 +123,11 @@ impl StageSpec for EvaluateT2m {
             return;
         }
         let model = &self.model;
+        if stages.evaluator_of_model(model) == Some(evaluator) {
+            let message =
+                format!("`{model}` was trained to agree with `{evaluator}`, so that its metrics would flatter it");
+            p.add("evaluator", message, "train another evaluator, under another name, to measure with");
+        }
         if let (Some(ours), Some(theirs)) = (stages.format(dataset), stages.format(model))
             && ours != theirs
         {

@@ -16,7 +16,9 @@ mod text_embed;
 mod train_discord;
 mod train_evaluator;
 mod train_length;
+mod train_mdm;
 mod train_mld;
+mod train_stablemofusion;
 mod train_tokenizer;
 mod train_tokens;
 mod train_vae;
@@ -37,7 +39,9 @@ pub use text_embed::{TextEmbed, TextEncoder};
 pub use train_discord::{FlowBackbone, FlowNetwork, FlowProjection, FlowSolver, TrainDiscord};
 pub use train_evaluator::{EvaluatorNetwork, MovementPhase, TrainEvaluator};
 pub use train_length::TrainLength;
+pub use train_mdm::{MdmNetwork, TrainMdm};
 pub use train_mld::TrainMld;
+pub use train_stablemofusion::{StableMoFusionNetwork, TrainStableMoFusion};
 pub use train_tokenizer::{Resets, TokenizerLoss, TokenizerNetwork, TrainTokenizer, WindowsOf};
 pub use train_tokens::{TokenGenerator, TokenNetwork, TrainTokens};
 pub use train_vae::{TrainVae, VaeLoss, Windows};
@@ -62,6 +66,8 @@ super::spec::stage_kinds! {
     TrainTokens,
     TrainDiscord,
     ModelDecoder,
+    TrainMdm,
+    TrainStableMoFusion,
     ImportEvaluator,
     EvaluateT2m,
     Register,

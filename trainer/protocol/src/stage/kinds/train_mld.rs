@@ -5,7 +5,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
 use crate::stage::{
-    Diffusion, Family, Neighbours, Network, Output, Problems, Ref, Shape, StageSpec, TextEmbed, Training,
+    Diffusion, Family, FrequencyLosses, Neighbours, Network, Output, Problems, Ref, Shape, StageSpec, TextEmbed,
+    Training,
 };
 
 /// `train.mld`: the latent-diffusion teacher. Source: MLD, MotionLCM v1/v2.
@@ -18,6 +19,8 @@ pub struct TrainMld {
     pub latents: String,
     /// Stage that gives the caption embeddings.
     pub text: String,
+    /// Stage that gives a model of this kind whose weights training begins with; empty begins with random ones.
+    pub init: String,
     /// Size.
     pub network: Network,
     /// Noise schedule and prediction; students take over the teacher's.
@@ -28,6 +31,10 @@ pub struct TrainMld {
     pub guidance_dropout: f64,
     /// EMA of the weights that is kept as the result; 0 keeps the weights themselves.
     pub ema: f64,
+    /// Free-T2M's losses, on motions through the frozen decoder.
+    pub losses: FrequencyLosses,
+    /// Share of the batch whose latents are decoded for `losses`: decoding costs more than denoising.
+    pub decoded: f64,
     /// The rest.
     #[serde(flatten)]
     pub training: Training,
@@ -39,11 +46,14 @@ impl Default for TrainMld {
             vae: "vae".into(),
             latents: "latents".into(),
             text: "text".into(),
+            init: String::new(),
             network: Network::default(),
             diffusion: Diffusion::default(),
             text_relu: false,
             guidance_dropout: 0.1,
             ema: 0.0,
+            losses: FrequencyLosses::default(),
+            decoded: 0.25,
             training: Training::published(1_150_000, 64, 1e-4),
         }
     }
@@ -61,6 +71,8 @@ impl StageSpec for TrainMld {
             Ref::stage("vae", &mut self.vae, ArtifactKind::Vae),
             Ref::stage("latents", &mut self.latents, ArtifactKind::Latents),
             Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
+            Ref::stage("init", &mut self.init, ArtifactKind::Model).optional(),
+            self.losses.reference(),
         ]
     }
 
@@ -69,6 +81,11 @@ impl StageSpec for TrainMld {
         self.diffusion.check(p);
         p.fraction("guidance_dropout", self.guidance_dropout, false);
         p.fraction("ema", self.ema, true);
+        self.losses.check(p);
+        p.fraction("decoded", self.decoded, false);
+        if self.losses.any() && self.decoded == 0.0 {
+            p.add("decoded", "`decoded` is 0, so that `losses` never act", "take a share above 0");
+        }
         self.training.check(p);
     }
 

@@ -1,0 +1,177 @@
+//! Frequencies of a motion along time, and the losses of Free-T2M (Chen et al., 2025) that look at them.
+//!
+//! The orthonormal cosine transform of n frames has coefficient k at `k fps / (2 n)` Hz; the lowest K of them are the slow part of a
+//! motion. It is linear, so the slow part of a difference is the difference of the slow parts, and one pass is enough. The transform is over
+//! the valid frames of each clip. Which noise levels a term acts on is a [`Stage`].
+//!
+//! Departs: the released code transforms 196 frames whatever a clip's length, which lengths of 196 for all give, and the paper prints no K.
+//! Its semantic term has no gradient (embeddings are taken without graph); here the prediction's embedding has one.
+//!
+//! As in [`crate::losses`], a term is the sum over examples of per-example values, so that slices add up.
+
+use std::ops::RangeInclusive;
+
+use burn::tensor::{Device, Tensor, TensorData};
+
+use crate::losses::Pointwise;
+
+/// The timesteps at which a term acts.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Stage(RangeInclusive<usize>);
+
+impl Stage {
+    /// These timesteps, both ends included.
+    pub fn new(timesteps: RangeInclusive<usize>) -> Self {
+        Self(timesteps)
+    }
+
+    /// The timesteps t of `steps` whose share `t / steps` lies in `from..=to`: what "30 to 50 of 50" is for other numbers of steps.
+    pub fn of_shares(from: f64, to: f64, steps: usize) -> Self {
+        let at = |share: f64| share * steps as f64;
+        // A share such as .6 times 50 may come out a hair above 30.
+        Self((at(from) - 1e-6).ceil().max(0.0) as usize..=(at(to) + 1e-6).floor() as usize)
+    }
+
+    /// Whether the term acts at `t`.
+    pub fn has(&self, t: usize) -> bool {
+        self.0.contains(&t)
+    }
+
+    /// 1 for each timestep at which it acts, 0 for each other.
+    pub fn mask(&self, timesteps: &[usize]) -> Vec<f32> {
+        timesteps.iter().map(|t| if self.has(*t) { 1.0 } else { 0.0 }).collect()
+    }
+}
+
+/// The first `keep` rows of the orthonormal cosine transform of `length` frames, [keep, frames]; zero past the length, and in rows that so
+/// few frames do not have.
+fn basis(length: usize, frames: usize, keep: usize) -> Vec<f32> {
+    let n = length as f64;
+    let value = |k: usize, i: usize| {
+        if k >= length || i >= length {
+            return 0.0;
+        }
+        let scale = if k == 0 { (1.0 / n).sqrt() } else { (2.0 / n).sqrt() };
+        let angle = std::f64::consts::PI * (2 * i + 1) as f64 * k as f64 / (2.0 * n);
+        (scale * angle.cos()) as f32
+    };
+    (0..keep).flat_map(|k| (0..frames).map(move |i| value(k, i))).collect()
+}
+
+/// [B, keep, T] of clips with these lengths.
+fn bases(lengths: &[usize], frames: usize, keep: usize, device: &Device) -> Tensor<3> {
+    let values = lengths.iter().flat_map(|length| basis(*length, frames, keep)).collect();
+    Tensor::from_data(TensorData::new(values, [lengths.len(), keep, frames]), device)
+}
+
+/// The lowest `keep` coefficients of the cosine transform of `x_btd` [B, T, D] along time, [B, keep, D]; of clip b the first `lengths[b]` frames
+/// are transformed.
+pub fn coefficients(x_btd: Tensor<3>, lengths: &[usize], keep: usize) -> Tensor<3> {
+    let frames = x_btd.dims()[1];
+    bases(lengths, frames, keep, &x_btd.device()).matmul(x_btd)
+}
+
+/// What the lowest `keep` coefficients hold of `x_btd` [B, T, D]; zero past a clip's length.
+pub fn low_pass(x_btd: Tensor<3>, lengths: &[usize], keep: usize) -> Tensor<3> {
+    let frames = x_btd.dims()[1];
+    let basis = bases(lengths, frames, keep, &x_btd.device());
+    basis.clone().swap_dims(1, 2).matmul(basis.matmul(x_btd))
+}
+
+/// How far the slow part of `found` is from that of `expected` [B, T, D]: for each clip the mean over its frames and features, times
+/// `weights[b]`, summed.
+pub fn low_frequency(
+    found: Tensor<3>,
+    expected: Tensor<3>,
+    lengths: &[usize],
+    keep: usize,
+    distance: Pointwise,
+    weights: &[f32],
+) -> Tensor<1> {
+    let [batch, _, width] = found.dims();
+    let device = found.device();
+    let slow = distance.of(low_pass(found - expected, lengths, keep));
+    let each = weights.iter().zip(lengths).map(|(weight, length)| weight / (length * width) as f32).collect();
+    (slow * Tensor::<3>::from_data(TensorData::new(each, [batch, 1, 1]), &device)).sum()
+}
+
+/// How the agreement of two embeddings becomes a loss.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Agreement {
+    /// `1 - S`: pulls everywhere. The released code.
+    Cosine,
+    /// `max(0, threshold - S)`: pulls below a threshold.
+    Below(f64),
+}
+
+/// Cosines [B] of rows [B, E]. As PyTorch has it, a norm below 1e-8 counts as 1e-8.
+pub fn cosines(a_be: Tensor<2>, b_be: Tensor<2>) -> Tensor<1> {
+    let batch = a_be.dims()[0];
+    let norm = |x: &Tensor<2>| x.clone().square().sum_dim(1).clamp_min(1e-16).sqrt();
+    let norms = norm(&a_be) * norm(&b_be);
+    ((a_be * b_be).sum_dim(1) / norms).reshape([batch])
+}
+
+/// How little the embeddings of predictions agree with those of their targets [B, E], times `weights[b]`, summed.
+pub fn semantic(found_be: Tensor<2>, expected_be: Tensor<2>, agreement: Agreement, weights: &[f32]) -> Tensor<1> {
+    let device = found_be.device();
+    let s = cosines(found_be, expected_be);
+    let each = match agreement {
+        Agreement::Cosine => s.neg() + 1.0,
+        Agreement::Below(threshold) => (s.neg() + threshold as f32).clamp_min(0.0),
+    };
+    let weights = Tensor::<1>::from_data(TensorData::new(weights.to_vec(), [weights.len()]), &device);
+    (each * weights).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn column(values: &[f32], device: &Device) -> Tensor<3> {
+        Tensor::from_data(TensorData::new(values.to_vec(), [1, values.len(), 1]), device)
+    }
+
+    fn close(found: Tensor<3>, expected: &[f32]) {
+        let found = found.into_data().try_into_vec::<f32>().unwrap();
+        assert_eq!(found.len(), expected.len());
+        for (f, e) in found.iter().zip(expected) {
+            assert!((f - e).abs() < 2e-5, "{found:?} instead of {expected:?}");
+        }
+    }
+
+    const X: [f32; 8] = [1.0, 2.0, 4.0, 7.0, 3.0, 0.0, -1.0, 2.0];
+
+    #[test]
+    fn the_transform_is_the_orthonormal_cosine_transform() {
+        let x = column(&X, &Device::flex());
+        let all = [6.363_961, 2.258_133, -3.807_604, -3.781_081, 2.828_427, 0.304_157, 0.046_427, -1.229_532];
+        close(coefficients(x.clone(), &[8], 8), &all);
+        close(low_pass(x.clone(), &[8], 1), &[2.25; 8]);
+        let three = [1.598_488, 2.460_231, 3.605_829, 4.229_153, 3.788_614, 2.351_278, 0.582_662, -0.616_255];
+        close(low_pass(x.clone(), &[8], 3), &three);
+        close(low_pass(x.clone(), &[8], 8), &X);
+        // Of three frames there are three coefficients, and what stands behind them is not seen.
+        close(low_pass(x, &[3], 5), &[1.0, 2.0, 4.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn stages_are_those_of_the_released_code_at_its_step_counts() {
+        let (low, semantic) = (Stage::of_shares(0.6, 1.0, 50), Stage::of_shares(0.0, 0.4, 50));
+        assert_eq!([29, 30, 49].map(|t| low.has(t)), [false, true, true]);
+        assert_eq!([0, 20, 21].map(|t| semantic.has(t)), [true, true, false]);
+        let low = Stage::of_shares(0.0, 0.3, 1000);
+        assert_eq!(low.mask(&[0, 300, 301]), [1.0, 1.0, 0.0]);
+    }
+
+    #[test]
+    fn a_threshold_lets_go_above_it() {
+        let device = Device::flex();
+        let row = |x: [f32; 2]| Tensor::<2>::from_floats([x], &device);
+        let loss = |found, agreement| semantic(row(found), row([1.0, 0.0]), agreement, &[2.0]).into_scalar::<f32>();
+        assert!((loss([3.0, 0.0], Agreement::Cosine)).abs() < 1e-6);
+        assert!((loss([0.0, 3.0], Agreement::Cosine) - 2.0).abs() < 1e-6);
+        assert_eq!(loss([3.0, 4.0], Agreement::Below(0.5)), 0.0);
+        assert!((loss([3.0, 4.0], Agreement::Below(0.7)) - 0.2).abs() < 1e-6);
+    }
+}

@@ -1,0 +1,105 @@
+//! The ControlNet of a latent denoiser: a trainable copy that tells the frozen one, block by block, where joints should be. Source: MotionLCM
+//! (Dai et al., ECCV 2024; v2 of late 2024), after Zhang et al., arXiv:2302.05543.
+//!
+//! Tokens of the [trajectory encoder](super::TrajectoryEncoder) go through three Linears, the last of which is zero at first, and are added to the
+//! noised latent; v2 has SiLU between them. The copy's block outputs, each through a Linear that is zero at first, are added to those of the same
+//! blocks of the frozen denoiser, before these are kept for its skip connections. So at the start nothing changes, and only the zero
+//! layers get a gradient. The copy has no norm at its end; its `latent_post` is copied and has no use.
+
+use burn::tensor::Tensor;
+
+use super::{ConditionEmbedding, Denoiser, DenoiserConfig, Init, Linear};
+use crate::flat;
+use crate::kernels::Dropout;
+
+/// What a ControlNet adds.
+#[derive(Debug, Clone, Copy)]
+pub struct Control<'a> {
+    /// For each block [B, N + 1 + L, H].
+    pub residuals: &'a [Tensor<3>],
+    /// What they are multiplied by; 1 as trained.
+    pub scale: f64,
+}
+
+impl Denoiser {
+    /// A ControlNet for denoisers of `config`'s size, whose condition embedding has width `embed` and, in v2, activations.
+    pub fn controlnet(config: &DenoiserConfig, embed: usize, activated: bool, init: &mut Init<'_>) -> Self {
+        let mut network = Self::new(config, init);
+        network.encoder.norm = None;
+        network.controlnet_cond_embedding = Some(ConditionEmbedding::new(init, config.dim, embed, activated));
+        let zero = || Linear {
+            weight: init.constant(0.0, [config.width, config.width]),
+            bias: Some(init.constant(0.0, [config.width])),
+        };
+        network.controlnet_down_mid_blocks = (0..config.layers).map(|_| zero()).collect();
+        network
+    }
+
+    /// What a ControlNet adds to the output of each block of its denoiser, [B, N + 1 + L, H] each. `condition_bnd` [B, N, d] are the trajectory
+    /// encoder's tokens; the rest is what the denoiser is given.
+    ///
+    /// # Panics
+    /// If this is no ControlNet.
+    pub fn residuals(
+        &self,
+        latent_bnd: Tensor<3>,
+        timesteps: &[usize],
+        text_blc: Tensor<3>,
+        guidance_bg: Option<Tensor<2>>,
+        condition_bnd: Tensor<3>,
+        dropout: &mut Dropout,
+    ) -> Vec<Tensor<3>> {
+        let embed = self.controlnet_cond_embedding.as_ref().expect("a ControlNet has a condition embedding");
+        let latent = latent_bnd + embed.forward(condition_bnd);
+        let mut residuals = Vec::with_capacity(self.controlnet_down_mid_blocks.len());
+        let _unused_output = self.tokens_through(latent, timesteps, text_blc, guidance_bg, dropout, |block, x_bth| {
+            residuals.push(self.controlnet_down_mid_blocks[block].forward(x_bth.clone()));
+            x_bth
+        });
+        residuals
+    }
+
+    /// As [`forward`](Self::forward), with what a ControlNet adds to the blocks' outputs.
+    pub fn forward_controlled(
+        &self,
+        latent_bnd: Tensor<3>,
+        timesteps: &[usize],
+        text_blc: Tensor<3>,
+        guidance_bg: Option<Tensor<2>>,
+        control: Control<'_>,
+        dropout: &mut Dropout,
+    ) -> Tensor<3> {
+        let add = |block: usize, x_bth: Tensor<3>| {
+            let residual = control.residuals[block].clone();
+            x_bth + if control.scale == 1.0 { residual } else { residual * (control.scale as f32) }
+        };
+        let out = self.tokens_through(latent_bnd, timesteps, text_blc, guidance_bg, dropout, add);
+        match &self.latent_post {
+            Some(project) => project.forward(out),
+            None => out,
+        }
+    }
+}
+
+/// `control` with every parameter that `base` has too taken from there; the condition embedding and the zero layers keep their own.
+pub fn copied_from(base: &Denoiser, control: Denoiser) -> Denoiser {
+    let (entries, values) = (flat::layout(base), flat::read(base));
+    let mut at = 0;
+    let known: std::collections::BTreeMap<&str, &[f32]> = entries
+        .iter()
+        .map(|entry| {
+            at += entry.len();
+            (entry.name.as_str(), &values[at - entry.len()..at])
+        })
+        .collect();
+    let (own, mut weights) = (flat::layout(&control), flat::read(&control));
+    let mut at = 0;
+    for entry in &own {
+        let to = &mut weights[at..at + entry.len()];
+        at += entry.len();
+        if let Some(from) = known.get(entry.name.as_str()).filter(|from| from.len() == to.len()) {
+            to.copy_from_slice(from);
+        }
+    }
+    flat::write(control, &weights)
+}

@@ -1,0 +1,117 @@
+//! MDM: the clean motion predicted from a noised one, a timestep and a caption's vector. Source: Tevet et al., arXiv:2209.14916 (`trans_enc`).
+//!
+//! One sequence: a condition token, which is time plus text, and the frames; sinusoidal positions; post-norm encoder; all outputs but the first.
+//! A caption is left out by a zero vector before its projection, so that the projection's bias remains. The published model attends to
+//! frames of padding; its authors call the key mask over them a fix, and have it in their model of 50 steps.
+
+#![expect(non_snake_case, reason = "fields have the published names")]
+
+use burn::module::Module;
+use burn::tensor::Tensor;
+use burn::tensor::activation::silu;
+use serde::{Deserialize, Serialize};
+
+use super::{Init, Layers, Linear, StackConfig, position_sinusoid};
+use crate::kernels::{Dropout, KeyMask, dropout};
+
+/// Size of an MDM.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MdmConfig {
+    /// Features per frame: 263 or 251.
+    pub features: usize,
+    /// Width H of the transformer.
+    pub width: usize,
+    /// Blocks.
+    pub layers: usize,
+    /// Heads.
+    pub heads: usize,
+    /// Feed-forward width.
+    pub feed_forward: usize,
+    /// Width of a caption's vector.
+    pub text_dim: usize,
+    /// Added to variances in layer norms.
+    pub norm_eps: f64,
+}
+
+/// Features -> H.
+#[derive(Module, Debug)]
+pub struct InputProcess {
+    /// For every frame.
+    pub poseEmbedding: Linear,
+}
+
+/// H -> features.
+#[derive(Module, Debug)]
+pub struct OutputProcess {
+    /// For every frame.
+    pub poseFinal: Linear,
+}
+
+/// Two layers on the timestep's position sinusoid.
+#[derive(Module, Debug)]
+pub struct TimestepEmbedder {
+    /// H -> H.
+    pub time_embed_0: Linear,
+    /// H -> H, after SiLU.
+    pub time_embed_2: Linear,
+}
+
+/// The network.
+#[derive(Module, Debug)]
+pub struct Mdm {
+    /// Features -> H.
+    pub input_process: InputProcess,
+    /// The transformer.
+    pub seqTransEncoder: Layers,
+    /// Timestep -> H.
+    pub embed_timestep: TimestepEmbedder,
+    /// Caption -> H.
+    pub embed_text: Linear,
+    /// H -> features.
+    pub output_process: OutputProcess,
+}
+
+impl Mdm {
+    /// A fresh one.
+    pub fn new(config: &MdmConfig, init: &mut Init<'_>) -> Self {
+        let MdmConfig { features, width, layers, heads, feed_forward, text_dim, norm_eps } = *config;
+        let stack = StackConfig { width, layers, heads, feed_forward, norm_eps, memory: false };
+        Self {
+            input_process: InputProcess { poseEmbedding: Linear::new(init, features, width) },
+            seqTransEncoder: Layers::new(init, &stack),
+            embed_timestep: TimestepEmbedder {
+                time_embed_0: Linear::new(init, width, width),
+                time_embed_2: Linear::new(init, width, width),
+            },
+            embed_text: Linear::new(init, text_dim, width),
+            output_process: OutputProcess { poseFinal: Linear::new(init, width, features) },
+        }
+    }
+
+    /// The clean motion [B, T, F], normalised, that `x_btf` [B, T, F] at `timesteps` is taken for. `text_bc` [B, text_dim] has zeros where the
+    /// caption is left out. With `lengths`, frames past them are attended by nobody.
+    pub fn forward(
+        &self,
+        x_btf: Tensor<3>,
+        timesteps: &[usize],
+        text_bc: Tensor<2>,
+        lengths: Option<&[usize]>,
+        drop: &mut Dropout,
+    ) -> Tensor<3> {
+        let [batch, frames, _] = x_btf.dims();
+        assert_eq!(timesteps.len(), batch, "one timestep a sample");
+        let width = self.embed_text.weight.dims()[0];
+        let device = x_btf.device();
+        let time = &self.embed_timestep;
+        let sinusoid = position_sinusoid(timesteps.iter().copied(), width, &device);
+        let time = time.time_embed_2.forward(silu(time.time_embed_0.forward(sinusoid)));
+        let condition = (self.embed_text.forward(text_bc) + time).reshape([batch, 1, width]);
+
+        let embedded = self.input_process.poseEmbedding.forward(x_btf);
+        let positions = position_sinusoid(0..frames + 1, width, &device).reshape([1, frames + 1, width]);
+        let x = dropout(Tensor::cat(vec![condition, embedded], 1) + positions, drop);
+        let mask = lengths.map(|lengths| KeyMask::new(lengths, 1));
+        let out = self.seqTransEncoder.forward(x, mask.as_ref(), drop);
+        self.output_process.poseFinal.forward(out.slice([0..batch, 1..frames + 1, 0..width]))
+    }
+}

@@ -1,0 +1,140 @@
+//! The trajectory encoder: a few tokens out of the frames at which joints are given. Source: MotionLCM (Dai et al., ECCV 2024; v2 of late 2024).
+//!
+//! N learned tokens stand before the frames, each of which is the hint's joints at it; the first N outputs are taken, in v2 through a Linear. Frames
+//! without a given joint are attended by nobody, so they are left out altogether: a frame's place is in its position alone.
+
+use burn::module::{Module, Param};
+use burn::tensor::{Device, Int, Tensor, TensorData};
+use serde::{Deserialize, Serialize};
+
+use super::vae::Positions;
+use super::{Init, Linear, POSITIONS, SkipStack, StackConfig};
+use crate::kernels::{Dropout, KeyMask};
+
+/// Coordinates of a joint.
+const AXES: usize = 3;
+
+/// Size of a trajectory encoder.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TrajectoryConfig {
+    /// Joints of the skeleton.
+    pub joints: usize,
+    /// N tokens.
+    pub tokens: usize,
+    /// Width d of a token.
+    pub dim: usize,
+    /// Width H of the transformer.
+    pub width: usize,
+    /// Blocks.
+    pub layers: usize,
+    /// Heads.
+    pub heads: usize,
+    /// Feed-forward width.
+    pub feed_forward: usize,
+    /// A Linear H -> d at the end (v2); without it d is H (v1).
+    pub projection: bool,
+    /// Added to variances in layer norms.
+    pub norm_eps: f64,
+}
+
+/// Where which joints should be: for a batch, the frames at which any is given.
+#[derive(Debug, Clone)]
+pub struct Hints {
+    /// Normalised coordinates [B, M, joints x 3] of those frames, zero for joints that are not given, one after the other and then padding.
+    rows_bmj: Tensor<3>,
+    /// Their numbers in the motion, 0 for padding; B x M.
+    frames: Vec<usize>,
+    /// How many there are of each motion.
+    counts: Vec<usize>,
+}
+
+impl Hints {
+    /// Of `values` [B, T, joints, 3], normalised, and `given` of the same shape, which says which coordinates count.
+    ///
+    /// # Panics
+    /// If the two differ in length, or are not B x T x joints x 3.
+    pub fn new(
+        values: &[f32],
+        given: &[bool],
+        (batch, frames, joints): (usize, usize, usize),
+        device: &Device,
+    ) -> Self {
+        let width = AXES * joints;
+        assert_eq!((values.len(), given.len()), (batch * frames * width, batch * frames * width), "values and mask");
+        let row = |b: usize, t: usize| (b * frames + t) * width..(b * frames + t + 1) * width;
+        let live: Vec<Vec<usize>> =
+            (0..batch).map(|b| (0..frames).filter(|t| given[row(b, *t)].contains(&true)).collect()).collect();
+        // One row of padding where nothing is given at all.
+        let most = live.iter().map(Vec::len).max().unwrap_or_default().max(1);
+        let (mut rows, mut numbers) = (vec![0.0; batch * most * width], vec![0; batch * most]);
+        for (b, kept) in live.iter().enumerate() {
+            for (m, t) in kept.iter().enumerate() {
+                let at = b * most + m;
+                numbers[at] = *t;
+                for ((to, from), given) in
+                    rows[at * width..(at + 1) * width].iter_mut().zip(&values[row(b, *t)]).zip(&given[row(b, *t)])
+                {
+                    *to = if *given { *from } else { 0.0 };
+                }
+            }
+        }
+        Self {
+            rows_bmj: Tensor::from_data(TensorData::new(rows, [batch, most, width]), device),
+            frames: numbers,
+            counts: live.iter().map(Vec::len).collect(),
+        }
+    }
+}
+
+/// The trajectory encoder.
+#[derive(Module, Debug)]
+pub struct TrajectoryEncoder {
+    /// Learned tokens [N, H].
+    pub global_motion_token: Param<Tensor<2>>,
+    /// joints x 3 -> H.
+    pub skel_embedding: Linear,
+    /// Positions of tokens and frames.
+    pub query_pos_encoder: Positions,
+    /// The transformer.
+    pub encoder: SkipStack,
+    /// H -> d (v2).
+    pub latent_proj: Option<Linear>,
+}
+
+impl TrajectoryEncoder {
+    /// A fresh one.
+    pub fn new(config: &TrajectoryConfig, init: &mut Init<'_>) -> Self {
+        let TrajectoryConfig { joints, tokens, dim, width, layers, heads, feed_forward, norm_eps, .. } = *config;
+        let stack = StackConfig { width, layers, heads, feed_forward, norm_eps, memory: false };
+        Self {
+            global_motion_token: init.normal([tokens, width]),
+            skel_embedding: Linear::new(init, AXES * joints, width),
+            query_pos_encoder: Positions::new(init, width),
+            encoder: SkipStack::new(init, &stack),
+            latent_proj: config.projection.then(|| Linear::new(init, width, dim)),
+        }
+    }
+
+    /// Tokens [B, N, d], shaped as a latent is.
+    ///
+    /// # Panics
+    /// If a hint stands at a frame for which there is no position.
+    pub fn forward(&self, hints: &Hints, dropout: &mut Dropout) -> Tensor<3> {
+        let [batch, most, _] = hints.rows_bmj.dims();
+        let [tokens, width] = self.global_motion_token.dims();
+        let positions: Vec<i64> = hints.frames.iter().map(|t| (tokens + t) as i64).collect();
+        assert!(positions.iter().all(|p| *p < POSITIONS as i64), "a hint behind the longest motion");
+        let table = self.query_pos_encoder.pe.val().reshape([POSITIONS, width]);
+        let indices = Tensor::<1, Int>::from_data(TensorData::new(positions, [batch * most]), &table.device());
+        let at_frames = table.select(0, indices).reshape([batch, most, width]);
+        let embedded = self.skel_embedding.forward(hints.rows_bmj.clone()) + at_frames;
+        let own = self.global_motion_token.val().reshape([1, tokens, width]) + self.query_pos_encoder.rows(tokens);
+        let x = Tensor::cat(vec![own.expand([batch, tokens, width]), embedded], 1);
+        let mask = KeyMask::new(&hints.counts, tokens);
+        let out = self.encoder.forward(x, None, Some(&mask), dropout).slice([0..batch, 0..tokens, 0..width]);
+        match &self.latent_proj {
+            Some(project) => project.forward(out),
+            None => out,
+        }
+    }
+}

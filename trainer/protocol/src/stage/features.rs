@@ -1,0 +1,43 @@
+//! What models that diffuse motion itself share.
+
+use super::{Diffusion, Neighbours, NoiseSchedule, Problems};
+use crate::limits;
+
+/// Checks a schedule of `timesteps` for samplers that draw among features.
+pub(super) fn check_diffusion(p: &mut Problems, diffusion: &Diffusion, timesteps: usize) {
+    diffusion.check(p);
+    if diffusion.schedule == NoiseSchedule::Flow {
+        let message = "samplers of motion go along diffusions, and a flow is none";
+        p.add("diffusion.schedule", message, "write `schedule: cosine` or `schedule: linear`");
+    }
+    if !(2..=1000).contains(&timesteps) {
+        p.add("timesteps", format!("`timesteps` is {timesteps}; expected 2 to 1000"), "published: 50 and 1000");
+    }
+}
+
+/// Checks the number of frames that motions are padded to.
+pub(super) fn check_frames(p: &mut Problems, max_frames: usize) {
+    if !(4..=10_000).contains(&max_frames) {
+        p.add("max_frames", format!("`max_frames` is {max_frames}; expected 4 to 10000"), "published: 196");
+    }
+}
+
+/// Refuses a network of more parameters than any.
+pub(super) fn check_parameters(p: &mut Problems, parameters: usize) {
+    if parameters > limits::PARAMETERS {
+        let message = format!("it has {parameters} parameters or more; expected at most {}", limits::PARAMETERS);
+        p.add("network", message, "take fewer layers, or narrower ones");
+    }
+}
+
+/// What must hold between such a kind and the stages that it reads.
+pub(super) fn check_neighbours(p: &mut Problems, stages: &Neighbours<'_>, dataset: &str, text: &str, init: &str) {
+    stages.same_captions(p, text, dataset);
+    if let (false, Some(ours), Some(theirs)) = (init.is_empty(), stages.format(dataset), stages.format(init))
+        && ours != theirs
+    {
+        let message =
+            format!("`{init}` makes motions of {}, but `{dataset}` has {}", theirs.skeleton(), ours.skeleton());
+        p.add("init", message, "go on from a model that was trained on the same format");
+    }
+}

@@ -1,0 +1,213 @@
+//! `train.mdm`: diffusion of motion itself with a transformer. Source: MDM (Tevet et al., arXiv:2209.14916).
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::stage::features::{check_diffusion, check_frames, check_neighbours, check_parameters};
+use crate::stage::{
+    Batch, Decay, Diffusion, Family, FrequencyLosses, Neighbours, NoiseSchedule, Optimizer, Output, Prediction,
+    Problems, Ref, Shape, Solver, StageSpec, Training,
+};
+use crate::{ArtifactKind, Steps};
+
+/// Size of an MDM. Published: the default.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct MdmNetwork {
+    /// Width of the tokens; even.
+    pub width: usize,
+    /// Transformer blocks.
+    pub layers: usize,
+    /// Attention heads; divides `width`.
+    pub heads: usize,
+    /// Width of the feed-forward layer.
+    pub feed_forward: usize,
+    /// Dropout probability.
+    pub dropout: f64,
+}
+
+impl Default for MdmNetwork {
+    fn default() -> Self {
+        Self { width: 512, layers: 8, heads: 4, feed_forward: 1024, dropout: 0.1 }
+    }
+}
+
+impl MdmNetwork {
+    fn check(&self, p: &mut Problems) {
+        for (field, value) in [
+            ("network.width", self.width),
+            ("network.layers", self.layers),
+            ("network.heads", self.heads),
+            ("network.feed_forward", self.feed_forward),
+        ] {
+            p.positive(field, value);
+        }
+        if self.heads > 0 && !self.width.is_multiple_of(self.heads) {
+            let message =
+                format!("`network.heads` is {}, which does not divide `network.width`, {}", self.heads, self.width);
+            p.add("network.heads", message, "");
+        }
+        if !self.width.is_multiple_of(2) {
+            let message = format!("`network.width` is {}; expected an even number", self.width);
+            p.add("network.width", message, "positions are pairs of a sine and a cosine");
+        }
+        let wide = self.width.saturating_mul(4).saturating_add(self.feed_forward.saturating_mul(2));
+        check_parameters(p, self.width.saturating_mul(wide).saturating_mul(self.layers));
+        p.fraction("network.dropout", self.dropout, true);
+    }
+}
+
+/// `train.mdm`: diffusion of motion itself with a transformer.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct TrainMdm {
+    /// Stage that gives the clips.
+    pub dataset: String,
+    /// Stage that gives the caption embeddings.
+    pub text: String,
+    /// Stage that gives a model of this kind whose weights training begins with; empty begins with random ones.
+    pub init: String,
+    /// Size.
+    pub network: MdmNetwork,
+    /// Noise schedule and prediction.
+    pub diffusion: Diffusion,
+    /// Timesteps of the schedule: 1000 in the paper, 50 in its authors' later model.
+    pub timesteps: usize,
+    /// Keeps attention off frames of padding, which the authors call a fix; the paper's model looks at them.
+    pub mask_frames: bool,
+    /// Frames of the longest motion.
+    pub max_frames: usize,
+    /// Probability that a caption is left out.
+    pub guidance_dropout: f64,
+    /// EMA of the weights that is kept as the result; 0 keeps the weights themselves. The authors' model of 50 steps has 0.9999.
+    pub ema: f64,
+    /// Free-T2M's losses.
+    pub losses: FrequencyLosses,
+    /// The rest.
+    #[serde(flatten)]
+    pub training: Training,
+}
+
+impl Default for TrainMdm {
+    fn default() -> Self {
+        Self {
+            dataset: "dataset".into(),
+            text: "text".into(),
+            init: String::new(),
+            network: MdmNetwork::default(),
+            diffusion: Diffusion {
+                schedule: NoiseSchedule::Cosine,
+                prediction: Prediction::Sample,
+                ..Diffusion::default()
+            },
+            timesteps: 1000,
+            mask_frames: false,
+            max_frames: 196,
+            guidance_dropout: 0.1,
+            ema: 0.0,
+            losses: FrequencyLosses::default(),
+            training: Training {
+                steps: Steps(600_000),
+                batch: Batch { global: 64, slices: 8 },
+                lr: 1e-4,
+                warmup: Steps(0),
+                decay: Decay::Constant,
+                optimizer: Optimizer::default(),
+                max_grad_norm: 0.0,
+                stop: None,
+            },
+        }
+    }
+}
+
+impl StageSpec for TrainMdm {
+    const KIND: &'static str = "train.mdm";
+    const SHAPE: Shape = Shape::Gang;
+    const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![
+            Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
+            Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
+            Ref::stage("init", &mut self.init, ArtifactKind::Model).optional(),
+            self.losses.reference(),
+        ]
+    }
+
+    fn check(&self, p: &mut Problems) {
+        self.network.check(p);
+        check_diffusion(p, &self.diffusion, self.timesteps);
+        check_frames(p, self.max_frames);
+        p.fraction("guidance_dropout", self.guidance_dropout, false);
+        p.fraction("ema", self.ema, true);
+        self.losses.check(p);
+        self.training.check(p);
+    }
+
+    fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
+        check_neighbours(p, stages, &self.dataset, &self.text, &self.init);
+    }
+
+    fn training(&mut self) -> Option<&mut Training> {
+        Some(&mut self.training)
+    }
+
+    fn family(&self) -> Option<Family> {
+        Some(Family::Features { timesteps: self.timesteps, solver: Solver::Ddpm })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::pipeline::read;
+
+    const GOOD: &str = "name: p
+seed: 7
+dataset: {format: synthetic, clips: 40}
+stages:
+  vae: {kind: train.vae}
+  latents: {kind: encode.latents}
+  semantics: {kind: train.evaluator}
+  evaluator: {kind: train.evaluator}
+  mdm: {kind: train.mdm, timesteps: 50, losses: {low_frequency: {weight: 1}, semantic: {weight: 0.5}}}
+  tuned: {kind: train.mdm, init: mdm, timesteps: 50}
+  smf: {kind: train.stablemofusion, network: {width: 16, multipliers: [1, 2]}}
+  t2m: {kind: evaluate.t2m, model: mdm, sampler: {steps: 50, guidance: 2.5}}
+  ten: {kind: evaluate.t2m, model: smf, sampler: {steps: 10, guidance: 2.5, solver: ddim}}
+";
+
+    #[test]
+    fn what_does_not_go_together_is_refused_where_it_stands() {
+        let good = read("p.yaml", GOOD, &[]).unwrap_or_else(|e| panic!("{e}"));
+        let inputs = |name: &str| -> Vec<(String, String)> {
+            let stage = good.stage(&name.into()).expect("a stage");
+            stage.inputs.iter().map(|i| (i.field.clone(), i.stage.to_string())).collect()
+        };
+        assert!(inputs("mdm").contains(&("losses.semantic.evaluator".into(), "semantics".into())));
+        assert!(inputs("tuned").contains(&("init".into(), "mdm".into())));
+        assert_eq!(inputs("smf").len(), 2, "no term, no evaluator");
+        for (from, to, line, words) in [
+            ("model: mdm, sampler", "model: mdm, evaluator: semantics, sampler", "12:", "would flatter it"),
+            ("steps: 50, guidance", "steps: 51, guidance", "12:", "1 to 50"),
+            ("solver: ddim", "solver: euler", "13:", "expected one of `own`, `ddpm`"),
+            ("weight: 0.5}}", "weight: 0.5, evaluator: smf}}", "9:", "an evaluator"),
+            ("weight: 1}", "weight: 1, from: 0.9, to: 0.2}", "9:", "`from` to be the smaller"),
+            ("weight: 1}", "weight: 1, keep: 0}", "9:", "keep"),
+            ("weight: 0.5}}", "weight: 0.5, threshold: 2}}", "9:", "threshold"),
+            ("init: mdm,", "init: evaluator,", "10:", "a model"),
+            ("init: mdm,", "network: {width: 30},", "10:", "does not divide"),
+            ("init: mdm,", "diffusion: {schedule: flow, prediction: sample},", "10:", "a flow is none"),
+            ("init: mdm,", "network: {width: 16384, feed_forward: 65536},", "10:", "parameters"),
+            ("[1, 2]", "[1, 2, 2, 2, 2]", "11:", "1 to 4 numbers"),
+            ("{width: 16, ", "{width: 12, ", "11:", "heads and groups"),
+            ("stages:\n", "stages:\n  lcm: {kind: distill.lcm, teacher: mdm}\n", "", "is no latent diffusion"),
+            ("stages:\n", "stages:\n  fid: {kind: evaluate.latent_fid, model: mdm}\n", "", "has no latents"),
+        ] {
+            assert!(GOOD.contains(from), "{from}");
+            let text = GOOD.replacen(from, to, 1);
+            let shown = read("p.yaml", &text, &[]).expect_err(to).to_string();
+            let found = shown.lines().any(|said| said.starts_with(&format!("p.yaml:{line}")));
+            assert!(found && shown.contains(words), "{to}: {shown}");
+        }
+    }
+}

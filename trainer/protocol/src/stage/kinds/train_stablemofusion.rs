@@ -1,0 +1,234 @@
+//! `train.stablemofusion`: diffusion of motion itself with a U-Net over frames. Source: StableMoFusion (Huang et al., arXiv:2405.05691).
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::stage::features::{check_diffusion, check_frames, check_neighbours, check_parameters};
+use crate::stage::{
+    Batch, Decay, Diffusion, Family, FrequencyLosses, Neighbours, NoiseSchedule, Optimizer, Output, Prediction,
+    Problems, Ref, Shape, Solver, StageSpec, Training,
+};
+use crate::{ArtifactKind, Steps};
+
+/// Heads of the cross-attention, and groups of the group norms.
+const PARTS: usize = 8;
+/// Frames are filled up to a multiple of 16, so that they can be halved as often.
+const LEVELS: usize = 4;
+
+/// Size of a StableMoFusion network. Published: the default.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct StableMoFusionNetwork {
+    /// Channels that the multipliers count in.
+    pub width: usize,
+    /// A level of the U-Net each; at most 4.
+    pub multipliers: Vec<usize>,
+    /// Width of the timestep's embedding; even.
+    pub time: usize,
+    /// Width of a token.
+    pub text: usize,
+    /// Blocks of the text transformer.
+    pub text_layers: usize,
+    /// Heads of the text transformer; divides `text`.
+    pub text_heads: usize,
+    /// Feed-forward width of the text transformer.
+    pub text_feed_forward: usize,
+    /// The usual cross-attention in place of the linear one.
+    pub full_attention: bool,
+    /// Dropout probability.
+    pub dropout: f64,
+}
+
+impl Default for StableMoFusionNetwork {
+    fn default() -> Self {
+        Self {
+            width: 512,
+            multipliers: vec![2; 4],
+            time: 512,
+            text: 256,
+            text_layers: 4,
+            text_heads: 4,
+            text_feed_forward: 2048,
+            full_attention: false,
+            dropout: 0.1,
+        }
+    }
+}
+
+impl StableMoFusionNetwork {
+    fn check(&self, p: &mut Problems) {
+        for (field, value) in [
+            ("network.width", self.width),
+            ("network.time", self.time),
+            ("network.text", self.text),
+            ("network.text_layers", self.text_layers),
+            ("network.text_heads", self.text_heads),
+            ("network.text_feed_forward", self.text_feed_forward),
+        ] {
+            p.positive(field, value);
+        }
+        if !(1..=LEVELS).contains(&self.multipliers.len()) || self.multipliers.contains(&0) {
+            let message =
+                format!("`network.multipliers` is {:?}; expected 1 to {LEVELS} numbers above 0", self.multipliers);
+            p.add("network.multipliers", message, "published: [2, 2, 2, 2]");
+        }
+        for channels in self.multipliers.iter().map(|m| self.width.saturating_mul(*m)) {
+            if !channels.is_multiple_of(PARTS) {
+                let message = format!("a level has {channels} channels, which {PARTS} heads and groups do not divide");
+                p.add("network.width", message, "");
+                break;
+            }
+        }
+        if self.text_heads > 0 && !self.text.is_multiple_of(self.text_heads) {
+            let (heads, text) = (self.text_heads, self.text);
+            let message = format!("`network.text_heads` is {heads}, which does not divide `network.text`, {text}");
+            p.add("network.text_heads", message, "");
+        }
+        if !self.time.is_multiple_of(2) {
+            let message = format!("`network.time` is {}; expected an even number", self.time);
+            p.add("network.time", message, "the timestep becomes pairs of a sine and a cosine");
+        }
+        // Two convolutions of five taps in a block, five blocks a level.
+        let widest = self.multipliers.iter().max().map_or(0, |m| self.width.saturating_mul(*m));
+        let block = widest.saturating_mul(widest.saturating_mul(10));
+        check_parameters(p, block.saturating_mul(5 * self.multipliers.len().min(LEVELS)));
+        let wide = self.text.saturating_mul(4).saturating_add(self.text_feed_forward.saturating_mul(2));
+        check_parameters(p, self.text.saturating_mul(wide).saturating_mul(self.text_layers));
+        p.fraction("network.dropout", self.dropout, true);
+    }
+}
+
+/// `train.stablemofusion`: diffusion of motion itself with a U-Net over frames.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct TrainStableMoFusion {
+    /// Stage that gives the clips.
+    pub dataset: String,
+    /// Stage that embeds the captions, whose encoder gives the tokens.
+    pub text: String,
+    /// Stage that gives a model of this kind whose weights training begins with; empty begins with random ones.
+    pub init: String,
+    /// Size.
+    pub network: StableMoFusionNetwork,
+    /// Noise schedule and prediction.
+    pub diffusion: Diffusion,
+    /// Timesteps of the schedule.
+    pub timesteps: usize,
+    /// What the deviations of root and contact features are divided by: these count for more.
+    pub feature_bias: f64,
+    /// Frames of the longest motion.
+    pub max_frames: usize,
+    /// Probability that a caption is left out.
+    pub guidance_dropout: f64,
+    /// EMA of the weights that is kept as the result; 0 keeps the weights themselves. As published, what an update takes in is `1 - ema` times
+    /// `106667 ema_every / steps`, at most 1.
+    pub ema: f64,
+    /// Updates of the weights between two of the average; the first of these copies.
+    pub ema_every: u64,
+    /// Free-T2M's losses.
+    pub losses: FrequencyLosses,
+    /// The rest.
+    #[serde(flatten)]
+    pub training: Training,
+}
+
+impl Default for TrainStableMoFusion {
+    fn default() -> Self {
+        Self {
+            dataset: "dataset".into(),
+            text: "text".into(),
+            init: String::new(),
+            network: StableMoFusionNetwork::default(),
+            diffusion: Diffusion {
+                schedule: NoiseSchedule::Linear,
+                beta_first: 1e-4,
+                beta_last: 0.02,
+                prediction: Prediction::Sample,
+            },
+            timesteps: 1000,
+            feature_bias: 5.0,
+            max_frames: 196,
+            guidance_dropout: 0.1,
+            ema: 0.9999,
+            ema_every: 32,
+            losses: FrequencyLosses::default(),
+            training: Training {
+                steps: Steps(50_000),
+                batch: Batch { global: 64, slices: 8 },
+                lr: 2e-4,
+                warmup: Steps(0),
+                decay: Decay::Staircase,
+                optimizer: Optimizer { weight_decay: 0.01, ..Optimizer::default() },
+                max_grad_norm: 1.0,
+                stop: None,
+            },
+        }
+    }
+}
+
+impl TrainStableMoFusion {
+    /// What an update of the average keeps of it. Published: .99317 for 50,000 steps.
+    pub fn ema_decay(&self) -> f64 {
+        const UNIT: f64 = 106_667.0;
+        let taken = (1.0 - self.ema) * UNIT * self.ema_every as f64 / self.training.steps.0.max(1) as f64;
+        1.0 - taken.min(1.0)
+    }
+}
+
+impl StageSpec for TrainStableMoFusion {
+    const KIND: &'static str = "train.stablemofusion";
+    const SHAPE: Shape = Shape::Gang;
+    const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![
+            Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
+            Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
+            Ref::stage("init", &mut self.init, ArtifactKind::Model).optional(),
+            self.losses.reference(),
+        ]
+    }
+
+    fn check(&self, p: &mut Problems) {
+        self.network.check(p);
+        check_diffusion(p, &self.diffusion, self.timesteps);
+        check_frames(p, self.max_frames);
+        p.above_zero("feature_bias", self.feature_bias);
+        p.fraction("guidance_dropout", self.guidance_dropout, false);
+        p.fraction("ema", self.ema, true);
+        if self.ema_every == 0 {
+            p.add("ema_every", "`ema_every` is 0; expected at least 1", "write `ema: 0` for no average");
+        }
+        self.losses.check(p);
+        self.training.check(p);
+    }
+
+    fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
+        check_neighbours(p, stages, &self.dataset, &self.text, &self.init);
+    }
+
+    fn training(&mut self) -> Option<&mut Training> {
+        Some(&mut self.training)
+    }
+
+    fn family(&self) -> Option<Family> {
+        Some(Family::Features { timesteps: self.timesteps, solver: Solver::SdeDpmSolverPp })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_average_takes_in_what_is_published() {
+        let of = |steps| {
+            let mut settings = TrainStableMoFusion::default();
+            settings.training.steps = Steps(steps);
+            settings.ema_decay()
+        };
+        assert!((of(50_000) - 0.993_173_312).abs() < 1e-9);
+        assert!((of(200_000) - 0.998_29).abs() < 1e-5);
+        assert_eq!(of(100), 0.0, "short runs keep the newest weights");
+    }
+}

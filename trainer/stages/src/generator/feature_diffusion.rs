@@ -1,0 +1,95 @@
+//! Diffusion of motion itself: a denoiser draws the features of frames, and nothing decodes them. Source: MDM, StableMoFusion.
+//!
+//! Parts: `denoiser`, `text`. Of a caption MDM reads one vector, StableMoFusion the tokens.
+
+use std::collections::BTreeMap;
+
+use burn::tensor::Device;
+use checkpoint::Blobs;
+use checkpoint::model::Model;
+use protocol::ArtifactKind;
+use protocol::artifact::Role;
+use protocol::stage::{DataFormat, Family, Sampler};
+
+use super::{Batch, Lap, MotionGenerator, Text};
+use crate::context::StageError;
+use crate::motion_networks::{CaptionRows, Drawing, MotionDenoiser};
+use crate::parts;
+use crate::text::{self, TextEncoder};
+
+/// Its name in manifests.
+pub(crate) const NAME: &str = "feature-diffusion";
+
+#[derive(Debug)]
+struct FeatureDiffusion {
+    denoiser: MotionDenoiser,
+    text: Box<dyn TextEncoder>,
+}
+
+/// Opens its parts, which must fit each other.
+pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<Box<dyn MotionGenerator>, StageError> {
+    let part = |role: &Role, kind| parts::part(blobs, model, role, kind);
+    let denoiser = MotionDenoiser::read(blobs, &part(&Role::DENOISER, ArtifactKind::Denoiser)?, device)?;
+    let text = text::open(&part(&Role::TEXT, ArtifactKind::TextEncoder)?, blobs, device)?;
+    let meta = denoiser.meta();
+    if meta.fits.get(&Role::TEXT) != model.parts.get(&Role::TEXT) {
+        return Err(StageError::Input("the denoiser was trained with another `text` than the model has".into()));
+    }
+    if meta.text_dim != text.dim() {
+        let (wanted, found) = (meta.text_dim, text.dim());
+        return Err(StageError::Input(format!(
+            "the denoiser reads {wanted} numbers a vector, the encoder gives {found}"
+        )));
+    }
+    Ok(Box::new(FeatureDiffusion { denoiser, text }))
+}
+
+impl MotionGenerator for FeatureDiffusion {
+    fn format(&self) -> DataFormat {
+        self.denoiser.meta().format
+    }
+
+    fn longest(&self) -> usize {
+        self.denoiser.meta().max_frames
+    }
+
+    fn family(&self) -> &Family {
+        &self.denoiser.meta().family
+    }
+
+    fn text(&self) -> &dyn TextEncoder {
+        &*self.text
+    }
+
+    fn embed(&self, captions: &[&str]) -> Result<Vec<Text>, StageError> {
+        if self.denoiser.meta().reads_tokens() {
+            return Ok(self.text.tokens(captions)?.into_iter().map(|values| Text { values }).collect());
+        }
+        let pooled = self.text.pooled(captions)?;
+        Ok(pooled.chunks_exact(self.text.dim()).map(|row| Text { values: row.to_vec() }).collect())
+    }
+
+    fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError> {
+        // Those of one length are drawn together; those of a network that always draws all frames, all.
+        let mut groups: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+        let whole = self.denoiser.meta().draws_whole();
+        for (b, frames) in batch.lengths.iter().enumerate() {
+            groups.entry(if whole { self.longest() } else { *frames }).or_default().push(b);
+        }
+        let width = self.denoiser.meta().mean.len();
+        let mut motions = vec![Vec::new(); batch.lengths.len()];
+        for (frames, members) in groups {
+            let rows = members.iter().map(|b| batch.texts[*b].values.clone()).collect();
+            let captions = CaptionRows { rows, kept: vec![true; members.len()] };
+            let drawing = Drawing { captions: &captions, frames, sampler };
+            let noise = |k: usize, i: usize, out: &mut [f32]| (batch.seeds)(k, members[i]).fill_normal(out);
+            for (b, mut motion) in members.iter().zip(self.denoiser.draw(drawing, &noise)?) {
+                motion.truncate(batch.lengths[*b] * width);
+                motions[*b] = motion;
+            }
+        }
+        lap(Lap::Sampled);
+        lap(Lap::Decoded);
+        Ok(motions)
+    }
+}

@@ -1,0 +1,260 @@
+//! `train.mdm` and `train.stablemofusion`: diffusion of motion itself. Sources: MDM (arXiv:2209.14916), StableMoFusion (arXiv:2405.05691), with the
+//! losses of Free-T2M where they are asked for.
+//!
+//! `t ~ U{0..T-1}`, `x_t = alpha_t x_0 + sigma_t eps` on normalised features, loss `mean over a clip's own frames of (x_0 hat - x_0)^2` (of the noise
+//! or the velocity where `diffusion` says so). A caption is left out with probability `guidance_dropout`: MDM then reads a zero vector,
+//! StableMoFusion skips its cross-attention.
+
+use std::collections::BTreeMap;
+
+use burn::module::Module;
+use burn::tensor::Device;
+use checkpoint::model::{Model, Parts};
+use models::diffusion::{Schedule, affine, unzip};
+use models::flat;
+use models::kernels::Dropout;
+use models::losses::{FrameWeights, Pointwise};
+use models::names::{self, to_bytes};
+use models::networks::Init;
+use protocol::artifact::Role;
+use protocol::stage::{FrequencyLosses, Positions, StageSpec, TrainMdm, TrainStableMoFusion, Training};
+use protocol::{ArtifactKind, Manifest};
+
+use super::feature_data::{Cut, FeatureData, Rules};
+use super::frequency::{FrequencyTerms, LOW_FREQUENCY, Predicted, SEMANTIC, clean};
+use super::{Gang, group, slice_result};
+use crate::artifacts::{self, Draft, MODEL_FILE, to_meta};
+use crate::context::{AttemptContext, ContextError, GangContext, Outcome, StageError};
+use crate::generator::FEATURE_DIFFUSION;
+use crate::motion_networks::{Architecture, MotionDenoiserMeta, MotionNetwork};
+use crate::parts::{self, model_error};
+use crate::train::{Average, GroupPlan, Losses, Objective, SliceResult, TrainState, Trained, train};
+
+/// The term of the loss that every diffusion has.
+const DENOISING: &str = "denoising";
+/// The input that gives weights to begin with.
+const INIT: &str = "init";
+
+struct Features<N> {
+    data: FeatureData,
+    network: N,
+    noise: Schedule,
+    terms: Option<FrequencyTerms>,
+    training: Training,
+    average: Option<Average>,
+    masked: bool,
+    guidance_dropout: f64,
+    dropout: f64,
+    seed: u64,
+    device: Device,
+}
+
+impl<N: MotionNetwork> Objective for Features<N> {
+    fn groups(&mut self) -> Vec<GroupPlan> {
+        vec![GroupPlan { average: self.average, ..group("model", &self.network, &self.training, 0.0) }]
+    }
+
+    fn terms(&self) -> Vec<&'static str> {
+        let mut terms = vec![Losses::TOTAL];
+        if self.terms.is_some() {
+            terms.extend([DENOISING, LOW_FREQUENCY, SEMANTIC]);
+        }
+        terms
+    }
+
+    fn load(&mut self, state: &TrainState) {
+        self.network = flat::write(self.network.clone(), &state.groups[0].params);
+    }
+
+    fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
+        let batch = self.data.slice(step, slice, self.noise.steps(), self.guidance_dropout)?;
+        let (a, e) = unzip(batch.timesteps.iter().map(|t| self.noise.add_noise(*t)));
+        let noisy = affine(batch.clean_btf.clone(), batch.noise_btf.clone(), &a, &e);
+        let mut dropout = Dropout::new(self.dropout, self.seed, step, slice as u64);
+        let condition = self.network.condition(&batch.captions, self.data.text_dim(), &self.device, &mut dropout);
+        let lengths = self.masked.then_some(&batch.lengths[..]);
+        let out = self.network.predict(noisy.clone(), &batch.timesteps, Some(&condition), lengths, &mut dropout);
+
+        let global = self.training.batch.global;
+        let mut losses = Losses::new(global);
+        let target = self.noise.target(batch.clean_btf.clone(), batch.noise_btf, &batch.timesteps);
+        let weights = FrameWeights::masked(&batch.lengths, target.dims()[1], &self.device);
+        losses.add(DENOISING, weights.compare(Pointwise::L2, out.clone(), target), 1.0);
+        if let Some(terms) = &self.terms {
+            let predicted = Predicted {
+                found: clean(&self.noise, noisy, out, &batch.timesteps),
+                target: batch.clean_btf,
+                lengths: &batch.lengths,
+                timesteps: &batch.timesteps,
+                batch_timesteps: &batch.batch_timesteps,
+            };
+            terms.add(&mut losses, &predicted, global);
+        }
+        slice_result(&self.network, &losses, &self.terms())
+    }
+}
+
+/// What the two kinds tell the common way of training.
+struct Recipe<'a> {
+    architecture: Architecture,
+    rules: Rules,
+    masked: bool,
+    guidance_dropout: f64,
+    dropout: f64,
+    average: Option<Average>,
+    diffusion: &'a protocol::stage::Diffusion,
+    losses: &'a FrequencyLosses,
+    training: &'a Training,
+    family: protocol::stage::Family,
+}
+
+/// Trains `make`'s network to the recipe.
+fn run<N: MotionNetwork>(
+    cx: &mut dyn GangContext,
+    recipe: Recipe<'_>,
+    make: impl FnOnce(&MotionDenoiserMeta, &mut Init<'_>) -> N,
+) -> Result<Outcome, StageError> {
+    let data = FeatureData::read(cx, recipe.training, recipe.rules)?;
+    let text_part = data.text_encoder(cx)?;
+    let meta = MotionDenoiserMeta {
+        family: recipe.family,
+        architecture: recipe.architecture,
+        format: data.dataset().format,
+        diffusion: recipe.diffusion.clone(),
+        mask_frames: recipe.masked,
+        max_frames: recipe.rules.max_frames,
+        mean: data.dataset().mean.clone(),
+        std: data.std().to_vec(),
+        text_dim: data.text_dim(),
+        fits: Parts::from([(Role::TEXT, text_part.digest())]),
+    };
+    let noise = Schedule::new(&meta.diffusion, meta.timesteps()?);
+    let statistics = (&meta.mean[..], &meta.std[..]);
+    let terms = FrequencyTerms::read(cx, recipe.losses, &noise, meta.format, statistics)?;
+    let tracked = cx.device().autodiff();
+    let purpose = format!("{}/init", cx.task().name);
+    let mut init = Init::new(cx.task().seed, &purpose, Positions::Uniform, &tracked);
+    let network = begin(cx, make(&meta, &mut init), &meta)?;
+    let mut objective = Features {
+        data,
+        network,
+        noise,
+        terms,
+        training: recipe.training.clone(),
+        average: recipe.average,
+        masked: recipe.masked,
+        guidance_dropout: recipe.guidance_dropout,
+        dropout: recipe.dropout,
+        seed: super::dropout_seed(cx),
+        device: cx.device(),
+    };
+    match train(&mut objective, recipe.training, cx)? {
+        Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
+        Trained::Finished { state, metrics } => {
+            let bytes = to_bytes(&state.groups[0].entries, state.result(0));
+            let mut denoiser = Draft::new(cx, ArtifactKind::Denoiser, to_meta(&meta));
+            denoiser.add(MODEL_FILE, bytes)?;
+            let parts = BTreeMap::from([(Role::DENOISER, denoiser.into_manifest()), (Role::TEXT, text_part)]);
+            let output = parts::publish_model(cx, FEATURE_DIFFUSION, meta.format, &parts)?;
+            Ok(Outcome::Finished { output, metrics })
+        }
+    }
+}
+
+/// The denoiser of the model that training begins with, if one is named.
+pub(super) fn init_part(cx: &dyn AttemptContext) -> Result<Option<Manifest>, StageError> {
+    if !cx.task().inputs.contains_key(INIT) {
+        return Ok(None);
+    }
+    let (_, manifest) = artifacts::input(cx, INIT, ArtifactKind::Model)?;
+    let model = Model::read(&manifest).map_err(model_error)?;
+    parts::part(&*cx.blobs(), &model, &Role::DENOISER, ArtifactKind::Denoiser).map(Some)
+}
+
+/// `network` with the weights of that denoiser.
+pub(super) fn with_weights<N: Module>(
+    cx: &dyn AttemptContext,
+    network: N,
+    denoiser: &Manifest,
+) -> Result<N, StageError> {
+    let weights = artifacts::file(&*cx.blobs(), denoiser, MODEL_FILE)?;
+    let corrupt = |e| StageError::Context(ContextError::Corrupt(format!("the denoiser of `{INIT}`: {e}")));
+    names::load(network, &weights, "").map_err(corrupt)
+}
+
+/// A model whose weights cannot be gone on from.
+pub(super) fn unfit(what: &str) -> StageError {
+    StageError::Input(format!("`{INIT}` has {what}; name a model that this stage could have trained"))
+}
+
+fn begin<N: Module>(cx: &dyn AttemptContext, network: N, meta: &MotionDenoiserMeta) -> Result<N, StageError> {
+    let Some(denoiser) = init_part(cx)? else { return Ok(network) };
+    let theirs: MotionDenoiserMeta = artifacts::meta(&denoiser, "the denoiser of `init`")?;
+    let differs = [
+        ("another network or size", theirs.architecture != meta.architecture),
+        (
+            "another noise schedule or prediction",
+            (&theirs.diffusion, &theirs.family) != (&meta.diffusion, &meta.family),
+        ),
+        ("been trained on features of another scale", (&theirs.mean, &theirs.std) != (&meta.mean, &meta.std)),
+        ("been trained with another text encoder", theirs.fits != meta.fits),
+    ];
+    if let Some((what, _)) = differs.iter().find(|(_, differs)| *differs) {
+        return Err(unfit(what));
+    }
+    with_weights(cx, network, &denoiser)
+}
+
+impl Gang for TrainMdm {
+    fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
+        let recipe = Recipe {
+            architecture: Architecture::Mdm(self.network.clone()),
+            rules: Rules {
+                cut: Cut::Jittered,
+                tokens: false,
+                whole: !self.mask_frames,
+                max_frames: self.max_frames,
+                bias: 1.0,
+            },
+            masked: self.mask_frames,
+            guidance_dropout: self.guidance_dropout,
+            dropout: self.network.dropout,
+            average: (self.ema > 0.0).then(|| Average::of(self.ema)),
+            diffusion: &self.diffusion,
+            losses: &self.losses,
+            training: &self.training,
+            family: family(self)?,
+        };
+        run(cx, recipe, |meta, init| meta.mdm(&self.network, init))
+    }
+}
+
+impl Gang for TrainStableMoFusion {
+    fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
+        let every = self.ema_every;
+        let average = Average { decay: self.ema_decay(), every, starts_as_copy: true };
+        let recipe = Recipe {
+            architecture: Architecture::StableMoFusion(self.network.clone()),
+            rules: Rules {
+                cut: Cut::Whole,
+                tokens: true,
+                whole: true,
+                max_frames: self.max_frames,
+                bias: self.feature_bias,
+            },
+            masked: false,
+            guidance_dropout: self.guidance_dropout,
+            dropout: self.network.dropout,
+            average: (self.ema > 0.0).then_some(average),
+            diffusion: &self.diffusion,
+            losses: &self.losses,
+            training: &self.training,
+            family: family(self)?,
+        };
+        run(cx, recipe, |meta, init| meta.stablemofusion(&self.network, init))
+    }
+}
+
+fn family(settings: &impl StageSpec) -> Result<protocol::stage::Family, StageError> {
+    settings.family().ok_or_else(|| StageError::Fault("a kind that trains a model has a family".into()))
+}
