@@ -178,10 +178,14 @@ type Damaged = (String, PathBuf, &'static str);
 
 fn damage(random: &mut Random, view: &Value, store: &Path) -> Result<Vec<Damaged>, String> {
     let mut choices: Vec<(String, Vec<PathBuf>)> = Vec::new();
-    for (stage, outputs) in digests(view) {
-        let all = own(&outputs, store);
-        if !all.is_empty() {
-            choices.push((stage, all.into_iter().collect()));
+    let stages: Vec<(String, BTreeSet<PathBuf>)> =
+        digests(view).into_iter().map(|(stage, outputs)| (stage, own(&outputs, store))).collect();
+    // A model lists the files of its parts: what is there again once the part was made is nothing to notice afterwards.
+    let is_shared = |path: &PathBuf| stages.iter().filter(|(_, all)| all.contains(path)).count() > 1;
+    for (stage, all) in &stages {
+        let alone: Vec<PathBuf> = all.iter().filter(|path| !is_shared(path)).cloned().collect();
+        if !alone.is_empty() {
+            choices.push((stage.clone(), alone));
         }
     }
     let mut damaged: Vec<Damaged> = Vec::new();
