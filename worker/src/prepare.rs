@@ -94,7 +94,7 @@ impl Preparation {
             let has_all = |ready: &Prepare| (&ready.inputs, ready.resume) == (&task.inputs, task.resume);
             let known = lock(&self.ready).iter().find(|(ready, _)| has_all(ready)).map(|(_, all)| all.clone());
             let prepared = match known.map_or_else(|| prepare(&task, client, cache, &mut news), Ok) {
-                // Whoever has the task can say so, and is heard.
+                // The attempt that reads it reports the damage; fetching ahead has nobody to report to.
                 Err(Stopped::Call(CallError::Damaged(why))) => {
                     tracing::warn!(task = %task.task, "not all of its inputs can be fetched ahead: {why}");
                     Ok(Vec::new())

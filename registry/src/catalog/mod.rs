@@ -54,7 +54,7 @@ pub trait Records: Debug + Send + Sync {
     /// Runs that ended before a time, in milliseconds since 1970; oldest first.
     async fn ended_before(&self, before_ms: i64) -> Result<Vec<RunId>>;
 
-    /// Under whose names the logs and values behind stage keys are stored: those of the value, or of what there is of it.
+    /// The run and the stage under whose names a stage key's logs and metrics are stored: those that made its value, or began to.
     async fn sources(&self, keys: &[Digest]) -> Result<BTreeMap<Digest, (RunId, StageName)>>;
 
     /// What a coordinator left of a stage's value when nobody waited for it any more, as JSON.

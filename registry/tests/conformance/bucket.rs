@@ -46,7 +46,7 @@ fn bytes(length: u32) -> Vec<u8> {
 #[test]
 fn objects_on_an_s3_server() {
     let bucket = Bucket::start();
-    // But for `a_marker_is_taken_by_one_of_many`: this server looks first and writes then, for whoever asks.
+    // Without `a_marker_is_taken_by_one_of_many`: this server checks a condition first and writes afterwards, which is not one step.
     objects(&client(&bucket, NAME, SECRET));
 }
 
@@ -64,7 +64,7 @@ fn a_wrong_key_and_a_missing_bucket_are_said() {
     assert!(matches!(&refused, BlobError::Storage(said) if said.contains("access was refused")), "{refused}");
 
     let (_dir, place) = open(client(&bucket, "nowhere", SECRET));
-    // Asked first by whoever opens a store; this server would make the bucket for whoever puts something there.
+    // Opening a store asks this first. A put would not show it: this server makes the bucket that is missing.
     let refused = place.is_empty().unwrap_err();
     let BlobError::Storage(said) = &refused else { panic!("{refused}") };
     assert!(said.contains("there is no bucket") && said.contains("`--blobs`"), "{said}");
