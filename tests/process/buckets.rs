@@ -2,8 +2,9 @@
 
 use std::fs;
 
-use cluster_tests::bucket::Bucket;
-use cluster_tests::{Bench, Running, Said, digests, states};
+use cluster_tests::bucket::{Bucket, NAME};
+use cluster_tests::documented::{shell_lines, words};
+use cluster_tests::{Bench, Running, Said, digests, states, wait_for};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
@@ -63,4 +64,94 @@ fn what_is_wrong_with_a_bucket_is_said() {
     assert!(plain.stderr.contains("AWS_ALLOW_HTTP=true"), "{}", plain.stderr);
     let away = run(("AWS_ENDPOINT_URL", "http://127.0.0.1:9"), &url);
     assert!(away.stderr.contains("that the server runs"), "{}", away.stderr);
+}
+
+/// The commands of `ops/README.md`, with a bucket, folders and a pipeline of ours in place of those that it names.
+#[test]
+fn the_commands_that_are_documented() {
+    let bucket = Bucket::start();
+    let bench = user(&bucket);
+    let smoke = format!("{} --until vae", Bench::config("smoke.yaml"));
+    let lines =
+        shell_lines(&Bench::repository().join("ops/README.md"), Some("<!-- run by tests/process/buckets.rs -->"));
+    let mut ran = 0;
+    for line in lines {
+        if let Some(variables) = line.strip_prefix("export ") {
+            let known = bucket.environment();
+            for variable in variables.split(' ').filter_map(|pair| pair.split_once('=')) {
+                assert!(known.iter().any(|(name, _)| *name == variable.0), "{} is what the tests set", variable.0);
+            }
+            continue;
+        }
+        let line = line.replace("my-bucket", NAME).replace("configs/quickstart.yaml", &smoke);
+        let line = line.replace("/backups", "backups").replace("/var/lib/stride", "served");
+        let mut words = words(&line);
+        if words[0] == "registry" {
+            words.insert(0, "trainer".to_owned());
+        }
+        let arguments: Vec<&str> = words[1..].iter().map(String::as_str).collect();
+        if arguments[0] == "serve" {
+            let mut server = bench.spawn(&[&arguments[..], &["--bind", "127.0.0.1:0"]].concat());
+            wait_for("the server to have its place in the bucket", || {
+                assert!(server.alive(), "{line} ended");
+                bucket.objects().join("stride/IDENTITY").exists().then_some(())
+            });
+            server.signal(nix::sys::signal::Signal::SIGTERM);
+            let said = server.wait();
+            assert_eq!(said.code, Some(0), "{}", said.stderr);
+        } else {
+            bench.run(&arguments).expect_code(0);
+        }
+        ran += 1;
+    }
+    assert_eq!(ran, 6, "each command, and no other");
+    // What came back from the backup is all that was there.
+    bench.run(&["registry", "fsck", "--store", "elsewhere"]).expect_code(0);
+    let again =
+        bench.run(&["run", &Bench::config("smoke.yaml"), "--until", "vae", "--store", "elsewhere", "-o", "json"]);
+    let again = again.expect_code(0).json();
+    assert!(states(&again).values().all(|state| matches!(state.as_str(), "cached" | "skipped")), "{again:#}");
+}
+
+/// Two folders and one bucket: only the one that was opened last may go on, until somebody says which it is.
+#[test]
+fn a_copy_of_the_folder_does_not_share_the_bucket() {
+    let bucket = Bucket::start();
+    let bench = user(&bucket);
+    let config = Bench::config("smoke.yaml");
+    let arguments = ["run", &config, "--until", "dataset", "--store"];
+    bench.run(&[&arguments[..], &["first", "--blobs", &Bucket::url("shared")]].concat()).expect_code(0);
+    let copied = Running::start({
+        let mut command = std::process::Command::new("cp");
+        command.args(["-a", "first", "second"]).current_dir(bench.path());
+        command
+    });
+    copied.wait().expect_code(0);
+    let objects = || walk(&bucket.objects());
+    let run = |store: &str| bench.run(&[&arguments[..], &[store]].concat());
+
+    run("first").expect_code(0);
+    let before = objects();
+    for refused in [run("second"), bench.run(&["registry", "gc", "--store", "second", "--grace", "0"])] {
+        assert_ne!(refused.code, Some(0), "{}", refused.stdout);
+        assert!(refused.stderr.contains("registry adopt"), "{}", refused.stderr);
+    }
+    assert_eq!(objects(), before, "nothing was collected");
+
+    bench.run(&["registry", "adopt", "--store", "second"]).expect_code(0);
+    run("second").expect_code(0);
+    let refused = run("first");
+    assert!(refused.code != Some(0) && refused.stderr.contains("registry adopt"), "{}", refused.stderr);
+    bench.run(&["registry", "fsck", "--store", "second"]).expect_code(0);
+}
+
+/// The names of all objects that are blobs.
+fn walk(dir: &std::path::Path) -> Vec<std::path::PathBuf> {
+    let mut found = Vec::new();
+    for entry in fs::read_dir(dir).expect("a folder") {
+        let path = entry.expect("an entry").path();
+        if path.is_dir() { found.extend(walk(&path)) } else { found.push(path) }
+    }
+    found.sort();
+    found
 }

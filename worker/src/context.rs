@@ -272,6 +272,7 @@ impl GangContext for HttpContext {
     fn exchange(&mut self, step: u64, slices: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError> {
         self.check()?;
         self.held.busy().set(Phase::Working);
+        failpoints::pace();
         let Some(mesh) = self.mesh.clone() else { return Ok(Exchange::Regroup) };
         let generation = mesh.config.generation;
         if self.held.halt(generation).is_some() {

@@ -2,6 +2,9 @@
 //!
 //! Built only with the feature `failpoints`. `STRIDE_WORKER_FAILPOINT=name`, or `name@3` for the third time it gets there,
 //! has the process end as by `kill -9` at one of them. The registry has points and a variable of its own.
+//!
+//! `STRIDE_WORKER_PACE=25` has every training step take 25 ms at the least, so that a test which stops something in the middle
+//! of a stage finds a middle on a fast machine too.
 
 /// Every point, in the order in which an attempt reaches them. An upload is one blob of a gang's stage.
 pub const ALL: [&str; 6] = [
@@ -13,15 +16,22 @@ pub const ALL: [&str; 6] = [
     "outcome::after_report",
 ];
 
-/// Arms what `STRIDE_WORKER_FAILPOINT` names; called once when a worker starts. Does nothing without the feature.
+/// The point before each exchange of a training step, at which `STRIDE_WORKER_PACE` sleeps.
+const PACE: &str = "exchange::pace";
+
+/// Arms what the two variables name; called once when a worker starts. Does nothing without the feature.
 ///
 /// # Panics
-/// If the variable names no known point: a test would otherwise pass without having killed anything.
+/// If a variable names no known point or no number: a test would otherwise pass without having killed anything.
 pub fn arm_from_env() {
     #[cfg(feature = "failpoints")]
     {
         use std::sync::atomic::{AtomicU64, Ordering};
 
+        if let Ok(text) = std::env::var("STRIDE_WORKER_PACE") {
+            let pace = text.parse::<u64>().expect("STRIDE_WORKER_PACE: a number of milliseconds");
+            fail::cfg(PACE, &format!("sleep({pace})")).expect("a fail point can sleep");
+        }
         let Ok(text) = std::env::var("STRIDE_WORKER_FAILPOINT") else { return };
         let (name, nth) = match text.split_once('@') {
             Some((name, nth)) => (name, nth.parse::<u64>().expect("STRIDE_WORKER_FAILPOINT: a number after `@`")),
@@ -46,4 +56,9 @@ pub fn arm_from_env() {
 pub(crate) fn hit(name: &'static str) {
     debug_assert!(ALL.contains(&name));
     fail::fail_point!(name);
+}
+
+/// Gets to the exchange of a training step.
+pub(crate) fn pace() {
+    fail::fail_point!(PACE);
 }
