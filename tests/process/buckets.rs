@@ -43,6 +43,24 @@ fn a_run_on_a_bucket_that_is_killed_and_goes_on_gives_the_digests_of_a_folder() 
     bench.run(&["registry", "fsck"]).expect_code(0);
 }
 
+/// Sampled: nothing; two quickstarts with `STRIDE_LONG_TESTS=1`, of the optimised build that `TRAINER=path` names, if it does.
+#[test]
+fn the_quickstart_on_a_bucket_gives_the_digests_of_a_folder() {
+    if std::env::var_os("STRIDE_LONG_TESTS").is_none() {
+        eprintln!("SKIPPED: the quickstart on a bucket (set STRIDE_LONG_TESTS=1)");
+        return;
+    }
+    let trainer = std::env::var("TRAINER").unwrap_or_else(|_| TRAINER.to_owned());
+    let reference = Bench::new(&trainer).pipeline("quickstart.yaml", &[]);
+    let bucket = Bucket::start();
+    let bench = Bench::new(&trainer).with_environment(bucket.environment());
+    let report = bench.pipeline("quickstart.yaml", &["--blobs", &Bucket::url("quickstart")]);
+    assert_eq!(digests(&report), digests(&reference));
+    bench.run(&["registry", "fsck"]).expect_code(0);
+    assert!(!bench.store().join("blobs/sha256").exists(), "all blobs are in the bucket");
+    eprintln!("{} digests are equal", digests(&report).len());
+}
+
 #[test]
 fn what_is_wrong_with_a_bucket_is_said() {
     let bucket = Bucket::start();

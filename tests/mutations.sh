@@ -1,0 +1,51 @@
+#!/usr/bin/env bash
+# Breaks the code on purpose, one fault at a time, and wants a test to fail: tests/mutations.sh [NAME...]
+# Works on a copy of what is committed; what it builds lies in target/mutations, or where MUTATIONS_TARGET says.
+# Ends with 1 if a fault is found by no test, or stands no longer where this file looks for it.
+set -euo pipefail
+root=$(cd "$(dirname "$0")/.." && pwd)
+copy=$(mktemp -d)
+export CARGO_TARGET_DIR=${MUTATIONS_TARGET:-$root/target/mutations}
+git -C "$root" worktree add --quiet --force --detach "$copy" HEAD
+trap 'git -C "$root" worktree remove --force "$copy"' EXIT
+cd "$copy"
+log=$copy/mutation.log
+wanted=("$@")
+missed=0
+
+# mutation NAME FILE PERL CRATES: PERL changes FILE, and a test of CRATES must fail.
+mutation() {
+    local name=$1 file=$2 change=$3 crates=$4 options=() crate
+    if [ ${#wanted[@]} -gt 0 ] && [[ ! " ${wanted[*]} " == *" $name "* ]]; then return; fi
+    perl -0pi -e "$change" "$file"
+    if git diff --quiet; then
+        echo "$name: stands no longer in $file"
+        missed=1
+        return
+    fi
+    for crate in $crates; do options+=(-p "$crate"); done
+    if cargo test --quiet --locked --no-fail-fast "${options[@]}" --lib --tests >"$log" 2>&1; then
+        echo "$name: NO TEST FAILS"
+        missed=1
+    elif ! grep -q '^test result: FAILED' "$log"; then
+        echo "$name: does not compile"
+        tail -20 "$log"
+        missed=1
+    else
+        echo "$name: $(grep -E '^    [a-z_:0-9]+$' "$log" | sort -u | tr -s ' \n' ' ')"
+    fi
+    git checkout --quiet -- .
+}
+
+mutation leniency-times-ten trainer/coordinator/src/observe.rs 's/heard\.after\(overslept\)\.min\(at\)/heard.after(overslept * 10)/' coordinator
+mutation back-off-times-ten trainer/coordinator/src/policy.rs 's/(self\.backoff_ms)\.saturating_mul/$1.saturating_mul(10).saturating_mul/' coordinator
+mutation heard-is-lost trainer/coordinator/src/batch.rs 's/(Ask::Observation\(\.\.\) =>) [^,]*,/$1 {}/' coordinator
+mutation cancelled-shards-forgotten registry/src/sqlite/retention.rs "s/state = 'finished'/state IN ('finished', 'cancelled')/g" "registry coordinator"
+mutation synchronous-off registry/src/sqlite/open.rs 's/SqliteSynchronous::Full/SqliteSynchronous::Off/' registry
+mutation no-sync-of-a-blob registry/src/blob/fs.rs 's/self\.part\.file\.sync\(\)/Ok::<(), io::Error>(())/' "registry coordinator"
+mutation no-sync-of-its-folder registry/src/blob/fs.rs 's/folder\.disk\.sync_dir\(shard\)/Ok::<(), io::Error>(())/' "registry coordinator"
+mutation no-sync-of-the-operating-system registry/src/blob/disk.rs 's/(fn sync\(&mut self\) -> io::Result<\(\)> \{\s+)self\.sync_all\(\)/$1Ok(())/' registry
+mutation grace-0 registry/src/retention.rs 's/60 \* 60 \* 1000/0/' "registry coordinator"
+mutation no-touch registry/src/blob/store.rs 's/let touched = self\.backend\(\)\.touch\(digest\)\?;/let touched = stat;/' registry
+mutation constant-nonce worker/src/gang/handshake.rs 's/getrandom::fill\(&mut bytes\)/getrandom::fill(&mut bytes[..0])/' worker
+exit $missed
