@@ -35,18 +35,31 @@ pub struct Weights<'a> {
 }
 
 impl<'a> Weights<'a> {
-    /// Tensors named by `entries`, cut out of a flat buffer. The file is in the order and with the alignment of the `safetensors` crate.
+    /// Tensors named by `entries`, cut out of a flat buffer.
     ///
     /// # Panics
-    /// If `flat` has another length than `entries` have elements, or two of them have one name.
-    pub fn new(entries: &[Entry], mut flat: &'a [f32]) -> Self {
+    /// As [`of`](Self::of).
+    pub fn new(entries: &[Entry], flat: &'a [f32]) -> Self {
+        Self::of(&[(entries, flat)])
+    }
+
+    /// Tensors of several buffers, each with the entries that name its parts, in one file. The file is in the order and with the alignment of
+    /// the `safetensors` crate.
+    ///
+    /// # Panics
+    /// If a buffer has another length than its entries have elements, or two entries have one name.
+    pub fn of(buffers: &[(&[Entry], &'a [f32])]) -> Self {
         let mut by_name = BTreeMap::new();
-        for entry in entries {
-            let (tensor, rest) = flat.split_at(entry.len());
-            flat = rest;
-            by_name.insert(entry.name.as_str(), (&entry.shape, tensor));
+        for (entries, flat) in buffers {
+            let mut flat = *flat;
+            for entry in *entries {
+                let (tensor, rest) = flat.split_at(entry.len());
+                flat = rest;
+                let other = by_name.insert(entry.name.as_str(), (&entry.shape, tensor));
+                assert!(other.is_none(), "two tensors are called `{}`", entry.name);
+            }
+            assert!(flat.is_empty(), "every value has a name");
         }
-        assert!(flat.is_empty() && by_name.len() == entries.len(), "every name stands for its part of the buffer");
         let mut end = 0;
         let info = |(name, (shape, tensor)): (&&str, &(&Vec<usize>, &[f32]))| {
             let begin = end;

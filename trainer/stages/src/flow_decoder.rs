@@ -8,7 +8,6 @@ use checkpoint::Blobs;
 use checkpoint::model::Parts;
 use models::flow::{Solver, follow};
 use models::kernels::Dropout;
-use models::names::load;
 use models::networks::{DitConfig, FlowDit, FlowUnet, Init, Projection, TimeFeatures, UnetConfig};
 use motion::Stream;
 use protocol::artifact::Role;
@@ -16,9 +15,10 @@ use protocol::stage::{DataFormat, FlowBackbone, FlowNetwork, FlowProjection, Flo
 use protocol::{Digest, Manifest, Seed};
 use serde::{Deserialize, Serialize};
 
-use crate::artifacts::{self, MODEL_FILE};
-use crate::context::{ContextError, StageError};
+use crate::artifacts;
+use crate::context::StageError;
 use crate::tokenizer::TrainedTokenizer;
+use crate::weights;
 
 /// Widths of the U-Net's two levels, over the first.
 const MULTIPLES: [usize; 2] = [1, 2];
@@ -146,13 +146,10 @@ impl FlowDecoder {
             ));
         }
         let device = device.clone().inner();
-        let weights = artifacts::file(blobs, manifest, MODEL_FILE)?;
-        let misfit = |error: models::names::LoadError| {
-            StageError::Context(ContextError::Corrupt(format!("the flow decoder's weights: {error}")))
-        };
+        let what = "the flow decoder's weights";
         let field = match meta.field(&mut Init::new(Seed(0), "blank", Positions::Uniform, &device)) {
-            Field::Unet(network) => Field::Unet(load(network, &weights, "").map_err(misfit)?),
-            Field::Dit(network) => Field::Dit(load(network, &weights, "").map_err(misfit)?),
+            Field::Unet(network) => Field::Unet(weights::load(network, blobs, manifest, what)?),
+            Field::Dit(network) => Field::Dit(weights::load(network, blobs, manifest, what)?),
         };
         Ok(Self { field, meta, device })
     }

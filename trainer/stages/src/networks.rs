@@ -264,7 +264,7 @@ impl Denoiser {
                 let fresh: Vec<_> = (1..timesteps.len()).map(|j| on_device(step_noise(j - 1), shape)).collect();
                 lcm_sample(&self.schedule, &timesteps, z, &fresh, &mut eps)
             }
-            Family::Autoregressive | Family::Masked | Family::Features { .. } => {
+            Family::Autoregressive | Family::Masked | Family::Mmm | Family::Features { .. } => {
                 return Err(StageError::Input(
                     "the denoiser says that it draws something else than latents, which it does not".into(),
                 ));

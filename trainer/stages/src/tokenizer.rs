@@ -7,16 +7,17 @@ use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
 use models::flat::{self, Entry};
 use models::kernels::Dropout;
-use models::names::{from_bytes, to_bytes};
+use models::names::from_bytes;
 use models::networks::{Init, Tokenizer, TokenizerConfig};
 use models::quantizer::{Pass, look_up};
 use protocol::stage::{DataFormat, Positions, TokenizerNetwork};
-use protocol::{Manifest, Seed};
+use protocol::{ArtifactKind, Digest, Manifest, Seed};
 use serde::{Deserialize, Serialize};
 
-use crate::artifacts::{self, HostTensor, MODEL_FILE, Tensors};
-use crate::context::{ContextError, StageError};
+use crate::artifacts::{self, Draft, HostTensor, MODEL_FILE, Tensors, to_meta};
+use crate::context::{AttemptContext, ContextError, StageError};
 use crate::kinds::word;
+use crate::weights;
 
 /// Levels of every published tokenizer, each of which halves the frames.
 const LEVELS: usize = 2;
@@ -64,10 +65,18 @@ impl TokenizerMeta {
         (0..self.quantizers).map(|q| Entry { name: name(q), shape: shape.clone() }).collect()
     }
 
-    /// The bytes of a tokenizer's file: parameters in the order of `entries`, and its codebooks.
-    pub fn to_bytes(&self, entries: &[Entry], params: &[f32], books: &[&[f32]]) -> Vec<u8> {
-        let entries: Vec<Entry> = entries.iter().cloned().chain(self.books()).collect();
-        to_bytes(&entries, &[params, &books.concat()].concat())
+    /// Uploads a tokenizer: its parameters, and its codebooks.
+    pub fn publish(
+        &self,
+        cx: &mut dyn AttemptContext,
+        params: (&[Entry], &[f32]),
+        books: &[&[f32]],
+    ) -> Result<Digest, StageError> {
+        let names = self.books();
+        let books = names.chunks(1).zip(books.iter().copied());
+        let mut draft = Draft::new(cx, ArtifactKind::Tokenizer, to_meta(self));
+        weights::add_all(&mut draft, &[params].into_iter().chain(books).collect::<Vec<_>>())?;
+        draft.finish(cx)
     }
 }
 
@@ -180,7 +189,7 @@ pub struct TokensMeta {
     /// The data.
     pub format: DataFormat,
     /// The tokenizer that encoded.
-    pub tokenizer: protocol::Digest,
+    pub tokenizer: Digest,
     /// Codes K of a codebook.
     pub codes: usize,
     /// Codebooks Q.

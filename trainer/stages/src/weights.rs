@@ -14,6 +14,11 @@ pub fn add(draft: &mut Draft, entries: &[Entry], values: &[f32]) -> Result<(), S
     draft.add_pieces(MODEL_FILE, &Weights::new(entries, values).pieces())
 }
 
+/// Uploads weights that lie in several buffers as the one file of an artifact.
+pub fn add_all(draft: &mut Draft, buffers: &[(&[Entry], &[f32])]) -> Result<(), StageError> {
+    draft.add_pieces(MODEL_FILE, &Weights::of(buffers).pieces())
+}
+
 /// Uploads weights and a manifest around them.
 pub fn publish(
     cx: &mut dyn AttemptContext,
@@ -28,8 +33,19 @@ pub fn publish(
 
 /// `blank` with the weights of an artifact, read tensor by tensor; `what` names them in the error.
 pub fn load<M: Module>(blank: M, blobs: &dyn Blobs, manifest: &Manifest, what: &str) -> Result<M, StageError> {
+    load_under(blank, blobs, manifest, "", what)
+}
+
+/// As [`load`], of those weights alone whose names begin with `prefix`.
+pub fn load_under<M: Module>(
+    blank: M,
+    blobs: &dyn Blobs,
+    manifest: &Manifest,
+    prefix: &str,
+    what: &str,
+) -> Result<M, StageError> {
     let file = artifacts::open(blobs, manifest, MODEL_FILE)?;
-    let loaded = load_from(blank, file.bytes(), &mut |offset, out| file.read_at(offset, out), "");
+    let loaded = load_from(blank, file.bytes(), &mut |offset, out| file.read_at(offset, out), prefix);
     let misfit = |e| StageError::Context(ContextError::Corrupt(format!("{what}: {e}")));
     loaded.map_err(artifacts::blob_error)?.map_err(misfit)
 }

@@ -46,7 +46,15 @@ fn tokenizer(quantizers: usize, codes: usize, resets: Resets) -> StageSettings {
 fn generator(generator: TokenGenerator) -> StageSettings {
     StageSettings::from(TrainTokens {
         generator,
-        network: TokenNetwork { width: 16, layers: 1, heads: 2, feed_forward: 32, dropout: 0.1, embedding: 8 },
+        network: TokenNetwork {
+            width: 16,
+            layers: if generator == TokenGenerator::Mmm { 2 } else { 1 },
+            heads: 2,
+            feed_forward: 32,
+            dropout: 0.1,
+            embedding: 8,
+            word_blocks: 1,
+        },
         longest: 20,
         training: training(STEPS),
         ..TrainTokens::default()
@@ -66,7 +74,7 @@ fn discord() -> StageSettings {
 
 type Link = (&'static str, StageSettings, Vec<(&'static str, &'static str)>);
 
-/// Everything from clips to models: a plain tokenizer with an autoregressive generator, a residual one with a masked one.
+/// Everything from clips to models: a plain tokenizer with an autoregressive generator and MMM's, a residual one with a masked one.
 fn chain(shards: usize) -> Vec<Link> {
     let encode = || StageSettings::from(EncodeTokens { padded: 40, shards, ..EncodeTokens::default() });
     let evaluate = || {
@@ -93,6 +101,11 @@ fn chain(shards: usize) -> Vec<Link> {
         ("reconstruction", evaluate(), with("residual")),
         ("gpt", generator(TokenGenerator::Autoregressive), model("plain-tokens", "plain")),
         ("momask", generator(TokenGenerator::Masked), model("residual-tokens", "residual")),
+        (
+            "mmm",
+            generator(TokenGenerator::Mmm),
+            [model("plain-tokens", "plain"), vec![("dataset", "dataset")]].concat(),
+        ),
         ("discord", discord(), with("residual")),
         ("smooth", ModelDecoder::default().into(), vec![("model", "momask"), ("decoder", "discord")]),
         (
@@ -154,6 +167,7 @@ fn models_of_tokens_draw_motions_as_all_others_do() {
     for (name, sampler) in [
         ("gpt", Sampler { steps: 1, guidance: 0.0, ..Sampler::default() }),
         ("smooth", Sampler { steps: 3, guidance: 1.0, ..Sampler::default() }),
+        ("mmm", Sampler { steps: 4, guidance: 0.0, ..Sampler::default() }),
         ("momask", Sampler { steps: 4, guidance: 2.0, ..Sampler::default() }),
     ] {
         let manifest = world.bench.manifest(world.outputs[name]).unwrap();
@@ -179,7 +193,7 @@ fn models_of_tokens_draw_motions_as_all_others_do() {
 fn p5_p6_kills_joins_and_losses_change_no_byte() {
     let whole = run(1, 1);
     for (name, settings, inputs) in chain(1) {
-        if !["plain", "residual", "gpt", "momask", "discord"].contains(&name) {
+        if !["plain", "residual", "gpt", "momask", "mmm", "discord"].contains(&name) {
             continue;
         }
         let inputs = whole.inputs(&inputs);

@@ -134,9 +134,15 @@ impl SplitAttention {
         kernels::dropout(self.proj.forward(attended), dropout)
     }
 
-    pub(super) fn cross(&self, x_bth: Tensor<3>, memory_bnh: Tensor<3>, dropout: &mut Dropout) -> Tensor<3> {
+    pub(super) fn cross(
+        &self,
+        x_bth: Tensor<3>,
+        memory_bnh: Tensor<3>,
+        mask: Option<&KeyMask>,
+        dropout: &mut Dropout,
+    ) -> Tensor<3> {
         let kv = Tensor::cat(vec![self.key.forward(memory_bnh.clone()), self.value.forward(memory_bnh)], 2);
-        let attended = kernels::cross_attention(self.query.forward(x_bth), kv, self.heads, None, dropout);
+        let attended = kernels::cross_attention(self.query.forward(x_bth), kv, self.heads, mask, dropout);
         kernels::dropout(self.proj.forward(attended), dropout)
     }
 }
@@ -239,9 +245,15 @@ impl CrossBlock {
         }
     }
 
-    pub(super) fn forward(&self, x_bth: Tensor<3>, words_bnh: Tensor<3>, dropout: &mut Dropout) -> Tensor<3> {
+    pub(super) fn forward(
+        &self,
+        x_bth: Tensor<3>,
+        words_bnh: Tensor<3>,
+        mask: Option<&KeyMask>,
+        dropout: &mut Dropout,
+    ) -> Tensor<3> {
         let words = self.ln3.forward(words_bnh, EPS);
-        let x = x_bth.clone() + self.attn.cross(self.ln1.forward(x_bth, EPS), words, dropout);
+        let x = x_bth.clone() + self.attn.cross(self.ln1.forward(x_bth, EPS), words, mask, dropout);
         let hidden = through(&self.mlp, self.ln2.forward(x.clone(), EPS), dropout);
         x + hidden
     }

@@ -1,7 +1,7 @@
 //! The masked token generator of MMM (Pinyoanuntapong et al., CVPR 2024).
 //!
 //! A token is its frozen code, or a learned row for end, pad and mask, through one Linear. Positions are added, the words of the caption are
-//! looked at (cross blocks, no mask on the words), the caption as a whole is put in front, positions are added again from its place on, so
+//! looked at (cross blocks; published without a mask on the words), the caption as a whole is put in front, positions are added again from its place on, so
 //! that a token carries two neighbouring rows of the table; then pre-norm blocks without a causal mask. Classes are the codes.
 //!
 //! Departs: the published state holds the frozen tokenizer, a learned position table that nothing reads, and masks; here the codes are an
@@ -95,6 +95,8 @@ pub struct MmmCondition {
     pub text_bc: Tensor<2>,
     /// Words [B, W, C].
     pub words_bnc: Tensor<3>,
+    /// Words of each caption, behind which nothing is looked at; `None` if all W count, as published, where W is always 77.
+    pub words: Option<Vec<usize>>,
 }
 
 impl Mmm {
@@ -130,7 +132,7 @@ impl Mmm {
         text_visible: Option<&[bool]>,
         dropout: &mut Dropout,
     ) -> Tensor<3> {
-        let MmmCondition { codes_kd, text_bc, words_bnc } = condition.clone();
+        let MmmCondition { codes_kd, text_bc, words_bnc, words } = condition.clone();
         let base = &self.trans_base;
         let (batch, device) = (text_bc.dims()[0], text_bc.device());
         let positions = ids.len() / batch;
@@ -138,8 +140,9 @@ impl Mmm {
         let x = base.to_emb.forward(rows_of(table, ids, batch));
         let width = x.dims()[2];
         let x = x + sinusoids(positions, width, &device);
+        let mask = words.map(|counts| KeyMask::new(&counts, 0));
         let words = base.word_emb.forward(words_bnc);
-        let x = base.cross_att.iter().fold(x, |x, block| block.forward(x, words.clone(), dropout));
+        let x = base.cross_att.iter().fold(x, |x, block| block.forward(x, words.clone(), mask.as_ref(), dropout));
         let condition = base.cond_emb.forward(text_bc).reshape([batch, 1, width]);
         let x = Tensor::cat(vec![condition, x], 1) + sinusoids(positions + 1, width, &device);
         let sight = match (visible, text_visible) {

@@ -32,6 +32,7 @@ impl Loaded {
             codes_kd: self.codes.tensor(&self.device),
             text_bc: io.get(&format!("{case}/sentence")).tensor(&self.device),
             words_bnc: io.get(&format!("{case}/words")).tensor(&self.device),
+            words: None,
         }
     }
 }

@@ -47,6 +47,7 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("network.text_feed_forward", Whole(1, 65_536), "channels"),
     ("guidance_dim", Whole(4, 16_384), "channels"),
     ("network.depth", Whole(1, 16), "blocks"),
+    ("network.word_blocks", Whole(0, 255), "blocks"),
     ("network.growth", Whole(1, 16), ""),
     ("network.condition", Whole(1, 16_384), "channels"),
     ("solver_steps", Whole(1, 1_000), "steps"),

@@ -188,7 +188,7 @@ impl<'a> Neighbours<'a> {
             Family::Lcm { .. } | Family::Pcm { .. } => {
                 ("a student", "a student has guidance built in, and cannot be asked without it")
             }
-            Family::Autoregressive | Family::Masked | Family::Features { .. } => {
+            Family::Autoregressive | Family::Masked | Family::Mmm | Family::Features { .. } => {
                 ("no latent diffusion", "only such a model gives latents to learn from")
             }
         };

@@ -55,11 +55,11 @@ impl Solver {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Sampler {
-    /// Network evaluations. A PCM student has as many as phases; a masked token generator fills in a motion in so many; an autoregressive
-    /// one takes no number of steps, so this is 1.
+    /// Network evaluations. A PCM student has as many as phases; a masked token generator fills in a motion in so many, MMM's the longest one,
+    /// in this many; an autoregressive one takes no number of steps, so this is 1.
     pub steps: usize,
     /// Teacher and masked token generator: g in `uncond + g (cond - uncond)`. Student: the embedded w, which is g - 1. An autoregressive
-    /// generator has none: 0.
+    /// generator and MMM's have none: 0.
     pub guidance: f64,
     /// LCM only: timesteps, first to last; empty takes evenly spaced points of the training grid from 999 down.
     pub timesteps: Vec<usize>,
@@ -134,6 +134,8 @@ pub enum Family {
     Autoregressive,
     /// Fills in all tokens at once, again and again, with classifier-free guidance.
     Masked,
+    /// The same as MMM does it: without guidance.
+    Mmm,
     /// Diffuses motion itself, without latents; classifier-free guidance.
     Features {
         /// Timesteps of its noise schedule.
@@ -149,10 +151,15 @@ impl Family {
         matches!(self, Self::Lcm { .. } | Self::Pcm { .. })
     }
 
+    /// Whether what it draws are tokens.
+    pub fn draws_tokens(&self) -> bool {
+        matches!(self, Self::Autoregressive | Self::Masked | Self::Mmm)
+    }
+
     /// What of `solver` it is that a model of this family draws with; `None` for one that it does not have.
     pub fn solver(&self, solver: Solver) -> Option<Solver> {
         match (self, solver) {
-            (Self::Lcm { .. } | Self::Pcm { .. } | Self::Autoregressive | Self::Masked, solver) => {
+            (Self::Lcm { .. } | Self::Pcm { .. } | Self::Autoregressive | Self::Masked | Self::Mmm, solver) => {
                 (solver == Solver::Own).then_some(Solver::Own)
             }
             (Self::Mld, Solver::Own) => Some(Solver::Ddim),
@@ -166,6 +173,10 @@ impl Family {
     /// What must hold of a sampler for a model of this family; `model` is what messages call it.
     pub(super) fn check(&self, model: &str, sampler: &Sampler, p: &mut Problems) {
         let steps = sampler.steps;
+        if matches!(self, Self::Autoregressive | Self::Mmm) && sampler.guidance != 0.0 {
+            let message = format!("`sampler.guidance` is {}, but {model} has none", sampler.guidance);
+            p.add("sampler.guidance", message, "write `guidance: 0`");
+        }
         if !sampler.timesteps.is_empty() && !matches!(self, Self::Lcm { .. }) {
             let message = format!("`sampler.timesteps` are for LCM students, and {model} is none");
             p.add("sampler.timesteps", message, "leave them out");
@@ -174,7 +185,9 @@ impl Family {
             let message = format!("`sampler.solver` is `{}`, which {model} does not have", sampler.solver.name());
             let help = match self {
                 Self::Mld => "take `ddim`, `dpm-solver` or `dpm-solver++`",
-                Self::Autoregressive | Self::Masked => "tokens are drawn, not solved for; leave the solver out",
+                Self::Autoregressive | Self::Masked | Self::Mmm => {
+                    "tokens are drawn, not solved for; leave the solver out"
+                }
                 _ => "a student draws by its own jumps; leave the solver out",
             };
             p.add("sampler.solver", message, help);
@@ -190,7 +203,7 @@ impl Family {
                 let points = TIMESTEPS / (*skip).max(1);
                 at_most(points, &format!("the grid of {model} has {points} points"));
             }
-            Self::Lcm { .. } | Self::Masked => {}
+            Self::Lcm { .. } | Self::Masked | Self::Mmm => {}
             Self::Features { timesteps, solver } => {
                 let solver = if sampler.solver == Solver::Own { *solver } else { sampler.solver };
                 // A deterministic path has one level more than moves.
@@ -199,10 +212,6 @@ impl Family {
             }
             Self::Autoregressive => {
                 at_most(1, &format!("{model} draws a token after the other until it ends"));
-                if sampler.guidance != 0.0 {
-                    let message = format!("`sampler.guidance` is {}, but {model} has none", sampler.guidance);
-                    p.add("sampler.guidance", message, "write `guidance: 0`");
-                }
             }
             Self::Pcm { phases, .. } if *phases == steps => {}
             Self::Pcm { phases, .. } => {
@@ -227,7 +236,7 @@ impl Family {
     }
 
     /// How the papers draw: a teacher with 50 steps at its published guidance, a student with as many steps as it has phases (an LCM with
-    /// one), at a third of the range of guidance scales that it was trained for; MoMask in ten steps at 4; MDM over all its timesteps and
+    /// one), at a third of the range of guidance scales that it was trained for; MoMask in ten steps at 4, MMM in ten; MDM over all its timesteps and
     /// StableMoFusion in ten steps, both at 2.5. The published range 5 to 15 gives w = 8.3, near
     /// MotionLCM's 7 to 12.5. For models that nobody has measured; a measured one has its own.
     pub fn published(&self) -> Sampler {
@@ -240,6 +249,7 @@ impl Family {
             Self::Mld => Sampler { steps: 50, guidance: 7.5, ..Sampler::default() },
             Self::Autoregressive => Sampler { steps: 1, guidance: 0.0, ..Sampler::default() },
             Self::Masked => Sampler { steps: 10, guidance: 4.0, ..Sampler::default() },
+            Self::Mmm => Sampler { steps: 10, guidance: 0.0, ..Sampler::default() },
             Self::Lcm { guidance, .. } => student(1, *guidance),
             Self::Pcm { guidance, phases, .. } => student(*phases, *guidance),
             Self::Features { timesteps, solver } => {
@@ -316,8 +326,10 @@ mod tests {
         assert_eq!(Family::Mld.accepts(&sampler(50, &[])), Ok(()));
         assert_eq!(lcm.accepts(&sampler(2, &[699, 299])), Ok(()));
         assert_eq!(pcm.accepts(&sampler(2, &[])), Ok(()));
-        assert!(Family::Autoregressive.accepts(&sampler(1, &[])).unwrap_err().contains("has none"));
-        for family in [Family::Mld, lcm, pcm, mdm, Family::Autoregressive, Family::Masked] {
+        for family in [Family::Autoregressive, Family::Mmm] {
+            assert!(family.accepts(&sampler(1, &[])).unwrap_err().contains("has none"), "{family:?}");
+        }
+        for family in [Family::Mld, lcm, pcm, mdm, Family::Autoregressive, Family::Masked, Family::Mmm] {
             assert_eq!(family.accepts(&family.published()), Ok(()), "{family:?}");
         }
     }

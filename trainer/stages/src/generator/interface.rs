@@ -12,7 +12,7 @@ use crate::text::TextEncoder;
 /// A caption as a generator wants it: what it asked its text encoder for.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Text {
-    /// The caption's one vector, or a vector for each of its tokens.
+    /// The caption's one vector, a vector for each of its tokens, or both, the caption's first.
     pub values: Vec<f32>,
 }
 

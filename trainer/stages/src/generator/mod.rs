@@ -7,6 +7,7 @@ mod feature_diffusion;
 mod interface;
 mod latent_diffusion;
 mod tokens;
+mod words;
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -25,6 +26,7 @@ pub(crate) use feature_diffusion::NAME as FEATURE_DIFFUSION;
 pub use interface::{Batch, Lap, LatentGenerator, MotionGenerator, Seeds, Text};
 pub(crate) use latent_diffusion::NAME as LATENT_DIFFUSION;
 pub(crate) use tokens::{GeneratorMeta, MASKED_PREFIX, NAME as TOKENS, RESIDUAL_PREFIX};
+pub(crate) use words::{codebook, with_words};
 
 /// Opens a generator with the parts of a model.
 type Open = fn(&Model, &dyn Blobs, &Device) -> Result<Box<dyn MotionGenerator>, StageError>;

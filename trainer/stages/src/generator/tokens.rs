@@ -1,30 +1,33 @@
-//! Token generators: a network draws ids for a caption, a tokenizer turns them into motion. Source: T2M-GPT, MoMask.
+//! Token generators: a network draws ids for a caption, a tokenizer turns them into motion. Source: T2M-GPT, MoMask, MMM.
 //!
-//! Parts: `generator`, `tokenizer`, `text`, and `decoder` if a flow decodes in the tokenizer's place. The generator reads a caption's one vector. An autoregressive one decides how long a motion is:
-//! what is asked for is not looked at; where it ends at once it gives a motion of the single id 1, as T2M-GPT's evaluation does.
+//! Parts: `generator`, `tokenizer`, `text`, and `decoder` if a flow decodes in the tokenizer's place. The generator reads a caption's one vector,
+//! MMM's also one for each word. An autoregressive one decides how long a motion is: what is asked for is not looked at; where it ends at once it gives a motion of the single id 1, as T2M-GPT's evaluation does.
 //!
 //! Layers above the first are drawn at guidance 5, as published for both datasets, whatever the sampler says of the first.
+//!
+//! Departs: MMM's published code ends early where a batch is one motion; here no motion depends on what it is drawn together with.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
 use checkpoint::model::{Model, Parts};
-use models::names::load;
-use models::networks::{Gpt, GptConfig, Init, MaskedTransformer, MomaskConfig, ResidualTransformer};
+use models::networks::{Gpt, GptConfig, Init, MaskedTransformer, Mmm, MmmConfig, MomaskConfig, ResidualTransformer};
 use models::tokens::autoregressive::{self, Draw};
 use models::tokens::masked::{self, Canvas, Sampling};
-use models::tokens::residual;
+use models::tokens::{mmm, residual};
 use protocol::artifact::Role;
 use protocol::stage::{DataFormat, Family, Positions, Sampler, TokenNetwork};
 use protocol::{ArtifactKind, Manifest, Seed};
 use serde::{Deserialize, Serialize};
 
+use super::words::{codebook, with_words};
 use super::{Batch, Lap, MotionGenerator, Seeds, Text};
-use crate::artifacts::{self, MODEL_FILE};
-use crate::context::{ContextError, StageError};
+use crate::artifacts;
+use crate::context::StageError;
 use crate::flow_decoder::FlowDecoder;
 use crate::parts;
 use crate::text::{self, TextEncoder};
 use crate::tokenizer::TrainedTokenizer;
+use crate::weights;
 
 /// Its name in manifests.
 pub(crate) const NAME: &str = "tokens";
@@ -85,6 +88,22 @@ impl GeneratorMeta {
         }
     }
 
+    /// Size of MMM's network, on codes of `code_dim` numbers.
+    pub(crate) fn mmm(&self, code_dim: usize) -> MmmConfig {
+        let TokenNetwork { width, layers, heads, feed_forward, word_blocks, .. } = self.network;
+        MmmConfig {
+            codes: self.codes,
+            dim: code_dim,
+            width,
+            heads,
+            layers,
+            local: word_blocks,
+            block: self.longest + 2,
+            text_dim: self.text_dim,
+            rate: feed_forward / width,
+        }
+    }
+
     /// Whether there are layers above the first.
     pub(crate) fn layered(&self) -> bool {
         self.quantizers > 1
@@ -96,6 +115,8 @@ impl GeneratorMeta {
 enum Network {
     Autoregressive(Box<Gpt>),
     Masked(Box<MaskedTransformer>, Option<Box<ResidualTransformer>>),
+    /// With the tokenizer's codes [K, d].
+    Mmm(Box<Mmm>, Tensor<2>),
 }
 
 #[derive(Debug)]
@@ -144,37 +165,41 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
         false => None,
     };
     let device = device.clone().inner();
-    let network = network(&meta, blobs, &manifest, &device)?;
+    let network = network(&meta, &tokenizer, blobs, &manifest, &device)?;
     Ok(Box::new(TokenModel { network, meta, tokenizer, decoder, text, device }))
 }
 
 fn network(
     meta: &GeneratorMeta,
+    tokenizer: &TrainedTokenizer,
     blobs: &dyn Blobs,
     manifest: &Manifest,
     device: &Device,
 ) -> Result<Network, StageError> {
-    let weights = artifacts::file(blobs, manifest, MODEL_FILE)?;
-    let misfit = |error: models::names::LoadError| {
-        StageError::Context(ContextError::Corrupt(format!("the token generator's weights: {error}")))
-    };
+    let what = "the token generator's weights";
     let mut init = Init::new(Seed(0), "blank", Positions::Uniform, device);
     match meta.family {
         Family::Autoregressive => {
-            let network = load(Gpt::new(&meta.gpt(), &mut init), &weights, "").map_err(misfit)?;
+            let network = weights::load(Gpt::new(&meta.gpt(), &mut init), blobs, manifest, what)?;
             Ok(Network::Autoregressive(Box::new(network)))
         }
         Family::Masked => {
             let config = meta.momask();
-            let first = load(MaskedTransformer::new(&config, &mut init), &weights, MASKED_PREFIX).map_err(misfit)?;
+            let fresh = MaskedTransformer::new(&config, &mut init);
+            let first = weights::load_under(fresh, blobs, manifest, MASKED_PREFIX, what)?;
             let above = match meta.layered() {
                 true => {
                     let fresh = ResidualTransformer::new(&config, true, &mut init);
-                    Some(Box::new(load(fresh, &weights, RESIDUAL_PREFIX).map_err(misfit)?))
+                    Some(Box::new(weights::load_under(fresh, blobs, manifest, RESIDUAL_PREFIX, what)?))
                 }
                 false => None,
             };
             Ok(Network::Masked(Box::new(first), above))
+        }
+        Family::Mmm => {
+            let fresh = Mmm::new(&meta.mmm(tokenizer.meta().code_dim), &mut init);
+            let network = weights::load(fresh, blobs, manifest, what)?;
+            Ok(Network::Mmm(Box::new(network), codebook(tokenizer, device)))
         }
         _ => Err(StageError::Input("the token generator's manifest says that it draws no tokens".into())),
     }
@@ -183,21 +208,47 @@ fn network(
 impl TokenModel {
     /// Ids `[tokens, Q]` of each motion.
     fn ids(&self, batch: Batch<'_>, sampler: &Sampler) -> Vec<Vec<i64>> {
-        let values = batch.texts.iter().flat_map(|text| text.values.iter().copied()).collect();
-        let shape = [batch.texts.len(), self.meta.text_dim];
-        let text = Tensor::<2>::from_data(TensorData::new(values, shape), &self.device);
+        let text = || {
+            let values = batch.texts.iter().flat_map(|text| text.values.iter().copied()).collect();
+            let shape = [batch.texts.len(), self.meta.text_dim];
+            Tensor::<2>::from_data(TensorData::new(values, shape), &self.device)
+        };
         match &self.network {
             Network::Autoregressive(network) => {
                 let mut fill = |step: usize, b: usize, out: &mut [f64]| {
                     let mut draw = (batch.seeds)(step, b);
                     out.iter_mut().for_each(|e| *e = -(1.0 - draw.uniform()).ln());
                 };
-                let ids = autoregressive::sample(network, &self.meta.gpt(), text, Draw::Categorical(&mut fill));
+                let ids = autoregressive::sample(network, &self.meta.gpt(), text(), Draw::Categorical(&mut fill));
                 let or_one = |ids: Vec<usize>| if ids.is_empty() { vec![1] } else { ids };
                 ids.into_iter().map(|ids| or_one(ids).into_iter().map(|id| id as i64).collect()).collect()
             }
-            Network::Masked(first, above) => self.filled_in((first, above.as_deref()), batch, sampler, text),
+            Network::Masked(first, above) => self.filled_in((first, above.as_deref()), batch, sampler, text()),
+            Network::Mmm(network, codes) => self.with_words((network, codes), batch, sampler),
         }
+    }
+
+    /// As MMM draws them.
+    fn with_words(
+        &self,
+        (network, codes_kd): (&Mmm, &Tensor<2>),
+        batch: Batch<'_>,
+        sampler: &Sampler,
+    ) -> Vec<Vec<i64>> {
+        let config = self.meta.mmm(codes_kd.dims()[1]);
+        let unit = self.tokenizer.unit();
+        let given: Vec<Vec<Option<usize>>> = batch.lengths.iter().map(|f| vec![None; f.div_ceil(unit)]).collect();
+        let rows: Vec<&[f32]> = batch.texts.iter().map(|text| &text.values[..]).collect();
+        let condition = with_words(codes_kd, &rows, self.meta.text_dim, &self.device);
+        let sampling =
+            mmm::Sampling { steps: sampler.steps, greedy: false, counts: mmm::Counts::Open, stops_alone: false };
+        let mut draws = |step: usize, b: usize, p: usize, out: &mut [f32]| {
+            let mut draw = (batch.seeds)(step * self.meta.longest + p, b);
+            out.iter_mut().for_each(|u| *u = draw.uniform() as f32);
+        };
+        let ids = mmm::sample(network, &config, &sampling, &condition, &given, &mut draws, |_| ());
+        let own = ids.chunks_exact(config.positions()).zip(&given);
+        own.map(|(ids, given)| ids[..given.len()].iter().map(|id| *id as i64).collect()).collect()
     }
 
     fn filled_in(
@@ -261,7 +312,12 @@ impl MotionGenerator for TokenModel {
 
     fn embed(&self, captions: &[&str]) -> Result<Vec<Text>, StageError> {
         let pooled = self.text.pooled(captions)?;
-        Ok(pooled.chunks_exact(self.text.dim()).map(|row| Text { values: row.to_vec() }).collect())
+        let pooled = pooled.chunks_exact(self.text.dim());
+        if self.meta.family != Family::Mmm {
+            return Ok(pooled.map(|row| Text { values: row.to_vec() }).collect());
+        }
+        let words = self.text.tokens(captions)?;
+        Ok(pooled.zip(words).map(|(row, words)| Text { values: [row, &words].concat() }).collect())
     }
 
     fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError> {

@@ -12,7 +12,6 @@ use models::flat;
 use models::flow::between;
 use models::kernels::Dropout;
 use models::losses;
-use models::names::to_bytes;
 use models::networks::Init;
 use motion::Stream;
 
@@ -22,11 +21,12 @@ use protocol::stage::{Positions, TrainDiscord};
 
 use super::token_windows::TokenWindows;
 use super::{Gang, dropout_seed, group, slice_result};
-use crate::artifacts::{self, MODEL_FILE, to_meta};
+use crate::artifacts::{self, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::flow_decoder::{Field, FlowMeta};
 use crate::tokenizer::TrainedTokenizer;
 use crate::train::{GroupPlan, Losses, Objective, Order, SliceResult, TrainState, Trained, train};
+use crate::weights;
 
 struct Flow {
     settings: TrainDiscord,
@@ -124,8 +124,8 @@ impl Gang for TrainDiscord {
         match train(&mut objective, &self.training, cx)? {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {
-                let bytes = to_bytes(&state.groups[0].entries, state.result(0));
-                let output = artifacts::publish(cx, ArtifactKind::FlowDecoder, to_meta(&meta), MODEL_FILE, bytes)?;
+                let trained = (&state.groups[0].entries[..], state.result(0));
+                let output = weights::publish(cx, ArtifactKind::FlowDecoder, to_meta(&meta), trained)?;
                 Ok(Outcome::Finished { output, metrics })
             }
         }

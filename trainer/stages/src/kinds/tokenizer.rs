@@ -22,12 +22,10 @@ use models::networks::{Init, Tokenizer};
 use models::quantizer::{Book, Pass, candidates, perplexity};
 use motion::Stream;
 use motion::random::permutation;
-use protocol::ArtifactKind;
 use protocol::stage::{Positions, Resets, TrainTokenizer};
 
 use super::token_windows::TokenWindows;
 use super::{Gang, dropout_seed, group, slice_result};
-use crate::artifacts::{self, MODEL_FILE, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::tokenizer::TokenizerMeta;
 use crate::train::{
@@ -321,8 +319,7 @@ impl Gang for TrainTokenizer {
             Trained::Finished { state, metrics } => {
                 let names: Vec<String> = (0..self.quantizers).map(|q| of("codebook", q)).collect();
                 let books: Vec<&[f32]> = names.iter().map(|name| state.buffers.get(name)).collect();
-                let bytes = meta.to_bytes(&state.groups[0].entries, state.result(0), &books);
-                let output = artifacts::publish(cx, ArtifactKind::Tokenizer, to_meta(&meta), MODEL_FILE, bytes)?;
+                let output = meta.publish(cx, (&state.groups[0].entries, state.result(0)), &books)?;
                 Ok(Outcome::Finished { output, metrics })
             }
         }

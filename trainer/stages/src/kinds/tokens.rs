@@ -1,7 +1,7 @@
-//! `train.tokens`: a network that draws token ids for captions. Source: T2M-GPT (Zhang et al., CVPR 2023), MoMask (Guo et al., CVPR 2024).
+//! `train.tokens`: a network that draws token ids for captions. Source: T2M-GPT (Zhang et al., CVPR 2023), MoMask (Guo et al., CVPR 2024),
+//! MMM (Pinyoanuntapong et al., CVPR 2024), whose objective is in `mmm`.
 //!
-//! Autoregressive: cross-entropy over tokens and end, on inputs of which a share is replaced by random codes; with probability 1/3 a clip
-//! misses its first or its last token. Masked: cross-entropy over a share of the first layer's tokens that a cosine of a uniform draw gives,
+//! Autoregressive: cross-entropy over tokens and end, on inputs of which a share is replaced by random codes. Masked: cross-entropy over a share of the first layer's tokens that a cosine of a uniform draw gives,
 //! and, for the layers above, over all tokens of a drawn layer given those below it. Its two networks are two groups of one training.
 //!
 //! Departs: both of MoMask's networks are trained on one batch, the one of the residual layers not from another stage; clips are shortened by
@@ -9,86 +9,26 @@
 
 use std::collections::BTreeMap;
 
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Tensor};
 use checkpoint::model::Parts;
 use models::flat::{self, Entry};
 use models::kernels::Dropout;
-use models::names::to_bytes;
 use models::networks::{Gpt, GptConfig, Init, MaskedTransformer, MomaskConfig, ResidualTransformer};
 use models::tokens::{autoregressive, cross_entropy, masked, residual};
-use motion::Stream;
 use motion::dataset::Split;
 use protocol::artifact::Role;
 use protocol::stage::{Positions, StageSpec, TokenGenerator, TrainTokens};
-use protocol::{ArtifactKind, Manifest, Seed};
+use protocol::{ArtifactKind, Manifest};
 
+use super::mmm::WithWords;
+use super::token_data::{TokenData, uniforms};
 use super::{Gang, dropout_seed, group, no_clips, slice_gradient, slice_result};
-use crate::artifacts::{self, Draft, Embeddings, MODEL_FILE, to_meta};
+use crate::artifacts::{self, Draft, Embeddings, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::generator::{GeneratorMeta, MASKED_PREFIX, RESIDUAL_PREFIX, TOKENS};
-use crate::parts;
 use crate::tokenizer::Tokens;
 use crate::train::{GroupPlan, Losses, Objective, Order, Pick, SliceResult, TrainState, Trained, train};
-
-/// Tokens and captions of the training split.
-struct TokenData {
-    tokens: Tokens,
-    embeddings: Embeddings,
-    train: Vec<usize>,
-    order: Order,
-    seed: Seed,
-    purpose: String,
-    longest: usize,
-}
-
-impl TokenData {
-    fn stream(&self, what: &str, pick: Pick) -> Stream {
-        Stream::new(self.seed, &format!("{}/{what}", self.purpose), pick.place, 0)
-    }
-
-    fn batch(&mut self, step: u64) -> Vec<Pick> {
-        self.order.batch(step, |_| 0)
-    }
-
-    /// Ids `[tokens, Q]` of the clip at a place, at most the longest.
-    fn ids(&self, pick: Pick) -> &[i64] {
-        let (q, mut draw) = (self.tokens.meta.quantizers, self.stream("clip", pick));
-        let all = self.tokens.of(self.train[pick.example]);
-        let len = all.len() / q;
-        let (mut start, mut kept) = (0, len);
-        if len > self.longest {
-            (start, kept) = (draw.below(len - self.longest + 1), self.longest);
-        } else if len > 1 && draw.below(3) == 0 {
-            (start, kept) = (draw.below(2), len - 1);
-        }
-        &all[start * q..(start + kept) * q]
-    }
-
-    /// Tokens of layer `layer` of the clip at a place.
-    fn layer(&self, pick: Pick, layer: usize) -> Vec<usize> {
-        self.ids(pick).iter().skip(layer).step_by(self.tokens.meta.quantizers).map(|id| *id as usize).collect()
-    }
-
-    /// Caption embeddings [B, C]; that of a clip is zeros with probability `drop`.
-    fn text(&self, picks: &[Pick], drop: f64, what: &str, device: &Device) -> Tensor<2> {
-        let width = self.embeddings.meta.dim;
-        let mut values = Vec::with_capacity(picks.len() * width);
-        for pick in picks {
-            let captions = &self.tokens.meta.captions[self.train[pick.example]];
-            let caption = captions[self.stream("caption", *pick).below(captions.len())];
-            match self.stream(what, *pick).uniform() < drop {
-                true => values.resize(values.len() + width, 0.0),
-                false => values.extend_from_slice(self.embeddings.captions.row(caption)),
-            }
-        }
-        Tensor::from_data(TensorData::new(values, [picks.len(), width]), device)
-    }
-}
-
-/// So many uniform draws.
-fn uniforms(draw: &mut Stream, count: usize) -> Vec<f32> {
-    (0..count).map(|_| draw.uniform() as f32).collect()
-}
+use crate::{parts, weights};
 
 struct Autoregressive {
     settings: TrainTokens,
@@ -289,10 +229,10 @@ impl Inputs {
                 "a masked generator needs a tokenizer of one codebook, or of at least 3; this one has 2".into(),
             ));
         }
-        if settings.generator == TokenGenerator::Autoregressive && quantizers > 1 {
+        if settings.generator != TokenGenerator::Masked && quantizers > 1 {
             return Err(StageError::Input(format!(
-                "an autoregressive generator draws the tokens of one codebook, and the tokenizer has {quantizers}; train one with \
-                 `quantizers: 1`, or write `generator: masked`"
+                "this generator draws the tokens of one codebook, and the tokenizer has {quantizers}; train one with `quantizers: 1`, or \
+                 write `generator: masked`"
             )));
         }
         let usable = |e: &usize| tokens.meta.splits[*e] == Split::Train && tokens.meta.lengths[*e] > 0;
@@ -322,13 +262,14 @@ fn prefixed(prefix: &str, entries: &[Entry]) -> Vec<Entry> {
     entries.iter().map(|e| Entry { name: format!("{prefix}{}", e.name), shape: e.shape.clone() }).collect()
 }
 
-/// Names and values of what was trained.
-fn weights(state: &TrainState) -> Vec<u8> {
+/// Uploads what was trained, under names that say of which network it is.
+fn add_weights(draft: &mut Draft, state: &TrainState) -> Result<(), StageError> {
     let prefixes: &[&str] = if state.groups[0].name == "model" { &[""] } else { &[MASKED_PREFIX, RESIDUAL_PREFIX] };
-    let entries: Vec<Entry> =
-        state.groups.iter().zip(prefixes).flat_map(|(group, prefix)| prefixed(prefix, &group.entries)).collect();
-    let values: Vec<f32> = (0..state.groups.len()).flat_map(|i| state.result(i).iter().copied()).collect();
-    to_bytes(&entries, &values)
+    let entries: Vec<Vec<Entry>> =
+        state.groups.iter().zip(prefixes).map(|(group, prefix)| prefixed(prefix, &group.entries)).collect();
+    let buffers: Vec<(&[Entry], &[f32])> =
+        entries.iter().enumerate().map(|(i, entries)| (&entries[..], state.result(i))).collect();
+    weights::add_all(draft, &buffers)
 }
 
 impl Gang for TrainTokens {
@@ -349,12 +290,13 @@ impl Gang for TrainTokens {
                 let above = meta.layered().then(|| ResidualTransformer::new(&config, true, &mut init));
                 Box::new(Masked { settings: self.clone(), config, data, first, above, dropout_seed, device })
             }
+            TokenGenerator::Mmm => Box::new(WithWords::new(self, data, &meta, cx, &mut init)?),
         };
         match train(&mut *objective, &self.training, cx)? {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {
                 let mut generator = Draft::new(cx, ArtifactKind::TokenGenerator, to_meta(&meta));
-                generator.add(MODEL_FILE, weights(&state))?;
+                add_weights(&mut generator, &state)?;
                 parts.insert(Role::GENERATOR, generator.into_manifest());
                 let output = parts::publish_model(cx, TOKENS, format, &parts)?;
                 Ok(Outcome::Finished { output, metrics })

@@ -88,8 +88,13 @@ impl StageSpec for EvaluateLatentFid {
                 p.add("components", message, "");
             }
         }
-        if matches!(stages.family(&self.model), Some(Family::Features { .. })) {
-            let message = format!("`{}` diffuses motion itself and has no latents", self.model);
+        let without = match stages.family(&self.model) {
+            Some(Family::Features { .. }) => Some("diffuses motion itself"),
+            Some(family) if family.draws_tokens() => Some("draws tokens"),
+            _ => None,
+        };
+        if let Some(how) = without {
+            let message = format!("`{}` {how} and has no latents", self.model);
             p.add("model", message, "measure it with `evaluate.t2m`");
         }
         stages.check_sampler(p, &self.model, &self.sampler);

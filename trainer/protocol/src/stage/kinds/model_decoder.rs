@@ -4,7 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
-use crate::stage::{Family, Neighbours, Output, Problems, Ref, Shape, StageSpec};
+use crate::stage::{Neighbours, Output, Problems, Ref, Shape, StageSpec};
 
 /// `model.decoder`: draws tokens as another model does, and decodes them along a flow.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -36,7 +36,7 @@ impl StageSpec for ModelDecoder {
 
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
         let (model, decoder) = (&self.model, &self.decoder);
-        if stages.family(model).is_some_and(|family| !matches!(family, Family::Autoregressive | Family::Masked)) {
+        if stages.family(model).is_some_and(|family| !family.draws_tokens()) {
             let message = format!("`{model}` draws no tokens, and `{decoder}` decodes nothing else");
             p.add("model", message, "name a `train.tokens` stage");
         }

@@ -1,4 +1,4 @@
-//! `train.tokens`: generators of tokens: autoregressive (T2M-GPT), masked with residual layers (MoMask).
+//! `train.tokens`: generators of tokens: autoregressive (T2M-GPT), masked with residual layers (MoMask), masked with words (MMM).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -17,29 +17,33 @@ pub enum TokenGenerator {
     Autoregressive,
     /// All at once, again and again; then the layers above the first (MoMask).
     Masked,
+    /// All at once, again and again, by a network that looks at the caption's words, without guidance (MMM).
+    Mmm,
 }
 
-/// Size of a token generator. The default is T2M-GPT's; MoMask's two networks have 384, 8, 6, 1024, 0.2 and 512.
+/// Size of a token generator. The default is T2M-GPT's, and MMM's; MoMask's two networks have 384, 8, 6, 1024, 0.2 and 512.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct TokenNetwork {
     /// Width H.
     pub width: usize,
-    /// Blocks: of each half of T2M-GPT's, of each of MoMask's two networks.
+    /// Blocks: of each half of T2M-GPT's and MMM's, of each of MoMask's two networks.
     pub layers: usize,
     /// Attention heads; divides `width`.
     pub heads: usize,
-    /// Width of the feed-forward layer; T2M-GPT's is a multiple of `width`.
+    /// Width of the feed-forward layer; T2M-GPT's and MMM's are a multiple of `width`.
     pub feed_forward: usize,
     /// Dropout probability.
     pub dropout: f64,
-    /// Width of MoMask's token embeddings; T2M-GPT's are as wide as the network.
+    /// Width of MoMask's token embeddings; T2M-GPT's are as wide as the network, MMM's are the tokenizer's codes.
     pub embedding: usize,
+    /// MMM: blocks, counted among `layers` of the first half, that look at the caption's words.
+    pub word_blocks: usize,
 }
 
 impl Default for TokenNetwork {
     fn default() -> Self {
-        Self { width: 1024, layers: 9, heads: 16, feed_forward: 4096, dropout: 0.1, embedding: 512 }
+        Self { width: 1024, layers: 9, heads: 16, feed_forward: 4096, dropout: 0.1, embedding: 512, word_blocks: 2 }
     }
 }
 
@@ -79,17 +83,19 @@ pub struct TrainTokens {
     pub tokenizer: String,
     /// Stage that gives the caption embeddings.
     pub text: String,
+    /// MMM: stage that gives the clips of the tokens, whose captions are read word by word.
+    pub dataset: String,
     /// How tokens are generated.
     pub generator: TokenGenerator,
     /// Size.
     pub network: TokenNetwork,
     /// Tokens of the longest motion; of longer ones a drawn part is learned.
     pub longest: usize,
-    /// Autoregressive: probability that the network sees another code instead of a token.
+    /// Autoregressive and MMM: probability that the network sees another code instead of a token.
     pub corruption: f64,
     /// Masked: probability that the first layer's network sees no caption; half of what the other one has, 0.1 and 0.2 as published.
     pub guidance_dropout: f64,
-    /// The rest. Published: T2M-GPT 300,000 steps whose rate falls once, at half of them; here it follows a cosine.
+    /// The rest. Published: T2M-GPT and MMM 300,000 steps whose rate, 1e-4 and 2e-4, falls once, at half of them; here it follows a cosine.
     #[serde(flatten)]
     pub training: Training,
 }
@@ -100,6 +106,7 @@ impl Default for TrainTokens {
             tokens: "tokens".into(),
             tokenizer: "tokenizer".into(),
             text: "text".into(),
+            dataset: "dataset".into(),
             generator: TokenGenerator::Autoregressive,
             network: TokenNetwork::default(),
             longest: 49,
@@ -125,10 +132,12 @@ impl StageSpec for TrainTokens {
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
 
     fn refs(&mut self) -> Vec<Ref<'_>> {
+        let words = self.generator == TokenGenerator::Mmm;
         vec![
             Ref::stage("tokens", &mut self.tokens, ArtifactKind::Tokens),
             Ref::stage("tokenizer", &mut self.tokenizer, ArtifactKind::Tokenizer),
             Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
+            Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset).only_if(words),
         ]
     }
 
@@ -141,12 +150,16 @@ impl StageSpec for TrainTokens {
             p.add("guidance_dropout", message, "the network of the layers above the first has twice as much");
         }
         p.fraction("guidance_dropout", self.guidance_dropout, false);
-        let TokenNetwork { width, feed_forward, .. } = self.network;
-        if self.generator == TokenGenerator::Autoregressive && width > 0 && !feed_forward.is_multiple_of(width) {
+        let TokenNetwork { width, layers, feed_forward, word_blocks, .. } = self.network;
+        if self.generator != TokenGenerator::Masked && width > 0 && !feed_forward.is_multiple_of(width) {
             let message = format!(
                 "`network.feed_forward` is {feed_forward}, no multiple of `network.width`, {width}; expected one"
             );
             p.add("network.feed_forward", message, "published: four times the width");
+        }
+        if self.generator == TokenGenerator::Mmm && word_blocks > layers {
+            let message = format!("`network.word_blocks` is {word_blocks}, of `network.layers`, {layers}");
+            p.add("network.word_blocks", message, "expected at most as many; published: 2 of 9");
         }
         self.training.check(p);
     }
@@ -164,13 +177,16 @@ impl StageSpec for TrainTokens {
             );
         }
         stages.same_data(p, &self.tokens, &self.text);
+        if self.generator == TokenGenerator::Mmm {
+            stages.same_clips(p, &self.dataset, &self.tokens);
+        }
         let quantizers =
             stages.stage(&self.tokenizer).and_then(|stage| stage.get::<TrainTokenizer>()).map(|t| t.quantizers);
         let tokenizer = &self.tokenizer;
         match (self.generator, quantizers) {
-            (TokenGenerator::Autoregressive, Some(many)) if many > 1 => {
-                let message =
-                    format!("`generator` is `autoregressive`, but `{tokenizer}` has {many} codebooks; expected 1");
+            (TokenGenerator::Autoregressive | TokenGenerator::Mmm, Some(many)) if many > 1 => {
+                let word = if self.generator == TokenGenerator::Mmm { "mmm" } else { "autoregressive" };
+                let message = format!("`generator` is `{word}`, but `{tokenizer}` has {many} codebooks; expected 1");
                 p.add("generator", message, "write `generator: masked`, or `quantizers: 1` at the tokenizer");
             }
             (TokenGenerator::Masked, Some(2)) => {
@@ -190,6 +206,7 @@ impl StageSpec for TrainTokens {
         Some(match self.generator {
             TokenGenerator::Autoregressive => Family::Autoregressive,
             TokenGenerator::Masked => Family::Masked,
+            TokenGenerator::Mmm => Family::Mmm,
         })
     }
 }

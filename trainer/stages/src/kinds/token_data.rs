@@ -1,0 +1,77 @@
+//! Examples of what draws tokens: a clip's ids, one of its captions, and keyed draws about them.
+//!
+//! With probability 1/3 a clip misses its first or its last token, as T2M-GPT, MMM and, in frames, MoMask have it.
+
+use burn::tensor::{Device, Tensor, TensorData};
+use motion::Stream;
+use protocol::Seed;
+
+use crate::artifacts::Embeddings;
+use crate::tokenizer::Tokens;
+use crate::train::{Order, Pick};
+
+/// Tokens and captions of the training split.
+pub(super) struct TokenData {
+    pub(super) tokens: Tokens,
+    pub(super) embeddings: Embeddings,
+    /// Entries of the split that have tokens.
+    pub(super) train: Vec<usize>,
+    pub(super) order: Order,
+    pub(super) seed: Seed,
+    pub(super) purpose: String,
+    /// Tokens of the longest example.
+    pub(super) longest: usize,
+}
+
+impl TokenData {
+    pub(super) fn stream(&self, what: &str, pick: Pick) -> Stream {
+        Stream::new(self.seed, &format!("{}/{what}", self.purpose), pick.place, 0)
+    }
+
+    pub(super) fn batch(&mut self, step: u64) -> Vec<Pick> {
+        self.order.batch(step, |_| 0)
+    }
+
+    /// Ids `[tokens, Q]` of the clip at a place, at most the longest.
+    pub(super) fn ids(&self, pick: Pick) -> &[i64] {
+        let (q, mut draw) = (self.tokens.meta.quantizers, self.stream("clip", pick));
+        let all = self.tokens.of(self.train[pick.example]);
+        let len = all.len() / q;
+        let (mut start, mut kept) = (0, len);
+        if len > self.longest {
+            (start, kept) = (draw.below(len - self.longest + 1), self.longest);
+        } else if len > 1 && draw.below(3) == 0 {
+            (start, kept) = (draw.below(2), len - 1);
+        }
+        &all[start * q..(start + kept) * q]
+    }
+
+    /// Tokens of layer `layer` of the clip at a place.
+    pub(super) fn layer(&self, pick: Pick, layer: usize) -> Vec<usize> {
+        self.ids(pick).iter().skip(layer).step_by(self.tokens.meta.quantizers).map(|id| *id as usize).collect()
+    }
+
+    /// The caption of the clip at a place, by number.
+    pub(super) fn caption(&self, pick: Pick) -> usize {
+        let captions = &self.tokens.meta.captions[self.train[pick.example]];
+        captions[self.stream("caption", pick).below(captions.len())]
+    }
+
+    /// Caption embeddings [B, C]; that of a clip is zeros with probability `drop`.
+    pub(super) fn text(&self, picks: &[Pick], drop: f64, what: &str, device: &Device) -> Tensor<2> {
+        let width = self.embeddings.meta.dim;
+        let mut values = Vec::with_capacity(picks.len() * width);
+        for pick in picks {
+            match self.stream(what, *pick).uniform() < drop {
+                true => values.resize(values.len() + width, 0.0),
+                false => values.extend_from_slice(self.embeddings.captions.row(self.caption(*pick))),
+            }
+        }
+        Tensor::from_data(TensorData::new(values, [picks.len(), width]), device)
+    }
+}
+
+/// So many uniform draws.
+pub(super) fn uniforms(draw: &mut Stream, count: usize) -> Vec<f32> {
+    (0..count).map(|_| draw.uniform() as f32).collect()
+}
