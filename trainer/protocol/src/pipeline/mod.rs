@@ -33,3 +33,5 @@ mod range_tests;
 mod sweep_tests;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod token_tests;

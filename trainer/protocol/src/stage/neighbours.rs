@@ -104,7 +104,8 @@ impl<'a> Neighbours<'a> {
     /// The skeleton of a dataset, of a model's motions, or the one that an evaluator is for.
     pub fn format(&self, name: &str) -> Option<DataFormat> {
         self.stage(name)?.format().or_else(|| {
-            let tokens = || self.read_by(name, ArtifactKind::Tokens);
+            let of = |kind| self.read_by(name, kind);
+            let tokens = || of(ArtifactKind::Tokens).or_else(|| of(ArtifactKind::Model));
             let from = self.dataset_of(name).or_else(|| self.vae_of_model(name)).or_else(tokens)?;
             if from == name { None } else { self.format(from) }
         })
@@ -165,6 +166,30 @@ impl<'a> Neighbours<'a> {
         }
     }
 
+    /// Refuses clips of another skeleton than what stage `name`, which `field` names, is for.
+    pub(crate) fn same_skeleton(&self, p: &mut Problems, (field, name): (&str, &str), dataset: &str) {
+        if let (Some(ours), Some(theirs)) = (self.format(dataset), self.format(name))
+            && ours != theirs
+        {
+            let message = format!(
+                "`{name}` is for skeletons of {}, but the clips of `{dataset}` have {}",
+                theirs.skeleton(),
+                ours.skeleton()
+            );
+            p.add(field, message, "features of one skeleton mean nothing on another; name stages of one data set");
+        }
+    }
+
+    /// Refuses a decoder, or tokens, of another tokenizer than `tokenizer`; `field` names the stage `name` that gives them.
+    pub(crate) fn same_codes(&self, p: &mut Problems, (field, name): (&str, &str), tokenizer: &str) {
+        if let Some(other) = self.read_by(name, ArtifactKind::Tokenizer)
+            && other != tokenizer
+        {
+            let message = format!("`{name}` reads the codes of `{other}`, but the tokens are of `{tokenizer}`");
+            p.add(field, message, "tokens of another codebook mean other motions; train both on one tokenizer");
+        }
+    }
+
     /// Refuses captions of other clips than those of `dataset`.
     pub(crate) fn same_captions(&self, p: &mut Problems, text: &str, dataset: &str) {
         if let Some(data) = self.dataset_of(text)
@@ -178,6 +203,11 @@ impl<'a> Neighbours<'a> {
     /// The evaluator against whose embeddings a model was trained, if there is one.
     pub(crate) fn evaluator_of_model(&self, model: &str) -> Option<&str> {
         self.of_model(model, &|name| self.read_by(name, ArtifactKind::Evaluator))
+    }
+
+    /// Which tokenizer's codes a model draws.
+    pub(crate) fn tokenizer_of_model(&self, model: &str) -> Option<&str> {
+        self.of_model(model, &|name| self.read_by(name, ArtifactKind::Tokenizer))
     }
 
     /// Refuses anything but a latent teacher where one is needed.

@@ -4,7 +4,9 @@
 //! number depends on the sharding. Metrics without a prefix are of a sample z of the posterior, as every later stage uses it; `mu_` of the
 //! posterior's mean (a tokenizer has none, and no sample: it decodes what it encodes); `clip_mean_` of no network at all: the clip's own
 //! mean feature vector, held; `real_` of the clip itself.
-//! Of a tokenizer also, as means over its codebooks, the share of codes in `used` and the `perplexity` of all clips' codes.
+//! Of a tokenizer also, as means over its codebooks, the share of codes in `used` and the `perplexity` of all clips' codes. With an evaluator
+//! also `fid`, of the reconstructions against the clips, each embedded alone; the papers' is of crops of at most 196 frames, drawn anew in
+//! each of 20 repeats.
 //! Definitions: [`evaluation::reconstruction`](crate::evaluation::reconstruction).
 
 use std::collections::BTreeMap;
@@ -13,16 +15,24 @@ use motion::{Skeleton, Stream};
 use protocol::stage::{DataFormat, EvaluateReconstruction};
 use protocol::{ArtifactKind, Digest};
 use serde::{Deserialize, Serialize};
+use serde_json::json;
 
 use super::encode::shard_range;
-use super::{Map, REPORT_FILE, no_entries, publish_report};
-use crate::artifacts::{self, to_meta};
+use super::{Map, REPORT_FILE, no_entries};
+use crate::artifacts::{self, Draft, Tensors, to_meta};
 use crate::context::{AttemptContext, ContextError, Outcome, StageError};
+use crate::evaluation::frechet::{Gaussian, to_f64};
 use crate::evaluation::joints::time_mean;
 use crate::evaluation::reconstruction::{ClipErrors, real_skating, summary};
+use crate::evaluator::TrainedEvaluator;
 use crate::flow_decoder::FlowDecoder;
 use crate::networks::Autoencoder;
 use crate::tokenizer::TrainedTokenizer;
+
+/// Below this many clips a dimension, FID's covariances say little.
+const FEW: usize = 5;
+/// Where a shard's embeddings are: `real` and `made` `[clips, width]`.
+const EMBEDDINGS_FILE: &str = "embeddings.safetensors";
 
 /// Errors of the three guesses at one clip.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -91,6 +101,13 @@ impl Measured {
         }
     }
 
+    fn denormalise(&self, rows: &mut [f32]) {
+        match self {
+            Self::Vae(vae) => vae.denormalise(rows),
+            Self::Tokenizer(tokenizer, _) => tokenizer.denormalise(rows),
+        }
+    }
+
     /// Guesses at normalised rows `[frames, D]`: as later stages see them, and of the posterior's mean. Adds to `codes` those taken.
     fn guesses(
         &self,
@@ -128,6 +145,53 @@ impl Measured {
     }
 }
 
+/// Embeddings of clips and of what was made of them, one after the other.
+#[derive(Default)]
+struct Embedded {
+    real: Vec<f32>,
+    made: Vec<f32>,
+}
+
+impl Embedded {
+    /// Adds a clip and its reconstruction, both rows in the data's own scale.
+    fn add(&mut self, evaluator: &TrainedEvaluator, real: Vec<f32>, made: Vec<f32>) {
+        self.real.extend(evaluator.motions(&[real]));
+        self.made.extend(evaluator.motions(&[made]));
+    }
+
+    fn to_bytes(&self, width: usize) -> Result<Vec<u8>, StageError> {
+        let rows = |values: &[f32]| [values.len() / width, width];
+        let tensors = Tensors::default().with("real", rows(&self.real), self.real.clone());
+        tensors.with("made", rows(&self.made), self.made.clone()).to_bytes()
+    }
+
+    /// Of all shards.
+    fn gather(cx: &dyn AttemptContext, shards: &[Digest]) -> Result<Self, StageError> {
+        let mut all = Self::default();
+        for digest in shards {
+            let bytes = artifacts::mapped(&*cx.blobs(), &cx.manifest(*digest)?, EMBEDDINGS_FILE)?;
+            let mut tensors = Tensors::from_bytes(bytes, EMBEDDINGS_FILE)?;
+            all.real.extend_from_slice(&tensors.take("real", 2, EMBEDDINGS_FILE)?.values);
+            all.made.extend_from_slice(&tensors.take("made", 2, EMBEDDINGS_FILE)?.values);
+        }
+        Ok(all)
+    }
+
+    fn fid(&self, width: usize) -> f64 {
+        let fit = |values: &[f32]| Gaussian::fit(&to_f64(values), width);
+        fit(&self.real).distance(&fit(&self.made)).max(0.0)
+    }
+}
+
+/// The evaluator that FID is taken with, if one is named.
+fn evaluator(cx: &dyn AttemptContext, name: &str) -> Result<Option<(Digest, TrainedEvaluator)>, StageError> {
+    if name.is_empty() {
+        return Ok(None);
+    }
+    let (digest, manifest) = artifacts::input(cx, "evaluator", ArtifactKind::Evaluator)?;
+    Ok(Some((digest, TrainedEvaluator::read(&*cx.blobs(), &manifest, &cx.device())?)))
+}
+
 /// Share of codes in use and their perplexity, each a mean over the codebooks.
 fn usage(codes: &[Vec<u64>]) -> Vec<(String, f64)> {
     if codes.is_empty() {
@@ -153,6 +217,16 @@ impl Map for EvaluateReconstruction {
         if entries.is_empty() {
             return Err(no_entries(self.split));
         }
+        let evaluator = evaluator(cx, &self.evaluator)?;
+        if let Some((_, evaluator)) = &evaluator {
+            evaluator.check(&dataset, &entries)?;
+            if entries.len() < 2 {
+                return Err(StageError::Input(
+                    "FID needs at least 2 clips, the split has 1; leave `evaluator` out".into(),
+                ));
+            }
+        }
+        let mut embedded = Embedded::default();
 
         let range = shard_range(entries.len(), index, of);
         let total = range.len() as u64;
@@ -176,9 +250,15 @@ impl Map for EvaluateReconstruction {
                     tokenizer.unit()
                 )));
             }
+            let natural = truth.clone();
             measured.normalise(&mut truth);
             let mut stream = Stream::new(seed, "evaluate.reconstruction/noise", 0, e as u64);
             let (sample, mu) = measured.guesses(&truth, frames, &mut stream, &mut codes);
+            if let Some((_, evaluator)) = &evaluator {
+                let mut made = sample.clone();
+                measured.denormalise(&mut made);
+                embedded.add(evaluator, natural, made);
+            }
             let errors = |guess: &[f32]| ClipErrors::between(&truth, guess, mean, std, skeleton);
             rows.push(Row {
                 entry: entry.id.clone(),
@@ -191,8 +271,12 @@ impl Map for EvaluateReconstruction {
         }
         let rows = Rows { format: dataset.format, rows, codes };
         let bytes = serde_json::to_vec(&rows).map_err(|e| StageError::Fault(e.to_string()))?;
-        let meta = serde_json::json!({"shard": index, "of": of});
-        let output = artifacts::publish(cx, ArtifactKind::Shard, meta, REPORT_FILE, bytes)?;
+        let mut draft = Draft::new(cx, ArtifactKind::Shard, json!({"shard": index, "of": of}));
+        draft.add(REPORT_FILE, bytes)?;
+        if let Some((_, evaluator)) = &evaluator {
+            draft.add(EMBEDDINGS_FILE, embedded.to_bytes(evaluator.width())?)?;
+        }
+        let output = draft.finish(cx)?;
         Ok(Outcome::Finished { output, metrics: BTreeMap::new() })
     }
 
@@ -227,11 +311,27 @@ impl Map for EvaluateReconstruction {
         metrics.extend(summary(&column(|r| r.clip_mean), skeleton, "clip_mean_"));
         let skating = rows.iter().map(|row| row.real_skating).sum::<f64>() / rows.len() as f64;
         metrics.insert("real_skating_ratio".into(), skating);
+        let mut meta = json!({"kind": cx.task().settings.kind()});
+        if let Some((digest, evaluator)) = evaluator(cx, &self.evaluator)? {
+            let width = evaluator.width();
+            metrics.insert("fid".into(), Embedded::gather(cx, shards)?.fid(width));
+            meta["evaluator"] = to_meta(&digest);
+            meta["words"] = to_meta(&evaluator.meta().words);
+            if rows.len() < FEW * width {
+                cx.log(&format!(
+                    "FID is taken of {} clips in {width} dimensions; it compares only with FIDs of as many in the same evaluator",
+                    rows.len()
+                ));
+            }
+        }
         if metrics.values().any(|v| !v.is_finite()) {
             return Err(StageError::Input(
                 "the reconstructions are not finite; what made them has not been trained well".into(),
             ));
         }
-        publish_report(cx, metrics, to_meta(&rows))
+        meta["metrics"] = json!(metrics);
+        let bytes = protocol::canonical::to_bytes(&json!({"metrics": metrics, "details": rows}));
+        let output = artifacts::publish(cx, ArtifactKind::Report, meta, REPORT_FILE, bytes)?;
+        Ok(Outcome::Finished { output, metrics })
     }
 }

@@ -4,7 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
-use crate::stage::{Output, Problems, Ref, Shape, StageSpec};
+use crate::stage::{Neighbours, Output, Problems, Ref, Shape, StageSpec};
 
 /// Frames that one token stands for.
 const UNIT: usize = 4;
@@ -48,6 +48,10 @@ impl StageSpec for EncodeTokens {
             p.add("padded", message, "a token stands for 4 frames");
         }
         p.shards(self.shards);
+    }
+
+    fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
+        stages.same_skeleton(p, ("tokenizer", &self.tokenizer), &self.dataset);
     }
 
     fn shards(&self) -> usize {

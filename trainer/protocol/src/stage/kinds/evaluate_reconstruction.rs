@@ -1,12 +1,14 @@
-//! `evaluate.reconstruction`: what a VAE or a tokenizer loses. Source: MLD's MPJPE, DisCoRD's sJPE, and our feature error.
+//! `evaluate.reconstruction`: what a VAE or a tokenizer loses. Source: MLD's MPJPE, DisCoRD's sJPE, FID of the tokenizers' papers, and our
+//! feature error.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
-use crate::stage::{Output, Problems, Ref, Shape, Split, StageSpec};
+use crate::stage::{Neighbours, Output, Problems, Ref, Shape, Split, StageSpec};
 
-/// `evaluate.reconstruction`: MPJPE in mm, sJPE and feature error of a VAE or a tokenizer; of the latter also how many codes are in use.
+/// `evaluate.reconstruction`: MPJPE in mm, sJPE and feature error of a VAE or a tokenizer; with an evaluator also FID, of a tokenizer also how
+/// many codes are in use.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluateReconstruction {
@@ -16,6 +18,8 @@ pub struct EvaluateReconstruction {
     pub tokenizer: String,
     /// Stage that gives the flow decoder that decodes the tokenizer's tokens; the tokenizer's own if empty.
     pub decoder: String,
+    /// Stage that gives the evaluator in whose space FID is taken, of reconstructions against the clips themselves; no FID if empty.
+    pub evaluator: String,
     /// Stage that gives the clips.
     pub dataset: String,
     /// Clips.
@@ -30,6 +34,7 @@ impl Default for EvaluateReconstruction {
             vae: "vae".into(),
             tokenizer: String::new(),
             decoder: String::new(),
+            evaluator: String::new(),
             dataset: "dataset".into(),
             split: Split::Test,
             shards: 4,
@@ -51,6 +56,7 @@ impl StageSpec for EvaluateReconstruction {
             Ref::stage("vae", &mut self.vae, ArtifactKind::Vae).only_if(of_vae),
             Ref::stage("tokenizer", &mut self.tokenizer, ArtifactKind::Tokenizer).optional(),
             Ref::stage("decoder", &mut self.decoder, ArtifactKind::FlowDecoder).only_if(flows),
+            Ref::stage("evaluator", &mut self.evaluator, ArtifactKind::Evaluator).optional(),
             Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
         ]
     }
@@ -60,6 +66,20 @@ impl StageSpec for EvaluateReconstruction {
             p.add("decoder", "`decoder` decodes tokens, but there is no `tokenizer`; expected both", "");
         }
         p.shards(self.shards);
+    }
+
+    fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
+        let (field, measured) = match self.tokenizer.is_empty() {
+            true => ("vae", &self.vae),
+            false => ("tokenizer", &self.tokenizer),
+        };
+        stages.same_skeleton(p, (field, measured), &self.dataset);
+        if !self.evaluator.is_empty() {
+            stages.same_skeleton(p, ("evaluator", &self.evaluator), &self.dataset);
+        }
+        if !self.tokenizer.is_empty() && !self.decoder.is_empty() {
+            stages.same_codes(p, ("decoder", &self.decoder), &self.tokenizer);
+        }
     }
 
     fn shards(&self) -> usize {

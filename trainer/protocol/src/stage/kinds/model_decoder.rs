@@ -40,12 +40,14 @@ impl StageSpec for ModelDecoder {
             let message = format!("`{model}` draws no tokens, and `{decoder}` decodes nothing else");
             p.add("model", message, "name a `train.tokens` stage");
         }
-        if let (Some(ours), Some(theirs)) =
-            (stages.read_by(model, ArtifactKind::Tokenizer), stages.read_by(decoder, ArtifactKind::Tokenizer))
+        if let (Some(ours), Some(theirs)) = (stages.format(model), stages.format(decoder))
             && ours != theirs
         {
-            let message = format!("`{decoder}` decodes tokens of `{theirs}`, but `{model}` draws those of `{ours}`");
-            p.add("decoder", message, "tokens of another codebook mean other motions; train both on one tokenizer");
+            let (ours, theirs) = (ours.skeleton(), theirs.skeleton());
+            let message = format!("`{decoder}` decodes motions of {theirs}, but `{model}` draws those of {ours}");
+            p.add("decoder", message, "train the decoder on the data set of the model");
+        } else if let Some(tokenizer) = stages.tokenizer_of_model(model) {
+            stages.same_codes(p, ("decoder", decoder), tokenizer);
         }
     }
 }

@@ -3,7 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::stage::{Batch, Decay, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training, WindowsOf};
+use crate::stage::{Batch, Decay, Neighbours, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training, WindowsOf};
 use crate::{ArtifactKind, Steps, limits};
 
 /// Frames that one token stands for.
@@ -175,6 +175,10 @@ impl StageSpec for TrainDiscord {
         }
         p.fraction("ema", self.ema, true);
         self.training.check(p);
+    }
+
+    fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
+        stages.same_skeleton(p, ("tokenizer", &self.tokenizer), &self.dataset);
     }
 
     fn training(&mut self) -> Option<&mut Training> {
