@@ -1,6 +1,7 @@
-//! `trainer generate`: a sentence to a moving stick figure.
+//! `trainer generate`: a sentence to a moving stick figure, or to a part of a motion whose rest stays.
 
 use std::fmt;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -9,6 +10,7 @@ use motion::{Skeleton, npy};
 use protocol::Seed;
 use stages::generate::{Generated, Generator};
 
+use super::keep::Span;
 use super::model::{self, Found};
 use super::remote::check_parent;
 use super::sampler::SamplerArgs;
@@ -39,6 +41,12 @@ pub(crate) struct GenerateArgs {
     /// Length in frames [default: what the model's length estimator says, 120 without one]
     #[arg(long, value_name = "N")]
     frames: Option<usize>,
+    /// A motion, features [frames, features] as `--out FILE.npy` writes them, of which a part is drawn anew: masked token models only
+    #[arg(long, value_name = "FILE.npy", requires = "keep", conflicts_with = "frames")]
+    edit: Option<PathBuf>,
+    /// What stays of it, FROM:TO in frames or seconds, from the end if negative: `0:1s,-1s:` keeps the first and the last second
+    #[arg(long, value_name = "SPANS", value_delimiter = ',', requires = "edit", allow_hyphen_values = true)]
+    keep: Vec<Span>,
     /// Other seeds give other motions
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -88,10 +96,20 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
 
     let sampler = args.sampler.sampler(args.steps, generator.sampler(), &measured);
     let sampler = sampler.map_err(|why| Problem::usage(format!("{label}: {why}")))?;
+    let edit = args.edit.as_deref().map(|path| Edit::read(path, &args.keep, &generator)).transpose()?;
     let mut motions = Vec::new();
+    let mut kept = Vec::new();
     for prompt in &args.prompt {
-        let motion =
-            generator.generate(prompt, args.frames, Some(&sampler), Seed(args.seed)).map_err(model::refused)?;
+        let seed = Seed(args.seed);
+        let motion = match &edit {
+            None => generator.generate(prompt, args.frames, Some(&sampler), seed).map_err(model::refused)?,
+            Some(edit) => {
+                let edited = generator.edit(prompt, &edit.motion, &edit.keep, Some(&sampler), seed);
+                let edited = edited.map_err(model::refused)?;
+                kept = edited.kept;
+                edited.motion
+            }
+        };
         motions.push((prompt.clone(), motion));
     }
     let written = write(&args, &motions)?;
@@ -105,6 +123,7 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
             "model": label.to_string(),
             "prompt": prompt,
             "frames": motion.frames,
+            "kept": kept.iter().map(|span| [span.start, span.end]).collect::<Vec<_>>(),
             "sampler": sampler,
             "seed": args.seed,
             "files": written,
@@ -115,9 +134,10 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
             "load_ms": milliseconds(loaded),
         })),
         Output::Table => print::out(&format!(
-            "{} from {label}: {} frames, {}\n{:.1} ms per sentence (text {:.1}, sampling {:.1}, decoding {:.1}); the model loaded in {:.0} ms",
+            "{} from {label}: {} frames{}, {}\n{:.1} ms per sentence (text {:.1}, sampling {:.1}, decoding {:.1}); the model loaded in {:.0} ms",
             written.join(", "),
             motion.frames,
+            edit.map(|edit| edit.describe(motion.frames, &kept)).unwrap_or_default(),
             sampler,
             milliseconds(timing.total()),
             milliseconds(timing.text),
@@ -127,6 +147,47 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
         )),
     }
     Ok(0)
+}
+
+/// A motion to edit.
+struct Edit {
+    /// Rows `[frames, features]`.
+    motion: Vec<f32>,
+    frames: usize,
+    keep: Vec<Range<usize>>,
+}
+
+impl Edit {
+    fn read(path: &Path, keep: &[Span], generator: &Generator) -> Result<Self> {
+        let array = npy::read(path).map_err(|error| Problem::usage(error.to_string()))?;
+        let skeleton = Skeleton::of(generator.format());
+        let refuse = |what: String| Problem::usage(format!("{}: {what}", path.display()));
+        let [frames, width] = array.shape[..] else {
+            return Err(refuse(format!("has shape {:?}, expected [frames, {}]", array.shape, skeleton.features)));
+        };
+        if width != skeleton.features {
+            let name = generator.format().name();
+            return Err(refuse(format!(
+                "has {width} features a frame, the model's skeleton (`{name}`) has {}",
+                skeleton.features
+            )));
+        }
+        if let Some(at) = array.data.iter().position(|value| !value.is_finite()) {
+            return Err(refuse(format!("frame {} holds a number that is not finite", at / width)));
+        }
+        let keep = keep.iter().map(|span| span.of(frames, skeleton.fps)).collect::<std::result::Result<_, String>>();
+        Ok(Self { motion: array.data, frames, keep: keep.map_err(refuse)? })
+    }
+
+    /// What stayed, and what was left out because it fills no token.
+    fn describe(&self, frames: usize, kept: &[Range<usize>]) -> String {
+        let spans: Vec<String> = kept.iter().map(|span| format!("{}-{}", span.start, span.end - 1)).collect();
+        let rest = match self.frames - frames {
+            0 => String::new(),
+            rest => format!("; the last {rest} of {} fill no token and were left out", self.frames),
+        };
+        format!(" ({} stay{rest})", spans.join(", "))
+    }
 }
 
 /// Poses of one motion on a sheet.

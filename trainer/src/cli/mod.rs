@@ -3,6 +3,7 @@
 mod args;
 mod config;
 mod generate;
+mod keep;
 mod model;
 mod remote;
 mod sampler;

@@ -3,6 +3,7 @@
 //! Not a stage: nothing is kept, and the clock is read, because the time per sentence is what few-step models are about. The
 //! motion is a function of (model, sentence, frames, sampler, seed).
 
+use std::ops::Range;
 use std::rc::Rc;
 use std::time::{Duration, Instant};
 
@@ -16,7 +17,7 @@ use protocol::stage::{DataFormat, Sampler};
 use protocol::{ArtifactKind, Manifest, Seed};
 
 use crate::context::StageError;
-use crate::generator::{self, Batch, Lap, MotionGenerator};
+use crate::generator::{self, Batch, Edit, Lap, MotionGenerator, Seeds, Text};
 use crate::length::Lengths;
 use crate::parts::{self, model_error};
 
@@ -64,6 +65,15 @@ pub struct Generated {
     pub timing: Timing,
 }
 
+/// A motion of which a part stayed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Edited {
+    /// The whole.
+    pub motion: Generated,
+    /// Frames whose tokens stayed.
+    pub kept: Vec<Range<usize>>,
+}
+
 impl Generator {
     /// Loads an artifact of kind `model`.
     pub fn load(manifest: &Manifest, blobs: &dyn Blobs, device: &Device) -> Result<Self, StageError> {
@@ -107,6 +117,49 @@ impl Generator {
         Ok(drawn.min(self.model.longest()))
     }
 
+    /// Draws those parts of a motion anew, for `prompt`, that lie outside of the frames to `keep`. `motion` are rows `[frames, features]` in the data's
+    /// own scale. Frames behind the last whole token are left out, and a token stays only if all its frames do. Without `sampler` the model's own
+    /// is used.
+    ///
+    /// # Errors
+    /// A model that cannot, a motion of another width, or nothing to keep or to draw.
+    pub fn edit(
+        &self,
+        prompt: &str,
+        motion: &[f32],
+        keep: &[Range<usize>],
+        sampler: Option<&Sampler>,
+        seed: Seed,
+    ) -> Result<Edited, StageError> {
+        let unit = generator::infilling(&*self.model)?.unit();
+        let width = Skeleton::of(self.format()).features;
+        let pieces = motion.len() / width / unit;
+        let stays = |piece: usize| {
+            let frames = piece * unit..(piece + 1) * unit;
+            keep.iter().any(|span| span.start <= frames.start && frames.end <= span.end)
+        };
+        let kept: Vec<bool> = (0..pieces).map(stays).collect();
+        let drawn = kept.iter().filter(|kept| !**kept).count();
+        if drawn == 0 || drawn == pieces {
+            let what = if pieces == 0 || drawn == 0 { "nothing is left to draw" } else { "nothing stays" };
+            return Err(StageError::Input(format!(
+                "{what}: the motion has {pieces} whole pieces of {unit} frames, of which {} lie inside of what is kept",
+                pieces - drawn
+            )));
+        }
+        let sampler = sampler.cloned().unwrap_or_else(|| self.sampler());
+        let edit = Edit { motion: &motion[..pieces * unit * width], kept: &kept };
+        let motion = self.timed(prompt, seed, |texts, seeds, lap| {
+            generator::edited(&*self.model, edit, &texts[0], seeds, &sampler, lap)
+        })?;
+        let spans = kept.chunk_by(|a, b| a == b).scan(0, |at, run| {
+            let span = *at * unit..(*at + run.len()) * unit;
+            *at += run.len();
+            Some((run[0], span))
+        });
+        Ok(Edited { motion, kept: spans.filter(|(kept, _)| *kept).map(|(_, span)| span).collect() })
+    }
+
     /// Draws a motion for `prompt`. Without `frames` it is as long as [`frames`](Self::frames) says, without `sampler` the model's own is
     /// used.
     pub fn generate(
@@ -117,18 +170,30 @@ impl Generator {
         seed: Seed,
     ) -> Result<Generated, StageError> {
         let sampler = sampler.cloned().unwrap_or_else(|| self.sampler());
+        self.timed(prompt, seed, |texts, seeds, lap| {
+            let frames = frames.map_or_else(|| self.frames(prompt, seed), Ok)?;
+            let batch = Batch { texts, lengths: &[frames], seeds };
+            Ok(generator::motions(&*self.model, batch, &sampler, lap)?.concat())
+        })
+    }
+
+    /// What `draw` draws for `prompt`, and where the time went.
+    fn timed(
+        &self,
+        prompt: &str,
+        seed: Seed,
+        draw: impl FnOnce(&[Rc<Text>], &Seeds<'_>, &mut dyn FnMut(Lap)) -> Result<Vec<f32>, StageError>,
+    ) -> Result<Generated, StageError> {
         let start = Instant::now();
-        let frames = frames.map_or_else(|| self.frames(prompt, seed), Ok)?;
         let texts: Vec<_> = self.model.embed(&[prompt])?.into_iter().map(Rc::new).collect();
         let embedded = Instant::now();
         let seeds = |k: usize, _| Stream::new(seed, "generate/noise", 0, k as u64);
-        let batch = Batch { texts: &texts, lengths: &[frames], seeds: &seeds };
         let (mut sampled, mut decoded) = (embedded, embedded);
         let mut lap = |lap| match lap {
             Lap::Sampled => (sampled, decoded) = (Instant::now(), Instant::now()),
             Lap::Decoded => decoded = Instant::now(),
         };
-        let features = generator::motions(&*self.model, batch, &sampler, &mut lap)?.concat();
+        let features = draw(&texts, &seeds, &mut lap)?;
         let skeleton = Skeleton::of(self.format());
         let joints = recover_joints(&features, skeleton);
         // An autoregressive model ends a motion where it likes.

@@ -4,13 +4,14 @@
 use std::collections::BTreeMap;
 
 use protocol::stage::{
-    Batch, CheckpointPolicy, DataSynthetic, Decay, EncodeTokens, EvaluateReconstruction, FlowNetwork, ModelDecoder,
-    Optimizer, Resets, Sampler, StageSettings, TextEmbed, TokenGenerator, TokenNetwork, TokenizerNetwork, TrainDiscord,
-    TrainTokenizer, TrainTokens, Training,
+    Batch, CheckpointPolicy, DataSynthetic, Decay, EncodeTokens, EvaluateReconstruction, EvaluatorNetwork, FlowNetwork,
+    ModelDecoder, MovementPhase, Optimizer, Resets, Sampler, StageSettings, TextEmbed, TokenGenerator, TokenNetwork,
+    TokenizerNetwork, TrainDiscord, TrainEvaluator, TrainTokenizer, TrainTokens, Training,
 };
 use protocol::{Digest, Seed, Steps};
 use stages::generate::Generator;
 use stages::testing::{Bench, Script};
+use stages::tokenizer::TrainedTokenizer;
 
 const STEPS: u64 = 14;
 
@@ -72,6 +73,15 @@ fn discord() -> StageSettings {
     })
 }
 
+fn evaluator() -> StageSettings {
+    StageSettings::from(TrainEvaluator {
+        network: EvaluatorNetwork { movement: 8, motion: 8, text: 8, embedding: 8, ..EvaluatorNetwork::default() },
+        movement: MovementPhase { until: 0.5, window: 24, batch: 0, ..MovementPhase::default() },
+        training: training(4),
+        ..TrainEvaluator::default()
+    })
+}
+
 type Link = (&'static str, StageSettings, Vec<(&'static str, &'static str)>);
 
 /// Everything from clips to models: a plain tokenizer with an autoregressive generator and MMM's, a residual one with a masked one.
@@ -84,6 +94,7 @@ fn chain(shards: usize) -> Vec<Link> {
     let smooth = StageSettings::from(EvaluateReconstruction {
         tokenizer: "tokenizer".into(),
         decoder: "decoder".into(),
+        evaluator: "evaluator".into(),
         shards,
         ..EvaluateReconstruction::default()
     });
@@ -94,6 +105,7 @@ fn chain(shards: usize) -> Vec<Link> {
     vec![
         ("dataset", clips.into(), vec![]),
         ("text", TextEmbed::default().into(), data()),
+        ("evaluator", evaluator(), data()),
         ("plain", tokenizer(1, 8, Resets::Remembering), data()),
         ("residual", tokenizer(3, 40, Resets::Always), data()),
         ("plain-tokens", encode(), with("plain")),
@@ -111,7 +123,7 @@ fn chain(shards: usize) -> Vec<Link> {
         (
             "smooth-reconstruction",
             smooth,
-            vec![("dataset", "dataset"), ("tokenizer", "residual"), ("decoder", "discord")],
+            [with("residual"), vec![("decoder", "discord"), ("evaluator", "evaluator")]].concat(),
         ),
     ]
 }
@@ -156,9 +168,14 @@ fn p6_tokens_and_what_draws_them_have_the_same_bytes_for_any_number_of_members_a
     }
     let used = one.metrics["residual-tokens"]["used"];
     assert!(used > 0.0 && used <= 1.0, "{used}");
-    for metric in ["mpjpe_mm", "used", "perplexity"] {
+    for metric in ["mpjpe_mm", "sjpe", "used", "perplexity"] {
         assert!(one.metrics["reconstruction"][metric] > 0.0, "{metric}");
     }
+    // On the same tokens, and in an evaluator's space.
+    let (plain, smooth) = (&one.metrics["reconstruction"], &one.metrics["smooth-reconstruction"]);
+    assert!(smooth["fid"] > 0.0 && !plain.contains_key("fid"), "{smooth:?}");
+    assert_eq!((plain["used"], plain["perplexity"]), (smooth["used"], smooth["perplexity"]));
+    assert_ne!(plain["sjpe"], smooth["sjpe"]);
 }
 
 #[test]
@@ -187,6 +204,49 @@ fn models_of_tokens_draw_motions_as_all_others_do() {
     }
 }
 
+#[test]
+fn masked_generators_draw_a_part_of_a_motion_and_keep_the_tokens_of_the_rest() {
+    let world = run(1, 1);
+    let blobs = world.bench.blobs();
+    let device = burn::tensor::Device::flex();
+    let open = |name| Generator::load(&world.bench.manifest(world.outputs[name]).unwrap(), &*blobs, &device).unwrap();
+    for (name, tokenizer, guidance) in [("momask", "residual", 2.0), ("mmm", "plain", 0.0)] {
+        let model = open(name);
+        let sampler = Sampler { steps: 4, guidance, ..Sampler::default() };
+        let source = model.generate("a person walks", Some(64), Some(&sampler), Seed(1)).unwrap();
+        let edit = |seed| model.edit("a jump", &source.features, &[0..41, 60..64], Some(&sampler), Seed(seed)).unwrap();
+        let (edited, again, other) = (edit(3), edit(3), edit(4));
+        assert_eq!(edited.kept, [0..40, 60..64], "whole tokens");
+        assert_eq!((edited.motion.frames, &edited.motion.features), (64, &again.motion.features), "{name}");
+        assert_ne!(edited.motion.features, other.motion.features, "{name}: another seed draws another jump");
+
+        // Where no drawn token is near, what comes out is what the kept tokens stand for, in all layers.
+        let manifest = world.bench.manifest(world.outputs[tokenizer]).unwrap();
+        let tokenizer = TrainedTokenizer::read(&*blobs, &manifest, &device).unwrap();
+        let mut rows = source.features.clone();
+        tokenizer.normalise(&mut rows);
+        let mut rows = tokenizer.decode(&tokenizer.encode(rows));
+        tokenizer.denormalise(&mut rows);
+        let width = rows.len() / 64;
+        let differs = |t: usize| rows[t * width..(t + 1) * width] != edited.motion.features[t * width..(t + 1) * width];
+        assert!(
+            !(0..8).any(differs) && (40..60).any(differs),
+            "{name}: {:?}",
+            (0..64).map(differs).collect::<Vec<_>>()
+        );
+
+        let refused = |keep: &[std::ops::Range<usize>], motion: &[f32]| {
+            model.edit("a jump", motion, keep, Some(&sampler), Seed(3)).unwrap_err().to_string()
+        };
+        assert!(refused(&[0..64], &source.features).contains("nothing is left to draw"));
+        assert!(refused(&[1..4], &source.features).contains("nothing stays"));
+        assert!(refused(&[0..4], &source.features.repeat(2)).contains("draws motions of 1 to 80"));
+    }
+    let source = open("momask").generate("a person walks", Some(40), None, Seed(1)).unwrap();
+    let refused = open("gpt").edit("a jump", &source.features, &[0..20], None, Seed(1)).unwrap_err().to_string();
+    assert!(refused.contains("draws whole motions"), "{refused}");
+}
+
 /// Chains of kills with 1 to 3 members in turn, some right after a checkpoint, one before the first step; then members that join, take
 /// the state of a peer and are lost.
 #[test]
@@ -197,7 +257,7 @@ fn p5_p6_kills_joins_and_losses_change_no_byte() {
             continue;
         }
         let inputs = whole.inputs(&inputs);
-        let mut bench = run_up_to(name);
+        let mut bench = run_up_to(name).bench;
         for kills in [&[0_u64, 6][..], &[5, 9, 13]] {
             bench.forget(name);
             for (round, step) in kills.iter().enumerate() {
@@ -220,7 +280,7 @@ fn p5_p6_kills_joins_and_losses_change_no_byte() {
 }
 
 /// A world in which everything before stage `name` has run.
-fn run_up_to(name: &str) -> Bench {
+fn run_up_to(name: &str) -> World {
     let mut world = World { bench: bench(1), outputs: BTreeMap::new(), metrics: BTreeMap::new() };
     for (stage, settings, inputs) in chain(1) {
         if stage == name {
@@ -230,18 +290,22 @@ fn run_up_to(name: &str) -> Bench {
         let output = world.bench.run(stage, &settings, &inputs).unwrap().output();
         world.outputs.insert(stage, output);
     }
-    world.bench
+    world
 }
 
 #[test]
 fn what_does_not_fit_is_refused_with_a_reason() {
-    let mut world = run(1, 1);
+    let mut world = run_up_to("momask");
     let refused = |world: &mut World, settings: StageSettings, inputs: &[(&'static str, &'static str)]| {
         let inputs = world.inputs(inputs);
         world.bench.run("wrong", &settings, &inputs).unwrap_err().to_string()
     };
     let other = [("tokens", "plain-tokens"), ("tokenizer", "residual"), ("text", "text")];
     let error = refused(&mut world, generator(TokenGenerator::Autoregressive), &other);
+    assert!(error.contains("another tokenizer"), "{error}");
+    let mut other = other.to_vec();
+    other.push(("dataset", "dataset"));
+    let error = refused(&mut world, generator(TokenGenerator::Mmm), &other);
     assert!(error.contains("another tokenizer"), "{error}");
     let layered = [("tokens", "residual-tokens"), ("tokenizer", "residual"), ("text", "text")];
     let error = refused(&mut world, generator(TokenGenerator::Autoregressive), &layered);

@@ -8,6 +8,23 @@ use crate::networks::{MomaskConfig, ResidualTransformer};
 use crate::quantizer::NO_CODE;
 use crate::tokens::masked::Sampling;
 
+/// The layer that the others are added to.
+#[derive(Clone, Copy)]
+pub struct First<'a> {
+    /// Its ids [B n], [`NO_CODE`] behind the end of each clip.
+    pub ids: &'a [i64],
+    /// Tokens of each clip.
+    pub lengths: &'a [usize],
+    /// Codes that are known, by layer from 1 on and place in [B n]: they are not drawn, and the layers above see them. As published there are none.
+    pub known: &'a dyn Fn(usize, usize) -> Option<usize>,
+}
+
+impl std::fmt::Debug for First<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("First").field("lengths", &self.lengths).finish_non_exhaustive()
+    }
+}
+
 /// All ids [B n Q] for those of the first layer [B n], which are [`NO_CODE`] behind the end of each clip. A pad that is drawn inside a clip is
 /// [`NO_CODE`] too: that layer adds nothing there. The layers are drawn one after the other; `sampling.steps` does not matter.
 pub fn generate(
@@ -15,10 +32,10 @@ pub fn generate(
     config: &MomaskConfig,
     sampling: &Sampling,
     text_bc: Tensor<2>,
-    first: &[i64],
-    lengths: &[usize],
+    first: First<'_>,
     uniforms: Uniforms<'_>,
 ) -> Vec<i64> {
+    let First { ids: first, lengths, known } = first;
     let (batch, pad, classes) = (lengths.len(), config.residual_pad(), config.codes + 1);
     let len = first.len() / batch;
     let valid = |at: usize| at % len < lengths[at / len];
@@ -40,7 +57,7 @@ pub fn generate(
         for (at, logits) in host(logits).chunks_exact_mut(classes).enumerate().filter(|(at, _)| valid(*at)) {
             keep_top(logits, sampling.threshold);
             uniforms(layer - 1, at / len, at % len, &mut draws);
-            ids[at] = gumbel_draw(logits, sampling.temperature, &draws);
+            ids[at] = known(layer, at).unwrap_or_else(|| gumbel_draw(logits, sampling.temperature, &draws));
         }
         layers.push(ids);
         sum = Some(seen);

@@ -251,7 +251,8 @@ fn residual_generation(
     let text = io.get("cond").tensor::<2>(&device());
     let first = ids(io.get("res_generate/base_ids"));
     let mut draws = uniforms(io.get("res_generate/gumbel_u"));
-    let found = residual::generate(network, config, &sampling(expected), text, &first, &lengths, &mut draws);
+    let first = residual::First { ids: &first, lengths: &lengths, known: &|_, _| None };
+    let found = residual::generate(network, config, &sampling(expected), text, first, &mut draws);
     assert_eq!(found, ids(io.get("res_generate/all_indices")), "res_generate: ids");
     gates.check("generated", "res_generate", 0.0, 0.0);
 }

@@ -70,6 +70,37 @@ pub trait MotionGenerator: std::fmt::Debug {
     fn latents(&self) -> Option<&dyn LatentGenerator> {
         None
     }
+
+    /// How it fills in a part of a motion, if it can.
+    fn infilling(&self) -> Option<&dyn Infilling> {
+        None
+    }
+}
+
+/// A motion of which a part stays.
+#[derive(Debug, Clone, Copy)]
+pub struct Edit<'a> {
+    /// Feature rows `[frames, features]` in the data's own scale, as many as the pieces have.
+    pub motion: &'a [f32],
+    /// Whether each piece stays.
+    pub kept: &'a [bool],
+}
+
+/// A generator that draws a part of a motion so that it fits the rest.
+pub trait Infilling {
+    /// Frames of a piece, which stays or is drawn as a whole.
+    fn unit(&self) -> usize;
+
+    /// The motion with the pieces drawn anew that do not stay. What stays is decoded with them, so its frames change a little where the two meet.
+    /// The sampler is one that the model has.
+    fn fill_in(
+        &self,
+        edit: Edit<'_>,
+        text: &Rc<Text>,
+        seeds: &Seeds<'_>,
+        sampler: &Sampler,
+        lap: &mut dyn FnMut(Lap),
+    ) -> Vec<f32>;
 }
 
 /// A generator that draws latents and decodes them.

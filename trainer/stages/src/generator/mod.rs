@@ -23,7 +23,7 @@ use crate::context::StageError;
 use crate::parts::model_error;
 
 pub(crate) use feature_diffusion::NAME as FEATURE_DIFFUSION;
-pub use interface::{Batch, Lap, LatentGenerator, MotionGenerator, Seeds, Text};
+pub use interface::{Batch, Edit, Infilling, Lap, LatentGenerator, MotionGenerator, Seeds, Text};
 pub(crate) use latent_diffusion::NAME as LATENT_DIFFUSION;
 pub(crate) use tokens::{GeneratorMeta, MASKED_PREFIX, NAME as TOKENS, RESIDUAL_PREFIX};
 pub(crate) use words::{codebook, with_words};
@@ -77,10 +77,50 @@ pub fn motions(
         return Err(StageError::Input(format!("{frames} frames: the model draws motions of 1 to {longest}")));
     }
     let motions = generator.draw(batch, sampler, lap)?;
-    if !motions.iter().flatten().all(|v| v.is_finite()) {
-        return Err(StageError::Input("the motion is not finite; the model has not been trained well".into()));
-    }
+    finite(motions.iter().flatten())?;
     Ok(motions)
+}
+
+fn finite<'v>(mut values: impl Iterator<Item = &'v f32>) -> Result<(), StageError> {
+    match values.all(|v| v.is_finite()) {
+        true => Ok(()),
+        false => Err(StageError::Input("the motion is not finite; the model has not been trained well".into())),
+    }
+}
+
+/// How a model fills in a part of a motion.
+///
+/// # Errors
+/// It does not.
+pub fn infilling(generator: &dyn MotionGenerator) -> Result<&dyn Infilling, StageError> {
+    generator.infilling().ok_or_else(|| {
+        StageError::Input(
+            "the model draws whole motions; only masked token generators (MoMask, MMM) fill in a part of one".into(),
+        )
+    })
+}
+
+/// A motion with those pieces drawn anew that do not stay.
+///
+/// # Errors
+/// A model that fills in nothing, a sampler or a length that it does not have, or a motion that is not finite.
+pub fn edited(
+    generator: &dyn MotionGenerator,
+    edit: Edit<'_>,
+    text: &Rc<Text>,
+    seeds: &Seeds<'_>,
+    sampler: &Sampler,
+    lap: &mut dyn FnMut(Lap),
+) -> Result<Vec<f32>, StageError> {
+    check_sampler(generator, sampler)?;
+    let model = infilling(generator)?;
+    let (frames, longest) = (edit.kept.len() * model.unit(), generator.longest());
+    if !(1..=longest).contains(&frames) {
+        return Err(StageError::Input(format!("{frames} frames: the model draws motions of 1 to {longest}")));
+    }
+    let motion = model.fill_in(edit, text, seeds, sampler, lap);
+    finite(motion.iter())?;
+    Ok(motion)
 }
 
 /// The captions of a dataset as a generator wants them, each embedded once.

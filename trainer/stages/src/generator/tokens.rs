@@ -5,7 +5,12 @@
 //!
 //! Layers above the first are drawn at guidance 5, as published for both datasets, whatever the sampler says of the first.
 //!
-//! Departs: MMM's published code ends early where a batch is one motion; here no motion depends on what it is drawn together with.
+//! A masked generator also fills in a part of a motion: the rest's tokens stay, in all layers, and are looked at. Layers above the first are drawn
+//! at guidance 2 then, as MoMask's script for edits does.
+//!
+//! Departs: MoMask draws the layers above the first anew for the whole clip then. MMM's published code ends early where a batch is one motion; here no motion depends on what it is drawn together with.
+
+use std::rc::Rc;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
@@ -20,7 +25,7 @@ use protocol::{ArtifactKind, Manifest, Seed};
 use serde::{Deserialize, Serialize};
 
 use super::words::{codebook, with_words};
-use super::{Batch, Lap, MotionGenerator, Seeds, Text};
+use super::{Batch, Edit, Infilling, Lap, MotionGenerator, Seeds, Text};
 use crate::artifacts;
 use crate::context::StageError;
 use crate::flow_decoder::FlowDecoder;
@@ -33,6 +38,8 @@ use crate::weights;
 pub(crate) const NAME: &str = "tokens";
 /// Guidance of the layers above the first.
 const RESIDUAL_GUIDANCE: f32 = 5.0;
+/// The same where a part of a motion is filled in.
+const EDIT_GUIDANCE: f32 = 2.0;
 /// Share of the classes that a masked generator cannot draw.
 const THRESHOLD: f64 = 0.9;
 /// Prefix of the first layer's network in the file of a masked generator.
@@ -117,6 +124,20 @@ enum Network {
     Masked(Box<MaskedTransformer>, Option<Box<ResidualTransformer>>),
     /// With the tokenizer's codes [K, d].
     Mmm(Box<Mmm>, Tensor<2>),
+}
+
+/// Ids `[tokens, Q]` of a motion, of which those that are `kept` stay.
+#[derive(Debug, Clone, Copy)]
+struct Known<'a> {
+    ids: &'a [i64],
+    kept: &'a [bool],
+}
+
+impl Known<'_> {
+    /// The id of layer `layer` of `quantizers` at a place, if it is kept.
+    fn id(&self, quantizers: usize, layer: usize, place: usize) -> Option<usize> {
+        self.kept[place].then(|| self.ids[place * quantizers + layer] as usize)
+    }
 }
 
 #[derive(Debug)]
@@ -206,8 +227,8 @@ fn network(
 }
 
 impl TokenModel {
-    /// Ids `[tokens, Q]` of each motion.
-    fn ids(&self, batch: Batch<'_>, sampler: &Sampler) -> Vec<Vec<i64>> {
+    /// Ids `[tokens, Q]` of each motion; what is known is of the only one.
+    fn ids(&self, batch: Batch<'_>, sampler: &Sampler, known: Option<Known<'_>>) -> Vec<Vec<i64>> {
         let text = || {
             let values = batch.texts.iter().flat_map(|text| text.values.iter().copied()).collect();
             let shape = [batch.texts.len(), self.meta.text_dim];
@@ -223,9 +244,16 @@ impl TokenModel {
                 let or_one = |ids: Vec<usize>| if ids.is_empty() { vec![1] } else { ids };
                 ids.into_iter().map(|ids| or_one(ids).into_iter().map(|id| id as i64).collect()).collect()
             }
-            Network::Masked(first, above) => self.filled_in((first, above.as_deref()), batch, sampler, text()),
-            Network::Mmm(network, codes) => self.with_words((network, codes), batch, sampler),
+            Network::Masked(first, above) => self.filled_in((first, above.as_deref()), batch, sampler, text(), known),
+            Network::Mmm(network, codes) => self.with_words((network, codes), batch, sampler, known),
         }
+    }
+
+    /// What is known of the first layer of each motion.
+    fn given(&self, batch: Batch<'_>, known: Option<Known<'_>>) -> Vec<Vec<Option<usize>>> {
+        let (unit, quantizers) = (self.tokenizer.unit(), self.meta.quantizers);
+        let id = |place: usize| known.and_then(|known| known.id(quantizers, 0, place));
+        batch.lengths.iter().map(|frames| (0..frames.div_ceil(unit)).map(id).collect()).collect()
     }
 
     /// As MMM draws them.
@@ -234,10 +262,10 @@ impl TokenModel {
         (network, codes_kd): (&Mmm, &Tensor<2>),
         batch: Batch<'_>,
         sampler: &Sampler,
+        known: Option<Known<'_>>,
     ) -> Vec<Vec<i64>> {
         let config = self.meta.mmm(codes_kd.dims()[1]);
-        let unit = self.tokenizer.unit();
-        let given: Vec<Vec<Option<usize>>> = batch.lengths.iter().map(|f| vec![None; f.div_ceil(unit)]).collect();
+        let given = self.given(batch, known);
         let rows: Vec<&[f32]> = batch.texts.iter().map(|text| &text.values[..]).collect();
         let condition = with_words(codes_kd, &rows, self.meta.text_dim, &self.device);
         let sampling =
@@ -251,15 +279,28 @@ impl TokenModel {
         own.map(|(ids, given)| ids[..given.len()].iter().map(|id| *id as i64).collect()).collect()
     }
 
+    /// Rows of motion `b`'s ids in the data's own scale.
+    fn decoded(&self, ids: &[i64], sampler: &Sampler, seeds: &Seeds<'_>, b: usize) -> Vec<f32> {
+        // Behind all streams that ids are drawn from.
+        let noise = (sampler.steps + self.meta.quantizers) * self.meta.longest.max(2);
+        let mut rows = match &self.decoder {
+            None => self.tokenizer.decode(ids),
+            Some(decoder) => decoder.decode(&self.tokenizer, ids, &mut seeds(noise, b)),
+        };
+        self.tokenizer.denormalise(&mut rows);
+        rows
+    }
+
     fn filled_in(
         &self,
         (first, above): (&MaskedTransformer, Option<&ResidualTransformer>),
         batch: Batch<'_>,
         sampler: &Sampler,
         text: Tensor<2>,
+        known: Option<Known<'_>>,
     ) -> Vec<Vec<i64>> {
-        let unit = self.tokenizer.unit();
-        let lengths: Vec<usize> = batch.lengths.iter().map(|frames| frames.div_ceil(unit)).collect();
+        let canvases: Vec<Canvas> = self.given(batch, known).into_iter().map(|tokens| Canvas { tokens }).collect();
+        let lengths: Vec<usize> = canvases.iter().map(|canvas| canvas.tokens.len()).collect();
         let len = lengths.iter().copied().max().unwrap_or(0);
         let config = self.meta.momask();
         let of_first = Sampling {
@@ -268,7 +309,6 @@ impl TokenModel {
             temperature: 1.0,
             threshold: THRESHOLD,
         };
-        let canvases: Vec<Canvas> = lengths.iter().map(|len| Canvas::empty(*len)).collect();
         // Streams are numbered by step, then by position; those of the layers above follow those of the first.
         let fill = |stream: usize, b: usize, out: &mut [f32], seeds: &Seeds<'_>| {
             let mut draw = seeds(stream, b);
@@ -284,9 +324,12 @@ impl TokenModel {
                 let mut draws = |layer: usize, b: usize, p: usize, out: &mut [f32]| {
                     fill((steps + layer) * places + p, b, out, batch.seeds)
                 };
-                let sampling = Sampling { guidance: RESIDUAL_GUIDANCE, ..of_first };
-                let ids = residual::generate(network, &config, &sampling, text, &ids, &lengths, &mut draws);
-                (ids, self.meta.quantizers)
+                let guidance = if known.is_some() { EDIT_GUIDANCE } else { RESIDUAL_GUIDANCE };
+                let (sampling, quantizers) = (Sampling { guidance, ..of_first }, self.meta.quantizers);
+                let known = |layer, at| known.and_then(|known| known.id(quantizers, layer, at));
+                let first = residual::First { ids: &ids, lengths: &lengths, known: &known };
+                let ids = residual::generate(network, &config, &sampling, text, first, &mut draws);
+                (ids, quantizers)
             }
         };
         lengths.iter().enumerate().map(|(b, own)| all[b * len * layers..][..own * layers].to_vec()).collect()
@@ -321,25 +364,52 @@ impl MotionGenerator for TokenModel {
     }
 
     fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError> {
-        let ids = self.ids(batch, sampler);
+        let ids = self.ids(batch, sampler, None);
         lap(Lap::Sampled);
         let width = self.tokenizer.meta().features;
         let decides = matches!(self.network, Network::Autoregressive(_));
-        // Behind all streams that ids are drawn from.
-        let noise = (sampler.steps + self.meta.quantizers) * self.meta.longest.max(2);
         let motion = |(b, (ids, frames)): (usize, (Vec<i64>, &usize))| {
-            let mut rows = match &self.decoder {
-                None => self.tokenizer.decode(&ids),
-                Some(decoder) => decoder.decode(&self.tokenizer, &ids, &mut (batch.seeds)(noise, b)),
-            };
+            let mut rows = self.decoded(&ids, sampler, batch.seeds, b);
             if !decides {
                 rows.truncate(frames * width);
             }
-            self.tokenizer.denormalise(&mut rows);
             rows
         };
         let motions = ids.into_iter().zip(batch.lengths).enumerate().map(motion).collect();
         lap(Lap::Decoded);
         Ok(motions)
+    }
+
+    fn infilling(&self) -> Option<&dyn Infilling> {
+        match self.network {
+            Network::Autoregressive(_) => None,
+            Network::Masked(..) | Network::Mmm(..) => Some(self),
+        }
+    }
+}
+
+impl Infilling for TokenModel {
+    fn unit(&self) -> usize {
+        self.tokenizer.unit()
+    }
+
+    fn fill_in(
+        &self,
+        edit: Edit<'_>,
+        text: &Rc<Text>,
+        seeds: &Seeds<'_>,
+        sampler: &Sampler,
+        lap: &mut dyn FnMut(Lap),
+    ) -> Vec<f32> {
+        let mut rows = edit.motion.to_vec();
+        self.tokenizer.normalise(&mut rows);
+        let ids = self.tokenizer.encode(rows);
+        let lengths = [edit.kept.len() * self.tokenizer.unit()];
+        let batch = Batch { texts: std::slice::from_ref(text), lengths: &lengths, seeds };
+        let ids = self.ids(batch, sampler, Some(Known { ids: &ids, kept: edit.kept })).concat();
+        lap(Lap::Sampled);
+        let motion = self.decoded(&ids, sampler, seeds, 0);
+        lap(Lap::Decoded);
+        motion
     }
 }
