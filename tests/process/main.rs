@@ -3,6 +3,7 @@
 //! The pipeline is `configs/smoke.yaml`: every stage kind of the quickstart at toy sizes.
 
 mod access;
+mod backends;
 mod bad_input;
 mod buckets;
 mod checkpoints;

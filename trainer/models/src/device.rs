@@ -71,6 +71,22 @@ pub fn open(backend: Backend, index: usize) -> Result<Device, DeviceError> {
     Ok(found.swap_remove(index))
 }
 
+/// Whether `device` has a memory of its own, in which what training changes should stay from step to step.
+pub fn is_accelerator(device: &Device) -> bool {
+    identity(device).is_some()
+}
+
+/// What an accelerator calls itself, and whether it is hardware rather than a program on the CPU.
+#[cfg(any(feature = "wgpu", feature = "cuda"))]
+fn identity(device: &Device) -> Option<(String, bool)> {
+    device.identity().map(|identity| (identity.name, identity.physical.is_some()))
+}
+
+#[cfg(not(any(feature = "wgpu", feature = "cuda")))]
+fn identity(_: &Device) -> Option<(String, bool)> {
+    None
+}
+
 /// Every device of every backend in this program, and a line for each backend that has none or is not built in.
 pub fn available() -> Vec<DeviceInfo> {
     BACKENDS.into_iter().flat_map(list).collect()
@@ -84,11 +100,13 @@ fn list(backend: Backend) -> Vec<DeviceInfo> {
         Ok(found) => found
             .iter()
             .enumerate()
-            .map(|(index, device)| DeviceInfo {
-                backend,
-                index: Some(index),
-                name: format!("{device:?}"),
-                note: note(backend).to_owned(),
+            .map(|(index, device)| {
+                let (name, note) = match identity(device) {
+                    Some((name, true)) => (name, note(backend)),
+                    Some((name, false)) => (name, "a program on the CPU that stands in for a GPU: for checks, slow"),
+                    None => (format!("{device:?}"), note(backend)),
+                };
+                DeviceInfo { backend, index: Some(index), name, note: note.to_owned() }
             })
             .collect(),
     }

@@ -5,6 +5,8 @@ use std::convert::Infallible;
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Gradients, Tensor, TensorData};
 
+use crate::device::is_accelerator;
+
 /// One parameter tensor inside a flat buffer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Entry {
@@ -143,27 +145,114 @@ pub fn assign<M: Module>(module: &mut M, flat: &[f32]) {
     *module = write(whole, flat);
 }
 
+/// Parameters as one flat buffer, where they are.
+#[derive(Debug, Clone, Copy)]
+pub enum Values<'a> {
+    /// On the host.
+    Host(&'a [f32]),
+    /// On an accelerator, without autodiff: [N].
+    Device(&'a Tensor<1>),
+}
+
+impl Values<'_> {
+    /// How many.
+    pub fn len(self) -> usize {
+        match self {
+            Self::Host(values) => values.len(),
+            Self::Device(values) => values.dims()[0],
+        }
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(self) -> bool {
+        self.len() == 0
+    }
+
+    /// Replaces the parameters of `module`, as [`assign`] does.
+    ///
+    /// # Panics
+    /// If these are not as many as the module's parameters.
+    pub fn assign<M: Module>(self, module: &mut M) {
+        assert_eq!(self.len(), module.num_params(), "parameters of the module");
+        self.assign_first(module);
+    }
+
+    /// Replaces the parameters of `module` by the first of these.
+    ///
+    /// # Panics
+    /// If these are less than the module's parameters.
+    pub fn assign_first<M: Module>(self, module: &mut M) {
+        match self {
+            Self::Host(values) => assign(module, &values[..module.num_params()]),
+            Self::Device(values) => *module = module.clone().map(&mut Cut { values, at: 0 }),
+        }
+    }
+}
+
+/// Cuts parameters from a flat tensor on their device.
+struct Cut<'a> {
+    values: &'a Tensor<1>,
+    at: usize,
+}
+
+impl ModuleMapper for Cut<'_> {
+    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        let shape = param.dims();
+        let end = self.at + shape.iter().product::<usize>();
+        let new = self.values.clone().slice(self.at..end).reshape(shape);
+        self.at = end;
+        param.map(|old| {
+            let tracked = old.is_require_grad();
+            if old.device().is_autodiff() { new.autodiff().set_require_grad(tracked) } else { new }
+        })
+    }
+}
+
 /// Adds the gradients of all parameters to `out`, in the order of [`read`]. A parameter that took no part adds nothing.
 ///
 /// # Panics
 /// If `out` has another length than the module has parameters.
 pub fn add_gradients<M: Module>(module: &M, gradients: &mut Gradients, out: &mut [f32]) {
-    struct Add<'a>(&'a mut Gradients, &'a mut [f32], usize);
+    struct Add<'a> {
+        gradients: &'a mut Gradients,
+        out: &'a mut [f32],
+        at: usize,
+        /// What lies on an accelerator, and where it belongs: it comes over together.
+        there: Vec<(usize, Tensor<1>)>,
+    }
+    fn add(gradient: Tensor<1>, mut to: impl FnMut(&[f32])) {
+        to(gradient.into_data().as_slice::<f32>().expect("gradients are f32"));
+    }
+    fn sum(to: &mut [f32], from: &[f32]) {
+        to.iter_mut().zip(from).for_each(|(o, g)| *o += g);
+    }
     impl ModuleVisitor for Add<'_> {
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
             let len = param.dims().iter().product::<usize>();
-            if let Some(gradient) = param.val().grad_remove(self.0) {
-                let data = gradient.into_data();
-                let from = data.as_slice::<f32>().expect("gradients are f32");
-                for (o, g) in self.1[self.2..self.2 + len].iter_mut().zip(from) {
-                    *o += g;
+            if let Some(gradient) = param.val().grad_remove(self.gradients) {
+                let gradient = gradient.reshape([len]);
+                if is_accelerator(&gradient.device()) {
+                    self.there.push((self.at, gradient));
+                } else {
+                    add(gradient, |from| sum(&mut self.out[self.at..self.at + len], from));
                 }
             }
-            self.2 += len;
+            self.at += len;
         }
     }
-    let mut visitor = Add(gradients, out, 0);
+    let mut visitor = Add { gradients, out, at: 0, there: Vec::new() };
     module.visit(&mut visitor);
-    let (seen, len) = (visitor.2, visitor.1.len());
-    assert_eq!(seen, len, "the buffer and the module have different lengths");
+    let Add { out, at: seen, there, .. } = visitor;
+    assert_eq!(seen, out.len(), "the buffer and the module have different lengths");
+    if there.is_empty() {
+        return;
+    }
+    let (places, tensors): (Vec<_>, Vec<_>) = there.into_iter().map(|(at, t)| ((at, t.dims()[0]), t)).unzip();
+    add(Tensor::cat(tensors, 0), |mut from| {
+        for (at, len) in &places {
+            let (head, tail) = from.split_at(*len);
+            sum(&mut out[*at..at + len], head);
+            from = tail;
+        }
+    });
 }

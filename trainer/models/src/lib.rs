@@ -13,6 +13,7 @@ pub mod names;
 pub mod networks;
 pub mod optim;
 pub mod quantizer;
+pub mod resident;
 pub mod tokens;
 
 /// The instruction set that the kernels of this process dispatch to: ours, Burn's and those of `gemm` look for the same features. Another

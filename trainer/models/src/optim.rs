@@ -22,6 +22,25 @@ pub struct AdamW {
     pub weight_decay: f64,
 }
 
+/// What one update multiplies by.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Rates {
+    /// The parameters: weight decay.
+    pub(crate) keep: f32,
+    /// The first moment: the rate without its bias.
+    pub(crate) rate: f32,
+    /// The root of the second moment, against its bias.
+    pub(crate) unbias: f32,
+    /// What comes new into the first moment.
+    pub(crate) new1: f32,
+    /// What stays of the second moment.
+    pub(crate) beta2: f32,
+    /// What comes new into it.
+    pub(crate) new2: f32,
+    /// Added to the root.
+    pub(crate) eps: f32,
+}
+
 impl From<&Optimizer> for AdamW {
     fn from(settings: &Optimizer) -> Self {
         Self { beta1: settings.beta1, beta2: settings.beta2, eps: settings.eps, weight_decay: settings.weight_decay }
@@ -29,20 +48,32 @@ impl From<&Optimizer> for AdamW {
 }
 
 impl AdamW {
+    /// The constants of update number `t`, counted from 1, with rate `lr`.
+    ///
+    /// # Panics
+    /// If `t` is 0.
+    pub(crate) fn rates(&self, t: u64, lr: f64) -> Rates {
+        assert!(t > 0, "updates are counted from 1");
+        let power = |beta: f64| beta.powf(t as f64);
+        Rates {
+            keep: (1.0 - lr * self.weight_decay) as f32,
+            rate: (lr / (1.0 - power(self.beta1))) as f32,
+            unbias: (1.0 / (1.0 - power(self.beta2)).sqrt()) as f32,
+            new1: (1.0 - self.beta1) as f32,
+            beta2: self.beta2 as f32,
+            new2: (1.0 - self.beta2) as f32,
+            eps: self.eps as f32,
+        }
+    }
+
     /// Update number `t`, counted from 1, with rate `lr`, in one pass over the five buffers. `m` and `v` start at zero.
     ///
     /// # Panics
     /// If the buffers differ in length, or `t` is 0.
     pub fn step(&self, t: u64, lr: f64, params: &mut [f32], grads: &[f32], m: &mut [f32], v: &mut [f32]) {
-        assert!(t > 0, "updates are counted from 1");
         let len = params.len();
         assert_eq!((grads.len(), m.len(), v.len()), (len, len, len), "lengths of gradients and moments");
-        let power = |beta: f64| beta.powf(t as f64);
-        let keep = (1.0 - lr * self.weight_decay) as f32;
-        let rate = (lr / (1.0 - power(self.beta1))) as f32;
-        let unbias = (1.0 / (1.0 - power(self.beta2)).sqrt()) as f32;
-        let (new1, beta2, new2) = ((1.0 - self.beta1) as f32, self.beta2 as f32, (1.0 - self.beta2) as f32);
-        let eps = self.eps as f32;
+        let Rates { keep, rate, unbias, new1, beta2, new2, eps } = self.rates(t, lr);
         for (((p, g), m), v) in params.iter_mut().zip(grads).zip(m).zip(v) {
             *m += new1 * (*g - *m);
             *v = beta2 * *v + new2 * *g * *g;

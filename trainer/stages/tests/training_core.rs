@@ -149,8 +149,8 @@ impl Objective for Toy {
     }
 
     fn load(&mut self, state: &TrainState) {
-        self.shift.clone_from(&state.groups[0].params);
-        self.scale.clone_from(&state.groups[1].params);
+        self.shift = state.params(0).to_vec();
+        self.scale = state.params(1).to_vec();
         self.codebook = state.buffers.get("codebook").to_vec();
         self.seen.lock().unwrap().push(state.buffers.clone());
     }

@@ -117,9 +117,9 @@ impl Distiller {
     /// Takes over student and target.
     pub(super) fn load(&mut self, state: &TrainState) {
         let group = &state.groups[0];
-        flat::assign(&mut self.student, &group.params);
-        let average = group.average.as_ref().expect("the group was planned with an average");
-        flat::assign(&mut self.target, average);
+        group.trained().assign(&mut self.student);
+        // The group was planned with an average.
+        group.averaged().assign(&mut self.target);
     }
 
     /// Dropout of the student in one slice.

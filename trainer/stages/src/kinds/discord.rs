@@ -8,7 +8,6 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::model::Parts;
-use models::flat;
 use models::flow::between;
 use models::kernels::Dropout;
 use models::losses;
@@ -52,11 +51,11 @@ impl Objective for Flow {
     }
 
     fn load(&mut self, state: &TrainState) {
-        let params = &state.groups[0].params;
-        self.field = match self.field.clone() {
-            Field::Unet(network) => Field::Unet(flat::write(network, params)),
-            Field::Dit(network) => Field::Dit(flat::write(network, params)),
-        };
+        let params = state.groups[0].trained();
+        match &mut self.field {
+            Field::Unet(network) => params.assign(network),
+            Field::Dit(network) => params.assign(network),
+        }
     }
 
     fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {

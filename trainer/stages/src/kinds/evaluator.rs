@@ -238,13 +238,12 @@ impl Objective for EvaluatorObjective {
     }
 
     fn load(&mut self, state: &TrainState) {
-        flat::assign(&mut self.text, &state.groups[0].params);
-        flat::assign(&mut self.motion, &state.groups[1].params);
-        flat::assign(&mut self.movements, &state.groups[2].params);
+        state.groups[0].trained().assign(&mut self.text);
+        state.groups[1].trained().assign(&mut self.motion);
+        state.groups[2].trained().assign(&mut self.movements);
         if state.step >= self.turning_point() {
             // The average, where one is kept: it is what the evaluator will have.
-            let encoder = self.frozen.num_params();
-            flat::assign(&mut self.frozen, &state.result(2)[..encoder]);
+            state.groups[2].averaged().assign_first(&mut self.frozen);
         }
     }
 

@@ -11,7 +11,6 @@ use burn::module::Module;
 use burn::tensor::Device;
 use checkpoint::model::{Model, Parts};
 use models::diffusion::{Schedule, affine, unzip};
-use models::flat;
 use models::kernels::Dropout;
 use models::losses::{FrameWeights, Pointwise};
 use models::names::{self, to_bytes};
@@ -63,7 +62,7 @@ impl<N: MotionNetwork> Objective for Features<N> {
     }
 
     fn load(&mut self, state: &TrainState) {
-        self.network = flat::write(self.network.clone(), &state.groups[0].params);
+        state.groups[0].trained().assign(&mut self.network);
     }
 
     fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {

@@ -45,7 +45,7 @@ impl Gang for DistillLcm {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {
                 // The online network is what is kept, as upstream; its average only was the target.
-                let trained = (&state.groups[0].entries[..], &state.groups[0].params[..]);
+                let trained = (&state.groups[0].entries[..], state.params(0));
                 let family = self.family().expect("a distillation gives a student");
                 let output = objective.0.publish(cx, family, trained)?;
                 Ok(Outcome::Finished { output, metrics })

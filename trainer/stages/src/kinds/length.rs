@@ -8,7 +8,6 @@
 use burn::tensor::activation::softmax;
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::model::Parts;
-use models::flat;
 use models::kernels::Dropout;
 use models::networks::{Init, LengthEstimator};
 use motion::Stream;
@@ -50,7 +49,7 @@ impl Objective for Lengths {
     }
 
     fn load(&mut self, state: &TrainState) {
-        flat::assign(&mut self.network, &state.groups[0].params);
+        state.groups[0].trained().assign(&mut self.network);
     }
 
     fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {

@@ -11,7 +11,6 @@ use std::collections::BTreeMap;
 use burn::tensor::{Int, Tensor, TensorData};
 use checkpoint::model::Parts;
 use models::diffusion::{Schedule, TIMESTEPS, affine, unzip};
-use models::flat;
 use models::kernels::Dropout;
 use models::losses;
 use models::networks::{Denoiser, Init};
@@ -60,7 +59,7 @@ impl Objective for Mld {
     }
 
     fn load(&mut self, state: &TrainState) {
-        flat::assign(&mut self.network, &state.groups[0].params);
+        state.groups[0].trained().assign(&mut self.network);
     }
 
     fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {

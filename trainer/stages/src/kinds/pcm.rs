@@ -11,7 +11,6 @@
 
 use burn::tensor::Tensor;
 use models::diffusion::{Phases, affine, unzip};
-use models::flat;
 use models::kernels::Dropout;
 use models::losses;
 use models::networks::{Discriminator, Init};
@@ -50,8 +49,8 @@ impl Objective for Pcm {
 
     fn load(&mut self, state: &TrainState) {
         self.it.load(state);
-        if let Some(heads) = self.heads.take() {
-            self.heads = Some(flat::write(heads, &state.groups[1].params));
+        if let Some(heads) = &mut self.heads {
+            state.groups[1].trained().assign(heads);
         }
     }
 
@@ -144,7 +143,7 @@ impl Gang for DistillPcm {
         match train(&mut objective, &self.distillation.training, cx)? {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {
-                let trained = (&state.groups[0].entries[..], &state.groups[0].params[..]);
+                let trained = (&state.groups[0].entries[..], state.params(0));
                 let family = self.family().expect("a distillation gives a student");
                 let output = objective.it.publish(cx, family, trained)?;
                 Ok(Outcome::Finished { output, metrics })

@@ -15,7 +15,6 @@ use std::borrow::Cow;
 use std::rc::Rc;
 
 use burn::tensor::{Device, Tensor, TensorData};
-use models::flat;
 use models::kernels::Dropout;
 use models::losses::{FrameWeights, Pointwise};
 use models::networks::{Init, Tokenizer};
@@ -214,7 +213,7 @@ impl Objective for VqObjective {
     }
 
     fn load(&mut self, state: &TrainState) {
-        self.network = flat::write(self.network.clone(), &state.groups[0].params);
+        state.groups[0].trained().assign(&mut self.network);
         let book = |q| state.buffers.get(&of("codebook", q)).to_vec();
         self.books = (0..self.settings.quantizers).map(book).collect();
     }

@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 
 use burn::tensor::{Device, Tensor};
 use checkpoint::model::Parts;
-use models::flat::{self, Entry};
+use models::flat::Entry;
 use models::kernels::Dropout;
 use models::networks::{Gpt, GptConfig, Init, MaskedTransformer, MomaskConfig, ResidualTransformer};
 use models::tokens::{autoregressive, cross_entropy, masked, residual};
@@ -49,7 +49,7 @@ impl Objective for Autoregressive {
     }
 
     fn load(&mut self, state: &TrainState) {
-        self.network = flat::write(self.network.clone(), &state.groups[0].params);
+        state.groups[0].trained().assign(&mut self.network);
     }
 
     fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
@@ -169,9 +169,9 @@ impl Objective for Masked {
     }
 
     fn load(&mut self, state: &TrainState) {
-        self.first = flat::write(self.first.clone(), &state.groups[0].params);
-        if let Some(network) = self.above.take() {
-            self.above = Some(flat::write(network, &state.groups[1].params));
+        state.groups[0].trained().assign(&mut self.first);
+        if let Some(network) = &mut self.above {
+            state.groups[1].trained().assign(network);
         }
     }
 

@@ -5,7 +5,6 @@
 //! v1 counts padding up to the longest clip of a slice, not of the batch.
 
 use burn::tensor::{Device, Tensor, TensorData};
-use models::flat;
 use models::kernels::Dropout;
 use models::losses::{self, Body, VaeRecipe};
 use models::networks::{Init, Vae};
@@ -85,7 +84,7 @@ impl Objective for VaeObjective {
     }
 
     fn load(&mut self, state: &TrainState) {
-        flat::assign(&mut self.network, &state.groups[0].params);
+        state.groups[0].trained().assign(&mut self.network);
     }
 
     fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {

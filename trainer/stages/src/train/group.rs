@@ -2,8 +2,10 @@
 
 use std::ops::Range;
 
-use models::flat::Entry;
+use burn::tensor::Device;
+use models::flat::{Entry, Values};
 use models::optim::{AdamW, LrSchedule, clip_factor, ema, global_norm};
+use models::resident::{Host, Resident};
 
 /// Which steps train a group.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -74,13 +76,15 @@ impl Average {
         Self { decay, every: 1, starts_as_copy: false }
     }
 
-    /// Moves `average` after update number `turn` (from 0) gave `params`.
-    fn follow(&self, turn: u64, average: &mut [f32], params: &[f32]) {
+    /// What happens to the average after update number `turn` (from 0).
+    fn at(&self, turn: u64) -> Follow {
         let done = turn + 1;
         if self.starts_as_copy && done == self.every {
-            average.copy_from_slice(params);
+            Follow::Copy
         } else if done.is_multiple_of(self.every) {
-            ema(average, params, self.decay);
+            Follow::Move(self.decay)
+        } else {
+            Follow::Stay
         }
     }
 }
@@ -114,27 +118,55 @@ impl GroupPlan {
     }
 }
 
-/// A group in training: flat buffers.
-#[derive(Debug, Clone, PartialEq)]
+/// Which values are the newer ones.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Newer {
+    /// Host and accelerator have the same.
+    Nowhere,
+    /// The accelerator's.
+    There,
+}
+
+/// What an update does to an average.
+enum Follow {
+    Copy,
+    Move(f64),
+    Stay,
+}
+
+/// A group in training: flat buffers, on the host or, while training on an accelerator, there; those of the host are then older.
+#[derive(Debug, Clone)]
 pub struct Group {
     /// Short name.
     pub name: &'static str,
     /// Tensors in the buffer.
     pub entries: Vec<Entry>,
     /// Parameters.
-    pub params: Vec<f32>,
+    pub(super) params: Vec<f32>,
     /// AdamW's first moments; none of a frozen group.
-    pub m: Vec<f32>,
+    pub(super) m: Vec<f32>,
     /// AdamW's second moments; none of a frozen group.
-    pub v: Vec<f32>,
+    pub(super) v: Vec<f32>,
     /// Moving average of the parameters, if the plan asks for one.
-    pub average: Option<Vec<f32>>,
+    pub(super) average: Option<Vec<f32>>,
+    /// All of that on an accelerator, if training is there, and whether it is newer there.
+    resident: Option<(Resident, Newer)>,
     /// Learning rate by update.
     pub lr: LrSchedule,
     optimizer: AdamW,
     clip: Option<Clip>,
     averaging: Option<Average>,
     turns: Turns,
+}
+
+/// By the host's values.
+impl PartialEq for Group {
+    fn eq(&self, other: &Self) -> bool {
+        let plan = |group: &Self| (group.name, group.lr, group.optimizer, group.clip, group.averaging);
+        let rest = |a: &Self, b: &Self| a.entries == b.entries && a.turns == b.turns;
+        let values = |a: &Self, b: &Self| (&a.params, &a.m, &a.v, &a.average) == (&b.params, &b.m, &b.v, &b.average);
+        plan(self) == plan(other) && rest(self, other) && values(self, other)
+    }
 }
 
 impl Group {
@@ -147,6 +179,7 @@ impl Group {
             v: vec![0.0; moments],
             average: plan.average.map(|_| plan.params.clone()),
             params: plan.params,
+            resident: None,
             lr: plan.lr,
             optimizer: plan.optimizer,
             clip: plan.clip,
@@ -163,11 +196,66 @@ impl Group {
     /// Applies update number `turn` (from 0) with `factor` times the gradient, then moves the average.
     pub(super) fn update(&mut self, turn: u64, gradient: &[f32], factor: f64) {
         #[expect(clippy::cast_possible_truncation, reason = "a factor in (0, 1]")]
-        let scaled: Vec<f32> = gradient.iter().map(|g| g * factor as f32).collect();
+        let factor = factor as f32;
+        if let Some((resident, newer)) = &mut self.resident {
+            resident.step(&self.optimizer, turn + 1, self.lr.at(turn), gradient, factor);
+            match self.averaging.map(|averaging| averaging.at(turn)) {
+                Some(Follow::Copy) => resident.copy(),
+                Some(Follow::Move(decay)) => resident.follow(decay),
+                Some(Follow::Stay) | None => {}
+            }
+            *newer = Newer::There;
+            return;
+        }
+        let scaled: Vec<f32> = gradient.iter().map(|g| g * factor).collect();
         self.optimizer.step(turn + 1, self.lr.at(turn), &mut self.params, &scaled, &mut self.m, &mut self.v);
         if let (Some(averaging), Some(average)) = (self.averaging, &mut self.average) {
-            averaging.follow(turn, average, &self.params);
+            match averaging.at(turn) {
+                Follow::Copy => average.copy_from_slice(&self.params),
+                Follow::Move(decay) => ema(average, &self.params, decay),
+                Follow::Stay => {}
+            }
         }
+    }
+
+    /// The parameters, where they are.
+    pub fn trained(&self) -> Values<'_> {
+        match &self.resident {
+            Some((resident, _)) => Values::Device(resident.params()),
+            None => Values::Host(&self.params),
+        }
+    }
+
+    /// The parameters as they should be used, where they are: their average if one is kept.
+    pub fn averaged(&self) -> Values<'_> {
+        match &self.resident {
+            Some((resident, _)) => Values::Device(resident.average().unwrap_or(resident.params())),
+            None => Values::Host(self.average.as_ref().unwrap_or(&self.params)),
+        }
+    }
+
+    /// Has everything on `device` from now on, with the host's values.
+    pub(super) fn send(&mut self, device: &Device) {
+        let resident = Resident::send(&self.host(), device);
+        self.resident = Some((resident, Newer::Nowhere));
+    }
+
+    /// Brings the host's values up to date.
+    pub(super) fn fetch(&mut self) {
+        if let Some((resident, _)) = self.resident.take_if(|(_, newer)| *newer == Newer::There) {
+            resident.fetch(self.host());
+            self.resident = Some((resident, Newer::Nowhere));
+        }
+    }
+
+    /// Whether the host's values are the newest.
+    pub(super) fn is_fetched(&self) -> bool {
+        self.resident.as_ref().is_none_or(|(_, newer)| *newer == Newer::Nowhere)
+    }
+
+    fn host(&mut self) -> Host<'_> {
+        let Self { params, m, v, average, .. } = self;
+        Host { params, m, v, average: average.as_deref_mut() }
     }
 }
 

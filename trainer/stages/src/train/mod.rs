@@ -18,6 +18,7 @@ mod tree;
 
 use std::collections::BTreeMap;
 
+use burn::tensor::Device;
 use protocol::message::StageTask;
 use protocol::stage::Training;
 
@@ -133,11 +134,13 @@ pub fn train(
         .map_err(StageError::Input)?;
     // Names of other stages say nothing about a state, which the key of the next rung rests on.
     let config = cx.task().settings.digest();
+    let accelerator = Some(cx.device()).filter(models::device::is_accelerator);
     let mut state = TrainState::new(objective.groups(), objective.buffers());
     let mut saved_at = begin(objective, &mut state, cx)?;
     let mut save_is_due = false;
     let mut stop = false;
     let mut recent = Recent::default();
+    keep(&mut state, accelerator.as_ref());
     objective.load(&state);
     let mut done: BTreeMap<usize, Vec<f32>> = BTreeMap::new();
     loop {
@@ -145,8 +148,9 @@ pub fn train(
             if cx.leads() {
                 if saved_at != Some(state.step) {
                     // Publishing may fail or be cut off; the last step should not have to be found again.
-                    save(&state, config, &recent, cx)?;
+                    save(&mut state, config, &recent, cx)?;
                 }
+                state.fetch();
                 return Ok(if state.step < steps {
                     Trained::Yielded { at: state.step }
                 } else {
@@ -158,6 +162,7 @@ pub fn train(
             stop = false;
             let applied = Some(state.step);
             if meet(&mut state, applied, cx)? == Met::Adopted {
+                keep(&mut state, accelerator.as_ref());
                 objective.load(&state);
             }
             continue;
@@ -178,6 +183,7 @@ pub fn train(
                 if meet(&mut state, applied, cx)? == Met::Adopted {
                     // A peer was ahead: these slices are of a step that is over.
                     done.clear();
+                    keep(&mut state, accelerator.as_ref());
                     objective.load(&state);
                 } else {
                     done.extend(parts);
@@ -203,7 +209,7 @@ pub fn train(
         save_is_due |= every > 0 && state.step.is_multiple_of(every);
         stop = drain;
         if cx.leads() && state.step < steps && save_is_due && !stop && cx.can_save() {
-            save(&state, config, &recent, cx)?;
+            save(&mut state, config, &recent, cx)?;
             (saved_at, save_is_due) = (Some(state.step), false);
         }
     }
@@ -266,6 +272,7 @@ enum Met {
 /// Meets the others, and takes over a peer's state where one is ahead or this member has none (`applied` is `None`).
 fn meet(state: &mut TrainState, applied: Option<u64>, cx: &mut dyn GangContext) -> Result<Met, StageError> {
     let mut kept = Met::Kept;
+    state.fetch();
     loop {
         let mut step = state.step.to_le_bytes();
         if cx.rendezvous(applied, &state.pieces(&step))? == Rendezvous::Keep {
@@ -381,12 +388,21 @@ fn hook(
     objective.after(&mut AfterStep { step, buffers, sums, seed: task.seed, stage: &task.name })
 }
 
+/// Has the groups on the accelerator, if there is one, with the values of the host: parameters, moments and averages come back from there
+/// only for a checkpoint, a peer or the end.
+fn keep(state: &mut TrainState, accelerator: Option<&Device>) {
+    if let Some(device) = accelerator {
+        state.keep_on(device);
+    }
+}
+
 fn save(
-    state: &TrainState,
+    state: &mut TrainState,
     config: protocol::Digest,
     recent: &Recent,
     cx: &mut dyn GangContext,
 ) -> Result<(), StageError> {
+    state.fetch();
     let meta = json!({
         "step": state.step,
         "settings": config,

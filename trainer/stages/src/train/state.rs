@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use burn::tensor::Device;
 use bytemuck::{cast_slice, cast_slice_mut};
 use checkpoint::{Blob, BlobError};
 use safetensors::Dtype;
@@ -24,7 +25,8 @@ pub enum RestoreError {
     Blob(#[from] BlobError),
 }
 
-/// All that a training stage carries from step to step.
+/// All that a training stage carries from step to step. Groups may be on an accelerator ([`keep_on`](Self::keep_on)); what is saved, sent to
+/// a peer or published is the host's, which [`fetch`](Self::fetch) brings up to date.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainState {
     /// Updates applied.
@@ -46,6 +48,20 @@ impl TrainState {
         let names: usize = state.groups.iter().map(|group| 3 + usize::from(group.average.is_some())).sum();
         assert_eq!(state.values().len(), names + state.buffers.iter().count(), "every name stands for one buffer");
         state
+    }
+
+    /// Has the groups on `device` from now on, with the values of the host.
+    pub fn keep_on(&mut self, device: &Device) {
+        self.groups.iter_mut().for_each(|group| group.send(device));
+    }
+
+    /// Brings the host's values up to date. Costs nothing where groups are on the host anyway.
+    pub fn fetch(&mut self) {
+        self.groups.iter_mut().for_each(Group::fetch);
+    }
+
+    fn is_fetched(&self) -> bool {
+        self.groups.iter().all(Group::is_fetched)
     }
 
     /// All that is saved besides the step, by its name there.
@@ -91,6 +107,7 @@ impl TrainState {
     /// Calls `save` with the bytes of a saved state in pieces, nearly all of which lie where they are: no second copy of a large
     /// state is made.
     pub fn saved<T>(&self, save: impl FnOnce(&[&[u8]]) -> T) -> T {
+        debug_assert!(self.is_fetched());
         let (header, step) = (self.header(), self.step.to_le_bytes());
         let all = self.values();
         let mut pieces: Vec<&[u8]> = vec![&header, &step];
@@ -161,6 +178,7 @@ impl TrainState {
     /// The state as it travels between members of a gang, who have the same plan: `step` (as little-endian bytes), then the buffers as they
     /// lie in memory. Nothing is copied: with large models that is what takes the time.
     pub fn pieces<'a>(&'a self, step: &'a [u8; 8]) -> Vec<&'a [u8]> {
+        debug_assert!(self.is_fetched());
         let groups = self.groups.iter().flat_map(|group| {
             [&group.params, &group.m, &group.v].into_iter().chain(&group.average).map(|values| cast_slice(values))
         });
@@ -178,8 +196,15 @@ impl TrainState {
         std::iter::once(step.as_mut_slice()).chain(groups).chain(buffers).collect()
     }
 
+    /// The parameters of group `index`.
+    pub fn params(&self, index: usize) -> &[f32] {
+        debug_assert!(self.is_fetched());
+        &self.groups[index].params
+    }
+
     /// The parameters of group `index` as they should be used: their average where one is kept.
     pub fn result(&self, index: usize) -> &[f32] {
+        debug_assert!(self.is_fetched());
         let group = &self.groups[index];
         group.average.as_ref().unwrap_or(&group.params)
     }
@@ -196,18 +221,61 @@ mod tests {
     use crate::artifacts::Tensors;
     use crate::train::{Average, Turns};
 
-    #[test]
-    fn a_state_is_taken_over_bit_for_bit_from_a_peer_and_from_a_checkpoint() {
-        let plan = |name, average, turns| GroupPlan {
+    fn plan(name: &'static str, average: Option<Average>, turns: Turns) -> GroupPlan {
+        GroupPlan {
             name,
             entries: Vec::new(),
             params: vec![1.0, -2.0, 0.5],
-            optimizer: AdamW { beta1: 0.9, beta2: 0.999, eps: 1e-8, weight_decay: 0.0 },
+            optimizer: AdamW { beta1: 0.9, beta2: 0.999, eps: 1e-8, weight_decay: 0.01 },
             lr: LrSchedule { peak: 1e-2, warmup: 0, steps: 10, decay: Decay::Constant },
             clip: None,
             average,
             turns,
+        }
+    }
+
+    /// Flex stands in for an accelerator: what is tested is who has the newest values.
+    #[test]
+    fn groups_on_a_device_train_as_on_the_host_and_come_back_for_a_checkpoint() {
+        let device = models::device::open(protocol::stage::Backend::Flex, 0).unwrap();
+        let late = Average { decay: 0.5, every: 2, starts_as_copy: true };
+        let plans = [
+            plan("model", Some(Average::of(0.9)), Turns::ALWAYS),
+            plan("late", Some(late), Turns::ALWAYS),
+            plan("frozen", None, Turns::NEVER),
+        ];
+        let mut host = TrainState::new(plans.to_vec(), Vec::new());
+        let mut there = host.clone();
+        there.keep_on(&device);
+        let train = |state: &mut TrainState| {
+            for step in state.step..state.step + 3 {
+                state.groups[..2].iter_mut().for_each(|group| group.update(step, &[0.1, 0.2, -0.3], 0.5));
+                state.step = step + 1;
+            }
         };
+        let near = |a: &TrainState, b: &TrainState| {
+            a.values().into_iter().zip(b.values()).all(|((name, a), (other, b))| {
+                name == other && a.len() == b.len() && a.iter().zip(b).all(|(a, b)| (a - b).abs() <= 1e-6)
+            })
+        };
+        train(&mut host);
+        train(&mut there);
+        assert!(!there.is_fetched() && !near(&host, &there), "the host's are older");
+        there.fetch();
+        assert!(there.is_fetched() && near(&host, &there), "{host:#?}\n{there:#?}");
+        // What was saved goes on, on the host and on the device.
+        let bytes: Arc<[u8]> = there.saved(|pieces| pieces.concat()).into();
+        let mut other = TrainState::new(plans.to_vec(), Vec::new());
+        other.restore(&bytes).unwrap();
+        other.keep_on(&device);
+        [&mut host, &mut there, &mut other].into_iter().for_each(train);
+        there.fetch();
+        other.fetch();
+        assert!(other == there && near(&host, &there));
+    }
+
+    #[test]
+    fn a_state_is_taken_over_bit_for_bit_from_a_peer_and_from_a_checkpoint() {
         let plans = [
             plan("model", Some(Average::of(0.9)), Turns::ALWAYS),
             plan("heads", None, Turns::ALWAYS),

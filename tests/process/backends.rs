@@ -1,0 +1,114 @@
+//! Every kind that trains, on another backend than the one that all else is tested on: `STRIDE_TEST_BACKEND`, or ndarray, which every test
+//! build has. `tests/gpu.sh` does it on accelerators.
+
+use std::collections::BTreeSet;
+
+use cluster_tests::cluster::{Cluster, stage_of};
+use cluster_tests::{Bench, digests, wait_for};
+use protocol::stage::StageSettings;
+use serde_json::Value;
+
+const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
+/// What a loss or a gradient's norm may be off, relative to its size: backends sum in other orders, and what a stage reads was trained on
+/// the same backend.
+const TOLERANCE: f64 = 1e-4;
+
+fn other() -> String {
+    std::env::var("STRIDE_TEST_BACKEND").unwrap_or_else(|_| "ndarray".to_owned())
+}
+
+fn config() -> std::path::PathBuf {
+    Bench::repository().join("tests/process/kinds.yaml")
+}
+
+/// One worker of a backend runs every kind; its run, and the stages that trained.
+fn run(backend: &str, sets: &[&str]) -> (Cluster, String, Value) {
+    let mut cluster = Cluster::start(TRAINER);
+    cluster.join_by("w1", &[], &["--backend", backend]);
+    let choice = format!("backend={backend}");
+    let run = cluster.submit(&config(), &[&["--set", &choice][..], sets].concat());
+    let view = cluster.wait_end(&run);
+    assert_eq!(view["state"], "finished", "on {backend}: {view:#}\n{}", cluster.everything());
+    (cluster, run, view)
+}
+
+fn kinds(view: &Value) -> Vec<(String, String)> {
+    let stages = view["stages"].as_array().expect("stages");
+    let text = |value: &Value| value.as_str().expect("a text").to_owned();
+    stages.iter().map(|stage| (text(&stage["name"]), text(&stage["kind"]))).collect()
+}
+
+#[test]
+fn every_kind_trains_on_another_backend_as_on_flex() {
+    let (flex, run_on_flex, view) = run("flex", &[]);
+    let (there, run_there, _) = run(&other(), &[]);
+    let mut tried = BTreeSet::new();
+    let mut off = Vec::new();
+    for (stage, kind) in kinds(&view) {
+        let expected = flex.metrics(&run_on_flex, &stage);
+        let found = there.metrics(&run_there, &stage);
+        assert_eq!(found.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>(), "{stage}");
+        for (name, points) in &expected {
+            assert_eq!(found[name].len(), points.len(), "{stage}: {name}");
+            for (found, expected) in found[name].iter().zip(points) {
+                let error = (found.1 - expected.1).abs() / expected.1.abs().max(1e-3);
+                off.push((error, format!("{stage}: {name} after step {}: {} and {}", expected.0, found.1, expected.1)));
+            }
+        }
+        if expected.contains_key("gradient_norm") {
+            tried.insert(kind);
+        }
+    }
+    let trains = |kind: StageSettings| kind.training().is_some().then(|| kind.kind().to_owned());
+    let all: BTreeSet<String> = StageSettings::all().into_iter().filter_map(trains).collect();
+    assert_eq!(tried, all, "kinds.yaml has every kind that trains");
+    off.sort_by(|a, b| b.0.total_cmp(&a.0));
+    eprintln!("{} values on {}; the furthest off:", off.len(), other());
+    off.iter().take(5).for_each(|(error, what)| eprintln!("  {error:.1e} {what}"));
+    assert!(off[0].0 < TOLERANCE, "{:?}", off[0]);
+}
+
+/// A worker is killed after a checkpoint; what it goes on to is what one that was not killed has. The same bits on one device: that is what
+/// keys rest on.
+#[test]
+fn p5_a_kill_on_another_backend_changes_no_byte() {
+    let sets = ["--set", "stages.vae.steps=6", "--until", "vae"];
+    let (_, _, whole) = run(&other(), &sets);
+    let mut cluster = Cluster::start(TRAINER);
+    let dies = ["env".to_owned(), "STRIDE_WORKER_FAILPOINT=checkpoint::after_commit@3".to_owned()];
+    cluster.join_by("w1", &dies, &["--backend", &other()]);
+    let choice = format!("backend={}", other());
+    let id = cluster.submit(&config(), &[&["--set", &choice][..], &sets].concat());
+    wait_for("the worker to die", || (!cluster.alive("w1")).then_some(()));
+    cluster.join_by("w2", &[], &["--backend", &other()]);
+    let view = cluster.wait_end(&id);
+    assert!(cluster.said("w2").contains("goes on from the checkpoint after step 3"), "{}", cluster.said("w2"));
+    assert_eq!(digests(&view), digests(&whole));
+}
+
+/// The smoke pipeline, whose rate is an ordinary one: what differs in the last bits grows from step to step. Sampled: its first stage; all of
+/// it with `STRIDE_TEST_BACKEND`.
+#[test]
+fn the_smoke_pipeline_on_another_backend() {
+    let last = if std::env::var_os("STRIDE_TEST_BACKEND").is_some() { "release" } else { "vae" };
+    let until = ["--until", last];
+    let run = |backend: &str| {
+        let mut cluster = Cluster::start(TRAINER);
+        cluster.join_by("w1", &[], &["--backend", backend]);
+        let choice = format!("backend={backend}");
+        let config = Bench::repository().join("configs/smoke.yaml");
+        let run = cluster.submit(&config, &[&["--set", &choice][..], &until].concat());
+        let view = cluster.wait_end(&run);
+        assert_eq!(view["state"], "finished", "on {backend}: {view:#}\n{}", cluster.everything());
+        (cluster.metrics(&run, "vae"), view)
+    };
+    let (expected, _) = run("flex");
+    let (found, view) = run(&other());
+    assert_eq!(stage_of(&view, last)["state"], "ran");
+    let (expected, found) = (&expected["loss"], &found["loss"]);
+    assert_eq!(found.len(), expected.len());
+    for (found, expected) in found.iter().zip(expected) {
+        let error = (found.1 - expected.1).abs() / expected.1;
+        assert!(error < 1e-4, "loss after step {}: {} on {}, {} on flex", found.0, found.1, other(), expected.1);
+    }
+}
