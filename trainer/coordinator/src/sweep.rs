@@ -174,7 +174,7 @@ fn concluded(run: &Run, sweep: &Sweeping) -> Status {
         let message = format!("none of the {} trials of the sweep got to the end{why}", sweep.search.trials().len());
         return Status::Failed { key, message };
     };
-    let (Status::Done { key, known, attempt, .. }, Status::Done { known: judged, .. }) =
+    let (Status::Done { key, known, attempt, .. }, Status::Done { known: evaluated, .. }) =
         (&run.stages[place], &run.stages[place + 1])
     else {
         unreachable!("a trial with a result is done");
@@ -182,7 +182,7 @@ fn concluded(run: &Run, sweep: &Sweeping) -> Status {
     let name = run.pipeline.stages[place].settings.output().name;
     let outputs = value(known).map(|output| (name.to_owned(), *output)).into_iter().collect();
     let mut metrics = known.metrics.clone();
-    metrics.extend(judged.metrics.clone());
+    metrics.extend(evaluated.metrics.clone());
     metrics.insert("sweep.trial".into(), trial as f64);
     let numbers = sweep.search.trials()[trial].iter().filter_map(|(path, value)| Some((path, value.as_f64()?)));
     metrics.extend(numbers.map(|(path, value)| (format!("sweep.{path}"), value)));

@@ -1,4 +1,4 @@
-//! `sweep:` on a training stage: which settings are searched, how, and what judges a trial.
+//! `sweep:` on a training stage: which settings are searched, how, and what evaluates a trial.
 //!
 //! A trial is the stage with some of its settings changed, trained in rungs: a rung is an ordinary stage that stops before the end of
 //! its learning rate schedule, and the next rung goes on from the state that it left. This module is data and the arithmetic on it; who
@@ -94,7 +94,7 @@ pub struct Sweep {
     pub rungs: Rungs,
     /// What is searched, by path.
     pub space: BTreeMap<String, Domain>,
-    /// The stage that judges a trial; its reference to the judged stage is filled in.
+    /// The stage that evaluates a trial; its reference to the evaluated stage is filled in.
     pub evaluate: Box<StageSettings>,
 }
 
@@ -157,7 +157,7 @@ pub fn with_values(base: &StageSettings, values: &Values) -> Result<StageSetting
 }
 
 /// The field through which `evaluate` looks at a stage that gives a `kind`.
-pub fn judged_field(evaluate: &StageSettings, kind: ArtifactKind) -> Option<String> {
+pub fn evaluated_field(evaluate: &StageSettings, kind: ArtifactKind) -> Option<String> {
     evaluate.inputs().into_iter().find(|(_, _, wanted)| *wanted == kind).map(|(field, _, _)| field)
 }
 

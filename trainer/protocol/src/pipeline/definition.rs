@@ -106,10 +106,10 @@ impl Pipeline {
         }
     }
 
-    /// Notes the code versions of its kinds, those that judge trials included.
+    /// Notes the code versions of its kinds, those that evaluate trials included.
     pub(crate) fn note_code_versions(&mut self) {
-        let judges = self.stages.iter().filter_map(|stage| stage.sweep.as_ref()).map(|sweep| &*sweep.evaluate);
-        let kinds = self.stages.iter().map(|stage| &stage.settings).chain(judges);
+        let evaluations = self.stages.iter().filter_map(|stage| stage.sweep.as_ref()).map(|sweep| &*sweep.evaluate);
+        let kinds = self.stages.iter().map(|stage| &stage.settings).chain(evaluations);
         let beyond = kinds.filter(|settings| settings.code_version() > FIRST_VERSION);
         self.code_versions = beyond.map(|settings| (settings.kind().to_owned(), settings.code_version())).collect();
     }

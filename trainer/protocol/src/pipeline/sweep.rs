@@ -15,7 +15,7 @@ use super::schema::{list_keys, overlay, unknown_key};
 use super::yaml::{Content, Entry, Node};
 use crate::ArtifactKind;
 use crate::stage::{Mode, StageSettings};
-use crate::sweep::{Domain, Rungs, SearchKind, Sweep, judged_field, setting};
+use crate::sweep::{Domain, Rungs, SearchKind, Sweep, evaluated_field, setting};
 
 /// What a domain may be.
 const DOMAINS: [&str; 3] = ["choice", "uniform", "log_uniform"];
@@ -59,7 +59,7 @@ pub(super) fn described() -> Value {
         "type": "object",
     });
     properties["evaluate"] = json!({
-        "description": "The stage that judges a trial, without what it judges: an `evaluate.*` kind and its keys.",
+        "description": "The stage that evaluates a trial, without what it evaluates: an `evaluate.*` kind and its keys.",
         "type": "object",
         "required": ["kind"],
     });
@@ -121,14 +121,14 @@ impl Reader {
                 );
                 return None;
             }
-            Some(entry) => self.judge(entry, name, default, &format!("{path}.evaluate"))?,
+            Some(entry) => self.evaluation(entry, name, default, &format!("{path}.evaluate"))?,
         };
         let Head { search, metric, mode, trials, parallel, rungs } = head?;
         Some(Sweep { search, metric, mode, trials, parallel, rungs, space, evaluate: Box::new(evaluate) })
     }
 
-    /// The stage that judges trials, with its reference to the judged stage filled in.
-    fn judge(&mut self, entry: &Entry, name: &str, default: &StageSettings, path: &str) -> Option<StageSettings> {
+    /// The stage that evaluates trials, with its reference to the evaluated stage filled in.
+    fn evaluation(&mut self, entry: &Entry, name: &str, default: &StageSettings, path: &str) -> Option<StageSettings> {
         let owner = format!("`evaluate` of the sweep of stage `{name}`");
         let node = &entry.value;
         if node.map().is_none() {
@@ -136,17 +136,17 @@ impl Reader {
             self.mistake(node.at, path, message, Some("such as `{kind: evaluate.latent_fid}`".into()));
             return None;
         }
-        let judge = self.kind(node, entry.key_at, &owner, path)?;
+        let evaluation = self.kind(node, entry.key_at, &owner, path)?;
         let gives = default.output().kind;
-        let field = judged_field(&judge, gives).filter(|_| judge.output().kind == ArtifactKind::Report);
+        let field = evaluated_field(&evaluation, gives).filter(|_| evaluation.output().kind == ArtifactKind::Report);
         let Some(field) = field else {
-            let judges = StageSettings::all();
-            let judges = judges
-                .iter()
-                .filter(|judge| judge.output().kind == ArtifactKind::Report && judged_field(judge, gives).is_some());
-            let message = format!("`{}` does not measure {}, which `{name}` gives", judge.kind(), gives.noun());
+            let evaluations = StageSettings::all();
+            let evaluations = evaluations.iter().filter(|evaluation| {
+                evaluation.output().kind == ArtifactKind::Report && evaluated_field(evaluation, gives).is_some()
+            });
+            let message = format!("`{}` does not measure {}, which `{name}` gives", evaluation.kind(), gives.noun());
             let at = node.entry("kind").map_or(node.at, |kind| kind.value.at);
-            let help = format!("kinds that do: {}", list_keys(judges.map(StageSettings::kind)));
+            let help = format!("kinds that do: {}", list_keys(evaluations.map(StageSettings::kind)));
             self.mistake(at, &format!("{path}.kind"), message, Some(help));
             return None;
         };
@@ -154,11 +154,11 @@ impl Reader {
             && written.value.as_text() != Some(name)
         {
             let message =
-                format!("`{field}` of {owner} is {}; a sweep judges its own trials", written.value.describe());
+                format!("`{field}` of {owner} is {}; a sweep evaluates its own trials", written.value.describe());
             self.mistake(written.value.at, &format!("{path}.{field}"), message, Some("leave it out".into()));
             return None;
         }
-        let mut base = serde_json::to_value(&judge).ok()?;
+        let mut base = serde_json::to_value(&evaluation).ok()?;
         base[field.as_str()] = Value::String(name.to_owned());
         self.overlaid(base, node, &owner, path, &[])
     }

@@ -7,7 +7,7 @@ use super::graph::{self, ByStage};
 use super::rules::{self, Problem, Problems};
 use crate::limits;
 use crate::stage::Placement;
-use crate::sweep::{Domain, MAX_TRIALS, Rungs, SearchKind, Sweep, Values, judged_field, setting, with_values};
+use crate::sweep::{Domain, MAX_TRIALS, Rungs, SearchKind, Sweep, Values, evaluated_field, setting, with_values};
 use crate::{ArtifactKind, StageName};
 
 /// Everything that can be said of a stage's sweep without looking at other stages.
@@ -19,11 +19,11 @@ pub(super) fn rules(stage: &PipelineStage) -> Vec<Problem> {
         return problems.0;
     };
     space_rules(p, stage, sweep);
-    if judged_field(&sweep.evaluate, stage.settings.output().kind).is_none()
+    if evaluated_field(&sweep.evaluate, stage.settings.output().kind).is_none()
         || sweep.evaluate.output().kind != ArtifactKind::Report
     {
-        let (judge, gives) = (sweep.evaluate.kind(), stage.settings.output().kind.noun());
-        p.add("sweep.evaluate", format!("`{judge}` does not measure {gives}"), "");
+        let (evaluation, gives) = (sweep.evaluate.kind(), stage.settings.output().kind.noun());
+        p.add("sweep.evaluate", format!("`{evaluation}` does not measure {gives}"), "");
     }
     if !p.0.is_empty() {
         return problems.0;
@@ -93,7 +93,7 @@ pub(super) fn rules(stage: &PipelineStage) -> Vec<Problem> {
         }
     }
     // What is wrong with the stage's placement is said there.
-    p.0.extend(rules::stage(&sweep.evaluate, &Placement::default()).into_iter().map(in_judge));
+    p.0.extend(rules::stage(&sweep.evaluate, &Placement::default()).into_iter().map(in_evaluation));
     problems.0
 }
 
@@ -141,7 +141,7 @@ fn tried(domain: &Domain, whole: bool) -> Vec<(String, Value)> {
     }
 }
 
-fn in_judge(problem: Problem) -> Problem {
+fn in_evaluation(problem: Problem) -> Problem {
     Problem { field: format!("sweep.evaluate.{}", problem.field), ..problem }
 }
 
@@ -149,20 +149,20 @@ fn in_judge(problem: Problem) -> Problem {
 pub(super) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
     for (i, stage) in stages.iter().enumerate() {
         let Some(sweep) = &stage.sweep else { continue };
-        let judge_name = StageName::new(format!("{}.eval", stage.name));
-        let judge = PipelineStage {
-            name: judge_name.clone(),
+        let evaluation_name = StageName::new(format!("{}.eval", stage.name));
+        let evaluation = PipelineStage {
+            name: evaluation_name.clone(),
             settings: (*sweep.evaluate).clone(),
             inputs: graph::references(&sweep.evaluate),
             sweep: None,
             ..stage.clone()
         };
         let mut all = stages.to_vec();
-        all.push(judge);
+        all.push(evaluation);
         let mut problems = ByStage::new();
         graph::check_agreement(&all, &mut problems);
-        if let Some(wrong) = problems.remove(&judge_name).filter(|wrong| !wrong.0.is_empty()) {
-            found.entry(stage.name.clone()).or_default().0.extend(wrong.0.into_iter().map(in_judge));
+        if let Some(wrong) = problems.remove(&evaluation_name).filter(|wrong| !wrong.0.is_empty()) {
+            found.entry(stage.name.clone()).or_default().0.extend(wrong.0.into_iter().map(in_evaluation));
             continue;
         }
         for (path, domain) in &sweep.space {

@@ -87,7 +87,7 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
         "20:24",
         &["`evaluate.reconstruction` does not measure a model", "`evaluate.latent_fid`"],
     ),
-    ("teacher: mld", "model: mld", "20:52", &["a sweep judges its own trials", "leave it out"]),
+    ("teacher: mld", "model: mld", "20:52", &["a sweep evaluates its own trials", "leave it out"]),
     ("teacher: mld", "teacher: mdl", "20:54", &["the stage `mdl`, which does not exist; did you mean `mld`?"]),
     ("teacher: mld", "repeats: 0", "20:54", &["`repeats` is 0"]),
     (

@@ -23,7 +23,7 @@ use crate::train::{GroupPlan, Losses, Objective, SliceResult, TrainState, Traine
 use burn::module::Module;
 
 struct Pcm {
-    it: Distiller,
+    distiller: Distiller,
     settings: DistillPcm,
     phases: Phases,
     heads: Option<Discriminator>,
@@ -31,7 +31,7 @@ struct Pcm {
 
 impl Objective for Pcm {
     fn groups(&mut self) -> Vec<GroupPlan> {
-        let Some(heads) = &self.heads else { return vec![self.it.group()] };
+        let Some(heads) = &self.heads else { return vec![self.distiller.group()] };
         let training = &self.settings.distillation.training;
         let lr = if self.settings.discriminator_lr > 0.0 { self.settings.discriminator_lr } else { training.lr };
         let heads = GroupPlan {
@@ -39,7 +39,7 @@ impl Objective for Pcm {
             ..group("heads", heads, &Training { lr, ..training.clone() }, 0.0)
         };
         let [student, critic] = self.turns();
-        vec![self.it.group().taking(student, training.steps.0), heads.taking(critic, training.steps.0)]
+        vec![self.distiller.group().taking(student, training.steps.0), heads.taking(critic, training.steps.0)]
     }
 
     fn terms(&self) -> Vec<&'static str> {
@@ -48,27 +48,27 @@ impl Objective for Pcm {
     }
 
     fn load(&mut self, state: &TrainState) {
-        self.it.load(state);
+        self.distiller.load(state);
         if let Some(heads) = &mut self.heads {
             state.groups[1].trained().assign(heads);
         }
     }
 
     fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
-        let solved = self.it.solve(step, slice);
+        let solved = self.distiller.solve(step, slice);
         let phases: Vec<usize> = solved.index.iter().map(|i| self.phases.phase_of(*i)).collect();
         let edges: Vec<usize> = phases.iter().map(|m| self.phases.edge_time(*m)).collect();
 
         // The jump from a point to itself is the identity, which is what the target is next to an edge (t' = s_m).
-        let (a, e) = unzip(solved.to.iter().zip(&edges).map(|(t, s)| self.it.noise.jump(*t, *s)));
-        let target = affine(solved.solved_bnd.clone(), self.it.target_out(&solved, step, slice), &a, &e);
-        let (a, e) = unzip(solved.from.iter().zip(&edges).map(|(t, s)| self.it.noise.jump(*t, *s)));
-        let student = affine(solved.noisy_bnd.clone(), self.it.student_out(&solved, step, slice), &a, &e);
+        let (a, e) = unzip(solved.to.iter().zip(&edges).map(|(t, s)| self.distiller.noise.jump(*t, *s)));
+        let target = affine(solved.solved_bnd.clone(), self.distiller.target_out(&solved, step, slice), &a, &e);
+        let (a, e) = unzip(solved.from.iter().zip(&edges).map(|(t, s)| self.distiller.noise.jump(*t, *s)));
+        let student = affine(solved.noisy_bnd.clone(), self.distiller.student_out(&solved, step, slice), &a, &e);
 
         let global = self.settings.distillation.training.batch.global;
         let mut all = Losses::new(global);
-        all.add("consistency", self.it.distance(student.clone(), target), 1.0);
-        let Some(heads) = &self.heads else { return slice_result(&self.it.student, &all, &self.terms()) };
+        all.add("consistency", self.distiller.distance(student.clone(), target), 1.0);
+        let Some(heads) = &self.heads else { return slice_result(&self.distiller.student, &all, &self.terms()) };
 
         let levels: Vec<usize> = solved
             .batch
@@ -77,12 +77,12 @@ impl Objective for Pcm {
             .zip(&phases)
             .zip(&edges)
             .map(|((pick, m), edge)| {
-                edge + self.it.data.stream("level", *pick).below(self.phases.next_edge_time(*m) - edge)
+                edge + self.distiller.data.stream("level", *pick).below(self.phases.next_edge_time(*m) - edge)
             })
             .collect();
         let (fake, real) = self.levels(&solved, student, &edges, &levels);
         let text = &solved.batch.text_blc;
-        let features = |z: Tensor<3>| self.it.teacher.features(z, &levels, text.clone(), &mut Dropout::off());
+        let features = |z: Tensor<3>| self.distiller.teacher.features(z, &levels, text.clone(), &mut Dropout::off());
 
         let fake_features = features(fake);
         let detached: Vec<Tensor<3>> = fake_features.iter().map(|f| f.clone().inner()).collect();
@@ -94,7 +94,7 @@ impl Objective for Pcm {
         let total = all.total().expect("the consistency is part of it");
         let [student_turns, critic_turns] = self.turns().map(|turns| turns.turn(step).is_some());
         let gradients = vec![
-            if student_turns { slice_gradient(&self.it.student, total) } else { Vec::new() },
+            if student_turns { slice_gradient(&self.distiller.student, total) } else { Vec::new() },
             if critic_turns { slice_gradient(heads, critic) } else { Vec::new() },
         ];
         Ok(SliceResult { gradients, terms: all.values(&self.terms()), ..SliceResult::default() })
@@ -120,32 +120,32 @@ impl Pcm {
         levels: &[usize],
     ) -> (Tensor<3>, Tensor<3>) {
         let picks = &solved.batch.picks;
-        let (a, e) = unzip(edges.iter().zip(levels).map(|(m, s)| self.it.noise.transition(*m, *s)));
-        let fake = affine(student, self.it.data.noise("fake", picks), &a, &e);
-        let (a, e) = unzip(levels.iter().map(|s| self.it.noise.add_noise(*s)));
-        let real = affine(solved.batch.clean_bnd.clone(), self.it.data.noise("real", picks), &a, &e);
+        let (a, e) = unzip(edges.iter().zip(levels).map(|(m, s)| self.distiller.noise.transition(*m, *s)));
+        let fake = affine(student, self.distiller.data.noise("fake", picks), &a, &e);
+        let (a, e) = unzip(levels.iter().map(|s| self.distiller.noise.add_noise(*s)));
+        let real = affine(solved.batch.clean_bnd.clone(), self.distiller.data.noise("real", picks), &a, &e);
         (fake, real)
     }
 }
 
 impl Gang for DistillPcm {
     fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
-        let it = Distiller::read(cx, &self.distillation)?;
-        let phases = Phases::new(&it.grid, self.phases);
+        let distiller = Distiller::read(cx, &self.distillation)?;
+        let phases = Phases::new(&distiller.grid, self.phases);
         let heads = (self.adversarial > 0.0).then(|| {
             let device = cx.device().autodiff();
             let purpose = format!("{}/heads", cx.task().name);
-            let network = &it.teacher_meta.network;
+            let network = &distiller.teacher_meta.network;
             let mut init = Init::new(cx.task().seed, &purpose, network.positions, &device);
             Discriminator::new(network.layers, network.width, &mut init)
         });
-        let mut objective = Pcm { it, settings: self.clone(), phases, heads };
+        let mut objective = Pcm { distiller, settings: self.clone(), phases, heads };
         match train(&mut objective, &self.distillation.training, cx)? {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {
                 let trained = (&state.groups[0].entries[..], state.params(0));
                 let family = self.family().expect("a distillation gives a student");
-                let output = objective.it.publish(cx, family, trained)?;
+                let output = objective.distiller.publish(cx, family, trained)?;
                 Ok(Outcome::Finished { output, metrics })
             }
         }
