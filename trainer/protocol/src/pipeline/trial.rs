@@ -6,7 +6,7 @@ use super::definition::{PipelineStage, StageInput};
 use super::graph;
 use super::rules::{Problem, Problems};
 use crate::stage::{Shape, StageSettings};
-use crate::sweep::{Derived, STATE_OUTPUT, Values, beside, judged_field, rung_name, with_values};
+use crate::sweep::{Derived, STATE_OUTPUT, Values, beside, evaluated_field, rung_name, with_values};
 use crate::{ArtifactKind, StageName, Steps};
 
 /// What is written behind the name of a swept stage to say that its best trial is meant. It always is.
@@ -15,8 +15,9 @@ const BEST: &str = "@best";
 /// What a swept stage reads because its trials' evaluations do.
 pub(super) fn references(stage: &PipelineStage) -> Vec<StageInput> {
     let Some(sweep) = &stage.sweep else { return Vec::new() };
-    let judged = judged_field(&sweep.evaluate, stage.settings.output().kind);
-    let inputs = graph::references(&sweep.evaluate).into_iter().filter(|input| Some(&input.field) != judged.as_ref());
+    let evaluated = evaluated_field(&sweep.evaluate, stage.settings.output().kind);
+    let inputs =
+        graph::references(&sweep.evaluate).into_iter().filter(|input| Some(&input.field) != evaluated.as_ref());
     inputs.map(|input| StageInput { field: format!("sweep.evaluate.{}", input.field), ..input }).collect()
 }
 
@@ -70,17 +71,17 @@ impl PipelineStage {
             let stage = rung_name(&self.name, trial, before);
             inputs.push(StageInput { field: STATE_OUTPUT.into(), stage, kind: ArtifactKind::Checkpoint });
         }
-        let mut judge = (*sweep.evaluate).clone();
-        if let Some(field) = judged_field(&judge, self.settings.output().kind) {
-            refer(&mut judge, &field, name.as_str());
+        let mut evaluation = (*sweep.evaluate).clone();
+        if let Some(field) = evaluated_field(&evaluation, self.settings.output().kind) {
+            refer(&mut evaluation, &field, name.as_str());
         }
         debug_assert!(settings.shape() == Shape::Gang, "only gangs train");
         let placement = beside(&self.placement);
         let derived = |keyed_as: StageName| Some(Derived { of: self.name.clone(), trial, rung, keyed_as });
         let eval = Self {
             name: StageName::new(format!("{name}.eval")),
-            inputs: graph::references(&judge),
-            settings: judge,
+            inputs: graph::references(&evaluation),
+            settings: evaluation,
             placement: placement.clone(),
             external: BTreeMap::new(),
             sweep: None,

@@ -121,7 +121,7 @@ impl<'a> Neighbours<'a> {
         self.measured.contains_key(name)
     }
 
-    /// The evaluations of the pipeline that draw from stage `name`, and how. What judges a sweep's trials is none of them: a judge has a dot
+    /// The evaluations of the pipeline that draw from stage `name`, and how. What evaluates a sweep's trials is none of them: it has a dot
     /// in its name, which no name of a user's has.
     pub fn samplers_of(&self, name: &str) -> impl Iterator<Item = (&'a str, &'a Sampler)> {
         let all = self.measured.get(name).into_iter().flatten().filter(|(evaluation, _)| !evaluation.contains('.'));

@@ -7,7 +7,6 @@
 //! Departs: nothing is looked at behind a caption's last word, where upstream's encoder has always 77 of them.
 
 use burn::tensor::{Device, Tensor};
-use models::flat;
 use models::kernels::Dropout;
 use models::networks::{Init, Mmm, MmmConfig};
 use models::tokens::mmm;
@@ -99,7 +98,7 @@ impl Objective for WithWords {
     }
 
     fn load(&mut self, state: &TrainState) {
-        self.network = flat::write(self.network.clone(), &state.groups[0].params);
+        state.groups[0].trained().assign(&mut self.network);
     }
 
     fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
