@@ -25,9 +25,22 @@ pub(super) fn attend(
     bias: Option<Tensor<4>>,
     dropout: &mut Dropout,
 ) -> Tensor<3> {
+    let scale = 1.0 / ((q_bqh.dims()[2] / heads) as f32).sqrt();
+    attend_at(scale, q_bqh, k_bkh, v_bkh, heads, bias, dropout)
+}
+
+/// The same with another scale of the scores.
+pub(super) fn attend_at(
+    scale: f32,
+    q_bqh: Tensor<3>,
+    k_bkh: Tensor<3>,
+    v_bkh: Tensor<3>,
+    heads: usize,
+    bias: Option<Tensor<4>>,
+    dropout: &mut Dropout,
+) -> Tensor<3> {
     let ([batch, queries, width], keys) = (q_bqh.dims(), k_bkh.dims()[1]);
     let split = |x: Tensor<3>, len: usize| x.reshape([batch, len, heads, width / heads]).swap_dims(1, 2);
-    let scale = 1.0 / ((width / heads) as f32).sqrt();
     let mut scores = split(q_bqh, queries).matmul(split(k_bkh, keys).swap_dims(2, 3)) * scale;
     if let Some(bias) = bias {
         scores = scores + bias;

@@ -3,6 +3,7 @@
 //! Notation in tensor names: b batch, t frames or tokens, h width, n latent tokens, d latent width, f features.
 
 mod attend;
+mod clip_text;
 mod condition;
 mod control;
 mod conv;
@@ -20,11 +21,13 @@ mod mdm;
 mod mmm;
 mod momask;
 mod stablemofusion;
+mod t5;
 mod tokenizer;
 mod trajectory;
 mod transformer;
 mod vae;
 
+pub use clip_text::{ClipActivation, ClipStates, ClipText, ClipTextConfig, renamed_from_openai};
 pub use condition::ConditionEmbedding;
 pub use control::{Control, copied_from};
 pub use denoiser::{Denoiser, DenoiserConfig};
@@ -43,6 +46,7 @@ pub use mdm::{Mdm, MdmConfig};
 pub use mmm::{Mmm, MmmCondition, MmmConfig};
 pub use momask::{MaskedTransformer, MomaskConfig, ResidualTransformer};
 pub use stablemofusion::{StableMoFusion, StableMoFusionConfig, TokenCondition};
+pub use t5::{T5Config, T5Encoder, T5FeedForward, distance_bucket, mean_of_tokens, normalised};
 pub use tokenizer::{Tokenizer, TokenizerConfig};
 pub use trajectory::{Hints, TrajectoryConfig, TrajectoryEncoder};
 pub use transformer::{Attention, Block, Linear, Norm, SkipStack, StackConfig};

@@ -22,6 +22,7 @@ mod pcm_step;
 mod raw_diffusion;
 mod samplers;
 mod schedules;
+mod text;
 mod tokenizer;
 mod vae;
 
