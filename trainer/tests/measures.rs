@@ -101,6 +101,78 @@ fn models_of_motion_are_models(bench: &Bench, generate: &dyn Fn(&[&str]) -> serd
     assert!(refused.contains("would flatter it"), "{refused}");
 }
 
+/// Students with a control part: measured, registered beside their bases, and told where to go.
+fn motion_goes_where_it_is_told(bench: &Bench, generate: &dyn Fn(&[&str]) -> serde_json::Value) {
+    let config = Bench::config("smoke.yaml");
+    let control = |base: &str| {
+        format!(
+            "stages.on_{base}={{kind: train.control, model: {base}, hints: {{setting: spatial, joints: [pelvis, left_wrist], density: [0, 100]}}, \
+             guidance: [0.5, 5], network: {{width: 32, layers: 3, heads: 2, feed_forward: 64}}, embedding: 16, steps: 6, \
+             batch: {{global: 8, slices: 4}}, checkpoint: {{every: 2}}, lr: 1e-3}}"
+        )
+    };
+    let evaluate = |base: &str| {
+        format!(
+            "stages.told_{base}={{kind: evaluate.control, model: on_{base}, setting: spatial, joints: [pelvis, six], percent: [25], frames: [2], \
+             sampler: {{steps: 1, guidance: 2.5}}, repeats: 2, split: all, shards: 2}}"
+        )
+    };
+    let register = |base: &str| {
+        format!(
+            "stages.out_{base}={{kind: register, model: on-{base}, from: on_{base}, metric: average_error, promote: {{to: staging, \
+             require: [\"average_error < 1000\", \"average_error/pelvis/2frames < 1000\"]}}}}"
+        )
+    };
+    let sets: Vec<String> = ["lcm", "pcm"].iter().flat_map(|b| [control(b), evaluate(b), register(b)]).collect();
+    let sets: Vec<&str> = sets.iter().flat_map(|set| ["--set", set.as_str()]).collect();
+    bench.run(&[&["run", &config], &sets[..]].concat()).expect_code(0);
+    let shown = bench.run(&["registry", "show", "on-lcm@staging"]).expect_code(0).stdout;
+    for part in ["control=", "control for denoiser=", "denoiser for text=", "average_error/six/25pct"] {
+        assert!(shown.contains(part), "`{part}` is missing in\n{shown}");
+    }
+
+    let path = |text: &str| {
+        let file = bench.path().join("path.csv");
+        std::fs::write(&file, text).expect("the path is written");
+        file.display().to_string()
+    };
+    let told = path("t,joint,x,y,z\n0,pelvis,0,0.9,0\n1,pelvis,0,0.9,1\n2,left_wrist,0.3,1.2,2\n");
+    let drawn = generate(&["--model", "on-lcm@staging", "--control", &told]);
+    assert_eq!((&drawn["control"]["told"], &drawn["frames"]), (&3.into(), &44.into()), "{drawn}");
+    assert!(drawn["control"]["average_error_m"].as_f64().is_some_and(|error| error > 0.0), "{drawn}");
+    let one = generate(&["--stage", "on_pcm", "--control", &told, "--joints", "pelvis", "--control-scale", "0.5"]);
+    assert_eq!(one["control"]["told"], 2, "{one}");
+    let whole = bench.path().join("x.npy").display().to_string();
+    let again = generate(&["--model", "on-lcm@staging", "--control", &whole, "--joints", "pelvis,head"]);
+    assert_eq!((&again["control"]["told"], &again["frames"]), (&80.into(), &40.into()), "two joints, {again}");
+    let sheet = ["generate", "a person walks", "--model", "on-lcm@staging", "--control", &told, "-o", "x.png"];
+    let said = bench.run(&sheet).expect_code(0).stdout;
+    assert!(said.contains("3 positions told"), "{said}");
+
+    let fast = "t,x,y,z\n0,0,0.9,0\n0.1,0,0.9,5\n";
+    for (text, args, words) in [
+        ("t,x,y,z\n9.95,0,0.9,0\n", vec!["--model", "on-lcm@staging", "--frames", "60"], ["9.95 s", "60 frames"]),
+        ("t,x,y,z\n900,0,0.9,0\n", vec!["--model", "on-lcm@staging"], ["900", "at most"]),
+        ("t,x,y,z\n0,0,0.9,0\n", vec!["--model", "on-lcm@staging", "--joints", "tail"], ["`tail`", "left_wrist"]),
+        (fast, vec!["--model", "on-lcm@staging"], ["line 3", "50.0 m/s"]),
+        ("t,x,y,z\n0,0,0.9,0\n", vec!["--stage", "lcm"], ["has no control part", "train.control"]),
+        (
+            "t,x,y,z\n0,0,0.9,0\n",
+            vec!["--stage", "lcm", "--control-from", "on-pcm@staging"],
+            ["`control` was made for the `denoiser`", "registry show"],
+        ),
+    ] {
+        let file = path(text);
+        let line = [&["generate", "a person walks", "-o", "x.npy", "--control", &file], &args[..]].concat();
+        let said = bench.run(&line).expect_code(2).stderr;
+        assert!(words.iter().all(|word| said.contains(word)), "{args:?}: {said}");
+    }
+    generate(&["--stage", "lcm", "--control-from", "on-lcm@staging", "--control", &path("t,x,y,z\n0,0,0.9,0\n")]);
+    let kit = ["--set", "stages.on_lcm.hints.joints=[right_midfoot]"];
+    let refused = bench.run(&[&["plan", &config], &sets[..], &kit[..]].concat()).expect_code(2).stderr;
+    assert!(refused.contains("`right_midfoot` is no joint of a skeleton of 22 joints"), "{refused}");
+}
+
 /// A promoted student, and what a stage gave, are drawn with the sampler of their evaluations, which is not that of the papers.
 fn models_are_drawn_as_they_were_measured(bench: &Bench) {
     let config = Bench::config("smoke.yaml");
@@ -138,6 +210,7 @@ fn models_are_drawn_as_they_were_measured(bench: &Bench) {
     let solved = generate(&["--stage", "mld", "--solver", "dpm-solver++"]);
     assert_eq!(solved["sampler"]["solver"], "dpm-solver++", "{solved}");
     models_of_motion_are_models(bench, &generate);
+    motion_goes_where_it_is_told(bench, &generate);
 
     // Evaluations that differ, and the one that `register` names.
     let other = ["--set", "stages.t2m_pcm.sampler.guidance=3"];

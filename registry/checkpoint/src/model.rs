@@ -142,8 +142,8 @@ pub fn add_part(whole: &mut Manifest, role: &Role, part: &Manifest) -> Digest {
     digest
 }
 
-/// The parts that `part` was made for.
-fn fits(role: &Role, part: &Manifest) -> Result<Parts, ModelError> {
+/// The parts that `part` was made for, by role.
+pub fn fits(role: &Role, part: &Manifest) -> Result<Parts, ModelError> {
     let fits = part.meta.get("fits").map(Parts::deserialize).transpose();
     Ok(fits.map_err(|e| malformed(&format!("part `{role}`"), &e))?.unwrap_or_default())
 }

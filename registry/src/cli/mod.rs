@@ -11,8 +11,11 @@ mod client;
 mod export;
 mod print;
 
+use std::collections::BTreeMap;
+
 use access::Scope;
-use checkpoint::model::Model as ModelMeta;
+use checkpoint::model::{self, Model as ModelMeta, Parts};
+use protocol::artifact::Role;
 use protocol::message::ApiError;
 use protocol::{Alias, Digest, Manifest, ModelName, RunId};
 use serde::{Deserialize, Serialize};
@@ -168,7 +171,13 @@ pub enum Data {
     /// Of `show MODEL`.
     Model { model: Model, versions: Vec<Version> },
     /// Of `show MODEL@ALIAS`.
-    Version { version: Version, manifest: Manifest },
+    Version {
+        version: Version,
+        manifest: Manifest,
+        /// For each part of a model those that it was made for.
+        #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+        fits: BTreeMap<Role, Parts>,
+    },
     /// Of `history`.
     History { model: ModelName, history: Vec<Promotion> },
     /// Of `promote` and `rollback`.
@@ -468,5 +477,20 @@ async fn show(store: &ReadStore, text: &str) -> Result<Data, Refused> {
     }
     let version = store.resolve(text).await?;
     let manifest = store.blobs().manifest(version.artifact).map_err(|e| QueryError::Blob(e.to_string()))?;
-    Ok(Data::Version { version, manifest })
+    let fits = fits(store, &manifest)?;
+    Ok(Data::Version { version, manifest, fits })
+}
+
+/// For each part of a model those that it was made for; nothing for what is no model.
+fn fits(store: &ReadStore, manifest: &Manifest) -> Result<BTreeMap<Role, Parts>, Refused> {
+    let Ok(model) = ModelMeta::read(manifest) else { return Ok(BTreeMap::new()) };
+    let mut all = BTreeMap::new();
+    for (role, digest) in model.parts {
+        let part = store.blobs().manifest(digest).map_err(|e| QueryError::Blob(e.to_string()))?;
+        let fits = model::fits(&role, &part).map_err(|e| QueryError::Blob(e.to_string()))?;
+        if !fits.is_empty() {
+            all.insert(role, fits);
+        }
+    }
+    Ok(all)
 }

@@ -1,8 +1,9 @@
 //! Answers on the terminal. Data goes to stdout, messages to stderr.
 
+use std::collections::BTreeMap;
 use std::io::{self, Write};
 
-use checkpoint::model::Model;
+use checkpoint::model::{Model, Parts};
 use comfy_table::{ContentArrangement, Table, presets};
 use protocol::artifact::Role;
 use protocol::message::ApiError;
@@ -80,7 +81,7 @@ pub fn render(data: &Data) -> String {
             }
             format!("{}\n{}\n", model.model, table.trim_fmt())
         }
-        Data::Version { version, manifest } => {
+        Data::Version { version, manifest, fits } => {
             let mut text = format!("{}:{}\n", version.model, version.version);
             let lines = [
                 ("artifact", version.artifact.to_string()),
@@ -88,7 +89,7 @@ pub fn render(data: &Data) -> String {
                 ("from", source(version)),
                 ("registered", format_ms(version.created_ms)),
             ];
-            for (name, value) in lines.into_iter().chain(drawn(manifest)) {
+            for (name, value) in lines.into_iter().chain(drawn(manifest)).chain(made_for(fits)) {
                 text += &format!("  {name:<11} {value}\n");
             }
             let mut values = table(&["EVALUATION", "METRIC", "VALUE, ± HALF THE 95 % INTERVAL"]);
@@ -243,6 +244,15 @@ fn drawn(manifest: &Manifest) -> Vec<(&'static str, String)> {
         ("sampler", sampler),
         ("parts", list(model.parts.iter().map(part))),
     ]
+}
+
+/// Which parts each part was made for.
+fn made_for(fits: &BTreeMap<Role, Parts>) -> Option<(&'static str, String)> {
+    let one = |(role, parts): (&Role, &Parts)| {
+        let each = parts.iter().map(|(role, digest)| format!("{role}={}", digest.short()));
+        format!("{role} for {}", each.collect::<Vec<_>>().join(" and "))
+    };
+    (!fits.is_empty()).then(|| ("fits", list(fits.iter().map(one))))
 }
 
 fn source(version: &Version) -> String {

@@ -3,25 +3,20 @@
 //! A small rasteriser of our own: orthographic projection from a 3/4 view, anti-aliased thick lines, a built-in 5x7 font.
 //! Joints are `[T, J, 3]` in the skeleton's units with y up.
 
+mod colours;
 mod font;
+mod plan;
 mod raster;
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
+use colours::{BODY, GRID, INK, LEFT, PAPER, RIGHT, SHADOW, TOLD, TRAIL};
 use raster::{Canvas, Colour};
 
 use crate::skeleton::Skeleton;
-
-const PAPER: Colour = [250, 250, 248];
-const INK: Colour = [40, 42, 48];
-const GRID: Colour = [222, 223, 224];
-const TRAIL: Colour = [150, 170, 150];
-const SHADOW: Colour = [205, 206, 208];
-const BODY: Colour = [70, 74, 84];
-const LEFT: Colour = [36, 110, 200];
-const RIGHT: Colour = [214, 84, 48];
+pub use crate::waypoints::Waypoint;
 
 /// Where the picture is seen from: turned about the vertical and tipped down, radians.
 const TURN: f64 = -0.65;
@@ -106,15 +101,41 @@ fn ground(canvas: &mut Canvas, view: &View, reach: f64) {
     }
 }
 
+/// What was told: a line through each joint's waypoints, and the waypoints, those of frames to come lighter.
+fn told(canvas: &mut Canvas, view: &View, waypoints: &[Waypoint], t: usize) {
+    let place = |w: &Waypoint| view.project(w.position.map(f64::from)).0;
+    for pair in waypoints.windows(2).filter(|pair| pair[0].joint == pair[1].joint) {
+        canvas.line(place(&pair[0]), place(&pair[1]), 1.5, raster::blend(PAPER, TOLD, 0.4));
+    }
+    for waypoint in waypoints {
+        let strength = if waypoint.frame <= t { 1.0 } else { 0.5 };
+        canvas.disc(place(waypoint), 4.0, raster::blend(PAPER, TOLD, strength));
+    }
+}
+
 /// Writes an animated GIF: the motion at its own speed, the camera following the root, `title` above.
 ///
 /// # Errors
 /// When `out` refuses, or the joints are not a whole number of frames.
 pub fn gif_to(joints: &[f32], skeleton: &Skeleton, title: &str, out: impl Write) -> io::Result<()> {
+    gif_along_to(joints, skeleton, title, &[], out)
+}
+
+/// As [`gif_to`], with the waypoints that the motion was told.
+///
+/// # Errors
+/// As [`gif_to`].
+pub fn gif_along_to(
+    joints: &[f32],
+    skeleton: &Skeleton,
+    title: &str,
+    waypoints: &[Waypoint],
+    out: impl Write,
+) -> io::Result<()> {
     const WIDTH: usize = 400;
     const HEIGHT: usize = 400;
     let frames = frames_of(joints, skeleton)?;
-    let palette = raster::palette(&[PAPER, INK, GRID, TRAIL, SHADOW, BODY, LEFT, RIGHT]);
+    let palette = raster::palette(&[PAPER, INK, GRID, TRAIL, SHADOW, BODY, LEFT, RIGHT, TOLD]);
     let failed = |e: gif::EncodingError| io::Error::other(e.to_string());
     let mut encoder = gif::Encoder::new(out, WIDTH as u16, HEIGHT as u16, &palette.bytes).map_err(failed)?;
     encoder.set_repeat(gif::Repeat::Infinite).map_err(failed)?;
@@ -133,6 +154,7 @@ pub fn gif_to(joints: &[f32], skeleton: &Skeleton, title: &str, out: impl Write)
             let flat = |p: [f64; 3]| view.project([p[0], 0.0, p[2]]).0;
             canvas.line(flat(pair[0]), flat(pair[1]), 2.5, TRAIL);
         }
+        told(&mut canvas, &view, waypoints, t);
         figure(&mut canvas, &view, skeleton, &pose, 1.0);
         for (i, line) in lines.iter().enumerate() {
             font::draw(&mut canvas, line, [12.0, 12.0 + 20.0 * i as f64], 2, INK);
@@ -153,8 +175,22 @@ pub fn gif_to(joints: &[f32], skeleton: &Skeleton, title: &str, out: impl Write)
 /// # Errors
 /// When the file cannot be written, or the joints are not a whole number of frames.
 pub fn gif(joints: &[f32], skeleton: &Skeleton, title: &str, path: &Path) -> io::Result<()> {
+    gif_along(joints, skeleton, title, &[], path)
+}
+
+/// [`gif_along_to`] a file.
+///
+/// # Errors
+/// As [`gif`].
+pub fn gif_along(
+    joints: &[f32],
+    skeleton: &Skeleton,
+    title: &str,
+    waypoints: &[Waypoint],
+    path: &Path,
+) -> io::Result<()> {
     let mut file = BufWriter::new(File::create(path)?);
-    gif_to(joints, skeleton, title, &mut file)?;
+    gif_along_to(joints, skeleton, title, waypoints, &mut file)?;
     file.flush()
 }
 
@@ -183,9 +219,24 @@ pub fn strip_png_to(
     skeleton: &Skeleton,
     out: impl Write,
 ) -> io::Result<()> {
+    strip_png_along_to(motions, poses, skeleton, &[], out)
+}
+
+/// As [`strip_png_to`]; below, if there are waypoints, the first motion from above with the waypoints that it was told.
+///
+/// # Errors
+/// As [`strip_png_to`].
+pub fn strip_png_along_to(
+    motions: &[(String, Vec<f32>)],
+    poses: usize,
+    skeleton: &Skeleton,
+    waypoints: &[Waypoint],
+    out: impl Write,
+) -> io::Result<()> {
     const CELL: usize = 110;
     const ROW: usize = 210;
-    let (width, height) = (CELL * poses + 24, ROW * motions.len());
+    let below = if waypoints.is_empty() { 0 } else { plan::HEIGHT };
+    let (width, height) = (CELL * poses + 24, ROW * motions.len() + below);
     let mut canvas = Canvas::new(width, height, PAPER);
     for (row, (name, joints)) in motions.iter().enumerate() {
         let frames = frames_of(joints, skeleton)?;
@@ -211,6 +262,11 @@ pub fn strip_png_to(
             figure(&mut canvas, &view, skeleton, &pose, 1.0);
         }
     }
+    if let (Some((_, joints)), true) = (motions.first(), below > 0) {
+        let at = |t: usize, joint: usize| frame(joints, skeleton, t)[joint];
+        let frames = frames_of(joints, skeleton)?;
+        plan::draw(&mut canvas, (ROW * motions.len()) as f64, (frames, &at), waypoints);
+    }
     let mut encoder = png::Encoder::new(out, width as u32, height as u32);
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_depth(png::BitDepth::Eight);
@@ -223,7 +279,21 @@ pub fn strip_png_to(
 /// # Errors
 /// When the file cannot be written, or a motion is not a whole number of frames.
 pub fn strip_png(motions: &[(String, Vec<f32>)], poses: usize, skeleton: &Skeleton, path: &Path) -> io::Result<()> {
+    strip_png_along(motions, poses, skeleton, &[], path)
+}
+
+/// [`strip_png_along_to`] a file.
+///
+/// # Errors
+/// As [`strip_png`].
+pub fn strip_png_along(
+    motions: &[(String, Vec<f32>)],
+    poses: usize,
+    skeleton: &Skeleton,
+    waypoints: &[Waypoint],
+    path: &Path,
+) -> io::Result<()> {
     let mut file = BufWriter::new(File::create(path)?);
-    strip_png_to(motions, poses, skeleton, &mut file)?;
+    strip_png_along_to(motions, poses, skeleton, waypoints, &mut file)?;
     file.flush()
 }

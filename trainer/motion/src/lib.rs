@@ -18,6 +18,7 @@ pub mod skeleton;
 pub mod synthetic;
 pub mod text;
 mod values;
+pub mod waypoints;
 
 pub use dataset::Dataset;
 pub use random::Stream;

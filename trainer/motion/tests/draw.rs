@@ -34,6 +34,31 @@ fn a_gif_plays_as_long_as_the_motion() {
 }
 
 #[test]
+fn what_was_told_is_drawn() {
+    let skeleton = Skeleton::of(DataFormat::Humanml3d);
+    let (title, joints) = motion();
+    let at = |frame, z| draw::Waypoint { frame, joint: 0, position: [0.0, 0.9, z] };
+    let waypoints = [at(0, 0.0), at(10, 0.5), at(20, 1.0)];
+    let purple = |bytes: Vec<u8>| {
+        let mut reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();
+        let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+        reader.next_frame(&mut pixels).unwrap();
+        let found = pixels.chunks(3).filter(|p| **p == [140, 60, 160]).count();
+        (found, reader.info().height)
+    };
+    let (mut plain, mut along) = (vec![], vec![]);
+    draw::strip_png_to(&[(title.clone(), joints.clone())], 6, skeleton, &mut plain).unwrap();
+    draw::strip_png_along_to(&[(title.clone(), joints.clone())], 6, skeleton, &waypoints, &mut along).unwrap();
+    assert_eq!(purple(plain), (0, 210));
+    let (found, height) = purple(along);
+    assert!(found > 60 && height > 400, "{found} pixels of waypoints, {height} high");
+    let (mut plain, mut along) = (vec![], vec![]);
+    draw::gif_to(&joints, skeleton, &title, &mut plain).unwrap();
+    draw::gif_along_to(&joints, skeleton, &title, &waypoints, &mut along).unwrap();
+    assert_ne!(plain, along);
+}
+
+#[test]
 fn a_sheet_has_a_row_a_motion() {
     let skeleton = Skeleton::of(DataFormat::Humanml3d);
     let mut bytes = vec![];

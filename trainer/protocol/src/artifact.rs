@@ -39,6 +39,8 @@ pub enum ArtifactKind {
     Evaluator,
     /// Estimates the length of a motion from its caption.
     Length,
+    /// Tells a latent denoiser which positions to pass.
+    Control,
     /// Metrics of an evaluation.
     Report,
     /// A generator and its parts: everything that drawing a motion needs.
@@ -65,6 +67,7 @@ impl ArtifactKind {
             Self::Denoiser => "a denoiser",
             Self::Evaluator => "an evaluator",
             Self::Length => "a length estimator",
+            Self::Control => "a control part",
             Self::Report => "a report",
             Self::Model => "a model",
             Self::Checkpoint => "a checkpoint",
@@ -73,7 +76,7 @@ impl ArtifactKind {
     }
 }
 
-/// What an artifact is for in a model: `denoiser`, `vae`, `text`, `length`.
+/// What an artifact is for in a model: `denoiser`, `vae`, `text`, `length`, `control`.
 ///
 /// A role is a text, not a list of those there are: storing, registering, exporting and showing models handle each alike. Files of a
 /// model bear it as a folder's name, so it consists of small letters, digits and `-`.
@@ -94,6 +97,8 @@ impl Role {
     pub const TOKENIZER: Self = Self(Cow::Borrowed("tokenizer"));
     /// Turns captions into what the generator is conditioned on.
     pub const TEXT: Self = Self(Cow::Borrowed("text"));
+    /// Tells the denoiser which positions to pass.
+    pub const CONTROL: Self = Self(Cow::Borrowed("control"));
     /// Says how long a caption's motion is when nobody else does.
     pub const LENGTH: Self = Self(Cow::Borrowed("length"));
 

@@ -63,6 +63,9 @@ pub const PARAMETERS: usize = 2_000_000_000;
 /// Motions that one evaluation keeps embeddings of, besides one for each entry and repeat.
 pub const EVALUATED_MOTIONS: usize = 1_000_000;
 
+/// Repeats of cases that one evaluation of control draws all entries of.
+pub const CONTROL_CASES: usize = 10_000;
+
 // Files that somebody else made.
 
 /// Bytes of one clip's features.

@@ -9,6 +9,7 @@
 //! A store outlives the build that wrote it. Every struct that has a `Default` fills in what an older build did not write; a field that
 //! joins one that has none ([`Training`], [`Batch`]) brings `#[serde(default)]` along.
 
+mod control;
 mod data;
 mod diffusion;
 mod distillation;
@@ -27,6 +28,7 @@ mod training;
 
 use crate::{ArtifactKind, Digest, Steps};
 
+pub use control::{ControlHints, ControlSetting};
 pub use data::DataFormat;
 pub use diffusion::{Diffusion, NoiseSchedule, Prediction};
 pub use distillation::{Distance, Distillation};
@@ -34,12 +36,13 @@ pub use evaluation::{Mode, Split};
 pub use frequency::{FrequencyLosses, LowFrequency, Norm, Over, Semantic};
 pub use identity::{Backend, StageIdentity};
 pub use kinds::{
-    DataOpen, DataSynthetic, DistillLcm, DistillPcm, EncodeLatents, EncodeTokens, EvaluateLatentFid,
-    EvaluateReconstruction, EvaluateT2m, EvaluatorNetwork, FlowBackbone, FlowNetwork, FlowProjection, FlowSolver,
-    ImportEvaluator, MdmNetwork, ModelDecoder, MovementPhase, MultiModality, Promote, Register, Resets,
-    StableMoFusionNetwork, StageSettings, TextEmbed, TextEncoder, TokenGenerator, TokenNetwork, TokenizerLoss,
-    TokenizerNetwork, TrainDiscord, TrainEvaluator, TrainLength, TrainMdm, TrainMld, TrainStableMoFusion,
-    TrainTokenizer, TrainTokens, TrainVae, VaeLoss, Windows, WindowsOf,
+    ControlDistance, ControlLoss, ControlMean, DataOpen, DataSynthetic, DistillLcm, DistillPcm, EncodeLatents,
+    EncodeTokens, EvaluateControl, EvaluateLatentFid, EvaluateReconstruction, EvaluateT2m, EvaluatorNetwork,
+    FlowBackbone, FlowNetwork, FlowProjection, FlowSolver, ImportEvaluator, MdmNetwork, ModelDecoder, MovementPhase,
+    MultiModality, Promote, Register, Resets, StableMoFusionNetwork, StageSettings, TextEmbed, TextEncoder,
+    TokenGenerator, TokenNetwork, TokenizerLoss, TokenizerNetwork, TrainControl, TrainDiscord, TrainEvaluator,
+    TrainLength, TrainMdm, TrainMld, TrainStableMoFusion, TrainTokenizer, TrainTokens, TrainVae, VaeLoss, Windows,
+    WindowsOf,
 };
 pub use neighbours::{Neighbour, Neighbours};
 pub use network::{LatentShape, Network, Positions};

@@ -10,6 +10,7 @@ use motion::{Skeleton, npy};
 use protocol::Seed;
 use stages::generate::{Generated, Generator};
 
+use super::control::{ControlArgs, Told};
 use super::keep::Span;
 use super::model::{self, Found};
 use super::remote::check_parent;
@@ -56,9 +57,11 @@ pub(crate) struct GenerateArgs {
     /// Where to write: `.gif` for a moving figure, `.png` for a sheet of poses, `.npy` for features
     #[arg(short = 'o', long = "out", value_name = "FILE")]
     out: PathBuf,
+    #[command(flatten)]
+    control: ControlArgs,
     /// Also write joint positions [frames, joints, 3]
     #[arg(long, value_name = "FILE.npy")]
-    joints: Option<PathBuf>,
+    positions: Option<PathBuf>,
     /// Also write features
     #[arg(long, value_name = "FILE.npy")]
     features: Option<PathBuf>,
@@ -76,10 +79,13 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
         let expected = "expected a name that ends in .gif, .png or .npy";
         return Err(Problem::usage(format!("cannot write `{}`: {expected}", args.out.display())));
     }
-    if args.prompt.len() > 1 && (ending != "png" || args.joints.is_some() || args.features.is_some()) {
+    if args.prompt.len() > 1 && args.control.given() {
+        return Err(Problem::usage("a path is of one motion: give one sentence with `--control`"));
+    }
+    if args.prompt.len() > 1 && (ending != "png" || args.positions.is_some() || args.features.is_some()) {
         return Err(Problem::usage("several sentences make one sheet: give `--out FILE.png` and no other file"));
     }
-    for path in [Some(&args.out), args.joints.as_ref(), args.features.as_ref()].into_iter().flatten() {
+    for path in [Some(&args.out), args.positions.as_ref(), args.features.as_ref()].into_iter().flatten() {
         check_parent(path)?;
     }
     let start = Instant::now();
@@ -88,6 +94,7 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
         (Some(stage), _) => model::stage(&reader, &reader.find(&args.run).await?, stage).await?,
         (None, model) => model::version(&reader, model.as_deref().unwrap_or_default()).await?,
     };
+    let found = args.control.completed(&reader, found).await?;
     let Found { manifest, blobs, label, measured } = found;
     reader.close().await;
     let (device, _) = model::device(args.backend.as_deref())?;
@@ -97,13 +104,17 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
     let sampler = args.sampler.sampler(args.steps, generator.sampler(), &measured);
     let sampler = sampler.map_err(|why| Problem::usage(format!("{label}: {why}")))?;
     let edit = args.edit.as_deref().map(|path| Edit::read(path, &args.keep, &generator)).transpose()?;
+    let told = args.control.told(&generator, &label.to_string(), args.frames)?;
     let mut motions = Vec::new();
     let mut kept = Vec::new();
     for prompt in &args.prompt {
         let seed = Seed(args.seed);
-        let motion = match &edit {
-            None => generator.generate(prompt, args.frames, Some(&sampler), seed).map_err(model::refused)?,
-            Some(edit) => {
+        let motion = match (&edit, &told) {
+            (None, None) => generator.generate(prompt, args.frames, Some(&sampler), seed).map_err(model::refused)?,
+            (None, Some(told)) => {
+                generator.generate_controlled(prompt, Some(&sampler), seed, told.request()).map_err(model::refused)?
+            }
+            (Some(edit), _) => {
                 let edited = generator.edit(prompt, &edit.motion, &edit.keep, Some(&sampler), seed);
                 let edited = edited.map_err(model::refused)?;
                 kept = edited.kept;
@@ -112,9 +123,10 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
         };
         motions.push((prompt.clone(), motion));
     }
-    let written = write(&args, &motions)?;
+    let written = write(&args, &motions, told.as_ref())?;
     let (prompt, motion) = motions.last().expect("at least one sentence is required");
 
+    let missed = told.as_ref().and_then(|told| told.missed(motion));
     let timing = motion.timing;
     let milliseconds = |time: std::time::Duration| time.as_secs_f64() * 1e3;
     match args.report {
@@ -132,6 +144,12 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
             "sampling_ms": milliseconds(timing.sampling),
             "decoding_ms": milliseconds(timing.decoding),
             "load_ms": milliseconds(loaded),
+            "control": missed.map(|missed| serde_json::json!({
+                "told": missed.told,
+                "average_error_m": missed.average,
+                "worst_error_m": missed.worst,
+                "missed_by_50cm": missed.location,
+            })),
         })),
         Output::Table => print::out(&format!(
             "{} from {label}: {} frames{}, {}\n{:.1} ms per sentence (text {:.1}, sampling {:.1}, decoding {:.1}); the model loaded in {:.0} ms",
@@ -145,6 +163,15 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
             milliseconds(timing.decoding),
             milliseconds(loaded),
         )),
+    }
+    if let (Some(missed), Output::Table) = (missed, args.report) {
+        print::out(&format!(
+            "{} positions told: {:.1} cm off in the mean, {:.1} cm at worst, {:.0} % missed by more than 50 cm",
+            missed.told,
+            100.0 * missed.average,
+            100.0 * missed.worst,
+            100.0 * missed.location,
+        ));
     }
     Ok(0)
 }
@@ -193,7 +220,8 @@ impl Edit {
 /// Poses of one motion on a sheet.
 const POSES: usize = 10;
 
-fn write(args: &GenerateArgs, motions: &[(String, Generated)]) -> Result<Vec<String>> {
+fn write(args: &GenerateArgs, motions: &[(String, Generated)], told: Option<&Told>) -> Result<Vec<String>> {
+    let waypoints = told.map_or(&[][..], |told| &told.waypoints);
     let (prompt, motion) = &motions[0];
     let failed =
         |path: &Path, error: &dyn fmt::Display| Problem::failed(format!("cannot write `{}`: {error}", path.display()));
@@ -207,9 +235,9 @@ fn write(args: &GenerateArgs, motions: &[(String, Generated)]) -> Result<Vec<Str
     } else {
         if ends_in("png") {
             let rows: Vec<_> = motions.iter().map(|(prompt, motion)| (prompt.clone(), motion.joints.clone())).collect();
-            motion::draw::strip_png(&rows, POSES, skeleton, &args.out)
+            motion::draw::strip_png_along(&rows, POSES, skeleton, waypoints, &args.out)
         } else {
-            motion::draw::gif(&motion.joints, skeleton, prompt, &args.out)
+            motion::draw::gif_along(&motion.joints, skeleton, prompt, waypoints, &args.out)
         }
         .map_err(|error| failed(&args.out, &error))?;
         written.push(args.out.display().to_string());
@@ -218,7 +246,7 @@ fn write(args: &GenerateArgs, motions: &[(String, Generated)]) -> Result<Vec<Str
         npy::write(path, &[rows, width], &motion.features).map_err(|error| failed(path, &error))?;
         written.push(path.display().to_string());
     }
-    if let Some(path) = &args.joints {
+    if let Some(path) = &args.positions {
         let joints = motion.joints.len() / 3 / rows.max(1);
         npy::write(path, &[rows, joints, 3], &motion.joints).map_err(|error| failed(path, &error))?;
         written.push(path.display().to_string());

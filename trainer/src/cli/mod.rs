@@ -2,6 +2,7 @@
 
 mod args;
 mod config;
+mod control;
 mod generate;
 mod keep;
 mod model;

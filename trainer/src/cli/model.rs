@@ -61,6 +61,12 @@ impl Blobs for Fetched {
 }
 
 impl Fetched {
+    /// Those of `other` too.
+    pub(super) fn add(&self, other: Self) {
+        let others = other.0.into_inner().unwrap_or_else(PoisonError::into_inner);
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).extend(others);
+    }
+
     /// The files of a manifest.
     async fn files(reader: &Reader, manifest: &Manifest) -> Result<Self> {
         let blobs = Self::default();
@@ -91,7 +97,7 @@ pub(super) async fn version(reader: &Reader, name: &str) -> Result<Found> {
         return Err(problem);
     }
     let (version, manifest) = match answer.data {
-        Some(Data::Version { version, manifest }) => (version, manifest),
+        Some(Data::Version { version, manifest, .. }) => (version, manifest),
         Some(Data::Model { model, .. }) => {
             let aliases: Vec<String> = model.aliases.keys().map(|alias| format!("{name}@{alias}")).collect();
             let problem = Problem::usage(format!("`{name}` is a model; which of its {} versions?", model.versions));

@@ -93,6 +93,9 @@ pub struct LatentsMeta {
     pub captions: Vec<Vec<usize>>,
     /// Frames of each row.
     pub lengths: Vec<usize>,
+    /// First frame of each row in its entry; none in what an older build encoded.
+    #[serde(default)]
+    pub starts: Vec<usize>,
 }
 
 /// Meta of an artifact of kind `denoiser`.

@@ -17,7 +17,8 @@ use protocol::stage::{DataFormat, Sampler};
 use protocol::{ArtifactKind, Manifest, Seed};
 
 use crate::context::StageError;
-use crate::generator::{self, Batch, Edit, Lap, MotionGenerator, Seeds, Text};
+use crate::control::{ControlMeta, Hint};
+use crate::generator::{self, Batch, ControlRequest, Edit, Lap, MotionGenerator, Seeds, Text};
 use crate::length::Lengths;
 use crate::parts::{self, model_error};
 
@@ -160,6 +161,16 @@ impl Generator {
         Ok(Edited { motion, kept: spans.filter(|(kept, _)| *kept).map(|(_, span)| span).collect() })
     }
 
+    /// Its control part, if it has one.
+    pub fn control(&self) -> Option<&ControlMeta> {
+        self.model.control()
+    }
+
+    /// Frames of the longest motion that it draws.
+    pub fn longest(&self) -> usize {
+        self.model.longest()
+    }
+
     /// Draws a motion for `prompt`. Without `frames` it is as long as [`frames`](Self::frames) says, without `sampler` the model's own is
     /// used.
     pub fn generate(
@@ -169,10 +180,33 @@ impl Generator {
         sampler: Option<&Sampler>,
         seed: Seed,
     ) -> Result<Generated, StageError> {
+        self.draw(prompt, frames, sampler, seed, None)
+    }
+
+    /// As [`generate`](Self::generate), a motion as long as `hint` that passes what is told there, with a control part.
+    pub fn generate_controlled(
+        &self,
+        prompt: &str,
+        sampler: Option<&Sampler>,
+        seed: Seed,
+        (hint, scale): (&Hint, f64),
+    ) -> Result<Generated, StageError> {
+        let control = ControlRequest { hints: std::slice::from_ref(hint), scale };
+        self.draw(prompt, Some(hint.frames()), sampler, seed, Some(control))
+    }
+
+    fn draw(
+        &self,
+        prompt: &str,
+        frames: Option<usize>,
+        sampler: Option<&Sampler>,
+        seed: Seed,
+        control: Option<ControlRequest<'_>>,
+    ) -> Result<Generated, StageError> {
         let sampler = sampler.cloned().unwrap_or_else(|| self.sampler());
         self.timed(prompt, seed, |texts, seeds, lap| {
             let frames = frames.map_or_else(|| self.frames(prompt, seed), Ok)?;
-            let batch = Batch { texts, lengths: &[frames], seeds };
+            let batch = Batch { texts, lengths: &[frames], seeds, control };
             Ok(generator::motions(&*self.model, batch, &sampler, lap)?.concat())
         })
     }

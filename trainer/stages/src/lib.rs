@@ -4,6 +4,7 @@
 
 pub mod artifacts;
 pub mod context;
+pub mod control;
 pub mod evaluation;
 pub mod evaluator;
 pub mod flow_decoder;

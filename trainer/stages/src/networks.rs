@@ -10,13 +10,14 @@ use models::diffusion::{
     lcm_timesteps, pcm_sample,
 };
 use models::kernels::Dropout;
-use models::networks::{self, DenoiserConfig, Init, POSITIONS, Vae, VaeConfig, guidance_embedding};
+use models::networks::{self, Control, DenoiserConfig, Init, POSITIONS, Vae, VaeConfig, guidance_embedding};
 use motion::Stream;
 use protocol::stage::{DataFormat, Family, Positions, Sampler, Solver};
 use protocol::{Manifest, Seed};
 
 use crate::artifacts::{self, DenoiserMeta, VaeMeta};
 use crate::context::StageError;
+use crate::control::Steering;
 use crate::kinds::word;
 use crate::weights;
 
@@ -218,11 +219,13 @@ impl Denoiser {
     }
 
     /// Draws latents `[batch, N, d]`: a teacher by DDIM or a DPM-Solver with guidance g, an LCM with fresh noise between its jumps, a PCM by one jump a
-    /// phase; students embed w. `step_noise(j)` is asked for noise of the same shape after jump j of an LCM.
+    /// phase; students embed w. `step_noise(j)` is asked for noise of the same shape after jump j of an LCM. With `steering` every prediction is a
+    /// controlled one, also that without a caption.
     pub fn sample(
         &self,
         conditions: &Conditions,
         sampler: &Sampler,
+        steering: Option<&Steering<'_>>,
         step_noise: &mut dyn FnMut(usize) -> Vec<f32>,
     ) -> Result<Vec<f32>, StageError> {
         self.meta.family.accepts(sampler).map_err(StageError::Input)?;
@@ -231,7 +234,6 @@ impl Denoiser {
         let shape = [batch, latent.tokens, latent.dim];
         let on_device = |values: Vec<f32>, shape| tensor(values, shape, &self.device);
         let z = on_device(conditions.noise.clone(), shape);
-        let off = &mut Dropout::off();
         Ok(host(match self.meta.family {
             Family::Mld => {
                 let mut text = conditions.text.clone();
@@ -240,7 +242,7 @@ impl Denoiser {
                 let [_, tokens, dim] = shape;
                 let out = |z: Tensor<3>, t: usize| {
                     let both = Tensor::cat(vec![z.clone(), z], 0);
-                    let noise = self.network.forward(both, &vec![t; 2 * batch], text.clone(), None, off);
+                    let noise = self.predict(both, &vec![t; 2 * batch], text.clone(), None, steering);
                     let half = |from: usize| noise.clone().slice([from..from + batch, 0..tokens, 0..dim]);
                     guided(half(0), half(batch), sampler.guidance)
                 };
@@ -259,7 +261,7 @@ impl Denoiser {
                 }
             }
             Family::Lcm { skip, .. } => {
-                let mut eps = self.student(conditions, sampler, batch);
+                let mut eps = self.student(conditions, sampler, batch, steering);
                 let timesteps = lcm_path(skip, sampler);
                 let fresh: Vec<_> = (1..timesteps.len()).map(|j| on_device(step_noise(j - 1), shape)).collect();
                 lcm_sample(&self.schedule, &timesteps, z, &fresh, &mut eps)
@@ -270,10 +272,27 @@ impl Denoiser {
                 ));
             }
             Family::Pcm { skip, phases, .. } => {
-                let mut eps = self.student(conditions, sampler, batch);
+                let mut eps = self.student(conditions, sampler, batch, steering);
                 pcm_sample(&self.schedule, &Phases::new(&Grid::new(skip), phases), z, &mut eps)
             }
         }))
+    }
+
+    fn predict(
+        &self,
+        latent_bnd: Tensor<3>,
+        timesteps: &[usize],
+        text_blc: Tensor<3>,
+        guidance_bg: Option<Tensor<2>>,
+        steering: Option<&Steering<'_>>,
+    ) -> Tensor<3> {
+        let off = &mut Dropout::off();
+        let Some(steering) = steering else {
+            return self.network.forward(latent_bnd, timesteps, text_blc, guidance_bg, off);
+        };
+        let (residuals, scale) = steering.residuals(&latent_bnd, timesteps, &text_blc, guidance_bg.as_ref());
+        let control = Control { residuals: &residuals, scale };
+        self.network.forward_controlled(latent_bnd, timesteps, text_blc, guidance_bg, control, off)
     }
 
     /// A student's noise prediction as a function of latent and timestep.
@@ -282,12 +301,13 @@ impl Denoiser {
         conditions: &Conditions,
         sampler: &Sampler,
         batch: usize,
+        steering: Option<&Steering<'_>>,
     ) -> impl FnMut(Tensor<3>, usize) -> Tensor<3> {
         let text = tensor(conditions.text.clone(), [batch, 1, self.meta.text_dim], &self.device);
         #[expect(clippy::cast_possible_truncation, reason = "embedded in f32 by definition")]
         let w = vec![sampler.guidance as f32; batch];
         let guidance = guidance_embedding(&w, self.meta.guidance_dim, &self.device);
-        move |z, t| self.network.forward(z, &vec![t; batch], text.clone(), Some(guidance.clone()), &mut Dropout::off())
+        move |z, t| self.predict(z, &vec![t; batch], text.clone(), Some(guidance.clone()), steering)
     }
 }
 

@@ -89,7 +89,7 @@ fn p5_a_kill_at_every_step_changes_no_byte() {
 #[test]
 fn p5_chains_of_1_2_and_5_kills_change_no_byte() {
     let chains: [&[u64]; 3] = [&[13], &[7, 8], &[2, 9, 9, 15, 17]];
-    for name in ["vae", "length", "mld", "lcm", "pcm"] {
+    for name in ["vae", "length", "mld", "lcm", "pcm", "control"] {
         let mut case = case(name, [18; 4]);
         for chain in chains {
             case.run(name, &format!("{name} killed at {chain:?}"), chain);
@@ -102,7 +102,7 @@ fn p5_chains_of_1_2_and_5_kills_change_no_byte() {
 /// in one order or the other.
 #[test]
 fn p6_members_1_to_3_to_2_to_1_change_no_byte() {
-    for name in ["vae", "length", "mld", "lcm", "pcm"] {
+    for name in ["vae", "length", "mld", "lcm", "pcm", "control"] {
         let mut case = case(name, [24; 4]);
         assert_eq!(case.settings.shape(), Shape::Gang);
         case.bench.forget(name);

@@ -52,6 +52,7 @@ fn stages() -> Vec<(String, StageSettings)> {
             "flow",
             StageSettings::ModelDecoder(ModelDecoder { model: "generator".into(), decoder: "train_discord".into() }),
         ),
+        ("control", StageSettings::TrainControl(TrainControl::default())),
         ("evaluator", StageSettings::TrainEvaluator(TrainEvaluator::default())),
         ("imported", StageSettings::ImportEvaluator(ImportEvaluator { path: "t2m".into(), ..Default::default() })),
         ("t2m", StageSettings::EvaluateT2m(EvaluateT2m { model: "lcm".into(), sampler, ..EvaluateT2m::default() })),

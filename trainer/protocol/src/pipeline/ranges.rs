@@ -117,6 +117,16 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("huber_c", Real(0.0, 1e6), ""),
     ("phases", Whole(1, 1_000), "phases"),
     ("adversarial", Real(0.0, 1e6), ""),
+    // Control.
+    ("hints.density", Real(0.0, 100.0), "percent of the frames"),
+    ("loss.latent", Real(0.0, 1e6), ""),
+    ("loss.control", Real(0.0, 1e6), ""),
+    ("embedding", Whole(1, 16_384), "channels"),
+    ("trajectory_lr", Real(0.0, 1e3), ""),
+    ("percent", Real(0.0, 100.0), "percent of the frames"),
+    ("frames", Whole(1, 10_000), "frames"),
+    ("threshold", Real(0.0, 1e3), "metres"),
+    ("scale", Real(0.0, 1e3), ""),
     // Evaluation.
     ("sampler.steps", Whole(1, 1_000), "steps"),
     ("sampler.guidance", Real(0.0, 1e3), ""),

@@ -7,6 +7,7 @@ use protocol::Digest;
 use protocol::stage::{DataFormat, Family, LatentShape, Sampler};
 
 use crate::context::StageError;
+use crate::control::{ControlMeta, Hint};
 use crate::text::TextEncoder;
 
 /// A caption as a generator wants it: what it asked its text encoder for.
@@ -28,6 +29,17 @@ pub struct Batch<'a> {
     pub lengths: &'a [usize],
     /// What keys the draws: motions depend on nothing else that is random.
     pub seeds: &'a Seeds<'a>,
+    /// Positions that the motions should pass.
+    pub control: Option<ControlRequest<'a>>,
+}
+
+/// Positions that the motions of a batch should pass.
+#[derive(Debug, Clone, Copy)]
+pub struct ControlRequest<'a> {
+    /// For each motion, as long as it.
+    pub hints: &'a [Hint],
+    /// How strongly they are heeded; 1 as trained, 0 not at all.
+    pub scale: f64,
 }
 
 impl std::fmt::Debug for Batch<'_> {
@@ -65,6 +77,11 @@ pub trait MotionGenerator: std::fmt::Debug {
     /// A motion for each of the batch, feature rows `[frames, features]` in the data's own scale, of the length asked for unless the model
     /// decides on its own. The lengths and the sampler are ones that it has; [`motions`](super::motions) sees to that.
     fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError>;
+
+    /// Its control part, if it has one, without which a batch has no `control`.
+    fn control(&self) -> Option<&ControlMeta> {
+        None
+    }
 
     /// The way to its latents, if it draws motion from such.
     fn latents(&self) -> Option<&dyn LatentGenerator> {

@@ -1,6 +1,6 @@
 //! Latent diffusion and its students: a denoiser draws a latent, a VAE turns it into motion. Source: MLD, MotionLCM, MotionPCM.
 //!
-//! Parts: `denoiser`, `vae`, `text`. The denoiser reads a caption's one vector.
+//! Parts: `denoiser`, `vae`, `text`, and `control` where motions can be told where to go. The denoiser reads a caption's one vector.
 
 use std::rc::Rc;
 
@@ -11,8 +11,9 @@ use protocol::artifact::Role;
 use protocol::stage::{DataFormat, Family, LatentShape, Sampler};
 use protocol::{ArtifactKind, Digest};
 
-use super::{Batch, Lap, LatentGenerator, MotionGenerator, Seeds, Text};
+use super::{Batch, ControlRequest, Lap, LatentGenerator, MotionGenerator, Seeds, Text};
 use crate::context::StageError;
+use crate::control::{ControlMeta, TrainedControl};
 use crate::networks::{Autoencoder, Conditions, Denoiser};
 use crate::parts::{self, model_error};
 use crate::text::{self, TextEncoder};
@@ -27,6 +28,7 @@ struct LatentDiffusion {
     /// The VAE's manifest.
     vae_digest: Digest,
     text: Box<dyn TextEncoder>,
+    control: Option<TrainedControl>,
     /// The empty caption.
     null: Vec<f32>,
 }
@@ -58,9 +60,24 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
             "the denoiser reads {wanted} numbers a caption, the encoder gives {found}"
         )));
     }
+    let control = match model.parts.contains_key(&Role::CONTROL) {
+        true => {
+            let part = part(&Role::CONTROL, ArtifactKind::Control)?;
+            Some(TrainedControl::read(blobs, &part, meta, device)?)
+        }
+        false => None,
+    };
+    if let Some(control) = &control {
+        let fits = |role: &Role| control.meta().fits.get(role) == model.parts.get(role);
+        if control.meta().format != vae.meta().format || !fits(&Role::DENOISER) {
+            return Err(StageError::Input(
+                "the control part was trained for another denoiser than the model has".into(),
+            ));
+        }
+    }
     let null = text.pooled(&[""])?;
     let vae_digest = model.part(&Role::VAE).map_err(model_error)?;
-    Ok(Box::new(LatentDiffusion { denoiser, vae, vae_digest, text, null }))
+    Ok(Box::new(LatentDiffusion { denoiser, vae, vae_digest, text, control, null }))
 }
 
 impl MotionGenerator for LatentDiffusion {
@@ -86,7 +103,7 @@ impl MotionGenerator for LatentDiffusion {
     }
 
     fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError> {
-        let z = self.sample(batch.texts, batch.seeds, sampler)?;
+        let z = self.steered(batch.texts, batch.seeds, sampler, batch.control)?;
         lap(Lap::Sampled);
         let mut motions = self.vae.decode_ragged(z, batch.lengths);
         motions.iter_mut().for_each(|motion| self.vae.denormalise(motion));
@@ -94,8 +111,36 @@ impl MotionGenerator for LatentDiffusion {
         Ok(motions)
     }
 
+    fn control(&self) -> Option<&ControlMeta> {
+        self.control.as_ref().map(TrainedControl::meta)
+    }
+
     fn latents(&self) -> Option<&dyn LatentGenerator> {
         Some(self)
+    }
+}
+
+impl LatentDiffusion {
+    fn steered(
+        &self,
+        texts: &[Rc<Text>],
+        seeds: &Seeds<'_>,
+        sampler: &Sampler,
+        control: Option<ControlRequest<'_>>,
+    ) -> Result<Vec<f32>, StageError> {
+        let size = self.shape().tokens * self.shape().dim;
+        let fill = |k: usize| {
+            let mut values = vec![0.0; texts.len() * size];
+            values.chunks_exact_mut(size).enumerate().for_each(|(b, row)| seeds(k, b).fill_normal(row));
+            values
+        };
+        let text = texts.iter().flat_map(|text| text.values.iter().copied()).collect();
+        let conditions = Conditions { text, null: self.null.clone(), noise: fill(0) };
+        let steering = match (control, &self.control) {
+            (Some(request), Some(control)) => Some(control.steer(request.hints, request.scale)),
+            _ => None,
+        };
+        self.denoiser.sample(&conditions, sampler, steering.as_ref(), &mut |step| fill(1 + step))
     }
 }
 
@@ -109,14 +154,6 @@ impl LatentGenerator for LatentDiffusion {
     }
 
     fn sample(&self, texts: &[Rc<Text>], seeds: &Seeds<'_>, sampler: &Sampler) -> Result<Vec<f32>, StageError> {
-        let size = self.shape().tokens * self.shape().dim;
-        let fill = |k: usize| {
-            let mut values = vec![0.0; texts.len() * size];
-            values.chunks_exact_mut(size).enumerate().for_each(|(b, row)| seeds(k, b).fill_normal(row));
-            values
-        };
-        let text = texts.iter().flat_map(|text| text.values.iter().copied()).collect();
-        let conditions = Conditions { text, null: self.null.clone(), noise: fill(0) };
-        self.denoiser.sample(&conditions, sampler, &mut |step| fill(1 + step))
+        self.steered(texts, seeds, sampler, None)
     }
 }

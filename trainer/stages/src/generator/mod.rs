@@ -20,10 +20,11 @@ use protocol::Manifest;
 use protocol::stage::Sampler;
 
 use crate::context::StageError;
+use crate::control::Hint;
 use crate::parts::model_error;
 
 pub(crate) use feature_diffusion::NAME as FEATURE_DIFFUSION;
-pub use interface::{Batch, Edit, Infilling, Lap, LatentGenerator, MotionGenerator, Seeds, Text};
+pub use interface::{Batch, ControlRequest, Edit, Infilling, Lap, LatentGenerator, MotionGenerator, Seeds, Text};
 pub(crate) use latent_diffusion::NAME as LATENT_DIFFUSION;
 pub(crate) use tokens::{GeneratorMeta, MASKED_PREFIX, NAME as TOKENS, RESIDUAL_PREFIX};
 pub(crate) use words::{codebook, with_words};
@@ -64,7 +65,7 @@ pub fn check_sampler(generator: &dyn MotionGenerator, sampler: &Sampler) -> Resu
 /// A motion for each of the batch, feature rows `[frames, features]` in the data's own scale.
 ///
 /// # Errors
-/// A sampler or a length that the model does not have, or motions that are not finite.
+/// A sampler, a length or a control part that the model does not have, or motions that are not finite.
 pub fn motions(
     generator: &dyn MotionGenerator,
     batch: Batch<'_>,
@@ -75,6 +76,16 @@ pub fn motions(
     let longest = generator.longest();
     if let Some(frames) = batch.lengths.iter().find(|frames| !(1..=longest).contains(*frames)) {
         return Err(StageError::Input(format!("{frames} frames: the model draws motions of 1 to {longest}")));
+    }
+    if let Some(control) = batch.control {
+        let Some(meta) = generator.control() else {
+            return Err(StageError::Input("the model has no control part, and so cannot be told where to go".into()));
+        };
+        let joints = meta.mean.len() / 3;
+        let fits = |(hint, frames): (&Hint, &usize)| (hint.frames(), hint.joints()) == (*frames, joints);
+        if control.hints.len() != batch.lengths.len() || !control.hints.iter().zip(batch.lengths).all(fits) {
+            return Err(StageError::Fault("hints are not of the motions that are drawn".into()));
+        }
     }
     let motions = generator.draw(batch, sampler, lap)?;
     finite(motions.iter().flatten())?;

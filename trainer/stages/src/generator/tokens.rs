@@ -405,7 +405,7 @@ impl Infilling for TokenModel {
         self.tokenizer.normalise(&mut rows);
         let ids = self.tokenizer.encode(rows);
         let lengths = [edit.kept.len() * self.tokenizer.unit()];
-        let batch = Batch { texts: std::slice::from_ref(text), lengths: &lengths, seeds };
+        let batch = Batch { texts: std::slice::from_ref(text), lengths: &lengths, seeds, control: None };
         let ids = self.ids(batch, sampler, Some(Known { ids: &ids, kept: edit.kept })).concat();
         lap(Lap::Sampled);
         let motion = self.decoded(&ids, sampler, seeds, 0);

@@ -56,6 +56,7 @@ impl Map for EncodeLatents {
             splits: Vec::new(),
             captions: Vec::new(),
             lengths: Vec::new(),
+            starts: Vec::new(),
         };
         for (done, e) in range.clone().enumerate() {
             if cx.interrupted() {
@@ -89,6 +90,7 @@ impl Map for EncodeLatents {
             meta.splits.push(entry.split);
             meta.captions.push(entry.captions.clone());
             meta.lengths.extend(crops.iter().map(|(_, frames)| frames));
+            meta.starts.extend(crops.iter().map(|(start, _)| start));
             cx.progress(done as u64 + 1, range.len() as u64, "clips", &[]);
         }
         let meta = ShardMeta { latents: meta, first: range.start };
@@ -120,6 +122,7 @@ impl Map for EncodeLatents {
                     whole.splits.extend(latents.splits);
                     whole.captions.extend(latents.captions);
                     whole.lengths.extend(latents.lengths);
+                    whole.starts.extend(latents.starts);
                 }
             }
         }

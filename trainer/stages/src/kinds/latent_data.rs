@@ -36,6 +36,8 @@ pub(super) struct LatentData {
 pub(super) struct LatentSlice {
     /// Keys of all draws.
     pub(super) picks: Vec<Pick>,
+    /// Rows of the latents: which entry and which crop of it.
+    pub(super) rows: Vec<usize>,
     /// Frames of the motion behind each latent.
     pub(super) lengths: Vec<usize>,
     /// Latents [B, N, d], drawn from their posteriors.
@@ -112,18 +114,25 @@ impl LatentData {
         self.order.batch(step, |_| 0)
     }
 
+    /// The row of the latents that [`slice`](Self::slice) takes for an example.
+    pub(super) fn row(&self, pick: Pick) -> usize {
+        let crops = self.latents.meta.crops;
+        self.train[pick.example] * crops + self.stream("example", pick).below(crops)
+    }
+
     /// Slice `slice` of the batch of `step`. With probability `drop` a caption is replaced by the empty one.
     pub(super) fn slice(&mut self, step: u64, slice: usize, drop: f64) -> LatentSlice {
         let range = self.order.slice(slice, self.slices);
         let picks: Vec<Pick> = self.picks(step)[range].to_vec();
         let latent = self.latents.meta.latent;
         let (size, crops) = (latent.tokens * latent.dim, self.latents.meta.crops);
-        let (mut clean, mut text, mut lengths) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut clean, mut text, mut lengths, mut rows) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         for pick in &picks {
             let entry = self.train[pick.example];
             let mut draw = self.stream("example", *pick);
             let row = entry * crops + draw.below(crops);
             lengths.push(self.latents.meta.lengths[row]);
+            rows.push(row);
             let captions = &self.latents.meta.captions[entry];
             let caption = captions[draw.below(captions.len())];
             let empty = draw.uniform() < drop;
@@ -138,6 +147,7 @@ impl LatentData {
         let null = self.embeddings.null.iter().copied().cycle().take(batch * width).collect();
         LatentSlice {
             picks,
+            rows,
             lengths,
             clean_bnd: tensor(clean, [batch, latent.tokens, latent.dim]),
             text_blc: tensor(text, [batch, 1, width]),

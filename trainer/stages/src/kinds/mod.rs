@@ -2,10 +2,13 @@
 //! `protocol::stage`.
 
 mod consistency;
+mod control;
+mod control_report;
 mod data;
 mod discord;
 mod encode;
 mod encode_tokens;
+mod entry_draws;
 mod evaluator;
 mod feature_data;
 mod features;
@@ -89,9 +92,9 @@ macro_rules! runners {
 // The list of what runs. It is held against `protocol`'s list of kinds by a test below.
 runners! {
     Plain: DataOpen, DataSynthetic, TextEmbed, ImportEvaluator, ModelDecoder;
-    Map: EncodeLatents, EncodeTokens, EvaluateReconstruction, EvaluateLatentFid, EvaluateT2m;
+    Map: EncodeLatents, EncodeTokens, EvaluateReconstruction, EvaluateLatentFid, EvaluateT2m, EvaluateControl;
     Gang: TrainVae, TrainMld, DistillLcm, DistillPcm, TrainEvaluator, TrainLength, TrainTokenizer, TrainTokens, TrainDiscord,
-        TrainMdm, TrainStableMoFusion;
+        TrainMdm, TrainStableMoFusion, TrainControl;
 }
 
 /// Runs a plain stage.

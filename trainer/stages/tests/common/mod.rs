@@ -3,8 +3,8 @@
 use protocol::Steps;
 use protocol::stage::{
     Batch, DataSynthetic, Decay, DistillLcm, DistillPcm, Distillation, EncodeLatents, EvaluateLatentFid,
-    EvaluateReconstruction, LatentShape, Network, Optimizer, Sampler, StageSettings, TextEmbed, TrainLength, TrainMld,
-    TrainVae, Training,
+    EvaluateReconstruction, LatentShape, Network, Optimizer, Sampler, StageSettings, TextEmbed, TrainControl,
+    TrainLength, TrainMld, TrainVae, Training,
 };
 
 fn network() -> Network {
@@ -36,7 +36,7 @@ fn distillation(steps: u64) -> Distillation {
 /// Name, settings and inputs (field, stage).
 pub(crate) type Link = (&'static str, StageSettings, Vec<(&'static str, &'static str)>);
 
-/// Steps of the training stages, in order: vae, mld, lcm, pcm. The length estimator makes as many as the VAE.
+/// Steps of the training stages, in order: vae, mld, lcm, pcm. The length estimator makes as many as the VAE, the control part as the LCM.
 pub(crate) type Steps4 = [u64; 4];
 
 /// The stages in order.
@@ -51,6 +51,8 @@ pub(crate) fn chain(shards: usize, steps: Steps4) -> Vec<Link> {
     let mld = TrainMld { network: network(), ema: 0.9, training: training(steps[1]), ..TrainMld::default() };
     let lcm = DistillLcm { distillation: distillation(steps[2]) };
     let pcm = DistillPcm { phases: 2, distillation: distillation(steps[3]), ..DistillPcm::default() };
+    let control =
+        TrainControl { network: network(), embedding: 12, training: training(steps[2]), ..TrainControl::default() };
     let evaluate = |model: &str, teacher: &str, steps: usize, guidance: f64| {
         StageSettings::EvaluateLatentFid(EvaluateLatentFid {
             model: model.into(),
@@ -90,6 +92,11 @@ pub(crate) fn chain(shards: usize, steps: Steps4) -> Vec<Link> {
         ("mld", StageSettings::TrainMld(mld), vec![("vae", "vae"), ("latents", "latents"), ("text", "text")]),
         ("lcm", StageSettings::DistillLcm(lcm), teacher()),
         ("pcm", StageSettings::DistillPcm(pcm), teacher()),
+        (
+            "control",
+            StageSettings::TrainControl(control),
+            vec![("model", "lcm"), ("dataset", "dataset"), ("latents", "latents"), ("text", "text")],
+        ),
         ("eval-mld", evaluate("mld", "mld", 4, 3.0), latent("mld")),
         ("eval-lcm", evaluate("lcm", "mld", 2, 2.0), latent("lcm")),
         ("eval-pcm", evaluate("pcm", "mld", 2, 2.0), latent("pcm")),

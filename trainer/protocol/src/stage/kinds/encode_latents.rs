@@ -28,6 +28,8 @@ impl Default for EncodeLatents {
 
 impl StageSpec for EncodeLatents {
     const KIND: &'static str = "encode.latents";
+    // 2: says where in its clip each crop begins.
+    const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "latents", kind: ArtifactKind::Latents };
 

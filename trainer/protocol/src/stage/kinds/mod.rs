@@ -6,6 +6,7 @@ mod distill_lcm;
 mod distill_pcm;
 mod encode_latents;
 mod encode_tokens;
+mod evaluate_control;
 mod evaluate_latent_fid;
 mod evaluate_reconstruction;
 mod evaluate_t2m;
@@ -13,6 +14,7 @@ mod import_evaluator;
 mod model_decoder;
 mod register;
 mod text_embed;
+mod train_control;
 mod train_discord;
 mod train_evaluator;
 mod train_length;
@@ -29,6 +31,7 @@ pub use distill_lcm::DistillLcm;
 pub use distill_pcm::DistillPcm;
 pub use encode_latents::EncodeLatents;
 pub use encode_tokens::EncodeTokens;
+pub use evaluate_control::EvaluateControl;
 pub use evaluate_latent_fid::EvaluateLatentFid;
 pub use evaluate_reconstruction::EvaluateReconstruction;
 pub use evaluate_t2m::{EvaluateT2m, MultiModality};
@@ -36,6 +39,7 @@ pub use import_evaluator::ImportEvaluator;
 pub use model_decoder::ModelDecoder;
 pub use register::{Promote, Register};
 pub use text_embed::{TextEmbed, TextEncoder};
+pub use train_control::{ControlDistance, ControlLoss, ControlMean, TrainControl};
 pub use train_discord::{FlowBackbone, FlowNetwork, FlowProjection, FlowSolver, TrainDiscord};
 pub use train_evaluator::{EvaluatorNetwork, MovementPhase, TrainEvaluator};
 pub use train_length::TrainLength;
@@ -68,6 +72,8 @@ super::spec::stage_kinds! {
     ModelDecoder,
     TrainMdm,
     TrainStableMoFusion,
+    TrainControl,
+    EvaluateControl,
     ImportEvaluator,
     EvaluateT2m,
     Register,

@@ -1,0 +1,140 @@
+//! `evaluate.control`: how well motions pass the positions that they are told, and what that costs. Source: OmniControl, MotionLCM (tables 3 and 4).
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::stage::control::{check_skeleton, check_words};
+use crate::stage::{ControlSetting, Neighbours, Output, Problems, Ref, Sampler, Shape, Split, StageSpec, TrainControl};
+use crate::{ArtifactKind, limits};
+
+/// `evaluate.control`: errors of told positions, with the control part and without it, by joints and density. Every combination of `joints` with
+/// an entry of `percent` or `frames` is a case, whose metrics are called `METRIC/CASE`, such as `average_error/six/25pct`; without a case a
+/// metric is the mean over the cases.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct EvaluateControl {
+    /// Stage that gives the model, of `train.control`.
+    pub model: String,
+    /// Stage that gives the clips.
+    pub dataset: String,
+    /// Stage that gives the evaluator.
+    pub evaluator: String,
+    /// When positions are told.
+    pub setting: ControlSetting,
+    /// Each a case: a joint, or `six`, `twelve` or `all` of them, which are told together.
+    pub joints: Vec<String>,
+    /// Densities in percent of the frames.
+    pub percent: Vec<f64>,
+    /// Densities as numbers of frames.
+    pub frames: Vec<usize>,
+    /// Metres beyond which a position is missed.
+    pub threshold: f64,
+    /// What the ControlNet's residuals are multiplied by.
+    pub scale: f64,
+    /// Sampler.
+    pub sampler: Sampler,
+    /// Repeats with other noise, captions, crops and pools.
+    pub repeats: usize,
+    /// Clips. Choose on `val`; `test` is for the last look.
+    pub split: Split,
+    /// Takes all clips where the split has fewer than a pool of 32, and says so in the report; otherwise so small a split is refused.
+    pub all_if_small: bool,
+    /// Shards.
+    pub shards: usize,
+}
+
+impl Default for EvaluateControl {
+    fn default() -> Self {
+        Self {
+            model: "control".into(),
+            dataset: "dataset".into(),
+            evaluator: "evaluator".into(),
+            setting: ControlSetting::Temporal,
+            joints: vec!["six".into()],
+            percent: vec![25.0],
+            frames: Vec::new(),
+            threshold: 0.5,
+            scale: 1.0,
+            sampler: Sampler { steps: 1, ..Sampler::default() },
+            repeats: 20,
+            split: Split::Val,
+            all_if_small: false,
+            shards: 8,
+        }
+    }
+}
+
+impl StageSpec for EvaluateControl {
+    const KIND: &'static str = "evaluate.control";
+    const SHAPE: Shape = Shape::Map;
+    const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![
+            Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
+            Ref::stage("evaluator", &mut self.evaluator, ArtifactKind::Evaluator),
+            Ref::stage("model", &mut self.model, ArtifactKind::Model).measured_if(true),
+        ]
+    }
+
+    fn check(&self, p: &mut Problems) {
+        check_words(p, "joints", &self.joints);
+        if self.percent.is_empty() && self.frames.is_empty() {
+            p.add("percent", "`percent` and `frames` are both empty, so nothing is told", "published: `percent: [25]`");
+        }
+        for (i, percent) in self.percent.iter().enumerate() {
+            if !(*percent > 0.0 && *percent <= 100.0) {
+                let message = format!("`percent` has {percent}; expected numbers above 0, up to 100");
+                p.add(&format!("percent[{i}]"), message, "");
+            }
+        }
+        if self.frames.contains(&0) {
+            p.add("frames", "`frames` has 0; expected at least 1", "");
+        }
+        p.above_zero("threshold", self.threshold);
+        p.not_negative("scale", self.scale);
+        self.sampler.check(p);
+        p.positive("repeats", self.repeats);
+        p.shards(self.shards);
+        let densities = self.percent.len() + self.frames.len();
+        p.product(
+            "joints",
+            &[("repeats", self.repeats), ("joints", self.joints.len()), ("densities", densities)],
+            limits::CONTROL_CASES,
+        );
+    }
+
+    fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
+        let (model, dataset, evaluator) = (&self.model, &self.dataset, &self.evaluator);
+        if stages.stage(model).is_some_and(|stage| stage.get::<TrainControl>().is_none() && stage.family().is_some()) {
+            let message = format!("`{model}` has no control part");
+            p.add("model", message, "name a `train.control` stage");
+        }
+        let ours = stages.format(dataset);
+        for (field, name) in [("evaluator", evaluator), ("model", model)] {
+            if let (Some(ours), Some(theirs)) = (ours, stages.format(name))
+                && ours != theirs
+            {
+                let (theirs, ours) = (theirs.skeleton(), ours.skeleton());
+                let message =
+                    format!("`{name}` is for skeletons of {theirs}, but the clips of `{dataset}` have {ours}");
+                p.add(field, message, "measure a model on the format that it was trained on");
+            }
+        }
+        if stages.evaluator_of_model(model) == Some(evaluator) {
+            let message =
+                format!("`{model}` was trained to agree with `{evaluator}`, so that its metrics would flatter it");
+            p.add("evaluator", message, "train another evaluator, under another name, to measure with");
+        }
+        check_skeleton(p, "joints", &self.joints, ours);
+        stages.check_sampler(p, model, &self.sampler);
+    }
+
+    fn sampler(&self) -> Option<&Sampler> {
+        Some(&self.sampler)
+    }
+
+    fn shards(&self) -> usize {
+        self.shards
+    }
+}

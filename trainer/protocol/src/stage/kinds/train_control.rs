@@ -1,0 +1,165 @@
+//! `train.control`: motion that passes given positions. Source: MotionLCM (Dai et al., ECCV 2024; v2 of late 2024).
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::ArtifactKind;
+use crate::stage::control::check_skeleton;
+use crate::stage::{ControlHints, Family, Neighbours, Network, Output, Problems, Ref, Shape, StageSpec, Training};
+
+/// How a joint's position is compared with the one that was told.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum ControlDistance {
+    /// `d^2`: temporal.
+    #[default]
+    L2,
+    /// `|d|`.
+    L1,
+    /// `d^2 / 2` up to 1, `|d| - 1/2` beyond: spatial.
+    SmoothL1,
+}
+
+/// What the sum over told positions is divided by.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum ControlMean {
+    /// The positions told in the whole batch (`sum` upstream): temporal.
+    #[default]
+    Batch,
+    /// Those of the sample, then the mean over samples (`sum_mask`).
+    Sample,
+    /// The coordinates of the sample, three a position, then the mean over samples (`mask`): spatial.
+    Coordinate,
+}
+
+/// Terms of the loss.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct ControlLoss {
+    /// Weight of the latent term: the clean latent that a student predicts, or the noise that a teacher does.
+    pub latent: f64,
+    /// Weight of the motion term, which compares joints through the frozen decoder; 0 leaves the decoder out.
+    pub control: f64,
+    /// Distance of the motion term.
+    pub distance: ControlDistance,
+    /// Its mean.
+    pub mean: ControlMean,
+    /// Compares metres (spatial) instead of normalised coordinates (temporal).
+    pub metres: bool,
+}
+
+impl Default for ControlLoss {
+    fn default() -> Self {
+        let (distance, mean) = (ControlDistance::default(), ControlMean::default());
+        Self { latent: 1.0, control: 1.0, distance, mean, metres: false }
+    }
+}
+
+/// `train.control`: a trajectory encoder and a ControlNet beside the frozen denoiser of a latent model. Defaults are MotionLCM v2's temporal
+/// setting.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct TrainControl {
+    /// Stage that gives the model to be controlled, of `train.mld`, `distill.lcm` or `distill.pcm`. All its parts stay as they are.
+    pub model: String,
+    /// Stage that gives the clips that `latents` were encoded from.
+    pub dataset: String,
+    /// Stage that gives the latents.
+    pub latents: String,
+    /// Stage that gives the caption embeddings.
+    pub text: String,
+    /// What is told.
+    pub hints: ControlHints,
+    /// Terms of the loss.
+    pub loss: ControlLoss,
+    /// A student's guidance scale w is drawn from this range; v1 fixes it at 6.5. A teacher has none.
+    pub guidance: (f64, f64),
+    /// A student trains at timesteps `k - 1`, `2k - 1` and so on to 999 (v2: k = 100); 1 takes all timesteps (v1). A teacher takes all.
+    pub skip: usize,
+    /// Size of the trajectory encoder. The ControlNet has the denoiser's.
+    pub network: Network,
+    /// Width of the layers between trajectory tokens and ControlNet.
+    pub embedding: usize,
+    /// The trajectory encoder's learning rate; 0 takes `lr`.
+    pub trajectory_lr: f64,
+    /// The rest. Gradients of both networks are clipped together.
+    #[serde(flatten)]
+    pub training: Training,
+}
+
+impl Default for TrainControl {
+    fn default() -> Self {
+        Self {
+            model: "lcm".into(),
+            dataset: "dataset".into(),
+            latents: "latents".into(),
+            text: "text".into(),
+            hints: ControlHints::default(),
+            loss: ControlLoss::default(),
+            guidance: (5.0, 15.0),
+            skip: 100,
+            network: Network::default(),
+            embedding: 256,
+            trajectory_lr: 0.0,
+            training: Training::published(192_000, 128, 1e-4),
+        }
+    }
+}
+
+impl StageSpec for TrainControl {
+    const KIND: &'static str = "train.control";
+    const SHAPE: Shape = Shape::Gang;
+    const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![
+            Ref::stage("model", &mut self.model, ArtifactKind::Model),
+            Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
+            Ref::stage("latents", &mut self.latents, ArtifactKind::Latents),
+            Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
+        ]
+    }
+
+    fn check(&self, p: &mut Problems) {
+        self.hints.check(p);
+        p.not_negative("loss.latent", self.loss.latent);
+        p.not_negative("loss.control", self.loss.control);
+        if self.loss.latent == 0.0 && self.loss.control == 0.0 {
+            p.add("loss.latent", "`loss.latent` and `loss.control` are both 0, so nothing is learned", "");
+        }
+        let (low, high) = self.guidance;
+        if !(low >= 0.0 && low <= high && high.is_finite()) {
+            let message = format!("`guidance` is [{low}, {high}]; expected numbers of 0 or more, the smaller first");
+            p.add("guidance", message, "published: [5, 15] (v2) and [6.5, 6.5] (v1)");
+        }
+        if self.skip == 0 || !1000usize.is_multiple_of(self.skip) {
+            let message = format!("`skip` is {}; expected a divisor of the 1000 timesteps", self.skip);
+            p.add("skip", message, "published: 100 (v2) and 1 (v1)");
+        }
+        self.network.check(p);
+        p.positive("embedding", self.embedding);
+        p.not_negative("trajectory_lr", self.trajectory_lr);
+        self.training.check(p);
+    }
+
+    fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
+        let model = &self.model;
+        if let Some(Family::Autoregressive | Family::Masked | Family::Features { .. }) = stages.family(model) {
+            let message = format!("`{model}` is no latent diffusion, and only such a model has a ControlNet");
+            p.add("model", message, "name a `train.mld`, `distill.lcm` or `distill.pcm` stage");
+        }
+        if stages.stage(model).is_some_and(|stage| stage.kind() == Self::KIND) {
+            let message = format!("`{model}` has a control part already");
+            p.add("model", message, "name the stage whose model it controls");
+        }
+        stages.same_vae(p, ("model", stages.vae_of_model(model)), &self.latents);
+        stages.same_data(p, &self.latents, &self.text);
+        stages.same_clips(p, &self.dataset, &self.latents);
+        check_skeleton(p, "hints.joints", &self.hints.joints, stages.format(&self.dataset));
+    }
+
+    fn training(&mut self) -> Option<&mut Training> {
+        Some(&mut self.training)
+    }
+}

@@ -1,0 +1,149 @@
+//! `trainer generate --control`: where a motion should go, and how far from it it went.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use checkpoint::Blobs as _;
+use checkpoint::model::{self as assembly, Model};
+use clap::Args;
+use motion::Skeleton;
+use motion::waypoints::{self, Waypoint};
+use protocol::Manifest;
+use protocol::artifact::Role;
+use stages::control::{Hint, metres};
+use stages::generate::{Generated, Generator};
+
+use super::model::{self, Found};
+use crate::problem::{Problem, Result};
+use crate::reader::Reader;
+
+/// Metres beyond which a waypoint counts as missed, in the papers.
+const MISSED: f64 = 0.5;
+
+#[derive(Debug, Args)]
+pub(super) struct ControlArgs {
+    /// Positions to pass: a .csv with columns t,x,y,z or t,joint,x,y,z, a .json of [t, x, y, z] by joint (seconds and metres; the motion starts
+    /// at x = z = 0 and faces z), or a motion as .npy
+    #[arg(long, value_name = "FILE", conflicts_with = "edit")]
+    control: Option<PathBuf>,
+    /// Joints that are told, such as pelvis,left_wrist [default: those that the file names, else the pelvis]
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', requires = "control")]
+    joints: Vec<String>,
+    /// How strongly positions are heeded; 1 as trained, 0 not at all
+    #[arg(long, value_name = "S", default_value_t = 1.0, requires = "control")]
+    control_scale: f64,
+    /// Takes the control part of another model, MODEL@ALIAS or MODEL:VERSION, which must have been trained for this one
+    #[arg(long, value_name = "MODEL", requires = "control")]
+    control_from: Option<String>,
+}
+
+/// What a motion is told.
+#[derive(Debug)]
+pub(super) struct Told {
+    hint: Hint,
+    scale: f64,
+    pub(super) waypoints: Vec<Waypoint>,
+}
+
+/// How far a motion is from what it was told.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Missed {
+    /// Positions told.
+    pub(super) told: usize,
+    /// Mean distance, metres.
+    pub(super) average: f64,
+    /// Largest distance, metres.
+    pub(super) worst: f64,
+    /// Share of positions missed by more than half a metre.
+    pub(super) location: f64,
+}
+
+impl ControlArgs {
+    /// Whether a path is given.
+    pub(super) fn given(&self) -> bool {
+        self.control.is_some()
+    }
+
+    /// `found` with the control part of another model, if one is named.
+    pub(super) async fn completed(&self, reader: &Reader, mut found: Found) -> Result<Found> {
+        let Some(name) = &self.control_from else { return Ok(found) };
+        let other = model::version(reader, name).await?;
+        let parts = Model::read(&other.manifest).map_err(Problem::failed)?.parts;
+        let Some(digest) = parts.get(&Role::CONTROL) else {
+            return Err(Problem::usage(format!("{name} has no control part")).hint(TRAIN));
+        };
+        let bytes = other.blobs.get(*digest).map_err(Problem::failed)?;
+        let part: Manifest = serde_json::from_slice(&bytes)
+            .map_err(|error| Problem::failed(format!("the control part of {name} is no manifest: {error}")))?;
+        found.manifest =
+            assembly::extend(&found.manifest, None, &BTreeMap::from([(Role::CONTROL, part)])).map_err(|error| {
+                Problem::usage(format!("{}: {error}", found.label))
+                    .hint("a control part is for the model that it was trained on; `trainer registry show` says which")
+            })?;
+        found.blobs.add(other.blobs);
+        Ok(found)
+    }
+
+    /// What a motion for a model is told; `None` without a path. Without `frames` it ends with the path.
+    pub(super) fn told(&self, generator: &Generator, label: &str, frames: Option<usize>) -> Result<Option<Told>> {
+        let Some(file) = &self.control else { return Ok(None) };
+        if !(self.control_scale >= 0.0 && self.control_scale.is_finite()) {
+            return Err(Problem::usage(format!("`--control-scale` is {}; expected 0 or more", self.control_scale)));
+        }
+        if generator.control().is_none() {
+            return Err(
+                Problem::usage(format!("{label} has no control part, and so cannot be told where to go")).hint(TRAIN)
+            );
+        }
+        let skeleton = Skeleton::of(generator.format());
+        let waypoints = waypoints::read(file, skeleton, &self.joints).map_err(Problem::usage)?;
+        let end = waypoints.iter().map(|waypoint| waypoint.frame + 1).max().unwrap_or_default();
+        let frames = frames.unwrap_or_else(|| end.next_multiple_of(skeleton.unit).max(skeleton.min_frames));
+        if let Some(outside) = waypoints.iter().find(|waypoint| waypoint.frame >= frames) {
+            return Err(Problem::usage(format!(
+                "`{}`: the waypoint of `{}` at {:.2} s is outside the motion, whose {frames} frames end at {:.2} s",
+                file.display(),
+                skeleton.names[outside.joint],
+                outside.frame as f64 / skeleton.fps,
+                frames.saturating_sub(1) as f64 / skeleton.fps
+            ))
+            .hint(format!("at least `--frames {end}` has room for all of them")));
+        }
+        let longest = generator.longest();
+        if frames > longest {
+            return Err(Problem::usage(format!(
+                "`{}`: the path takes {:.1} s, and {label} draws motions of at most {:.1} s ({longest} frames)",
+                file.display(),
+                end as f64 / skeleton.fps,
+                longest as f64 / skeleton.fps
+            )));
+        }
+        let mut hint = Hint::none(frames, skeleton.joints);
+        waypoints.iter().for_each(|waypoint| hint.tell(waypoint.frame, waypoint.joint, waypoint.position));
+        Ok(Some(Told { hint, scale: self.control_scale, waypoints }))
+    }
+}
+
+/// What to do about a model without a control part.
+const TRAIN: &str = "a `train.control` stage gives a model that has one";
+
+impl Told {
+    /// Positions and how strongly they are heeded.
+    pub(super) fn request(&self) -> (&Hint, f64) {
+        (&self.hint, self.scale)
+    }
+
+    /// How far `motion` is from it.
+    pub(super) fn missed(&self, motion: &Generated) -> Option<Missed> {
+        let skeleton = Skeleton::of(motion.format);
+        let joints = metres(&motion.features, skeleton);
+        let errors = self.hint.errors(&joints, MISSED)?;
+        let distance = |w: &Waypoint| {
+            let at = 3 * (w.frame * skeleton.joints + w.joint);
+            let squares = joints[at..at + 3].iter().zip(w.position).map(|(a, b)| f64::from(a - b).powi(2));
+            squares.sum::<f64>().sqrt()
+        };
+        let worst = self.waypoints.iter().map(distance).fold(0.0, f64::max);
+        Some(Missed { told: self.hint.told(), average: errors.average, worst, location: errors.location })
+    }
+}

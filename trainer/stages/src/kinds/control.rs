@@ -1,0 +1,362 @@
+//! `train.control`: a trajectory encoder and a ControlNet beside a frozen latent denoiser. Source: MotionLCM (Dai et al., ECCV 2024; v2 of late
+//! 2024).
+//!
+//! The ControlNet starts as a copy of the denoiser whose residuals are zero. `z_t = alpha_t z_0 + sigma_t eps`; the controlled denoiser's clean latent
+//! is compared with `z_0` (a teacher's output with what it learned to predict), and through the frozen decoder the joints of its motion with those that
+//! were told. Only trajectory encoder and ControlNet are trained, with dropout; all else is frozen and without.
+//!
+//! A phased student (MotionPCM) is trained alike, which nobody has published: from a given `z_t` its jump to any edge differs from the true one by a
+//! constant times the error of the clean latent, so that one loss serves both students.
+//!
+//! Departs: a sample of which nothing is told adds nothing to the motion term, where two of the three published means divide by zero. Hints of KIT-ML
+//! are in metres too, so that one weight suits both datasets.
+
+use std::collections::BTreeMap;
+
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+use checkpoint::model::{self, Model, Parts};
+use models::diffusion::{Grid, Schedule, TIMESTEPS, affine, unzip};
+use models::flat::{self, Entry};
+use models::kernels::Dropout;
+use models::losses::{self, Body, ControlTarget, Pointwise};
+use models::networks::{Control, Denoiser, Init, TrajectoryEncoder, copied_from, guidance_embedding};
+use motion::Skeleton;
+use motion::dataset::Dataset;
+use protocol::artifact::Role;
+use protocol::stage::{ControlDistance, ControlMean, ControlSetting, Family, Positions, TrainControl, Training};
+use protocol::{ArtifactKind, Digest, Manifest, Seed};
+
+use super::frequency::clean;
+use super::latent_data::{LatentData, LatentSlice};
+use super::{Gang, dropout_seed, group};
+use crate::artifacts::{self, DenoiserMeta, Draft, VaeMeta, to_meta};
+use crate::context::{AttemptContext, GangContext, Outcome, StageError};
+use crate::control::{
+    CONTROLNET_PREFIX, ControlMeta, Hint, NormalisedHints, TRAJECTORY_PREFIX, joint_statistics, metres, told_count,
+    told_frames,
+};
+use crate::networks::Autoencoder;
+use crate::parts::{self, model_error};
+use crate::train::{Clip, GroupPlan, Losses, Objective, Pick, SliceResult, TrainState, Trained, train};
+use crate::weights;
+
+/// The term on latents.
+const LATENT: &str = "latent";
+/// The term on joints.
+const CONTROL: &str = "control";
+
+/// What the motion term looks through.
+struct Decoder {
+    vae: Autoencoder,
+    body: Body,
+    /// Metres in one unit of the data.
+    metres: f32,
+}
+
+struct Controlled {
+    settings: TrainControl,
+    data: LatentData,
+    dataset: Dataset,
+    /// Numbers of the joints that may be told.
+    joints: Vec<usize>,
+    base: Denoiser,
+    base_meta: DenoiserMeta,
+    meta: ControlMeta,
+    control: Denoiser,
+    trajectory: TrajectoryEncoder,
+    decoder: Option<Decoder>,
+    noise: Schedule,
+    seed: u64,
+    device: Device,
+}
+
+/// Joints and frames that are told of one example.
+struct Told {
+    joints: Vec<usize>,
+    frames: Vec<usize>,
+}
+
+impl Objective for Controlled {
+    fn groups(&mut self) -> Vec<GroupPlan> {
+        let training = &self.settings.training;
+        let lr = if self.settings.trajectory_lr > 0.0 { self.settings.trajectory_lr } else { training.lr };
+        let clip = (training.max_grad_norm > 0.0).then_some(Clip { norm: training.max_grad_norm, together: "control" });
+        let own = Training { lr, ..training.clone() };
+        vec![
+            GroupPlan { clip, ..group("controlnet", &self.control, training, 0.0) },
+            GroupPlan { clip, ..group("trajectory", &self.trajectory, &own, 0.0) },
+        ]
+    }
+
+    fn terms(&self) -> Vec<&'static str> {
+        vec![Losses::TOTAL, LATENT, CONTROL]
+    }
+
+    fn load(&mut self, state: &TrainState) {
+        state.groups[0].trained().assign(&mut self.control);
+        state.groups[1].trained().assign(&mut self.trajectory);
+    }
+
+    fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
+        let whole = self.data.picks(step);
+        let batch = self.data.slice(step, slice, 0.0);
+        let hints = self.hints(&batch);
+        let hints = NormalisedHints::of(&hints, &self.meta.mean, &self.meta.std);
+        let timesteps: Vec<usize> = batch.picks.iter().map(|pick| self.timestep(*pick)).collect();
+        let noise = self.data.noise("noise", &batch.picks);
+        let (a, e) = unzip(timesteps.iter().map(|t| self.noise.add_noise(*t)));
+        let noisy = affine(batch.clean_bnd.clone(), noise.clone(), &a, &e);
+        let out = self.predict(&batch, &noisy, &timesteps, &hints, (step, slice as u64));
+
+        let loss = &self.settings.loss;
+        let mut all = Losses::new(self.settings.training.batch.global);
+        let found = clean(&self.noise, noisy, out.clone(), &timesteps);
+        if loss.latent > 0.0 {
+            let sum = match self.base_meta.family {
+                Family::Mld => losses::mse(out, self.noise.target(batch.clean_bnd, noise, &timesteps)),
+                _ => losses::mse(found.clone(), batch.clean_bnd),
+            };
+            all.add(LATENT, sum, loss.latent);
+        }
+        if let Some(decoder) = &self.decoder {
+            all.add(CONTROL, self.motion_term(decoder, found, &batch.lengths, &hints, &whole), loss.control);
+        }
+        let total = all.total().ok_or_else(|| StageError::Fault("every weight of the loss is 0".into()))?;
+        let mut gradients = total.backward();
+        let (mut first, mut second) = (vec![0.0; self.control.num_params()], vec![0.0; self.trajectory.num_params()]);
+        flat::add_gradients(&self.control, &mut gradients, &mut first);
+        flat::add_gradients(&self.trajectory, &mut gradients, &mut second);
+        let terms = all.values(&self.terms());
+        Ok(SliceResult { gradients: vec![first, second], terms, ..SliceResult::default() })
+    }
+}
+
+impl Controlled {
+    fn timestep(&self, pick: Pick) -> usize {
+        let mut draw = self.data.stream("timestep", pick);
+        match self.base_meta.family {
+            Family::Mld => draw.below(TIMESTEPS),
+            _ => {
+                let grid = Grid::new(self.settings.skip);
+                grid.tau(draw.below(grid.steps))
+            }
+        }
+    }
+
+    /// What is told of an example of `length` frames.
+    fn told(&self, pick: Pick, length: usize) -> Told {
+        let mut draw = self.data.stream("hint", pick);
+        let setting = self.settings.hints.setting;
+        let joints = match setting {
+            ControlSetting::Temporal => self.joints.clone(),
+            ControlSetting::Spatial => vec![self.joints[draw.below(self.joints.len())]],
+        };
+        let count = told_count(&self.settings.hints, length, &mut draw);
+        Told { joints, frames: told_frames(setting, count, length, &mut draw) }
+    }
+
+    /// What is told of a slice: joints of the very crops that its latents were encoded from.
+    fn hints(&self, batch: &LatentSlice) -> Vec<Hint> {
+        let (meta, skeleton) = (self.data.meta(), self.dataset.skeleton());
+        let one = |((pick, row), length): ((&Pick, &usize), &usize)| {
+            let features = self.dataset.features(&self.dataset.entries[row / meta.crops]);
+            let start = meta.starts[*row];
+            let crop = &features[start * skeleton.features..(start + length) * skeleton.features];
+            let told = self.told(*pick, *length);
+            Hint::of(&metres(crop, skeleton), skeleton.joints, &told.joints, &told.frames)
+        };
+        batch.picks.iter().zip(&batch.rows).zip(&batch.lengths).map(one).collect()
+    }
+
+    /// The controlled denoiser's output, on the tape of what is trained.
+    fn predict(
+        &self,
+        batch: &LatentSlice,
+        noisy_bnd: &Tensor<3>,
+        timesteps: &[usize],
+        hints: &NormalisedHints,
+        (step, slice): (u64, u64),
+    ) -> Tensor<3> {
+        let (low, high) = self.settings.guidance;
+        #[expect(clippy::cast_possible_truncation, reason = "a scale")]
+        let w = |pick: &Pick| self.data.stream("guidance", *pick).range(low, high) as f32;
+        let guidance = (self.base_meta.guidance_dim > 0).then(|| {
+            let scales: Vec<f32> = batch.picks.iter().map(w).collect();
+            guidance_embedding(&scales, self.base_meta.guidance_dim, &self.device)
+        });
+        let dropout = |probability, network: u64| Dropout::new(probability, self.seed ^ network, step, slice);
+        let mut drop = dropout(self.settings.network.dropout, 1);
+        let tokens = self.trajectory.forward(&hints.on(&self.device), &mut drop);
+        let mut drop = dropout(self.base_meta.network.dropout, 2);
+        let text = &batch.text_blc;
+        let residuals =
+            self.control.residuals(noisy_bnd.clone(), timesteps, text.clone(), guidance.clone(), tokens, &mut drop);
+        let control = Control { residuals: &residuals, scale: 1.0 };
+        let off = &mut Dropout::off();
+        self.base.forward_controlled(noisy_bnd.clone(), timesteps, text.clone(), guidance, control, off)
+    }
+
+    /// The distance of the decoded motion's joints from those that were told, summed over the slice so that dividing by the global batch gives the
+    /// mean that is asked for.
+    fn motion_term(
+        &self,
+        decoder: &Decoder,
+        found_bnd: Tensor<3>,
+        lengths: &[usize],
+        hints: &NormalisedHints,
+        batch: &[Pick],
+    ) -> Tensor<1> {
+        let loss = &self.settings.loss;
+        let distance = match loss.distance {
+            ControlDistance::L2 => Pointwise::L2,
+            ControlDistance::L1 => Pointwise::L1,
+            ControlDistance::SmoothL1 => Pointwise::SmoothL1,
+        };
+        let statistics = (&self.meta.mean[..], &self.meta.std[..]);
+        let target =
+            ControlTarget::new(&hints.values, &hints.given, hints.shape, statistics, loss.metres, &self.device);
+        let global = self.settings.training.batch.global as f32;
+        let all = || -> usize {
+            let lengths = &self.data.meta().lengths;
+            let count = |pick: &Pick| {
+                let told = self.told(*pick, lengths[self.data.row(*pick)]);
+                told.joints.len() * told.frames.len()
+            };
+            batch.iter().map(count).sum()
+        };
+        let entries = target.entries();
+        let weights: Vec<f32> = match loss.mean {
+            ControlMean::Batch => vec![global / all().max(1) as f32; entries.len()],
+            ControlMean::Sample => entries.iter().map(|own| 1.0 / (*own).max(1) as f32).collect(),
+            ControlMean::Coordinate => entries.iter().map(|own| 1.0 / (3 * own).max(1) as f32).collect(),
+        };
+        let joints = decoder.body.joints(decoder.vae.decode_tensor(found_bnd, lengths));
+        let joints = if decoder.metres == 1.0 { joints } else { joints * decoder.metres };
+        target.loss(joints, distance, &weights)
+    }
+
+    /// Uploads the model that was controlled, with the control part beside its others.
+    fn publish(&self, cx: &mut dyn AttemptContext, base: &Manifest, state: &TrainState) -> Result<Digest, StageError> {
+        let named = |prefix: &str, entries: &[Entry]| -> Vec<Entry> {
+            entries.iter().map(|e| Entry { name: format!("{prefix}{}", e.name), shape: e.shape.clone() }).collect()
+        };
+        let [control, trajectory] = &state.groups[..] else {
+            return Err(StageError::Fault("two networks were trained".into()));
+        };
+        let (control, trajectory) =
+            (named(CONTROLNET_PREFIX, &control.entries), named(TRAJECTORY_PREFIX, &trajectory.entries));
+        let mut part = Draft::new(cx, ArtifactKind::Control, to_meta(&self.meta));
+        weights::add_all(&mut part, &[(&control, state.result(0)), (&trajectory, state.result(1))])?;
+        let part = part.into_manifest();
+        cx.put_manifest(&part)?;
+        let model = model::extend(base, None, &BTreeMap::from([(Role::CONTROL, part)])).map_err(model_error)?;
+        Ok(cx.put_manifest(&model)?)
+    }
+}
+
+/// A model that has a denoiser of latents, of which these are.
+fn base_meta(denoiser: &Manifest, model: &Model, data: &LatentData) -> Result<DenoiserMeta, StageError> {
+    let refuse = |text: &str| Err(StageError::Input(text.to_owned()));
+    if model.parts.contains_key(&Role::CONTROL) {
+        return refuse("`model` has a control part already; name the model that it controls");
+    }
+    if model.generator != crate::generator::LATENT_DIFFUSION {
+        return refuse("`model` is no latent diffusion, and only such a model has a ControlNet");
+    }
+    let meta: DenoiserMeta = artifacts::meta(denoiser, "the denoiser of `model`")?;
+    if meta.fits.get(&Role::VAE) != Some(&data.vae()) {
+        return refuse("`latents` were made by another VAE than `model` was trained on; name its latents");
+    }
+    if meta.fits.get(&Role::TEXT) != Some(&data.text_meta().text) {
+        return refuse("`text` was embedded with another encoder than `model` was trained with; name its `text`");
+    }
+    Ok(meta)
+}
+
+/// The clips that the latents were encoded from.
+fn clips(cx: &dyn AttemptContext, data: &LatentData) -> Result<Dataset, StageError> {
+    let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
+    let dataset = artifacts::dataset(&*cx.blobs(), &manifest)?;
+    let meta = data.meta();
+    let rows = meta.splits.len() * meta.crops;
+    if meta.starts.len() != rows {
+        let text = "`latents` do not say where their crops begin: an older build encoded them; encode them again";
+        return Err(StageError::Input(text.into()));
+    }
+    let fits = |row: usize| {
+        let entry = dataset.entries.get(row / meta.crops);
+        entry.is_some_and(|entry| meta.starts[row] + meta.lengths[row] <= entry.len)
+    };
+    if dataset.entries.len() != meta.splits.len() || !(0..rows).all(fits) {
+        return Err(StageError::Input(
+            "`latents` were encoded from other clips than `dataset` has; name the dataset that they were encoded from"
+                .into(),
+        ));
+    }
+    Ok(dataset)
+}
+
+impl Gang for TrainControl {
+    fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
+        let blobs = cx.blobs();
+        let data = LatentData::read(cx, &self.training)?;
+        let (_, manifest) = artifacts::input(cx, "model", ArtifactKind::Model)?;
+        let model = Model::read(&manifest).map_err(model_error)?;
+        let denoiser = parts::part(&*blobs, &model, &Role::DENOISER, ArtifactKind::Denoiser)?;
+        let base_meta = base_meta(&denoiser, &model, &data)?;
+        let dataset = clips(cx, &data)?;
+        let joints = dataset.format.joints_of_all(&self.hints.joints).map_err(StageError::Input)?;
+        let (mean, std) = joint_statistics(&dataset);
+        let meta = ControlMeta {
+            format: dataset.format,
+            hints: self.hints.clone(),
+            embedding: self.embedding,
+            network: self.network.clone(),
+            mean,
+            std,
+            fits: Parts::from([(Role::DENOISER, denoiser.digest())]),
+        };
+        let device = cx.device();
+        let tracked = device.clone().autodiff();
+        let blank = Denoiser::new(&base_meta.config(), &mut Init::new(Seed(0), "blank", Positions::Uniform, &device));
+        let base = weights::load(blank, &*blobs, &denoiser, "the denoiser of `model`")?;
+        let purpose = format!("{}/init", cx.task().name);
+        let mut init = Init::new(cx.task().seed, &purpose, self.network.positions, &tracked);
+        let control = copied_from(&base, meta.controlnet(&base_meta, &mut init));
+        let trajectory = meta.trajectory(&base_meta, &mut init);
+        let decoder = if self.loss.control > 0.0 {
+            let part = parts::part(&*blobs, &model, &Role::VAE, ArtifactKind::Vae)?;
+            let vae: VaeMeta = artifacts::meta(&part, "the VAE")?;
+            let skeleton = Skeleton::of(vae.format);
+            #[expect(clippy::cast_possible_truncation, reason = "a unit")]
+            let metres = skeleton.metres_per_unit as f32;
+            let body = Body::new(skeleton, &vae.mean, &vae.std, &device);
+            Some(Decoder { vae: Autoencoder::read(&*blobs, &part, &device)?, body, metres })
+        } else {
+            None
+        };
+        let mut objective = Controlled {
+            settings: self.clone(),
+            data,
+            dataset,
+            joints,
+            base,
+            noise: Schedule::new(&base_meta.diffusion, TIMESTEPS),
+            base_meta,
+            meta,
+            control,
+            trajectory,
+            decoder,
+            seed: dropout_seed(cx),
+            device,
+        };
+        match train(&mut objective, &self.training, cx)? {
+            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
+            Trained::Finished { state, metrics } => {
+                let output = objective.publish(cx, &manifest, &state)?;
+                Ok(Outcome::Finished { output, metrics })
+            }
+        }
+    }
+}

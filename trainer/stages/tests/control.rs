@@ -1,0 +1,285 @@
+//! Controlled motion, at sizes at which a step takes a few milliseconds: training, drawing, measuring.
+
+use std::collections::BTreeMap;
+
+use burn::tensor::Device;
+use checkpoint::model::{self, Model};
+use protocol::artifact::Role;
+use protocol::stage::{
+    Batch, ControlDistance, ControlHints, ControlLoss, ControlMean, ControlSetting, DataSynthetic, Decay, DistillLcm,
+    DistillPcm, Distillation, EncodeLatents, EvaluateControl, EvaluatorNetwork, LatentShape, MovementPhase, Network,
+    Optimizer, Sampler, StageSettings, TextEmbed, TrainControl, TrainEvaluator, TrainMld, TrainVae, Training,
+};
+use protocol::{Digest, Manifest, Seed, Steps};
+use stages::context::Outcome;
+use stages::control::{Hint, metres};
+use stages::generate::Generator;
+use stages::testing::{Bench, Script};
+
+const STEPS: u64 = 9;
+
+fn training(steps: u64) -> Training {
+    Training {
+        steps: Steps(steps),
+        batch: Batch { global: 6, slices: 3 },
+        lr: 1e-3,
+        warmup: Steps(0),
+        decay: Decay::Constant,
+        optimizer: Optimizer::default(),
+        max_grad_norm: 1.0,
+        stop: None,
+    }
+}
+
+fn network() -> Network {
+    Network { width: 16, layers: 3, heads: 2, feed_forward: 32, dropout: 0.1, ..Network::default() }
+}
+
+/// The stages before control, on latents of this shape: 1x16 is v1, which has no projections.
+fn world(latent: LatentShape) -> (Bench, BTreeMap<&'static str, Digest>) {
+    let mut bench = Bench::new(Device::flex(), 7, 1);
+    let distillation = || Distillation {
+        training: training(3),
+        guidance_dim: 16,
+        guidance: (0.5, 5.0),
+        ..DistillLcm::default().distillation
+    };
+    let evaluator = TrainEvaluator {
+        network: EvaluatorNetwork { movement: 8, motion: 8, text: 8, embedding: 8, ..EvaluatorNetwork::default() },
+        movement: MovementPhase { until: 0.5, window: 24, batch: 0, ..MovementPhase::default() },
+        training: training(4),
+        ..TrainEvaluator::default()
+    };
+    let teacher: &[(&str, &str)] = &[("teacher", "mld"), ("latents", "latents"), ("text", "text")];
+    let pcm = DistillPcm { phases: 2, distillation: distillation(), ..DistillPcm::default() };
+    let stages: [(&str, StageSettings, &[(&str, &str)]); 8] = [
+        ("dataset", DataSynthetic { clips: 40, val: 0.1, test: 0.2, mirror: false }.into(), &[]),
+        ("text", TextEmbed::default().into(), &[("dataset", "dataset")]),
+        ("evaluator", evaluator.into(), &[("dataset", "dataset")]),
+        (
+            "vae",
+            TrainVae { latent, network: network(), training: training(6), ..TrainVae::default() }.into(),
+            &[("dataset", "dataset")],
+        ),
+        (
+            "latents",
+            EncodeLatents { crops: 2, shards: 2, ..EncodeLatents::default() }.into(),
+            &[("dataset", "dataset"), ("vae", "vae")],
+        ),
+        (
+            "mld",
+            TrainMld { network: network(), training: training(4), ..TrainMld::default() }.into(),
+            &[("vae", "vae"), ("latents", "latents"), ("text", "text")],
+        ),
+        ("lcm", DistillLcm { distillation: distillation() }.into(), teacher),
+        ("pcm", pcm.into(), teacher),
+    ];
+    let mut outputs = BTreeMap::new();
+    for (name, settings, inputs) in stages {
+        let inputs: Vec<_> = inputs.iter().map(|(field, from)| (*field, outputs[from])).collect();
+        let ran = bench.run(name, &settings, &inputs).unwrap_or_else(|e| panic!("{name}: {e}"));
+        outputs.insert(name, ran.output());
+    }
+    (bench, outputs)
+}
+
+fn v2() -> LatentShape {
+    LatentShape { tokens: 2, dim: 8 }
+}
+
+type Inputs = Vec<(&'static str, Digest)>;
+
+fn inputs(outputs: &BTreeMap<&'static str, Digest>, base: &str) -> Inputs {
+    let common = ["dataset", "latents", "text"].map(|name| (name, outputs[name]));
+    [("model", outputs[base])].into_iter().chain(common).collect()
+}
+
+fn temporal() -> TrainControl {
+    TrainControl { network: network(), embedding: 12, training: training(STEPS), ..TrainControl::default() }
+}
+
+fn spatial() -> TrainControl {
+    let joints = vec!["pelvis".into(), "left_wrist".into()];
+    TrainControl {
+        hints: ControlHints { setting: ControlSetting::Spatial, joints, density: (0.0, 100.0) },
+        loss: ControlLoss {
+            distance: ControlDistance::SmoothL1,
+            mean: ControlMean::Coordinate,
+            metres: true,
+            ..ControlLoss::default()
+        },
+        trajectory_lr: 5e-4,
+        ..temporal()
+    }
+}
+
+fn run(bench: &mut Bench, name: &str, settings: &StageSettings, inputs: &Inputs) -> Digest {
+    bench.run(name, settings, inputs).unwrap_or_else(|e| panic!("{name}: {e}")).output()
+}
+
+/// 1 member, 3 of which the leader is lost while another joins, and a kill of all with a resume: one value. A teacher and both students.
+#[test]
+fn p6_members_kills_and_resumes_change_no_byte() {
+    let (mut bench, outputs) = world(v2());
+    bench.checkpoint.every = Steps(3);
+    let latent_only = ControlLoss { control: 0.0, ..ControlLoss::default() };
+    let cases = [
+        ("on-lcm", "lcm", temporal(), true),
+        ("on-mld", "mld", spatial(), true),
+        ("on-pcm", "pcm", TrainControl { loss: latent_only, ..temporal() }, false),
+    ];
+    for (name, base, settings, motion) in cases {
+        let (settings, inputs) = (StageSettings::from(settings), inputs(&outputs, base));
+        let ran = bench.run(name, &settings, &inputs).unwrap_or_else(|e| panic!("{name}: {e}"));
+        let expected = ran.output();
+        for (term, there) in [("latent", true), ("control", motion)] {
+            let values: Vec<f64> =
+                ran.told.records.iter().filter(|(_, key, _)| key == term).map(|(_, _, value)| *value).collect();
+            assert_eq!(values.len(), STEPS as usize, "{name}");
+            assert_eq!(values.iter().any(|value| *value > 0.0), there, "{name}: {term} is {values:?}");
+        }
+        // All parts of the base stay as they are.
+        let read = |digest| Model::read(&bench.manifest(digest).unwrap()).unwrap().parts;
+        let (mut with, without) = (read(expected), read(outputs[base]));
+        assert!(with.remove(&Role::CONTROL).is_some());
+        assert_eq!(with, without, "{name}");
+
+        bench.forget(name);
+        bench.members = 3;
+        bench.script = Script { lost: vec![(0, 4)], joins: vec![(5, 2)], ..Script::default() };
+        assert_eq!(run(&mut bench, name, &settings, &inputs), expected, "{name}: three members");
+
+        bench.forget(name);
+        bench.members = 2;
+        bench.script = Script { lost: vec![(0, 5), (1, 5)], ..Script::default() };
+        assert!(bench.run(name, &settings, &inputs).is_err(), "{name}: over before it was killed");
+        bench.script = Script { drain: Some(6), ..Script::default() };
+        bench.members = 1;
+        let ran = bench.run(name, &settings, &inputs).unwrap_or_else(|e| panic!("{name}: {e}"));
+        assert_eq!(ran.outcome, Outcome::Yielded { at: 7 }, "{name}");
+        bench.script = Script::default();
+        assert_eq!(run(&mut bench, name, &settings, &inputs), expected, "{name}: killed at 5, yielded at 7");
+    }
+}
+
+/// A wave of the pelvis and one wrist in some frames.
+fn hint(frames: usize) -> Hint {
+    let mut hint = Hint::none(frames, 22);
+    for t in (0..frames).step_by(7) {
+        let at = t as f32 / frames as f32;
+        hint.tell(t, 0, [at.sin(), 0.9, at]);
+        hint.tell(t, 20, [0.3, 1.2 + 0.2 * at.cos(), at]);
+    }
+    hint
+}
+
+fn generator(bench: &Bench, manifest: &Manifest) -> Generator {
+    Generator::load(manifest, &*bench.blobs(), &Device::flex()).expect("it opens")
+}
+
+/// Training lowers the distance from what is told, and a model draws what it was told; with scale 0 it draws what its base does.
+#[test]
+fn a_control_part_learns_and_is_heeded() {
+    for (latent, base) in [(v2(), "lcm"), (LatentShape { tokens: 1, dim: 16 }, "pcm")] {
+        let (mut bench, outputs) = world(latent);
+        let steps = 160;
+        let settings = TrainControl {
+            network: Network { dropout: 0.0, ..network() },
+            training: Training { lr: 5e-3, ..training(steps) },
+            hints: ControlHints { density: (100.0, 100.0), ..ControlHints::default() },
+            loss: ControlLoss { latent: 0.0, ..ControlLoss::default() },
+            ..temporal()
+        };
+        let ran = bench.run("control", &settings.into(), &inputs(&outputs, base)).expect("it trains");
+        let values: Vec<f64> =
+            ran.told.records.iter().filter(|(_, key, _)| key == "control").map(|(_, _, value)| *value).collect();
+        let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+        let (first, last) = (mean(&values[..20]), mean(&values[values.len() - 20..]));
+        eprintln!("{base}: the motion term went from {first:.3} to {last:.3}");
+        assert!(last < 0.9 * first, "{base}: {first} to {last}");
+
+        let manifest = bench.manifest(ran.output()).expect("stored");
+        let controlled = generator(&bench, &manifest);
+        let free = generator(&bench, &bench.manifest(outputs[base]).expect("stored"));
+        let sampler = Sampler { steps: if base == "pcm" { 2 } else { 1 }, guidance: 2.0, ..Sampler::default() };
+        let draw = |scale| {
+            let told = (&hint(60), scale);
+            controlled.generate_controlled("a person walks", Some(&sampler), Seed(3), told).expect("a motion").features
+        };
+        let without = free.generate("a person walks", Some(60), Some(&sampler), Seed(3)).expect("a motion").features;
+        assert_eq!(controlled.generate("a person walks", Some(60), Some(&sampler), Seed(3)).unwrap().features, without);
+        let silent: f32 = draw(0.0).iter().zip(&without).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(silent < 1e-5, "{base}: scale 0 moves a feature by {silent}");
+        assert_ne!(draw(1.0), without);
+        assert_eq!(draw(1.0), draw(1.0));
+        let skeleton = motion::Skeleton::of(protocol::stage::DataFormat::Humanml3d);
+        let errors = hint(60).errors(&metres(&draw(1.0), skeleton), 0.5).expect("something is told");
+        assert!(errors.average.is_finite());
+
+        let told = (&hint(60), 1.0);
+        let refused =
+            free.generate_controlled("a person walks", Some(&sampler), Seed(3), told).unwrap_err().to_string();
+        assert!(refused.contains("no control part"), "{refused}");
+    }
+}
+
+/// A report has the same bytes for any number of shards, and measures with the part and without.
+#[test]
+fn control_is_measured_by_case() {
+    let (mut bench, outputs) = world(v2());
+    let model = run(&mut bench, "control", &spatial().into(), &inputs(&outputs, "lcm"));
+    let evaluate = |shards| EvaluateControl {
+        setting: ControlSetting::Spatial,
+        joints: vec!["pelvis".into(), "six".into()],
+        percent: vec![25.0],
+        frames: vec![2],
+        sampler: Sampler { steps: 1, guidance: 2.0, ..Sampler::default() },
+        repeats: 2,
+        all_if_small: true,
+        shards,
+        ..EvaluateControl::default()
+    };
+    let read = vec![("dataset", outputs["dataset"]), ("evaluator", outputs["evaluator"]), ("model", model)];
+    let two = bench.run("report", &evaluate(2).into(), &read).unwrap_or_else(|e| panic!("{e}"));
+    let metrics = two.metrics();
+    for name in ["average_error", "location_error", "trajectory_error", "fid", "r_precision_top3", "skating_ratio"] {
+        let mean = metrics[name];
+        let cases = ["pelvis/25pct", "pelvis/2frames", "six/25pct", "six/2frames"];
+        let of_cases = cases.iter().map(|case| metrics[&format!("{name}/{case}")]).sum::<f64>() / 4.0;
+        assert!((mean - of_cases).abs() < 1e-9, "{name}: {mean} and {of_cases}");
+        assert!(metrics.contains_key(&format!("uncontrolled_{name}")), "{name}");
+        assert!(metrics.contains_key(&format!("{name}.lower")), "{name}");
+    }
+    assert!(metrics["average_error"] > 0.0 && metrics["uncontrolled_average_error"] > 0.0);
+    assert!((0.0..=1.0).contains(&metrics["location_error/six/2frames"]));
+    let three = bench.run("report", &evaluate(3).into(), &read).expect("it runs");
+    assert_eq!(three.metrics(), metrics, "3 shards");
+
+    let without = vec![("dataset", outputs["dataset"]), ("evaluator", outputs["evaluator"]), ("model", outputs["lcm"])];
+    let refused = bench.run("report", &evaluate(2).into(), &without).unwrap_err().to_string();
+    assert!(refused.contains("no control part"), "{refused}");
+}
+
+/// A part for one denoiser is refused with another, and a model is not controlled twice.
+#[test]
+fn what_does_not_fit_is_refused() {
+    let (mut bench, outputs) = world(v2());
+    let model = run(&mut bench, "control", &temporal().into(), &inputs(&outputs, "lcm"));
+    let parts = Model::read(&bench.manifest(model).unwrap()).unwrap().parts;
+    let control = bench.manifest(parts[&Role::CONTROL]).expect("a part is stored by itself");
+    let other = bench.manifest(outputs["pcm"]).unwrap();
+    let refused = model::extend(&other, None, &BTreeMap::from([(Role::CONTROL, control)])).unwrap_err().to_string();
+    assert!(refused.contains("`control` was made for the `denoiser`"), "{refused}");
+
+    let mut twice = inputs(&outputs, "lcm");
+    twice[0].1 = model;
+    let refused = bench.run("twice", &temporal().into(), &twice).unwrap_err().to_string();
+    assert!(refused.contains("has a control part already"), "{refused}");
+
+    let foot = TrainControl {
+        hints: ControlHints { joints: vec!["right_midfoot".into()], ..ControlHints::default() },
+        ..temporal()
+    };
+    let refused = bench.run("kit", &foot.into(), &inputs(&outputs, "lcm")).unwrap_err().to_string();
+    assert!(refused.contains("`right_midfoot` is no joint") && refused.contains("left_wrist"), "{refused}");
+}
