@@ -21,6 +21,8 @@ use crate::{FORWARD, LOSS};
 
 /// Whole trajectories with guidance.
 const TRAJECTORY: f64 = 1e-5;
+/// Half of a forward pass's entries, where a network tears others apart.
+const MEDIAN: f64 = 1e-4;
 /// Norm of a parameter's change in one update.
 const CHANGE: f64 = 1e-3;
 /// A moving average.
@@ -252,7 +254,9 @@ fn parity_stablemofusion_forward() {
                         network.forward(x, &times, condition, &mut Dropout::off())
                     };
                     let gate = conditioned_gate(&network, &x_t, run);
-                    gates.tensor("output", what(key), run(&network, x_t.clone()), stored(key), gate);
+                    let found = run(&network, x_t.clone());
+                    gates.check("half of the entries", what(key), median_error(&found, stored(key)), MEDIAN);
+                    gates.tensor("output", what(key), found, stored(key), gate);
                 }
                 for key in io.names().filter(|n| n.starts_with(&what("output_cfg"))) {
                     let scale: f64 = key.rsplit_once("cfg").expect("a scale").1.parse().expect("a scale in the name");
@@ -262,7 +266,9 @@ fn parity_stablemofusion_forward() {
                         guided(with, network.forward(x, &times, None, off), scale)
                     };
                     let gate = conditioned_gate(&network, &x_t, run);
-                    gates.tensor("guided", key, run(&network, x_t.clone()), io.get(key), gate);
+                    let found = run(&network, x_t.clone());
+                    gates.check("half of the entries", key, median_error(&found, io.get(key)), MEDIAN);
+                    gates.tensor("guided", key, found, io.get(key), gate);
                 }
             }
         }
@@ -270,11 +276,22 @@ fn parity_stablemofusion_forward() {
     }
 }
 
+/// Median absolute difference over the largest absolute expected value: blind to the few entries that rounding tears apart.
+fn median_error(found: &Tensor<3>, expected: &Array) -> f64 {
+    let scale = expected.values.iter().fold(0.0_f64, |m, v| m.max(v.abs()));
+    let mut off: Vec<f64> =
+        values(found.clone()).iter().zip(&expected.values).map(|(f, e)| (f64::from(*f) - e).abs() / scale).collect();
+    off.sort_by(f64::total_cmp);
+    off[off.len() / 2]
+}
+
 /// The gate of one forward pass, unless a last bit of the weights and of the input does far more to the output; then it is what they do.
 ///
 /// A group norm of two channels gives little but a sign: channels that nearly agree are torn apart by the last bit of what came before, 300-fold,
 /// and again in the next block. The smallest networks here have such groups, and their stored guided passes disagree with their stored
-/// single passes by 5e-3 too. Mistakes are larger: the fixtures' README names 0.02 and more.
+/// single passes by 5e-3 (by 2e-2 with full attention, in passes that attend to nothing). The same arithmetic written a second time, in f64, is
+/// up to 8e-2 away from what is stored, and in f32 up to 2e-1 from itself in f64, both in a few entries of one unconditional pass: half of
+/// the entries agree to 4e-5 everywhere, which [`MEDIAN`] holds. Mistakes are larger: the fixtures' README names 0.02 and more.
 fn conditioned_gate(
     network: &StableMoFusion,
     x: &Tensor<3>,
