@@ -50,7 +50,7 @@ const fn column(key: &'static str, head: &'static str, better: Better) -> Column
 }
 
 /// The text-to-motion papers' order, then what they report of reconstruction and control, then what needs no evaluator.
-const COLUMNS: [Column; 25] = [
+const COLUMNS: [Column; 28] = [
     column("aits", "AITS (s)", Better::Lower),
     column("r_precision_top1", "R@1", Better::Higher),
     column("r_precision_top2", "R@2", Better::Higher),
@@ -71,6 +71,9 @@ const COLUMNS: [Column; 25] = [
     column("location_error", "Loc. err.", Better::Lower),
     column("average_error_m", "Avg. err. (m)", Better::Lower),
     column("latent_fid", "Latent FID", Better::Lower),
+    column("latent_fid_floor", "of real", Better::Neither),
+    column("latent_fid_test", "Latent FID, test", Better::Lower),
+    column("latent_fid_test_floor", "of real, test", Better::Neither),
     column("latent_r_precision_top1", "Latent R@1", Better::Higher),
     column("latent_r_precision_top3", "Latent R@3", Better::Higher),
     column("match", "Match", Better::Lower),

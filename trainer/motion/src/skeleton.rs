@@ -17,7 +17,9 @@ pub struct Skeleton {
     pub features: usize,
     /// Frames per second.
     pub fps: f64,
-    /// Metres in one unit of the data.
+    /// Metres in one unit of the data: the one place that decides it, for losses, metrics and drawings. HumanML3D is in metres. KIT-ML's unit is
+    /// not published; 0.75/480 m is what MLD's code divides by, with which its mean root is .87 m high. Others take it for a millimetre, so that
+    /// their values in mm are smaller by 1.5625.
     pub metres_per_unit: f64,
     /// Clips with fewer feature frames are not used.
     pub min_frames: usize,

@@ -26,6 +26,8 @@ mod sampler;
 mod spec;
 mod training;
 
+use std::collections::BTreeSet;
+
 use crate::{ArtifactKind, Digest, Steps};
 
 pub use control::{ControlHints, ControlSetting};
@@ -61,6 +63,10 @@ pub struct ExternalFolder {
     pub path: String,
     /// The dataset format that decides which of its files count; all of them without one.
     pub format: Option<DataFormat>,
+    /// Files that it must have; of several with `|` between them, one.
+    pub files: &'static [&'static str],
+    /// What it is and where to get it.
+    pub origin: &'static str,
 }
 
 /// What is asked of every kind, answered by the kind's [`StageSpec`].
@@ -145,13 +151,13 @@ impl StageSettings {
     pub fn folders(&self) -> Vec<ExternalFolder> {
         let mut settings = self.clone();
         let read = settings.refs().into_iter().filter(|reference| reference.read);
-        read.filter_map(|Ref { field, name, target, .. }| {
+        read.filter_map(|Ref { field, name, target, files, origin, .. }| {
             let format = match target {
                 Target::Stage(_) => return None,
                 Target::Dataset(format) => Some(format),
                 Target::Folder => None,
             };
-            Some(ExternalFolder { field: field.into_owned(), path: name.clone(), format })
+            Some(ExternalFolder { field: field.into_owned(), path: name.clone(), format, files, origin })
         })
         .collect()
     }
@@ -165,6 +171,17 @@ impl StageSettings {
     /// How an evaluation draws from what it measures.
     pub fn sampler(&self) -> Option<&Sampler> {
         self.spec().sampler()
+    }
+
+    /// The values that an evaluation may give, by name; none if that is not known.
+    pub fn metrics(&self) -> Option<BTreeSet<String>> {
+        self.spec().metrics()
+    }
+
+    /// What a training saves with its checkpoints, by name; empty if that is not known.
+    pub fn recorded(&self) -> Vec<&'static str> {
+        let own = self.spec().recorded();
+        if own.is_empty() { Vec::new() } else { own.iter().copied().chain(["gradient_norm", "lr"]).collect() }
     }
 
     /// The schema of the kind's keys.
@@ -200,6 +217,10 @@ impl Neighbour for StageSettings {
 
     fn family(&self) -> Option<Family> {
         self.spec().family()
+    }
+
+    fn metrics(&self) -> Option<BTreeSet<String>> {
+        self.spec().metrics()
     }
 
     fn format(&self) -> Option<DataFormat> {

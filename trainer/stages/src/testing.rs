@@ -6,7 +6,7 @@
 mod attempt;
 mod gang;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use burn::tensor::Device;
@@ -98,6 +98,9 @@ impl Bench {
     /// Runs the stage `name` to its end, or until its script stops it. A gang stage continues its newest checkpoint.
     ///
     /// Shards of a map stage run last to first: their order must not matter.
+    ///
+    /// # Panics
+    /// If the stage records or gives what its kind does not say.
     pub fn run(&mut self, name: &str, settings: &StageSettings, inputs: &[(&str, Digest)]) -> Result<Ran, StageError> {
         let task = self.task(name, settings, inputs);
         let attempt = || MemoryAttempt::new(task.clone(), self.device.clone(), Arc::clone(&self.blobs));
@@ -117,9 +120,26 @@ impl Bench {
                 shards.reverse();
                 let mut cx = attempt();
                 let outcome = kinds::run_part(&mut cx, Part::Merge { shards })?;
-                Ok(Ran { outcome, told: cx.told })
+                let ran = Ran { outcome, told: cx.told };
+                // A gate on anything else is refused before a run.
+                if let Some(may) = settings.metrics() {
+                    let unsaid: Vec<&String> = ran.metrics().keys().filter(|name| !may.contains(*name)).collect();
+                    assert!(unsaid.is_empty(), "`{}` gives {unsaid:?}, and does not say so", settings.kind());
+                }
+                Ok(ran)
             }
-            Shape::Gang => self.run_gang(name, settings, inputs, &kinds::run_gang),
+            Shape::Gang => {
+                let ran = self.run_gang(name, settings, inputs, &kinds::run_gang)?;
+                // Keeping checkpoints by anything else is refused before a run.
+                let recorded: BTreeSet<&str> = ran.told.records.iter().map(|(_, name, _)| name.as_str()).collect();
+                let said = BTreeSet::from_iter(settings.recorded());
+                assert!(
+                    recorded.is_empty() || recorded == said,
+                    "`{}` records {recorded:?}, and says {said:?}",
+                    settings.kind()
+                );
+                Ok(ran)
+            }
             Shape::Registry => Err(StageError::Fault(format!("`{}` runs in the coordinator", settings.kind()))),
         }
     }

@@ -135,6 +135,7 @@ fn reconstruction_is_the_same_however_the_clips_are_cut() {
     assert_eq!(reports[0], reports[2]);
     let metrics = &reports[0].1;
     println!("{metrics:?}");
+    assert_eq!(metrics["millimetres_per_unit"], 1000.0);
     for prefix in ["", "mu_", "clip_mean_"] {
         for name in [
             "mpjpe_mm",
@@ -194,6 +195,13 @@ fn latent_fid_is_the_same_however_the_samples_are_cut() {
             "latent_fid",
             "latent_fid_sd",
             "latent_fid_floor",
+            "latent_fid_halves",
+            "latent_fid_train",
+            "latent_fid_val_floor",
+            "latent_fid_test",
+            "latent_fid_test_sd",
+            "latent_fid_test_floor",
+            "latent_fid_test_halves",
             "latent_std",
             "latent_std_real",
             "match",
@@ -205,6 +213,13 @@ fn latent_fid_is_the_same_however_the_samples_are_cut() {
             assert!(metrics.get(name).is_some_and(|v| v.is_finite() && *v >= 0.0), "{name}: {metrics:?}");
         }
     }
+    let all = bench.run(
+        "eval",
+        &latent_fid(2, Sampler { steps: 1, guidance: 2.0, ..Sampler::default() }, false),
+        &[("model", lcm), ("latents", latents), ("dataset", dataset)],
+    );
+    let all = all.unwrap().metrics().clone();
+    assert!(all["latent_fid_test_floor"] < all["latent_fid_test_halves"], "the same clips are nearer: {all:?}");
     // The teacher's own 50 steps match themselves exactly.
     let inputs = [("model", teacher), ("latents", latents), ("dataset", dataset), ("teacher", teacher)];
     let own = Sampler { steps: 50, guidance: 2.0, ..Sampler::default() };

@@ -14,8 +14,8 @@ use protocol::message::FailureClass;
 use protocol::stage::Diffusion;
 use protocol::stage::{
     Batch, DataFormat, DataSynthetic, EvaluateT2m, EvaluatorNetwork, Family, ImportEvaluator, LatentShape,
-    MovementPhase, MultiModality, Network, Positions, Sampler, Split, StageSettings, TextEncoder, TrainEvaluator,
-    Training,
+    MovementPhase, MultiModality, Network, Positions, Sampler, Split, StageSettings, TextEmbed, TextEncoder,
+    TrainEvaluator, TrainLength, Training,
 };
 use protocol::{ArtifactKind, Digest, Manifest, Seed, Steps};
 use stages::artifacts::{self, DenoiserMeta, MODEL_FILE, VaeMeta, to_meta};
@@ -92,10 +92,7 @@ fn network() -> Network {
     Network { width: 16, layers: 3, heads: 2, feed_forward: 32, ..Network::default() }
 }
 
-/// An untrained model of a family.
-fn untrained(bench: &Bench, family: Family) -> Digest {
-    let text = text::manifest(TextEncoder::Hashed);
-    bench.blobs().put(text.to_bytes()).expect("stored");
+fn untrained_vae(bench: &Bench) -> Digest {
     let device = bench.device();
     let meta = VaeMeta {
         format: DataFormat::Humanml3d,
@@ -106,7 +103,15 @@ fn untrained(bench: &Bench, family: Family) -> Digest {
         std: vec![1.0; 263],
     };
     let net = Vae::new(&meta.config(), &mut Init::new(Seed(1), "vae", Positions::Sinusoid, &device));
-    let vae = put(bench, ArtifactKind::Vae, to_meta(&meta), save(&net));
+    put(bench, ArtifactKind::Vae, to_meta(&meta), save(&net))
+}
+
+/// An untrained model of a family.
+fn untrained(bench: &Bench, family: Family) -> Digest {
+    let text = text::manifest(TextEncoder::Hashed);
+    bench.blobs().put(text.to_bytes()).expect("stored");
+    let device = bench.device();
+    let vae = untrained_vae(bench);
     let meta = DenoiserMeta {
         guidance_dim: if family == Family::Mld { 0 } else { 32 },
         family,
@@ -176,6 +181,127 @@ fn t2m_is_the_same_however_the_motions_are_cut() {
     let report: serde_json::Value = serde_json::from_slice(&report).unwrap();
     assert_eq!(report["details"]["repeats"]["fid"].as_array().map(Vec::len), Some(3));
     assert!(report["details"]["note"].as_str().is_some_and(|note| note.contains("FID is taken of")), "{report}");
+}
+
+/// The metrics of `settings`, and what a reader is told.
+fn measured(
+    bench: &mut Bench,
+    settings: &EvaluateT2m,
+    inputs: &[(&str, Digest)],
+) -> (BTreeMap<String, f64>, Vec<String>, serde_json::Value) {
+    let cut: Vec<_> = [1, 3]
+        .map(|shards| bench.run("eval", &evaluate(shards, settings.clone()), inputs).expect("the stage runs"))
+        .into();
+    assert_eq!(cut[0].output(), cut[1].output(), "however the motions are cut");
+    let meta = bench.manifest(cut[0].output()).expect("stored").meta;
+    (cut[0].metrics().clone(), cut[0].told.log.clone(), meta)
+}
+
+#[test]
+fn pools_have_names_of_their_own_and_drop_last_leaves_out_what_fills_none() {
+    let mut bench = bench(1);
+    let data = dataset(&mut bench, 100);
+    let evaluator = bench.run("evaluator", &small(), &[("dataset", data)]).expect("the stage runs").output();
+    let inputs = [("dataset", data), ("evaluator", evaluator)];
+    let entries = {
+        let whole = artifacts::dataset(&*bench.blobs(), &bench.manifest(data).unwrap()).unwrap();
+        whole.entries_of(Split::Test).len()
+    };
+    assert!(entries % 16 != 0 && entries > 32, "{entries} entries: nothing would be left out");
+    let of = |pools: &[usize], drop_last| EvaluateT2m {
+        real: true,
+        split: Split::Test,
+        repeats: 3,
+        pools: pools.to_vec(),
+        drop_last,
+        ..EvaluateT2m::default()
+    };
+    let (both, log, meta) = measured(&mut bench, &of(&[16, 8], false), &inputs);
+    assert_eq!(
+        (&meta["pools"], log.iter().any(|line| line.contains("fill no pool"))),
+        (&serde_json::json!([16, 8]), false)
+    );
+    let (eight, ..) = measured(&mut bench, &of(&[8], false), &inputs);
+    for name in ["r_precision_top1", "r_precision_top2", "r_precision_top3", "mm_dist"] {
+        for end in ["", ".lower", ".upper"] {
+            assert_eq!(both[&format!("{name}_pool8{end}")], eight[&format!("{name}{end}")], "{name}{end}");
+        }
+    }
+    assert!(both["r_precision_top3"] < both["r_precision_top3_pool8"], "among fewer it is easier: {both:?}");
+    assert_eq!((both["fid"], both["diversity"], both["samples"]), (eight["fid"], eight["diversity"], entries as f64));
+
+    let (dropped, log, _) = measured(&mut bench, &of(&[16, 8], true), &inputs);
+    let left_out = entries % 16;
+    assert_eq!(dropped["samples"], (entries - left_out) as f64);
+    assert!(log.iter().any(|line| line.starts_with(&format!("{left_out} of {entries} entries"))), "{log:?}");
+    assert_eq!(dropped["r_precision_top1"], both["r_precision_top1"], "retrieval always leaves them out");
+    assert!(dropped["fid"] != both["fid"] && dropped["skating_ratio"] != both["skating_ratio"], "{dropped:?}");
+    assert!(both["fid_halves"] > both["fid"], "other clips are further apart than other crops: {both:?}");
+    // Nothing is left over of a pool that takes all.
+    let (whole, ..) = measured(&mut bench, &of(&[entries], false), &inputs);
+    let (kept, ..) = measured(&mut bench, &of(&[entries], true), &inputs);
+    assert_eq!(whole, kept);
+
+    let refused = bench.run("eval", &evaluate(1, of(&[32, entries + 1], false)), &inputs).unwrap_err().to_string();
+    assert!(refused.contains(&format!("among {}", entries + 1)) && refused.contains("smaller `pools`"), "{refused}");
+}
+
+#[test]
+fn reconstructions_are_measured_against_what_they_are_of() {
+    let mut bench = bench(1);
+    let data = dataset(&mut bench, 100);
+    let evaluator = bench.run("evaluator", &small(), &[("dataset", data)]).expect("the stage runs").output();
+    let vae = untrained_vae(&bench);
+    let common = EvaluateT2m { split: Split::Test, repeats: 2, ..EvaluateT2m::default() };
+    let real = EvaluateT2m { real: true, ..common.clone() };
+    let (real, ..) = measured(&mut bench, &real, &[("dataset", data), ("evaluator", evaluator)]);
+    let of_vae = EvaluateT2m { vae: "vae".into(), ..common };
+    let (found, _, meta) = measured(&mut bench, &of_vae, &[("dataset", data), ("evaluator", evaluator), ("vae", vae)]);
+    assert!(found["fid"] > 2.0 * real["fid"], "an untrained VAE makes other motion: {found:?} against {real:?}");
+    assert!(found["mm_dist"].is_finite() && !found.contains_key("multimodality"), "{found:?}");
+    assert_eq!(
+        (&meta["reconstructed"], &meta["real"], &meta["drawn"]),
+        (&true.into(), &false.into(), &serde_json::Value::Null)
+    );
+}
+
+#[test]
+fn motions_are_as_long_as_an_estimator_draws_if_there_is_one() {
+    let mut bench = bench(1);
+    let data = dataset(&mut bench, 100);
+    let evaluator = bench.run("evaluator", &small(), &[("dataset", data)]).expect("the stage runs").output();
+    let text = StageSettings::TextEmbed(TextEmbed::default());
+    let text = bench.run("text", &text, &[("dataset", data)]).expect("the stage runs").output();
+    let batch = Batch { global: 4, slices: 2 };
+    let training = Training { steps: Steps(3), batch, ..TrainLength::default().training };
+    let length = StageSettings::TrainLength(TrainLength { training, ..TrainLength::default() });
+    let length = bench.run("length", &length, &[("dataset", data), ("text", text)]).expect("the stage runs").output();
+    let model = untrained(&bench, Family::Lcm { skip: 100, guidance: (0.5, 5.0) });
+    let given = EvaluateT2m {
+        sampler: Sampler { steps: 1, guidance: 2.0, ..Sampler::default() },
+        repeats: 1,
+        multimodality: MultiModality { captions: 2, samples: 4, pairs: 2 },
+        split: Split::Test,
+        ..EvaluateT2m::default()
+    };
+    let drawn = EvaluateT2m { length: "length".into(), ..given.clone() };
+    let inputs = vec![("dataset", data), ("evaluator", evaluator), ("model", model)];
+    let with = [&inputs[..], &[("length", length)]].concat();
+    let (given, _, meta) = measured(&mut bench, &given, &inputs);
+    assert_eq!(meta["drawn_lengths"], false);
+    let (found, _, meta) = measured(&mut bench, &drawn, &with);
+    assert_eq!(meta["drawn_lengths"], true);
+    for name in ["fid", "mm_dist", "multimodality"] {
+        assert!(found[name] != given[name] && found[name].is_finite(), "{name}: {found:?}");
+    }
+
+    let mut other = bench.manifest(length).expect("stored");
+    other.meta["fits"]["text"] = serde_json::to_value(Digest::of(b"another encoder")).expect("a digest");
+    let other = bench.blobs().put(other.to_bytes()).expect("stored");
+    let with = [&inputs[..], &[("length", other)]].concat();
+    let refused = bench.run("eval", &evaluate(1, drawn), &with).expect_err("another encoder");
+    assert!(refused.to_string().contains("another text encoder"), "{refused}");
+    assert_eq!(refused.class(), FailureClass::Input, "{refused}");
 }
 
 #[test]

@@ -134,6 +134,7 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("repeats", Whole(1, 100), "repeats"),
     ("samples", Whole(1, 100), "samples of an entry"),
     ("components", Whole(1, 4_096), "components"),
+    ("pools", Whole(4, 4_096), "motions"),
     ("multimodality.captions", Whole(0, 1_000), "captions"),
     ("multimodality.samples", Whole(0, 1_000), "samples of a caption"),
     ("multimodality.pairs", Whole(0, 1_000), "pairs of a caption"),

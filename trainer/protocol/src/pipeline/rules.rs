@@ -9,6 +9,12 @@ pub(super) fn stage(settings: &StageSettings, placement: &Placement) -> Vec<Prob
     let mut problems = Problems::default();
     settings.check(&mut problems);
     placement.check(&mut problems);
+    let saved = settings.recorded();
+    if !saved.is_empty()
+        && let Err(message) = placement.checkpoint.keep.check(saved)
+    {
+        problems.add("checkpoint.keep.metric", message, "");
+    }
     for settings in [serde_json::to_value(settings), serde_json::to_value(placement)].iter().flatten() {
         ranges::check(&mut problems, settings);
     }

@@ -5,6 +5,7 @@ use serde_json::Value;
 use super::definition::PipelineStage;
 use super::graph::{self, ByStage};
 use super::rules::{self, Problem, Problems};
+use super::schema::list_keys;
 use crate::limits;
 use crate::stage::Placement;
 use crate::sweep::{Domain, MAX_TRIALS, Rungs, SearchKind, Sweep, Values, evaluated_field, setting, with_values};
@@ -30,6 +31,15 @@ pub(super) fn rules(stage: &PipelineStage) -> Vec<Problem> {
     }
     if sweep.metric.trim().is_empty() {
         p.add("sweep.metric", "`metric` is missing: the value of `evaluate` that decides which trial is best", "");
+    }
+    if let Some(given) = sweep.evaluate.metrics()
+        && !sweep.metric.trim().is_empty()
+        && !given.contains(&sweep.metric)
+    {
+        let message =
+            format!("`{}` does not give `{}`, by which trials are compared", sweep.evaluate.kind(), sweep.metric);
+        let names = given.iter().filter(|name| !name.ends_with(".lower") && !name.ends_with(".upper"));
+        p.add("sweep.metric", message, &format!("name one of {}", list_keys(names.map(String::as_str))));
     }
     if !(1..=1000).contains(&sweep.parallel) {
         p.add("sweep.parallel", format!("`parallel` is {}; expected 1 to 1000", sweep.parallel), "");

@@ -169,6 +169,42 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
         "17:",
         &["`mld` makes motions of 22 joints (humanml3d)", "`kit` have 21"],
     ),
+    (
+        "  recon: ",
+        "  t2m: {kind: evaluate.t2m, vae: vae, real: true, evaluator: judge}\n  judge: {kind: train.evaluator}\n  recon: ",
+        "15:",
+        &["`real` measures the clips themselves", "make a stage of each"],
+    ),
+    (
+        "  recon: ",
+        "  t2m: {kind: evaluate.t2m, vae: vae, length: mld, evaluator: judge}\n  judge: {kind: train.evaluator}\n  recon: ",
+        "15:",
+        &["no model is measured"],
+    ),
+    (
+        "  recon: ",
+        "  t2m: {kind: evaluate.t2m, model: mld, length: vae, evaluator: judge}\n  judge: {kind: train.evaluator}\n  recon: ",
+        "15:",
+        &["`vae` gives a VAE, but `length` needs a length estimator"],
+    ),
+    (
+        "  recon: ",
+        "  t2m: {kind: evaluate.t2m, real: true, pools: [], evaluator: judge}\n  judge: {kind: train.evaluator}\n  recon: ",
+        "15:",
+        &["`pools` is empty", "such as [32]"],
+    ),
+    (
+        "  recon: ",
+        "  t2m: {kind: evaluate.t2m, real: true, pools: [16, 32, 16], evaluator: judge}\n  judge: {kind: train.evaluator}\n  recon: ",
+        "15:",
+        &["`pools` has 16 twice"],
+    ),
+    (
+        "  recon: ",
+        "  t2m: {kind: evaluate.t2m, real: true, pools: [2], evaluator: judge}\n  judge: {kind: train.evaluator}\n  recon: ",
+        "15:",
+        &["expected 4 to 4096 motions"],
+    ),
     ("latent_fid <= 1", "latent_fid = 1", "17:", &["is not a gate"]),
     (
         "    steps: 10\n",

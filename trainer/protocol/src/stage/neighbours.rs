@@ -1,7 +1,7 @@
 //! The other stages of a pipeline, as a kind's checks see them: found by following references, not by kind.
 
 use std::any::Any;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::{DataFormat, Family, LatentShape, Problems, Sampler};
 use crate::{ArtifactKind, StageName};
@@ -16,6 +16,8 @@ pub trait Neighbour: std::fmt::Debug {
     fn evaluated_model(&self) -> Option<String>;
     /// How it draws from what it measures.
     fn sampler(&self) -> Option<&Sampler>;
+    /// The values that it may give, if it is an evaluation that says so.
+    fn metrics(&self) -> Option<BTreeSet<String>>;
     /// What the model that it trains can do.
     fn family(&self) -> Option<Family>;
     /// The skeleton of what it gives, if it decides that.
@@ -126,6 +128,22 @@ impl<'a> Neighbours<'a> {
     pub fn samplers_of(&self, name: &str) -> impl Iterator<Item = (&'a str, &'a Sampler)> {
         let all = self.measured.get(name).into_iter().flatten().filter(|(evaluation, _)| !evaluation.contains('.'));
         all.filter_map(|(evaluation, sampler)| Some((*evaluation, (*sampler)?)))
+    }
+
+    /// The metrics that a version of stage `name` may have: those of the evaluations that measure it, each also behind its evaluation's name
+    /// where there are several. `None` if nothing measures it, or an evaluation does not say what it gives.
+    pub fn metrics_of(&self, name: &str) -> Option<BTreeSet<String>> {
+        let looking = self.measured.get(name)?.iter().map(|(evaluation, _)| *evaluation);
+        let looking: Vec<&str> = looking.filter(|evaluation| !evaluation.contains('.')).collect();
+        let mut all = BTreeSet::new();
+        for evaluation in &looking {
+            let metrics = self.stage(evaluation)?.metrics()?;
+            if looking.len() > 1 {
+                all.extend(metrics.iter().map(|metric| format!("{evaluation}.{metric}")));
+            }
+            all.extend(metrics);
+        }
+        (!all.is_empty()).then_some(all)
     }
 
     /// Refuses latents of another VAE than `vae`, which `field` stands for.

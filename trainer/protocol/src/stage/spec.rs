@@ -5,6 +5,7 @@
 
 use std::any::Any;
 use std::borrow::Cow;
+use std::collections::BTreeSet;
 
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::Serialize;
@@ -86,6 +87,16 @@ pub trait StageSpec:
     fn sampler(&self) -> Option<&Sampler> {
         None
     }
+
+    /// The values that an evaluation may give, by name: all of them, whatever the data has. None says that it is not known.
+    fn metrics(&self) -> Option<BTreeSet<String>> {
+        None
+    }
+
+    /// What a training records after each step besides its gradient's norm and its learning rate, which checkpoints are kept by.
+    fn recorded(&self) -> &'static [&'static str] {
+        &[]
+    }
 }
 
 /// What a reference leads to.
@@ -112,24 +123,46 @@ pub struct Ref<'a> {
     pub read: bool,
     /// Whether it is this that an evaluation measures.
     pub measured: bool,
+    /// Files that the folder must have; of several with `|` between them, one.
+    pub files: &'static [&'static str],
+    /// What the folder is and where to get it.
+    pub origin: &'static str,
 }
 
 impl<'a> Ref<'a> {
     /// A stage that must give `kind`.
     pub fn stage(field: impl Into<Cow<'static, str>>, name: &'a mut String, kind: ArtifactKind) -> Self {
-        Self { field: field.into(), name, target: Target::Stage(kind), read: true, measured: false }
+        Self {
+            field: field.into(),
+            name,
+            target: Target::Stage(kind),
+            read: true,
+            measured: false,
+            files: &[],
+            origin: "",
+        }
     }
 
     /// A dataset's folder.
     pub fn dataset(field: &'static str, path: &'a mut String, format: DataFormat) -> Self {
-        let read = !path.is_empty();
-        Self { field: field.into(), name: path, target: Target::Dataset(format), read, measured: false }
+        let (read, target) = (!path.is_empty(), Target::Dataset(format));
+        let origin = match format {
+            DataFormat::Humanml3d => "HumanML3D, made from AMASS as github.com/EricGuo5513/HumanML3D says",
+            DataFormat::Kit => "KIT-ML, linked in github.com/EricGuo5513/HumanML3D",
+        };
+        Self { field: field.into(), name: path, target, read, measured: false, files: &[], origin }
     }
 
     /// A folder; none if the path is empty.
     pub fn folder(field: &'static str, path: &'a mut String) -> Self {
         let read = !path.is_empty();
-        Self { field: field.into(), name: path, target: Target::Folder, read, measured: false }
+        Self { field: field.into(), name: path, target: Target::Folder, read, measured: false, files: &[], origin: "" }
+    }
+
+    /// The folder must have these files; `origin` says what it is and where to get it.
+    #[must_use]
+    pub fn holding(self, files: &'static [&'static str], origin: &'static str) -> Self {
+        Self { files, origin, ..self }
     }
 
     /// Nothing is read unless `condition` holds.
@@ -168,6 +201,8 @@ pub(super) trait AnySpec: Any {
     fn format(&self) -> Option<DataFormat>;
     fn family(&self) -> Option<Family>;
     fn sampler(&self) -> Option<&Sampler>;
+    fn metrics(&self) -> Option<BTreeSet<String>>;
+    fn recorded(&self) -> &'static [&'static str];
 }
 
 impl<S: StageSpec> AnySpec for S {
@@ -225,6 +260,14 @@ impl<S: StageSpec> AnySpec for S {
 
     fn sampler(&self) -> Option<&Sampler> {
         StageSpec::sampler(self)
+    }
+
+    fn metrics(&self) -> Option<BTreeSet<String>> {
+        StageSpec::metrics(self)
+    }
+
+    fn recorded(&self) -> &'static [&'static str] {
+        StageSpec::recorded(self)
     }
 }
 

@@ -2,13 +2,17 @@
 //!
 //! Source: our own definitions, made to rank students on sets that are too small for a learned evaluator.
 //! * `latent_fid`: Frechet distance between samples and real latents in the first principal components of the train latents,
-//!   divided by the total variance of the real ones there. 0 is perfect, 1 is every sample at the data's mean.
+//!   divided by the total variance of the real ones there. 0 is perfect, 1 is every sample at the data's mean. With few clips it is not 0 even
+//!   for real motion, so it is to be read beside two values of real latents: the `floor` is another draw from the posteriors of the same
+//!   clips, as many as there are samples, which is what a model scores that redraws these clips; `halves` is one half of the clips against the
+//!   other, which is how far apart two sets of other clips are, at half the count.
 //! * R-precision: each sample ranks the mean latent of its own entry among those of 31 random entries that share no caption.
 //! * `match`: squared distance to another model's samples from the same noise and captions, as a share of their variance.
 
 use std::collections::{BTreeSet, HashMap};
 
 use motion::Stream;
+use motion::random::permutation;
 use protocol::Seed;
 
 use super::frechet::{Gaussian, PrincipalComponents, to_f64};
@@ -17,12 +21,32 @@ use super::retrieval;
 /// Entries that a sample's own one is ranked among, itself included.
 pub const POOL: usize = 32;
 
+/// The real latents of some entries, along the components.
+#[derive(Debug)]
+pub struct Target {
+    gaussian: Gaussian,
+    total_variance: f64,
+}
+
+impl Target {
+    fn of(components: &PrincipalComponents, real: Real<'_>, entries: &[usize]) -> Self {
+        let size = real.crops * real.width;
+        let rows = |e: &usize| components.project(&to_f64(&real.z[e * size..(e + 1) * size]));
+        let gaussian = Gaussian::fit(&entries.iter().flat_map(rows).collect::<Vec<f64>>(), components.len());
+        Self { total_variance: gaussian.total_variance(), gaussian }
+    }
+
+    /// Trace of the covariance.
+    pub fn total_variance(&self) -> f64 {
+        self.total_variance
+    }
+}
+
 /// What samples are compared with.
 #[derive(Debug)]
 pub struct Reference {
     components: PrincipalComponents,
-    real: Gaussian,
-    total_variance: f64,
+    target: Target,
     /// Mean latent of each entry along the components, `[entries, components]`.
     anchors: Vec<f64>,
     /// Captions of each entry; equal captions have equal numbers.
@@ -67,15 +91,14 @@ impl Reference {
             entries.iter().flat_map(|e| to_f64(&real.z[e * entry..(e + 1) * entry])).collect()
         };
         let components = PrincipalComponents::fit(&rows(train), real.width, components);
-        let gaussian = Gaussian::fit(&components.project(&rows(compared)), components.len());
+        let target = Target::of(&components, real, compared);
         let mut means = Vec::with_capacity(real.mu.len() / real.crops);
         for crops in real.mu.chunks_exact(entry) {
             let sum = |i: usize| crops.iter().skip(i).step_by(real.width).map(|v| f64::from(*v)).sum::<f64>();
             means.extend((0..real.width).map(|i| sum(i) / real.crops as f64));
         }
         let anchors = components.project(&means);
-        let total_variance = gaussian.total_variance();
-        Self { components, real: gaussian, total_variance, anchors, captions }
+        Self { components, target, anchors, captions }
     }
 
     /// Share of the train latents' variance that the components hold.
@@ -83,18 +106,40 @@ impl Reference {
         self.components.explained()
     }
 
-    /// Trace of the real covariance along the components.
-    pub fn total_variance(&self) -> f64 {
-        self.total_variance
+    /// All that is compared with.
+    pub fn whole(&self) -> &Target {
+        &self.target
     }
 
-    /// Frechet distance of `samples`, rows of the latents' width, over the real variance.
-    pub fn distance(&self, samples: &[f32]) -> f64 {
-        self.projected_distance(&self.components.project(&to_f64(samples)))
+    /// The entries `entries` alone.
+    pub fn target(&self, real: Real<'_>, entries: &[usize]) -> Target {
+        Target::of(&self.components, real, entries)
     }
 
-    fn projected_distance(&self, projected: &[f64]) -> f64 {
-        self.real.distance(&Gaussian::fit(projected, self.components.len())) / self.total_variance
+    /// Frechet distance of `samples`, rows of the latents' width, to `target`, over its variance.
+    pub fn distance(&self, target: &Target, samples: &[f32]) -> f64 {
+        self.projected_distance(target, &self.components.project(&to_f64(samples)))
+    }
+
+    fn projected_distance(&self, target: &Target, projected: &[f64]) -> f64 {
+        target.gaussian.distance(&Gaussian::fit(projected, self.components.len())) / target.total_variance
+    }
+
+    /// Distance of one half of `entries` to the other, over the variance of all of them: a mean over five ways of halving. `None` of fewer
+    /// than four entries.
+    pub fn halves(&self, real: Real<'_>, entries: &[usize], seed: Seed) -> Option<f64> {
+        const WAYS: u64 = 5;
+        if entries.len() < 4 {
+            return None;
+        }
+        let whole = self.target(real, entries);
+        let apart = |way: u64| {
+            let order = permutation(seed, "evaluate.latent_fid/halves", way, entries.len());
+            let (one, other) = order.split_at(entries.len() / 2);
+            let half = |of: &[u32]| self.target(real, &of.iter().map(|i| entries[*i as usize]).collect::<Vec<_>>());
+            half(one).gaussian.distance(&half(other).gaussian) / whole.total_variance
+        };
+        Some((0..WAYS).map(apart).sum::<f64>() / WAYS as f64)
     }
 
     /// The metrics of `samples`, one row for each of `entries`; pools are drawn for `repeat`.
@@ -109,7 +154,7 @@ impl Reference {
             retrieval::rank(retrieval::row(&projected, i, dim), anchor(entry), others)
         };
         SetMetrics {
-            latent_fid: self.projected_distance(&projected),
+            latent_fid: self.projected_distance(&self.target, &projected),
             ranks: entries.iter().enumerate().map(rank).collect(),
             latent_std: standard_deviation(samples),
         }
@@ -227,7 +272,14 @@ mod tests {
         // Every sample at the data's mean: all of the variance is missing.
         let middle: Vec<f32> =
             (0..WIDTH).map(|i| z.iter().skip(i).step_by(WIDTH).sum::<f32>() / (60 * CROPS) as f32).collect();
-        assert!((reference.distance(&middle.repeat(20)) - 1.0).abs() < 1e-3);
+        assert!((reference.distance(reference.whole(), &middle.repeat(20)) - 1.0).abs() < 1e-3);
+        // Against the entries that they are of alone, half of the rows are as near; two halves of other clusters are far apart.
+        let (some, rows) = (&all[..30], &z[..30 * CROPS * WIDTH]);
+        assert!(reference.distance(&reference.target(real, some), rows).abs() < 1e-9);
+        assert!(reference.distance(reference.whole(), rows) > 1e-3);
+        let apart = reference.halves(real, &all, Seed(3)).expect("enough entries");
+        assert!((1e-3..1.0).contains(&apart), "{apart}");
+        assert_eq!(reference.halves(real, &all[..3], Seed(3)), None);
     }
 
     #[test]

@@ -6,6 +6,9 @@
 //!
 //! `match` compares repeat 0 with the teacher's 50-step DDIM from the same noise and captions, at g = w + 1 for a student.
 //! `match_other_noise` is its yardstick: a teacher's sample against the teacher's next sample for the same entry.
+//!
+//! Where all splits are compared with, each has values of its own besides, such as `latent_fid_test`: samples of its captions against its
+//! clips, for a model knows most of the captions of all from its training. The principal components are those of the train latents either way.
 //! Definitions: [`evaluation::latent_fid`](crate::evaluation::latent_fid).
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -22,7 +25,7 @@ use super::{Map, no_entries, publish_report};
 use crate::artifacts::{self, Latents, Tensors, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::latent_fid::{
-    Real, Reference, mean_and_spread, relative_distance, same_captions, standard_deviation, top,
+    Real, Reference, Target, mean_and_spread, relative_distance, same_captions, standard_deviation, top,
 };
 use crate::generator::{self, LatentGenerator, MotionGenerator, Texts};
 
@@ -270,19 +273,20 @@ impl Map for EvaluateLatentFid {
         let z = draw(&plan, 0);
         let reference = reference(&plan, &z);
         let sampled: Vec<usize> = (0..plan.samples()).map(|i| plan.entry(i)).collect();
-        let tested = |i: &usize| plan.latents.meta.splits[sampled[*i]] == Split::Test;
-        let mut values: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
+        let splits = SplitTarget::all(&plan, &reference, real(&plan, &z));
+        let mut values: BTreeMap<String, Vec<f64>> = BTreeMap::new();
         for repeat in 0..self.repeats {
             let samples = of(Maker::Model, repeat);
             let found = reference.measure(&samples, &sampled, plan.seed, repeat as u64);
-            let test: Vec<usize> = (0..plan.samples()).filter(tested).map(|i| found.ranks[i]).collect();
-            let mut put = |name, value| values.entry(name).or_default().push(value);
+            let mut put = |name: &str, value| values.entry(name.to_owned()).or_default().push(value);
             put("latent_fid", found.latent_fid);
             put("latent_std", found.latent_std);
             put("latent_r_precision_top1", top(found.ranks.iter().copied(), 1));
             put("latent_r_precision_top3", top(found.ranks.iter().copied(), 3));
-            if !test.is_empty() {
-                put("latent_r_precision_top3_test", top(test.iter().copied(), 3));
+            for SplitTarget { split, samples: rows, target } in &splits {
+                put(&format!("latent_fid_{split}"), reference.distance(target, &taken(&samples, rows, plan.width())));
+                let ranks = rows.iter().map(|i| found.ranks[*i]);
+                put(&format!("latent_r_precision_top3_{split}"), top(ranks, 3));
             }
             if repeat == 0 && plan.matched {
                 let teacher = if plan.teacher.is_some() { of(Maker::Teacher, 0) } else { samples.clone() };
@@ -299,13 +303,13 @@ impl Map for EvaluateLatentFid {
         let mut spread = BTreeMap::new();
         for (name, values) in &values {
             let (mean, sd) = mean_and_spread(values);
-            metrics.insert((*name).to_owned(), mean);
-            spread.extend(sd.map(|sd| (*name, sd)));
+            metrics.insert(name.clone(), mean);
+            spread.extend(sd.map(|sd| (name.clone(), sd)));
         }
-        if let Some(sd) = spread.get("latent_fid") {
-            metrics.insert("latent_fid_sd".into(), *sd);
-        }
-        metrics.insert("latent_fid_floor".into(), reference.distance(&fresh(&plan)));
+        let of_distance = |name: &str| name == "latent_fid" || name.starts_with("latent_fid_");
+        metrics
+            .extend(spread.iter().filter(|(name, _)| of_distance(name)).map(|(name, sd)| (format!("{name}_sd"), *sd)));
+        metrics.extend(floors(&plan, &reference, real(&plan, &z), &splits));
         metrics.insert("latent_std_real".into(), standard_deviation(&compared(&plan, &z)));
         publish_report(cx, metrics, details(&plan, &reference, &values, &spread))
     }
@@ -315,15 +319,15 @@ impl Map for EvaluateLatentFid {
 fn details(
     plan: &Plan<'_>,
     reference: &Reference,
-    values: &BTreeMap<&str, Vec<f64>>,
-    spread: &BTreeMap<&str, f64>,
+    values: &BTreeMap<String, Vec<f64>>,
+    spread: &BTreeMap<String, f64>,
 ) -> Value {
     json!({
         "sampler": plan.settings.sampler,
         "model": to_meta(plan.model.family()),
         "samples_per_repeat": plan.samples(),
         "explained_variance": reference.explained(),
-        "real_variance": reference.total_variance(),
+        "real_variance": reference.whole().total_variance(),
         "repeats": values,
         "sd": spread,
     })
@@ -343,15 +347,65 @@ fn draw(plan: &Plan<'_>, repeat: u64) -> Vec<f32> {
     z
 }
 
+/// The real latents: `z` is a draw of each.
+fn real<'p>(plan: &'p Plan<'_>, z: &'p [f32]) -> Real<'p> {
+    Real { z, mu: &plan.latents.mu.values, crops: plan.latents.meta.crops, width: plan.width() }
+}
+
+/// A split that is compared with besides all of them.
+struct SplitTarget {
+    split: Split,
+    /// The samples that are of its entries.
+    samples: Vec<usize>,
+    target: Target,
+}
+
+impl SplitTarget {
+    /// Of every split that has two entries or more, where all are compared with.
+    fn all(plan: &Plan<'_>, reference: &Reference, real: Real<'_>) -> Vec<Self> {
+        if plan.settings.split != Wanted::All {
+            return Vec::new();
+        }
+        let of = |split: Split| {
+            let entries = entries_of(plan, split);
+            let samples = (0..plan.samples()).filter(|i| plan.latents.meta.splits[plan.entry(*i)] == split).collect();
+            (entries.len() > 1).then(|| Self { split, samples, target: reference.target(real, &entries) })
+        };
+        Split::ALL.into_iter().filter_map(of).collect()
+    }
+}
+
+fn entries_of(plan: &Plan<'_>, split: Split) -> Vec<usize> {
+    plan.entries.iter().copied().filter(|e| plan.latents.meta.splits[*e] == split).collect()
+}
+
+/// Of real latents, for all that is compared with and for each split: another draw of the same clips, and one half of the clips against the
+/// other.
+fn floors(plan: &Plan<'_>, reference: &Reference, real: Real<'_>, splits: &[SplitTarget]) -> Vec<(String, f64)> {
+    let fresh = fresh(plan);
+    let mut found = vec![("latent_fid_floor".to_owned(), reference.distance(reference.whole(), &fresh))];
+    found.extend(reference.halves(real, &plan.entries, plan.seed).map(|apart| ("latent_fid_halves".to_owned(), apart)));
+    for SplitTarget { split, samples, target } in splits {
+        let floor = reference.distance(target, &taken(&fresh, samples, plan.width()));
+        found.push((format!("latent_fid_{split}_floor"), floor));
+        let halves = reference.halves(real, &entries_of(plan, *split), plan.seed);
+        found.extend(halves.map(|apart| (format!("latent_fid_{split}_halves"), apart)));
+    }
+    found
+}
+
+/// The rows `rows` of `values`.
+fn taken(values: &[f32], rows: &[usize], width: usize) -> Vec<f32> {
+    rows.iter().flat_map(|row| values[row * width..(row + 1) * width].iter().copied()).collect()
+}
+
 fn reference(plan: &Plan<'_>, z: &[f32]) -> Reference {
-    let crops = plan.latents.meta.crops;
     let train: Vec<usize> =
         (0..plan.latents.entries()).filter(|&e| plan.latents.meta.splits[e] == Split::Train).collect();
-    let real = Real { z, mu: &plan.latents.mu.values, crops, width: plan.width() };
     let numbers = same_captions(plan.captions.iter().map(|caption| words(&caption.text)));
     let captions =
         plan.latents.meta.captions.iter().map(|captions| captions.iter().map(|c| numbers[*c]).collect()).collect();
-    Reference::new(real, &train, &plan.entries, captions, plan.settings.components)
+    Reference::new(real(plan, z), &train, &plan.entries, captions, plan.settings.components)
 }
 
 /// The rows of the entries that are compared with.

@@ -23,6 +23,7 @@ mod mmm;
 mod model_decoder;
 mod pcm;
 mod reconstruction;
+mod reconstructor;
 mod t2m;
 mod text;
 mod token_data;

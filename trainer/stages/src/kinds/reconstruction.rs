@@ -4,6 +4,7 @@
 //! number depends on the sharding. Metrics without a prefix are of a sample z of the posterior, as every later stage uses it; `mu_` of the
 //! posterior's mean (a tokenizer has none, and no sample: it decodes what it encodes); `clip_mean_` of no network at all: the clip's own
 //! mean feature vector, held; `real_` of the clip itself.
+//! `millimetres_per_unit` says what a unit of the data was taken for in all that ends in `_mm`.
 //! Of a tokenizer also, as means over its codebooks, the share of codes in `used` and the `perplexity` of all clips' codes. With an evaluator
 //! also `fid`, of the reconstructions against the clips, each embedded alone; the papers' is of crops of at most 196 frames, drawn anew in
 //! each of 20 repeats.
@@ -18,6 +19,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use super::encode::shard_range;
+use super::reconstructor::Reconstructor;
 use super::{Map, REPORT_FILE, no_entries};
 use crate::artifacts::{self, Draft, Tensors, to_meta};
 use crate::context::{AttemptContext, ContextError, Outcome, StageError};
@@ -25,9 +27,6 @@ use crate::evaluation::frechet::{Gaussian, to_f64};
 use crate::evaluation::joints::time_mean;
 use crate::evaluation::reconstruction::{ClipErrors, real_skating, summary};
 use crate::evaluator::TrainedEvaluator;
-use crate::flow_decoder::FlowDecoder;
-use crate::networks::Autoencoder;
-use crate::tokenizer::TrainedTokenizer;
 
 /// Below this many clips a dimension, FID's covariances say little.
 const FEW: usize = 5;
@@ -53,96 +52,6 @@ struct Rows {
     rows: Vec<Row>,
     /// How often each codebook's codes were taken; none of a VAE.
     codes: Vec<Vec<u64>>,
-}
-
-/// What is measured.
-#[expect(clippy::large_enum_variant, reason = "there is one of it")]
-enum Measured {
-    Vae(Autoencoder),
-    Tokenizer(TrainedTokenizer, Option<FlowDecoder>),
-}
-
-impl Measured {
-    fn read(cx: &dyn AttemptContext, settings: &EvaluateReconstruction) -> Result<Self, StageError> {
-        let blobs = cx.blobs();
-        if settings.tokenizer.is_empty() {
-            let (_, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
-            return Autoencoder::read(&*blobs, &vae, &cx.device()).map(Self::Vae);
-        }
-        let (digest, manifest) = artifacts::input(cx, "tokenizer", ArtifactKind::Tokenizer)?;
-        let tokenizer = TrainedTokenizer::read(&*blobs, &manifest, &cx.device())?;
-        if settings.decoder.is_empty() {
-            return Ok(Self::Tokenizer(tokenizer, None));
-        }
-        let (_, manifest) = artifacts::input(cx, "decoder", ArtifactKind::FlowDecoder)?;
-        let decoder = FlowDecoder::read(&*blobs, &manifest, digest, &cx.device())?;
-        Ok(Self::Tokenizer(tokenizer, Some(decoder)))
-    }
-
-    fn check_format(&self, format: DataFormat) -> Result<(), StageError> {
-        match self {
-            Self::Vae(vae) => vae.check_format(format),
-            Self::Tokenizer(tokenizer, _) => tokenizer.check_format(format),
-        }
-    }
-
-    /// Mean and standard deviation of its training data.
-    fn statistics(&self) -> (&[f32], &[f32]) {
-        match self {
-            Self::Vae(vae) => (&vae.meta().mean, &vae.meta().std),
-            Self::Tokenizer(tokenizer, _) => (&tokenizer.meta().mean, &tokenizer.meta().std),
-        }
-    }
-
-    fn normalise(&self, rows: &mut [f32]) {
-        match self {
-            Self::Vae(vae) => vae.normalise(rows),
-            Self::Tokenizer(tokenizer, _) => tokenizer.normalise(rows),
-        }
-    }
-
-    fn denormalise(&self, rows: &mut [f32]) {
-        match self {
-            Self::Vae(vae) => vae.denormalise(rows),
-            Self::Tokenizer(tokenizer, _) => tokenizer.denormalise(rows),
-        }
-    }
-
-    /// Guesses at normalised rows `[frames, D]`: as later stages see them, and of the posterior's mean. Adds to `codes` those taken.
-    fn guesses(
-        &self,
-        truth: &[f32],
-        frames: usize,
-        stream: &mut Stream,
-        codes: &mut [Vec<u64>],
-    ) -> (Vec<f32>, Option<Vec<f32>>) {
-        match self {
-            Self::Vae(vae) => {
-                let posterior = vae.encode(truth.to_vec(), frames);
-                let z = posterior.sample(stream);
-                (vae.decode(z, frames), Some(vae.decode(posterior.mu.clone(), frames)))
-            }
-            Self::Tokenizer(tokenizer, decoder) => {
-                let ids = tokenizer.encode(truth.to_vec());
-                for row in ids.chunks_exact(codes.len()) {
-                    row.iter().zip(&mut *codes).for_each(|(id, counts)| counts[*id as usize] += 1);
-                }
-                let decoded = match decoder {
-                    None => tokenizer.decode(&ids),
-                    Some(decoder) => decoder.decode(tokenizer, &ids, stream),
-                };
-                (decoded, None)
-            }
-        }
-    }
-
-    /// A count for each code of each codebook.
-    fn no_codes(&self) -> Vec<Vec<u64>> {
-        match self {
-            Self::Vae(_) => Vec::new(),
-            Self::Tokenizer(tokenizer, _) => vec![vec![0; tokenizer.meta().codes]; tokenizer.meta().quantizers],
-        }
-    }
 }
 
 /// Embeddings of clips and of what was made of them, one after the other.
@@ -211,7 +120,7 @@ impl Map for EvaluateReconstruction {
         let blobs = cx.blobs();
         let (_, dataset) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
         let dataset = artifacts::dataset(&*blobs, &dataset)?;
-        let measured = Measured::read(cx, self)?;
+        let measured = Reconstructor::read(cx)?;
         measured.check_format(dataset.format)?;
         let entries = dataset.entries_of(self.split);
         if entries.is_empty() {
@@ -241,15 +150,7 @@ impl Map for EvaluateReconstruction {
             let entry = &dataset.entries[e];
             let frames = (entry.len / skeleton.unit * skeleton.unit).max(entry.len.min(skeleton.unit));
             let mut truth = dataset.features(entry)[..frames * width].to_vec();
-            if let Measured::Tokenizer(tokenizer, _) = &measured
-                && frames < tokenizer.unit()
-            {
-                return Err(StageError::Input(format!(
-                    "clip `{}` has {frames} frames, a token stands for {}; leave it out of the split",
-                    entry.id,
-                    tokenizer.unit()
-                )));
-            }
+            measured.check_frames(&entry.id, frames)?;
             let natural = truth.clone();
             measured.normalise(&mut truth);
             let mut stream = Stream::new(seed, "evaluate.reconstruction/noise", 0, e as u64);
@@ -311,6 +212,7 @@ impl Map for EvaluateReconstruction {
         metrics.extend(summary(&column(|r| r.clip_mean), skeleton, "clip_mean_"));
         let skating = rows.iter().map(|row| row.real_skating).sum::<f64>() / rows.len() as f64;
         metrics.insert("real_skating_ratio".into(), skating);
+        metrics.insert("millimetres_per_unit".into(), 1000.0 * skeleton.metres_per_unit);
         let mut meta = json!({"kind": cx.task().settings.kind()});
         if let Some((digest, evaluator)) = evaluator(cx, &self.evaluator)? {
             let width = evaluator.width();

@@ -44,6 +44,10 @@ impl StageSpec for DistillLcm {
         Some(&mut self.distillation.training)
     }
 
+    fn recorded(&self) -> &'static [&'static str] {
+        &["loss"]
+    }
+
     fn family(&self) -> Option<Family> {
         let Distillation { skip, guidance, .. } = self.distillation;
         Some(Family::Lcm { skip, guidance })

@@ -77,6 +77,10 @@ impl StageSpec for DistillPcm {
         Some(&mut self.distillation.training)
     }
 
+    fn recorded(&self) -> &'static [&'static str] {
+        if self.adversarial > 0.0 { &["loss", "consistency", "adversarial", "discriminator"] } else { &["loss"] }
+    }
+
     fn family(&self) -> Option<Family> {
         let Distillation { skip, guidance, .. } = self.distillation;
         Some(Family::Pcm { skip, guidance, phases: self.phases })

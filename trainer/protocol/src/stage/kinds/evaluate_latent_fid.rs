@@ -1,5 +1,7 @@
 //! `evaluate.latent_fid`: a model measured in its own latent space, without an evaluator. Source: ours.
 
+use std::collections::BTreeSet;
+
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -26,7 +28,8 @@ pub struct EvaluateLatentFid {
     pub samples: usize,
     /// Principal components of the train latents in which distances are taken.
     pub components: usize,
-    /// Real clips compared with. `all` on small sets: with few clips the distance of real to real is large.
+    /// Real clips compared with. `all` on small sets, where with few clips the distance of real to real is large; each split then has values
+    /// of its own besides (`latent_fid_test`). The distance of real latents to real ones stands beside each: `_floor`, `_halves`.
     pub split: Split,
     /// Shards.
     pub shards: usize,
@@ -52,7 +55,8 @@ impl Default for EvaluateLatentFid {
 impl StageSpec for EvaluateLatentFid {
     const KIND: &'static str = "evaluate.latent_fid";
     // 2: retrieval among latents has names of its own. 3: captions are the same by their words, not by their vectors.
-    const VERSION: u32 = 3;
+    // 4: each split besides all, halves.
+    const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 
@@ -106,5 +110,24 @@ impl StageSpec for EvaluateLatentFid {
 
     fn shards(&self) -> usize {
         self.shards
+    }
+
+    /// A split has values of its own if it has entries enough.
+    fn metrics(&self) -> Option<BTreeSet<String>> {
+        let own = ["latent_std", "latent_std_real", "latent_r_precision_top1", "latent_r_precision_top3"];
+        let mut names: BTreeSet<String> = own.map(str::to_owned).into();
+        let splits: &[&str] = if self.split == Split::All { &["", "_train", "_val", "_test"] } else { &[""] };
+        for split in splits {
+            names.extend(["", "_floor", "_halves"].map(|suffix| format!("latent_fid{split}{suffix}")));
+            names.insert(format!("latent_r_precision_top3{split}"));
+            if self.repeats > 1 {
+                names.insert(format!("latent_fid{split}_sd"));
+            }
+        }
+        if !self.teacher.is_empty() {
+            names.insert("match".into());
+            names.extend((self.samples > 1).then(|| "match_other_noise".to_owned()));
+        }
+        Some(names)
     }
 }

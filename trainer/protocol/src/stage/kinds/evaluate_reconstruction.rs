@@ -8,7 +8,8 @@ use crate::ArtifactKind;
 use crate::stage::{Neighbours, Output, Problems, Ref, Shape, Split, StageSpec};
 
 /// `evaluate.reconstruction`: MPJPE in mm, sJPE and feature error of a VAE or a tokenizer; with an evaluator also FID, of a tokenizer also how
-/// many codes are in use.
+/// many codes are in use. A unit of KIT-ML is 1.5625 mm, which `millimetres_per_unit` says; papers that take one for a millimetre print values
+/// smaller by that.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluateReconstruction {
@@ -44,8 +45,8 @@ impl Default for EvaluateReconstruction {
 
 impl StageSpec for EvaluateReconstruction {
     const KIND: &'static str = "evaluate.reconstruction";
-    // 2: PA-MPJPE, accelerations, sJPE, skating.
-    const VERSION: u32 = 2;
+    // 2: PA-MPJPE, accelerations, sJPE, skating. 3: what a unit is.
+    const VERSION: u32 = 3;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 

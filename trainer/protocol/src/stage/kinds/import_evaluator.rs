@@ -6,6 +6,11 @@ use serde::{Deserialize, Serialize};
 use crate::ArtifactKind;
 use crate::stage::{DataFormat, Output, Problems, Ref, Shape, StageSpec};
 
+/// Files of a folder with the published word vectors.
+pub(super) const VOCABULARY: [&str; 3] = ["our_vab_data.npy", "our_vab_words.pkl", "our_vab_idx.pkl"];
+/// Where they are from.
+pub(super) const WORDS_ORIGIN: &str = "its word vectors (GloVe), linked in github.com/EricGuo5513/HumanML3D";
+
 /// `import.evaluator`: the published files.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
@@ -31,7 +36,12 @@ impl StageSpec for ImportEvaluator {
     const OUTPUT: Output = Output { name: "evaluator", kind: ArtifactKind::Evaluator };
 
     fn refs(&mut self) -> Vec<Ref<'_>> {
-        vec![Ref::folder("path", &mut self.path), Ref::folder("words", &mut self.words)]
+        let files = &["text_mot_match/model/finest.tar|text_mot_match/model/finest.safetensors"];
+        let origin = "the papers' evaluator, linked in github.com/EricGuo5513/text-to-motion";
+        vec![
+            Ref::folder("path", &mut self.path).holding(files, origin),
+            Ref::folder("words", &mut self.words).holding(&VOCABULARY, WORDS_ORIGIN),
+        ]
     }
 
     fn check(&self, p: &mut Problems) {

@@ -1,5 +1,7 @@
 //! `register`: model versions, and the best of them promoted. Done by the coordinator, because it changes the registry. Source: ours.
 
+use std::collections::BTreeSet;
+
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -105,6 +107,12 @@ impl StageSpec for Register {
                 let help = format!("add a stage such as `{{kind: evaluate.latent_fid, model: {from}}}`");
                 p.add(&format!("from[{i}]"), message, &help);
             }
+            if let Some(given) = stages.metrics_of(from)
+                && !given.contains(&self.metric)
+            {
+                let message = format!("no evaluation of `{from}` gives `{}`, by which `metric` judges", self.metric);
+                p.add("metric", message, &one_of(&self.metric, &given));
+            }
             match &self.sampler {
                 Some(sampler) => stages.check_sampler(p, from, sampler),
                 None => {
@@ -114,8 +122,27 @@ impl StageSpec for Register {
                 }
             }
         }
+        self.check_gates(stages, p);
     }
 }
+
+/// `one of ...`, those nearest to `wanted` first: at most a few, without the ends of intervals.
+fn one_of(wanted: &str, given: &BTreeSet<String>) -> String {
+    let plain = |name: &&String| !name.ends_with(".lower") && !name.ends_with(".upper");
+    let mut names: Vec<&String> = given.iter().filter(plain).collect();
+    names.sort_by_key(|name| (name.contains('.') != wanted.contains('.'), std::cmp::Reverse(alike(wanted, name))));
+    let more = names.len().saturating_sub(LISTED);
+    let listed = names.iter().take(LISTED).map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
+    if more > 0 { format!("name one of {listed} and {more} more") } else { format!("name one of {listed}") }
+}
+
+/// Letters that both have at the same place.
+fn alike(a: &str, b: &str) -> usize {
+    a.bytes().zip(b.bytes()).filter(|(a, b)| a == b).count()
+}
+
+/// Metrics that a message lists.
+const LISTED: usize = 12;
 
 /// What to do about evaluations that differ.
 const SAY_WHICH: &str = "say which one the model is drawn with, such as `sampler: {steps: 1, guidance: 2}`";
@@ -126,6 +153,20 @@ fn undecided(from: &str, differ: &str) -> String {
 }
 
 impl Register {
+    /// Refuses gates on metrics that no candidate has.
+    fn check_gates(&self, stages: &Neighbours<'_>, p: &mut Problems) {
+        let all: Option<Vec<BTreeSet<String>>> = self.from.iter().map(|from| stages.metrics_of(from)).collect();
+        let Some(given) = all.map(|all| all.into_iter().flatten().collect::<BTreeSet<String>>()) else { return };
+        for (i, gate) in self.promote.require.iter().enumerate().filter(|(_, gate)| is_gate(gate)) {
+            let metric = gate.split(['<', '>']).next().unwrap_or_default().trim();
+            if !given.contains(metric) {
+                let message =
+                    format!("the gate `{gate}` asks for `{metric}`, which no evaluation of a candidate gives");
+                p.add(&format!("promote.require[{i}]"), message, &one_of(metric, &given));
+            }
+        }
+    }
+
     /// Parts that are added to every version: role, and the stage that gives it.
     pub fn parts(&self) -> impl Iterator<Item = (Role, &str)> {
         [(Role::LENGTH, self.length.as_str())].into_iter().filter(|(_, stage)| !stage.is_empty())

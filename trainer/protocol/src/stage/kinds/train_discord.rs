@@ -184,4 +184,8 @@ impl StageSpec for TrainDiscord {
     fn training(&mut self) -> Option<&mut Training> {
         Some(&mut self.training)
     }
+
+    fn recorded(&self) -> &'static [&'static str] {
+        &["loss"]
+    }
 }

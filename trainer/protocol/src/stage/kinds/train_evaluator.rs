@@ -3,6 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::import_evaluator::{VOCABULARY, WORDS_ORIGIN};
 use crate::stage::{Batch, Decay, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training};
 use crate::{ArtifactKind, Steps};
 
@@ -105,7 +106,10 @@ impl StageSpec for TrainEvaluator {
     const OUTPUT: Output = Output { name: "evaluator", kind: ArtifactKind::Evaluator };
 
     fn refs(&mut self) -> Vec<Ref<'_>> {
-        vec![Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset), Ref::folder("words", &mut self.words)]
+        vec![
+            Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
+            Ref::folder("words", &mut self.words).holding(&VOCABULARY, WORDS_ORIGIN),
+        ]
     }
 
     fn check(&self, p: &mut Problems) {
@@ -132,6 +136,10 @@ impl StageSpec for TrainEvaluator {
 
     fn training(&mut self) -> Option<&mut Training> {
         Some(&mut self.training)
+    }
+
+    fn recorded(&self) -> &'static [&'static str] {
+        &["loss", "reconstruction", "positive", "negative"]
     }
 }
 

@@ -67,4 +67,8 @@ impl StageSpec for TrainLength {
     fn training(&mut self) -> Option<&mut Training> {
         Some(&mut self.training)
     }
+
+    fn recorded(&self) -> &'static [&'static str] {
+        &["loss", "frames_off"]
+    }
 }

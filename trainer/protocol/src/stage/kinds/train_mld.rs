@@ -109,6 +109,10 @@ impl StageSpec for TrainMld {
         Some(&mut self.training)
     }
 
+    fn recorded(&self) -> &'static [&'static str] {
+        if self.losses.any() { &["loss", "denoising", "low_frequency", "semantic"] } else { &["loss"] }
+    }
+
     fn family(&self) -> Option<Family> {
         Some(Family::Mld)
     }

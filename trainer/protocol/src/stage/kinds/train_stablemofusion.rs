@@ -211,6 +211,10 @@ impl StageSpec for TrainStableMoFusion {
         Some(&mut self.training)
     }
 
+    fn recorded(&self) -> &'static [&'static str] {
+        if self.losses.any() { &["loss", "denoising", "low_frequency", "semantic"] } else { &["loss"] }
+    }
+
     fn family(&self) -> Option<Family> {
         Some(Family::Features { timesteps: self.timesteps, solver: Solver::SdeDpmSolverPp })
     }

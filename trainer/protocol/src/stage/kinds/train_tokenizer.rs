@@ -190,4 +190,8 @@ impl StageSpec for TrainTokenizer {
     fn training(&mut self) -> Option<&mut Training> {
         Some(&mut self.training)
     }
+
+    fn recorded(&self) -> &'static [&'static str] {
+        &["loss", "feature", "position", "commitment", "perplexity"]
+    }
 }

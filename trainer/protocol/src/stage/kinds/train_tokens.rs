@@ -202,6 +202,13 @@ impl StageSpec for TrainTokens {
         Some(&mut self.training)
     }
 
+    fn recorded(&self) -> &'static [&'static str] {
+        match self.generator {
+            TokenGenerator::Autoregressive | TokenGenerator::Mmm => &["loss"],
+            TokenGenerator::Masked => &["loss", "first", "above"],
+        }
+    }
+
     fn family(&self) -> Option<Family> {
         Some(match self.generator {
             TokenGenerator::Autoregressive => Family::Autoregressive,

@@ -107,6 +107,10 @@ impl StageSpec for TrainVae {
         Some(&mut self.training)
     }
 
+    fn recorded(&self) -> &'static [&'static str] {
+        &["loss", "feature", "joint", "kl"]
+    }
+
     fn latent(&self) -> Option<LatentShape> {
         Some(self.latent)
     }

@@ -1,0 +1,129 @@
+//! What makes something of real motion that is measured against it: a VAE, a tokenizer, a tokenizer with a flow decoder.
+
+use motion::Stream;
+use protocol::ArtifactKind;
+use protocol::stage::DataFormat;
+
+use crate::artifacts;
+use crate::context::{AttemptContext, StageError};
+use crate::flow_decoder::FlowDecoder;
+use crate::networks::Autoencoder;
+use crate::tokenizer::TrainedTokenizer;
+
+/// Encodes clips and decodes them again.
+#[expect(clippy::large_enum_variant, reason = "there is one of it")]
+pub(super) enum Reconstructor {
+    Vae(Autoencoder),
+    Tokenizer(TrainedTokenizer, Option<FlowDecoder>),
+}
+
+impl Reconstructor {
+    /// Opens the inputs `vae`, or `tokenizer` and `decoder`, of which those are read that the stage has.
+    pub(super) fn read(cx: &dyn AttemptContext) -> Result<Self, StageError> {
+        let blobs = cx.blobs();
+        let has = |field: &str| cx.task().inputs.contains_key(field);
+        if !has("tokenizer") {
+            let (_, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
+            return Autoencoder::read(&*blobs, &vae, &cx.device()).map(Self::Vae);
+        }
+        let (digest, manifest) = artifacts::input(cx, "tokenizer", ArtifactKind::Tokenizer)?;
+        let tokenizer = TrainedTokenizer::read(&*blobs, &manifest, &cx.device())?;
+        if !has("decoder") {
+            return Ok(Self::Tokenizer(tokenizer, None));
+        }
+        let (_, manifest) = artifacts::input(cx, "decoder", ArtifactKind::FlowDecoder)?;
+        let decoder = FlowDecoder::read(&*blobs, &manifest, digest, &cx.device())?;
+        Ok(Self::Tokenizer(tokenizer, Some(decoder)))
+    }
+
+    /// Refuses data of another format than it was trained on.
+    pub(super) fn check_format(&self, format: DataFormat) -> Result<(), StageError> {
+        match self {
+            Self::Vae(vae) => vae.check_format(format),
+            Self::Tokenizer(tokenizer, _) => tokenizer.check_format(format),
+        }
+    }
+
+    /// Refuses a clip, called `id`, of fewer frames than a token stands for.
+    pub(super) fn check_frames(&self, id: &str, frames: usize) -> Result<(), StageError> {
+        match self {
+            Self::Tokenizer(tokenizer, _) if frames < tokenizer.unit() => Err(StageError::Input(format!(
+                "clip `{id}` has {frames} frames, a token stands for {}; leave it out of the split",
+                tokenizer.unit()
+            ))),
+            _ => Ok(()),
+        }
+    }
+
+    /// Mean and standard deviation of its training data.
+    pub(super) fn statistics(&self) -> (&[f32], &[f32]) {
+        match self {
+            Self::Vae(vae) => (&vae.meta().mean, &vae.meta().std),
+            Self::Tokenizer(tokenizer, _) => (&tokenizer.meta().mean, &tokenizer.meta().std),
+        }
+    }
+
+    pub(super) fn normalise(&self, rows: &mut [f32]) {
+        match self {
+            Self::Vae(vae) => vae.normalise(rows),
+            Self::Tokenizer(tokenizer, _) => tokenizer.normalise(rows),
+        }
+    }
+
+    pub(super) fn denormalise(&self, rows: &mut [f32]) {
+        match self {
+            Self::Vae(vae) => vae.denormalise(rows),
+            Self::Tokenizer(tokenizer, _) => tokenizer.denormalise(rows),
+        }
+    }
+
+    /// What later stages see of normalised rows `[frames, D]`: a sample of the posterior decoded, or the clip's tokens decoded.
+    pub(super) fn sample(&self, truth: &[f32], frames: usize, stream: &mut Stream) -> Vec<f32> {
+        match self {
+            Self::Vae(vae) => vae.decode(vae.encode(truth.to_vec(), frames).sample(stream), frames),
+            Self::Tokenizer(tokenizer, decoder) => {
+                let ids = tokenizer.encode(truth.to_vec());
+                decoded(tokenizer, decoder.as_ref(), &ids, stream)
+            }
+        }
+    }
+
+    /// As [`sample`](Self::sample), and what a VAE makes of the posterior's mean. Adds to `codes` those that were taken.
+    pub(super) fn guesses(
+        &self,
+        truth: &[f32],
+        frames: usize,
+        stream: &mut Stream,
+        codes: &mut [Vec<u64>],
+    ) -> (Vec<f32>, Option<Vec<f32>>) {
+        match self {
+            Self::Vae(vae) => {
+                let posterior = vae.encode(truth.to_vec(), frames);
+                let z = posterior.sample(stream);
+                (vae.decode(z, frames), Some(vae.decode(posterior.mu.clone(), frames)))
+            }
+            Self::Tokenizer(tokenizer, decoder) => {
+                let ids = tokenizer.encode(truth.to_vec());
+                for row in ids.chunks_exact(codes.len()) {
+                    row.iter().zip(&mut *codes).for_each(|(id, counts)| counts[*id as usize] += 1);
+                }
+                (decoded(tokenizer, decoder.as_ref(), &ids, stream), None)
+            }
+        }
+    }
+
+    /// A count for each code of each codebook.
+    pub(super) fn no_codes(&self) -> Vec<Vec<u64>> {
+        match self {
+            Self::Vae(_) => Vec::new(),
+            Self::Tokenizer(tokenizer, _) => vec![vec![0; tokenizer.meta().codes]; tokenizer.meta().quantizers],
+        }
+    }
+}
+
+fn decoded(tokenizer: &TrainedTokenizer, decoder: Option<&FlowDecoder>, ids: &[i64], stream: &mut Stream) -> Vec<f32> {
+    match decoder {
+        None => tokenizer.decode(ids),
+        Some(decoder) => decoder.decode(tokenizer, ids, stream),
+    }
+}

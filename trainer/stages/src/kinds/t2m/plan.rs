@@ -1,0 +1,149 @@
+//! What all shards of an evaluation and its merge agree on: clips, captions, crops, and which of them a repeat leaves out.
+
+use motion::Stream;
+use motion::dataset::{Dataset, crop};
+use motion::random::permutation;
+use protocol::stage::{EvaluateT2m, Split};
+use protocol::{ArtifactKind, Digest, Seed};
+use serde::{Deserialize, Serialize};
+
+use crate::artifacts;
+use crate::context::{AttemptContext, StageError};
+use crate::evaluator::TrainedEvaluator;
+use crate::kinds::{no_entries, word};
+
+/// Motions computed together.
+pub(super) const BLOCK: usize = 32;
+/// Where a shard's embeddings are.
+pub(super) const EMBEDDINGS_FILE: &str = "embeddings.safetensors";
+
+/// What a unit of work makes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum Part {
+    /// A block of the split's entries.
+    Entries,
+    /// More motions for one caption.
+    Many,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub(super) struct Unit {
+    pub(super) part: Part,
+    pub(super) repeat: usize,
+    pub(super) block: usize,
+}
+
+/// A caption and a crop of an entry.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Draw {
+    pub(super) entry: usize,
+    pub(super) caption: usize,
+    pub(super) start: usize,
+    /// Frames of the crop.
+    pub(super) len: usize,
+    /// Number of the entry in its split, and the repeat: what else is drawn for this motion is keyed by these.
+    pub(super) number: usize,
+    pub(super) repeat: usize,
+}
+
+pub(super) struct Plan<'a> {
+    pub(super) settings: &'a EvaluateT2m,
+    pub(super) seed: Seed,
+    pub(super) dataset: Dataset,
+    pub(super) entries: Vec<usize>,
+    pub(super) trained: TrainedEvaluator,
+    pub(super) evaluator: Digest,
+    /// What they are of.
+    pub(super) split: Split,
+}
+
+impl<'a> Plan<'a> {
+    pub(super) fn read(cx: &dyn AttemptContext, settings: &'a EvaluateT2m) -> Result<Self, StageError> {
+        let blobs = cx.blobs();
+        let refuse = |text: String| Err(StageError::Input(text));
+        if settings.repeats == 0 || settings.pools.is_empty() {
+            return refuse("`repeats` and `pools` must say at least 1".into());
+        }
+        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
+        let dataset = artifacts::dataset(&*blobs, &manifest)?;
+        let (evaluator, manifest) = artifacts::input(cx, "evaluator", ArtifactKind::Evaluator)?;
+        let trained = TrainedEvaluator::read(&*blobs, &manifest, &cx.device())?;
+        let pool = settings.largest_pool();
+        let (mut entries, mut taken) = (dataset.entries_of(settings.split), settings.split);
+        if settings.all_if_small && entries.len() < pool {
+            (entries, taken) = (dataset.entries_of(Split::All), Split::All);
+        }
+        if entries.is_empty() {
+            return Err(no_entries(taken));
+        }
+        if entries.len() < pool {
+            let instead = match taken {
+                Split::All => "there are no more in the dataset; take smaller `pools`",
+                Split::Test => "set `split: all`, or `all_if_small: true`, or smaller `pools`",
+                Split::Train | Split::Val => {
+                    "set `split: all`, `split: test` for a last look, `all_if_small: true`, or smaller `pools`"
+                }
+            };
+            return refuse(format!(
+                "the split `{}` has {} entries, R-precision ranks a motion among {pool}; {instead}",
+                word(&taken),
+                entries.len()
+            ));
+        }
+        trained.check(&dataset, &entries)?;
+        Ok(Self { settings, seed: cx.task().seed, dataset, entries, split: taken, trained, evaluator })
+    }
+
+    pub(super) fn stream(&self, what: &str, repeat: usize, index: usize) -> Stream {
+        Stream::new(self.seed, &format!("evaluate.t2m/{what}"), repeat as u64, index as u64)
+    }
+
+    /// A permutation of the split's entries.
+    pub(super) fn order(&self, what: &str, repeat: usize, count: usize) -> Vec<u32> {
+        permutation(self.seed, &format!("evaluate.t2m/{what}"), repeat as u64, count)
+    }
+
+    /// Entries that a repeat measures.
+    pub(super) fn kept(&self) -> usize {
+        let n = self.entries.len();
+        if self.settings.drop_last { n - n % self.settings.first_pool() } else { n }
+    }
+
+    /// A caption and a crop of entry number `i` of the split, for the motions (`main`) or for real ones to compare with.
+    pub(super) fn draw(&self, repeat: usize, i: usize, main: bool) -> Draw {
+        let entry = &self.dataset.entries[self.entries[i]];
+        let mut stream = self.stream(if main { "entry" } else { "other" }, repeat, i);
+        let caption = entry.captions[stream.below(entry.captions.len())];
+        let (start, len) = crop(&mut stream, entry.len, self.dataset.skeleton());
+        Draw { entry: self.entries[i], caption, start, len, number: i, repeat }
+    }
+
+    /// Entries whose captions MultiModality is taken over; none unless a model draws.
+    pub(super) fn many(&self, repeat: usize) -> Vec<usize> {
+        if !self.settings.generates() {
+            return Vec::new();
+        }
+        let order = self.order("many", repeat, self.entries.len());
+        order.into_iter().take(self.settings.multimodality.captions).map(|i| i as usize).collect()
+    }
+
+    pub(super) fn units(&self) -> Vec<Unit> {
+        let blocks = self.entries.len().div_ceil(BLOCK);
+        let of = |part, repeat, blocks: usize| (0..blocks).map(move |block| Unit { part, repeat, block });
+        (0..self.settings.repeats)
+            .flat_map(|repeat| of(Part::Entries, repeat, blocks).chain(of(Part::Many, repeat, self.many(repeat).len())))
+            .collect()
+    }
+
+    /// Entries, by number in the split, of a block.
+    pub(super) fn block(&self, block: usize) -> std::ops::Range<usize> {
+        block * BLOCK..((block + 1) * BLOCK).min(self.entries.len())
+    }
+
+    pub(super) fn crop(&self, draw: Draw) -> Vec<f32> {
+        let width = self.dataset.mean.len();
+        let rows = self.dataset.features(&self.dataset.entries[draw.entry]);
+        rows[draw.start * width..(draw.start + draw.len) * width].to_vec()
+    }
+}
