@@ -111,3 +111,61 @@ fn reading_a_store_that_nobody_holds_changes_nothing() {
     assert_eq!(state(&bench, "@last"), [&*interrupted, "paused", "ready"]);
     read_everything(&bench, &finished, &interrupted);
 }
+
+/// What a run would take is said before its data is there, and what could never come to an end is refused by `plan` and by `run`.
+#[test]
+fn a_plan_says_what_is_missing_and_what_a_run_would_take() {
+    let bench = Bench::new(TRAINER);
+    let recipe = Bench::config("motionpcm.yaml");
+    // From a folder without data, where the recipe's paths lead nowhere.
+    let plan = bench.run(&["plan", &recipe, "--no-time"]).expect_code(0).stdout;
+    println!("{plan}");
+    assert!(plan.lines().count() <= 40 && plan.lines().all(|line| line.chars().count() <= 100), "{plan}");
+    for part in
+        ["data/HumanML3D: no such folder", "deps/t2m/t2m", "deps/glove", "`data/HumanML3D` is missing", "384000"]
+    {
+        assert!(plan.contains(part), "`{part}` is missing from\n{plan}");
+    }
+    let run = bench.run(&["run", &recipe]).expect_code(2).stderr;
+    assert!(run.contains("deps/glove: no such folder") && run.contains("data/HumanML3D: no such folder"), "{run}");
+    assert!(!bench.store().exists(), "nothing was stored");
+
+    let smoke = Bench::config("smoke.yaml");
+    let plan = bench.run(&["plan", &smoke, "-o", "json"]).expect_code(0).json();
+    for stage in plan["stages"].as_array().expect("stages") {
+        let (kind, name) = (stage["kind"].as_str().expect("a kind"), &stage["stage"]);
+        if kind.starts_with("train.") || kind.starts_with("distill.") {
+            assert!(stage["parameters"].as_u64() > Some(1_000) && stage["steps"].is_u64(), "{name}: {stage}");
+        }
+        if ["train", "distill", "evaluate", "encode"].contains(&kind.split('.').next().expect("a word")) {
+            assert!(stage["seconds"].as_f64() > Some(0.0), "{name}: {stage}");
+        }
+    }
+    let table = bench.run(&["plan", &smoke]).expect_code(0).stdout;
+    assert!(table.contains("of one worker") && table.contains("made-up clips"), "{table}");
+
+    // Keys that would only fail hours later.
+    let kit = bench.path().join("kit");
+    std::fs::create_dir(&kit).expect("a folder");
+    // 251 zeros, as `numpy.save` writes them.
+    let mut mean = b"\x93NUMPY\x01\x00\x76\x00".to_vec();
+    mean.extend(format!("{:<117}\n", "{'descr': '<f4', 'fortran_order': False, 'shape': (251,), }").bytes());
+    mean.extend([0; 4 * 251]);
+    std::fs::write(kit.join("Mean.npy"), mean).expect("a file");
+    let folder = format!("dataset={{format: humanml3d, path: {}}}", kit.display());
+    for (sets, part) in [
+        (vec!["backend=cuda"], "--features cuda"),
+        (vec!["stages.release.metric=fdi"], "gives `fdi`"),
+        (vec!["stages.release.promote.require=[fdi <= 1]"], "asks for `fdi`"),
+        (vec!["stages.mld.checkpoint={every: 4, keep: {best: 1, metric: fdi}}"], "there is: loss, gradient_norm, lr"),
+        (vec![folder.as_str()], "251 features, as `kit` has"),
+    ] {
+        for verb in ["plan", "run"] {
+            let mut words = vec![verb, smoke.as_str()];
+            words.extend(sets.iter().flat_map(|set| ["--set", set]));
+            let said = bench.run(&words).expect_code(2).stderr;
+            assert!(said.contains(part), "{verb} {sets:?}:\n{said}");
+        }
+    }
+    assert!(!bench.store().exists(), "nothing was stored");
+}

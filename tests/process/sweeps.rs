@@ -91,11 +91,12 @@ fn p19_a_sweep_decides_the_same_with_other_workers_and_when_it_is_killed() {
 }
 
 #[test]
-fn a_metric_that_nobody_reports_ends_the_run_and_says_what_there_is() {
+fn a_metric_that_nobody_reports_is_refused_before_anything_runs_and_says_what_there_is() {
     let bench = Bench::new(TRAINER);
     let config = Bench::config(CONFIG);
     let sweep = SWEEP.replace("metric: latent_fid", "metric: fdi");
-    let said = bench.run(&[&["run", &config, "--workers", "2", "--set", &sweep][..], &STEPS].concat()).expect_code(1);
+    let said = bench.run(&[&["run", &config, "--workers", "2", "--set", &sweep][..], &STEPS].concat()).expect_code(2);
+    assert!(!bench.store().exists(), "nothing was stored");
     assert!(said.stderr.contains("`fdi`") && said.stderr.contains("latent_fid"), "{}", said.stderr);
 }
 

@@ -4,7 +4,9 @@
 
 mod cli;
 mod client;
+mod cost;
 mod fleet;
+mod missing;
 mod out_of_memory;
 mod pipeline_file;
 mod plan;

@@ -9,6 +9,7 @@ use protocol::pipeline::{self, Pipeline, PipelineStage};
 use protocol::stage::{DataFormat, ExternalFolder};
 use protocol::{Digest, StageName, limits};
 
+use crate::missing::{Missing, check_backend, check_format, missing};
 use crate::problem::{Problem, Result};
 
 /// A pipeline as read.
@@ -48,14 +49,49 @@ fn read_text(path: &Path) -> std::io::Result<String> {
     String::from_utf8(bytes).map_err(|error| refuse(format!("it is no UTF-8 text: {}", error.utf8_error())))
 }
 
-/// Reads the file and digests the dataset folders it names.
+/// Reads the file and digests the folders it names, which must all be there.
 pub(crate) fn read_with_data(path: &Path, sets: &[String]) -> Result<PipelineFile> {
     let mut file = read(path, sets)?;
-    file.pipeline.fill_external(|stage, ExternalFolder { path, format, .. }| match format {
-        Some(format) => folder_digest(Path::new(path), *format).map_err(bad_folder),
-        None => files_digest(Path::new(path)).map_err(|e| Problem::usage(format!("stage `{stage}`: {path}: {e}"))),
-    })?;
+    let missing = missing(&file.pipeline);
+    if !missing.is_empty() {
+        let lines: Vec<String> = missing.iter().map(|one| format!("\n  {}", one.line())).collect();
+        return Err(Problem::usage(format!("the pipeline reads what is not on this machine{}", lines.concat())).hint(
+            "set a folder with such as `--set dataset.path=FOLDER`; `trainer plan` shows all else; `dataset: {format: synthetic}` needs none",
+        ));
+    }
+    digest_folders(&mut file.pipeline)?;
     Ok(file)
+}
+
+/// As [`read_with_data`], and what is not there besides.
+pub(crate) fn read_to_plan(path: &Path, sets: &[String]) -> Result<(PipelineFile, Vec<Missing>)> {
+    let mut file = read(path, sets)?;
+    check_backend(file.pipeline.backend)?;
+    let missing = missing(&file.pipeline);
+    digest_folders(&mut file.pipeline)?;
+    Ok((file, missing))
+}
+
+/// Digests the folders that are there.
+fn digest_folders(pipeline: &mut Pipeline) -> Result<()> {
+    let absent: Vec<String> = missing(pipeline).into_iter().map(|one| one.path).collect();
+    for stage in &mut pipeline.stages {
+        for ExternalFolder { field, path, format, .. } in stage.settings.folders() {
+            if absent.contains(&path) {
+                continue;
+            }
+            let content = match format {
+                Some(format) => {
+                    check_format(Path::new(&path), format)?;
+                    folder_digest(Path::new(&path), format).map_err(bad_folder)?
+                }
+                None => files_digest(Path::new(&path))
+                    .map_err(|e| Problem::usage(format!("stage `{}`: {path}: {e}", stage.name)))?,
+            };
+            stage.external.insert(field, content);
+        }
+    }
+    Ok(())
 }
 
 /// Whether the stage of `--until` exists.

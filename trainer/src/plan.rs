@@ -4,14 +4,17 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use coordinator::search::{Score, Search, Ticket};
 use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
+use protocol::stage::TextEmbed;
 use protocol::sweep::{STATE_OUTPUT, rung_name};
 use protocol::{ArtifactKind, Digest, StageName, Steps, TaskId};
 use registry::{ReadStore, RunRow, StageResultRow};
 use serde::Serialize;
 use serde_json::Value;
+use stages::estimate::Estimate;
 
-use crate::print;
+use crate::missing::Missing;
 use crate::problem::Result;
+use crate::{fleet, print};
 
 /// What would happen to a stage.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -22,6 +25,12 @@ pub(crate) struct Step {
     pub(crate) action: &'static str,
     pub(crate) why: String,
     pub(crate) key: Option<Digest>,
+    /// Updates of a training stage.
+    pub(crate) steps: Option<u64>,
+    /// Of what it trains, if that was tried.
+    pub(crate) parameters: Option<u64>,
+    /// Of one worker, if it was tried: about.
+    pub(crate) seconds: Option<f64>,
 }
 
 /// The whole plan.
@@ -30,15 +39,111 @@ pub(crate) struct Plan {
     schema_version: u32,
     pipeline: String,
     pub(crate) stages: Vec<Step>,
+    /// Folders that a run would ask for in vain.
+    pub(crate) missing: Vec<Missing>,
+    pub(crate) device: String,
+    /// Worker processes that `run` starts when nobody says.
+    pub(crate) workers: usize,
 }
 
 impl Plan {
-    /// As people read it.
-    pub(crate) fn table(&self) -> String {
-        let rows =
-            self.stages.iter().map(|step| vec![step.stage.to_string(), step.action.to_owned(), step.why.clone()]);
-        print::table(&["STAGE", "ACTION", "WHY"], rows.collect())
+    /// Adds what the stages were found to take.
+    pub(crate) fn estimate(&mut self, estimates: &BTreeMap<StageName, Estimate>) {
+        for step in &mut self.stages {
+            if let Some(Estimate { parameters, seconds }) = estimates.get(&step.stage) {
+                (step.parameters, step.seconds) = (*parameters, *seconds);
+            }
+        }
     }
+
+    /// As people read it, in lines of at most [`COLUMNS`].
+    pub(crate) fn screen(&self, pipeline: &Pipeline) -> String {
+        let Self { pipeline: name, device, workers, .. } = self;
+        let mut text = format!("{name}, seed {}, on {device}, {workers} worker(s)\n", pipeline.seed);
+        if !self.missing.is_empty() {
+            text.push_str("\nMISSING on this machine:\n");
+            for one in &self.missing {
+                text.push_str(&format!("  {}\n    {}\n", cut(&one.place(), COLUMNS - 2), cut(one.origin, COLUMNS - 4)));
+            }
+            let built_in = pipeline.stages.iter().filter_map(|stage| stage.settings.get::<TextEmbed>());
+            for encoder in built_in.map(|text| text.encoder.name()).collect::<BTreeSet<_>>() {
+                text.push_str(&format!("  (the text encoder `{encoder}` is built in)\n"));
+            }
+        }
+        let known = |value: Option<String>| value.unwrap_or_default();
+        let cells = self.stages.iter().map(|step| {
+            let runs = step.action != "cached";
+            vec![
+                step.stage.to_string(),
+                step.action.to_owned(),
+                known(step.steps.map(|steps| steps.to_string())),
+                known(step.parameters.map(short)),
+                known(step.seconds.filter(|_| runs).map(long)),
+                step.why.clone(),
+            ]
+        });
+        let heads = ["STAGE", "ACTION", "STEPS", "PARAMETERS", "TIME", "WHY"];
+        let table = print::table(&heads, cells.collect());
+        text.push('\n');
+        text.extend(table.lines().map(|line| format!("{}\n", cut(line, COLUMNS))));
+        text.push_str(&self.total());
+        text.trim_end().to_owned()
+    }
+
+    fn total(&self) -> String {
+        let runs = self.stages.iter().filter(|step| step.action != "cached");
+        let (mut seconds, mut untried) = (0.0, 0);
+        for step in runs {
+            seconds += step.seconds.unwrap_or(0.0);
+            // Stages of other kinds take no time worth a word.
+            let long = ["train.", "distill.", "encode.", "evaluate."].iter().any(|kind| step.kind.starts_with(kind));
+            untried += usize::from(step.seconds.is_none() && long);
+        }
+        if seconds == 0.0 {
+            return String::new();
+        }
+        let wall = seconds / self.workers.max(1) as f64;
+        let mut text = format!(
+            "\nabout {} of one worker, {} of {} at best; from {} updates of {} made-up clips a stage\n",
+            long(seconds),
+            long(wall),
+            self.workers,
+            stages::estimate::STEPS - 1,
+            stages::estimate::EXAMPLES,
+        );
+        if untried > 0 {
+            text.push_str(&format!(
+                "without {untried} stage(s) that were not tried in the time that a plan may take\n"
+            ));
+        }
+        text
+    }
+}
+
+/// Columns of a screen.
+const COLUMNS: usize = 100;
+
+/// The beginning of a line that is too long.
+fn cut(line: &str, columns: usize) -> String {
+    if line.chars().count() <= columns {
+        return line.to_owned();
+    }
+    line.chars().take(columns - 1).chain(['…']).collect()
+}
+
+/// `18.06M`, `612k`.
+fn short(count: u64) -> String {
+    match count {
+        0..1_000 => count.to_string(),
+        1_000..1_000_000 => format!("{:.0}k", count as f64 / 1e3),
+        _ => format!("{:.2}M", count as f64 / 1e6),
+    }
+}
+
+/// As [`print::duration`], in days where those are many.
+fn long(seconds: f64) -> String {
+    const DAY: f64 = 86_400.0;
+    if seconds < 3.0 * DAY { print::duration(seconds) } else { format!("{:.0} days", seconds / DAY) }
 }
 
 /// Keys that are decided already, and the outputs of stages that are known.
@@ -65,6 +170,10 @@ async fn known(pipeline: &Pipeline, store: Option<&ReadStore>) -> Result<Known> 
         let inputs: Option<BTreeMap<String, Digest>> =
             stage.inputs.iter().map(|input| Some((input.field.clone(), *known.outputs.get(&input.stage)?))).collect();
         let Some(inputs) = inputs else { continue };
+        // Without a folder's content there is no key.
+        if !stage.settings.folders().iter().all(|folder| stage.external.contains_key(&folder.field)) {
+            continue;
+        }
         let key = pipeline.identity(stage, &inputs).key();
         known.keys.insert(stage.name.clone(), key);
         if let Some(store) = store
@@ -140,11 +249,15 @@ pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&ReadStore>) -> Resu
             ("cached", format!("key {} from run {run}", key.map(|key| key.short()).unwrap_or_default()))
         } else {
             let upstream = stage.inputs.iter().find(|input| running.contains(&input.stage));
+            let absent = stage.settings.folders().into_iter().find(|f| !stage.external.contains_key(&f.field));
             let resume = match (key, store) {
                 (Some(key), Some(store)) => checkpoint(stage, key, store, &earlier).await?,
                 _ => None,
             };
             match (resume, upstream) {
+                (None, _) if absent.is_some() => {
+                    ("run", format!("`{}` is missing", absent.map(|folder| folder.path).unwrap_or_default()))
+                }
                 (None, None) if stage.sweep.is_some() => {
                     let trials = stage.sweep.as_ref().map_or(0, protocol::sweep::Sweep::trials);
                     ("run", format!("a sweep of up to {trials} trials; those that are known are not run again"))
@@ -157,9 +270,29 @@ pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&ReadStore>) -> Resu
         if action != "cached" {
             running.insert(&stage.name);
         }
-        stages.push(Step { stage: stage.name.clone(), kind: stage.settings.kind(), action, why, key });
+        stages.push(Step {
+            stage: stage.name.clone(),
+            kind: stage.settings.kind(),
+            action,
+            why,
+            key,
+            steps: stage.settings.steps().map(|steps| steps.0),
+            parameters: None,
+            seconds: None,
+        });
     }
-    Ok(Plan { schema_version: 1, pipeline: pipeline.name.clone(), stages })
+    let backend = pipeline.backend;
+    let device = models::device::available().into_iter().find(|device| device.backend == backend);
+    // `CPU`, of a note that goes on.
+    let device = device.and_then(|device| device.note.split(',').next().map(str::to_owned)).unwrap_or_default();
+    Ok(Plan {
+        schema_version: 1,
+        pipeline: pipeline.name.clone(),
+        stages,
+        missing: Vec::new(),
+        device: format!("{} ({device})", backend.name()),
+        workers: fleet::default_size(backend),
+    })
 }
 
 /// The newest checkpoint of a stage with this key.
@@ -269,6 +402,37 @@ mod tests {
         assert_eq!(why(&[]), "not finished before");
         let other = pipeline(&["name=q"]);
         assert_eq!(difference(&other, other.stage(&"vae".into()).unwrap(), &earlier), "never run");
+    }
+
+    #[tokio::test]
+    async fn a_recipe_without_its_data_is_one_screen() {
+        let file = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/motionpcm.yaml");
+        let text = std::fs::read_to_string(file).expect("a shipped recipe");
+        // Folders that are nowhere, whatever lies beside the tests.
+        let text = text.replace("path: data/", "path: nowhere/data/").replace(" deps/", " nowhere/deps/");
+        let pipeline = protocol::pipeline::read("p.yaml", &text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"));
+        let mut plan = plan(&pipeline, None).await.unwrap_or_else(|problem| panic!("{problem:?}"));
+        plan.missing = crate::missing::missing(&pipeline);
+        let found = Estimate { parameters: Some(18_056_487), seconds: Some(1.2e7) };
+        plan.estimate(&BTreeMap::from([("vae".into(), found)]));
+        let screen = plan.screen(&pipeline);
+        println!("{screen}");
+        let (lines, widest) = (screen.lines().count(), screen.lines().map(|line| line.chars().count()).max());
+        assert!(lines <= 40 && widest <= Some(COLUMNS), "{lines} lines, the widest of {widest:?}");
+        for part in [
+            "nowhere/data/HumanML3D: no such folder",
+            "nowhere/deps/t2m/t2m: no such folder",
+            "nowhere/deps/glove: no such folder",
+            "`hashed` is built in",
+            "flex (CPU",
+            "1150000  18.06M      139 days",
+            "about 139 days of one worker",
+            "that were not tried",
+        ] {
+            assert!(screen.contains(part), "`{part}` is missing");
+        }
+        assert!(plan.stages.iter().all(|step| step.action == "run"), "nothing is known");
+        assert!(plan.stages[0].key.is_none(), "no key without the folder's content");
     }
 
     #[tokio::test]

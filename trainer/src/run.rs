@@ -12,6 +12,7 @@ use registry::{Holder, Place, Store};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use crate::fleet::{self, Death, Fleet};
+use crate::missing::check_backend;
 use crate::pipeline_file::PipelineFile;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result, exit};
@@ -79,6 +80,7 @@ pub(crate) async fn run(request: Request, options: Options) -> Result<u8> {
     }
     if let Request::Submit { file, until } = &request {
         pipeline_file::check_stage(&file.pipeline, until.as_ref())?;
+        check_backend(file.pipeline.backend)?;
         pipeline_file::check_data(&file.pipeline, &options.store)?;
     }
     let holder = Holder::this_process(&*options.command);

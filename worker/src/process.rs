@@ -72,7 +72,7 @@ pub(crate) fn default_name() -> String {
 
 /// Makes the calling thread the one that computes. Tensor kernels split their work over rayon's pool; with one thread, and
 /// that the caller, everything runs in place. `RAYON_NUM_THREADS` asks for more.
-pub(crate) fn compute_here() {
+pub fn compute_here() {
     let threads = std::env::var("RAYON_NUM_THREADS").ok().and_then(|n| n.parse::<usize>().ok()).filter(|n| *n > 0);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.unwrap_or(1)).use_current_thread().build_global();
     if let Err(error) = pool {

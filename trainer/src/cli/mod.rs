@@ -25,7 +25,7 @@ use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result, exit};
 use crate::reader::Reader;
-use crate::{pipeline_file, plan, run, verify};
+use crate::{cost, pipeline_file, plan, run, verify};
 
 /// Trains text-to-motion models across workers and keeps what came out of it
 #[derive(Debug, Parser)]
@@ -111,6 +111,9 @@ struct RunArgs {
 struct PlanArgs {
     #[command(flatten)]
     pipeline: PipelineArgs,
+    /// Tries no stage, and so says nothing of parameters and times
+    #[arg(long)]
+    no_time: bool,
     /// The store's folder
     #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR")]
     store: PathBuf,
@@ -276,16 +279,20 @@ async fn run_pipeline(args: RunArgs) -> Result<u8> {
 }
 
 async fn show_plan(args: PlanArgs) -> Result<u8> {
-    let file = pipeline_file::read_with_data(&args.pipeline.pipeline, &args.pipeline.set)?;
+    let (file, missing) = pipeline_file::read_to_plan(&args.pipeline.pipeline, &args.pipeline.set)?;
     let store = match ReadStore::open(&args.store).await {
         Ok(store) => Some(store),
         Err(OpenError::NotAStore(_)) => None,
         Err(error) => return Err(error.into()),
     };
-    let plan = plan::plan(&file.pipeline, store.as_ref()).await?;
+    let mut plan = plan::plan(&file.pipeline, store.as_ref()).await?;
+    plan.missing = missing;
+    if !args.no_time && plan.stages.iter().any(|step| step.action != "cached") {
+        plan.estimate(&cost::estimates(&file.pipeline));
+    }
     match args.output {
         Output::Json => print::json(&plan),
-        Output::Table => print::out(&plan.table()),
+        Output::Table => print::out(&plan.screen(&file.pipeline)),
     }
     Ok(0)
 }

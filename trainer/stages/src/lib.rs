@@ -5,6 +5,7 @@
 pub mod artifacts;
 pub mod context;
 pub mod control;
+pub mod estimate;
 pub mod evaluation;
 pub mod evaluator;
 pub mod flow_decoder;
@@ -15,6 +16,7 @@ pub mod length;
 pub mod motion_networks;
 pub mod networks;
 pub mod parts;
+mod solo;
 pub mod testing;
 pub mod text;
 pub mod timing;

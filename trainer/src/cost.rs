@@ -1,0 +1,58 @@
+//! What a plan says a run would cost: entries of its datasets, and the time of each stage, tried on this machine.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::time::Duration;
+
+use protocol::StageName;
+use protocol::pipeline::Pipeline;
+use protocol::stage::{DataFormat, DataOpen, DataSynthetic};
+use stages::estimate::{Entries, Estimate, estimate};
+
+/// How long stages are tried; the one that is being tried then is the last.
+const BUDGET: Duration = Duration::from_secs(30);
+
+/// An estimate for each stage that could be tried.
+pub(crate) fn estimates(pipeline: &Pipeline) -> BTreeMap<StageName, Estimate> {
+    let Ok(device) = models::device::open(pipeline.backend, 0) else { return BTreeMap::new() };
+    let entries: BTreeMap<StageName, Entries> = pipeline
+        .stages
+        .iter()
+        .filter_map(|stage| {
+            let entries = match (stage.settings.get::<DataOpen>(), stage.settings.get::<DataSynthetic>()) {
+                (Some(open), _) => listed(open),
+                (_, Some(made)) => synthetic(made),
+                _ => return None,
+            };
+            Some((stage.name.clone(), entries))
+        })
+        .collect();
+    let pipeline = pipeline.clone();
+    // As a worker computes: one thread, with room for deep graphs.
+    let thread = std::thread::Builder::new().name("estimate".to_owned()).stack_size(64 << 20);
+    let tried = thread.spawn(move || {
+        worker::process::compute_here();
+        estimate(&pipeline, &entries, &device, BUDGET)
+    });
+    // Without a thread, or if a stage panics on made-up clips, there is no estimate; the plan stands without.
+    tried.map(|tried| tried.join().unwrap_or_default()).unwrap_or_default()
+}
+
+/// Clips of the lists of a folder; those of the published set if it is not there.
+fn listed(data: &DataOpen) -> Entries {
+    let (train, val, test) = match data.format {
+        DataFormat::Humanml3d => (23_384, 1_460, 4_384),
+        DataFormat::Kit => (4_888, 300, 830),
+    };
+    let count = |name: &str, published: usize| {
+        let list = std::fs::read_to_string(Path::new(&data.path).join(name));
+        list.map_or(published, |list| list.lines().filter(|line| !line.trim().is_empty()).count())
+    };
+    Entries { train: count("train.txt", train), val: count("val.txt", val), test: count("test.txt", test) }
+}
+
+fn synthetic(data: &DataSynthetic) -> Entries {
+    let clips = (data.clips * if data.mirror { 2 } else { 1 }) as f64;
+    let share = |share: f64| (clips * share).round() as usize;
+    Entries { train: share(1.0 - data.val - data.test), val: share(data.val), test: share(data.test) }
+}

@@ -1,0 +1,149 @@
+//! A worker that is nobody's: the whole gang is one thread, and what it makes is kept in memory, over a store that is read and never changed.
+
+use std::collections::{BTreeMap, HashMap};
+use std::ops::Range;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
+
+use burn::tensor::Device;
+use checkpoint::{BlobError, Blobs};
+use protocol::message::StageTask;
+use protocol::{Digest, Manifest};
+
+use crate::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
+use crate::train::{STATE_FILE, tree_sum};
+
+/// The digest of a checkpoint's training state. Its manifest says besides by which build on which processor it was made.
+pub fn state_digest(checkpoint: &Manifest) -> Option<Digest> {
+    checkpoint.files.get(STATE_FILE).map(|entry| entry.digest)
+}
+
+/// A store below, if there is one, and what was put since in memory.
+#[derive(Debug, Default)]
+pub(crate) struct Overlay {
+    below: Option<Arc<dyn Blobs>>,
+    above: Mutex<HashMap<Digest, Arc<[u8]>>>,
+}
+
+impl Overlay {
+    pub(crate) fn over(below: Arc<dyn Blobs>) -> Self {
+        Self { below: Some(below), above: Mutex::default() }
+    }
+}
+
+impl Blobs for Overlay {
+    fn get(&self, digest: Digest) -> Result<Arc<[u8]>, BlobError> {
+        let found = self.above.lock().unwrap_or_else(PoisonError::into_inner).get(&digest).cloned();
+        match (found, &self.below) {
+            (Some(found), _) => Ok(found),
+            (None, Some(below)) => below.get(digest),
+            (None, None) => Err(BlobError::NotFound(digest)),
+        }
+    }
+
+    fn put(&self, bytes: Vec<u8>) -> Result<Digest, BlobError> {
+        let digest = Digest::of(&bytes);
+        self.above.lock().unwrap_or_else(PoisonError::into_inner).insert(digest, bytes.into());
+        Ok(digest)
+    }
+}
+
+/// A gang of one.
+#[derive(Debug)]
+pub(crate) struct Solo {
+    task: StageTask,
+    device: Device,
+    blobs: Arc<Overlay>,
+    checkpoint: Option<Manifest>,
+    until: u64,
+    /// What was recorded: step and name, value.
+    pub(crate) values: BTreeMap<(u64, String), f64>,
+    /// The digest of the training state after a step, wherever one was saved.
+    pub(crate) states: BTreeMap<u64, Digest>,
+    /// When it said how far it is.
+    pub(crate) progressed: Vec<Instant>,
+}
+
+impl Solo {
+    /// Does `task`, from `checkpoint` if there is one, and stops once `until` steps are applied.
+    pub(crate) fn new(
+        task: StageTask,
+        device: Device,
+        blobs: Arc<Overlay>,
+        checkpoint: Option<Manifest>,
+        until: u64,
+    ) -> Self {
+        let (values, states) = (BTreeMap::new(), BTreeMap::new());
+        Self { task, device, blobs, checkpoint, until, values, states, progressed: Vec::new() }
+    }
+}
+
+impl AttemptContext for Solo {
+    fn task(&self) -> &StageTask {
+        &self.task
+    }
+    fn device(&self) -> Device {
+        self.device.clone()
+    }
+    fn blobs(&self) -> Arc<dyn Blobs> {
+        Arc::clone(&self.blobs) as Arc<dyn Blobs>
+    }
+    fn manifest(&self, digest: Digest) -> Result<Manifest, ContextError> {
+        let bytes = self.blobs.get(digest).map_err(|e| ContextError::Corrupt(e.to_string()))?;
+        serde_json::from_slice(&bytes).map_err(|e| ContextError::Corrupt(format!("{digest} is not a manifest: {e}")))
+    }
+    fn put_manifest(&mut self, manifest: &Manifest) -> Result<Digest, ContextError> {
+        self.blobs.put(manifest.to_bytes()).map_err(|e| ContextError::Storage(e.to_string()))
+    }
+    fn progress(&mut self, _: u64, _: u64, _: &str, _: &[(&str, f64)]) {
+        self.progressed.push(Instant::now());
+    }
+    fn record(&mut self, step: u64, metrics: &[(&str, f64)]) {
+        self.values.extend(metrics.iter().map(|(name, value)| ((step, (*name).to_owned()), *value)));
+    }
+    fn log(&mut self, _: &str) {}
+    fn interrupted(&self) -> bool {
+        false
+    }
+}
+
+impl GangContext for Solo {
+    fn latest_checkpoint(&self) -> Result<Option<Manifest>, ContextError> {
+        Ok(self.checkpoint.clone())
+    }
+
+    fn rendezvous(&mut self, _: Option<u64>, _: &[&[u8]]) -> Result<Rendezvous, ContextError> {
+        Ok(Rendezvous::Keep)
+    }
+
+    fn adopt(&mut self, _: &mut [&mut [u8]]) -> Result<Adopted, ContextError> {
+        Ok(Adopted::Cut)
+    }
+
+    fn share(&self, slices: usize) -> Range<usize> {
+        0..slices
+    }
+
+    fn exchange(&mut self, step: u64, _: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError> {
+        let parts: Vec<Vec<f32>> = parts.iter().map(|(_, part)| part.clone()).collect();
+        Ok(Exchange::Sum { sum: tree_sum(&parts), drain: step + 1 >= self.until })
+    }
+
+    fn hold(&mut self) -> Result<(), ContextError> {
+        Err(ContextError::Unavailable("one member alone has nobody to wait for".to_owned()))
+    }
+
+    fn leads(&self) -> bool {
+        true
+    }
+
+    fn commit_checkpoint(
+        &mut self,
+        step: u64,
+        manifest: &Manifest,
+        _: &BTreeMap<String, f64>,
+    ) -> Result<(), ContextError> {
+        self.states.extend(state_digest(manifest).map(|digest| (step, digest)));
+        Ok(())
+    }
+}
