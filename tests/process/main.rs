@@ -16,6 +16,7 @@ mod failpoints;
 mod memory;
 mod reading;
 mod registry;
+mod results;
 mod storage;
 mod sweeps;
 mod verify;

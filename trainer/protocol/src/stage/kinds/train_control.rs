@@ -162,4 +162,8 @@ impl StageSpec for TrainControl {
     fn training(&mut self) -> Option<&mut Training> {
         Some(&mut self.training)
     }
+
+    fn recorded(&self) -> &'static [&'static str] {
+        &["loss", "latent", "control"]
+    }
 }

@@ -1,0 +1,38 @@
+#!/usr/bin/env bash
+# Runs a pipeline and writes what came of it: NAME.json, as `trainer run -o json` prints it, and NAME.md, the template NAME.in.md filled from it and
+# from the pipeline. The text also takes the place of README's part of that name, if there is one.
+#
+#   docs/results/regenerate.sh docs/results/mini.yaml --set dataset.path=PATH/TO/humanml3d-mini
+#
+# Arguments behind the pipeline are those of `trainer run`. What a store has already is not computed again: run it twice and only the text is made.
+# TRAINER and TABLES name binaries that are built already; README another file than this repository's.
+set -euo pipefail
+
+[ $# -ge 1 ] && [ -f "$1" ] || { echo "usage: $0 PIPELINE.yaml [options of trainer run]" >&2; exit 2; }
+pipeline=$(realpath "$1")
+shift
+name=$(basename "$pipeline" .yaml)
+base=${pipeline%.yaml}
+repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
+readme=${README:-$repository/README.md}
+built() { cargo build --quiet --release --locked --bin "$1" --manifest-path "$repository/Cargo.toml" && echo "$repository/target/release/$1"; }
+trainer=${TRAINER:-$(built trainer)}
+tables=${TABLES:-$(built tables)}
+
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+sets=()
+for ((i = 1; i <= $#; i++)); do
+    case ${!i} in
+        --set) j=$((i + 1)); sets+=(--set "${!j}") ;;
+        --set=*) sets+=("${!i}") ;;
+    esac
+done
+"$trainer" config show "$pipeline" "${sets[@]}" -o json > "$work/pipeline.json"
+"$trainer" run "$pipeline" "$@" -o json > "$work/run.json"
+"$tables" "$base.in.md" "$work/run.json" "$work/pipeline.json" "$work/text.md"
+cp "$work/run.json" "$base.json"
+part=()
+if grep -q "^<!-- $name: from here -->$" "$readme" 2> /dev/null; then part=("$readme" "$name"); fi
+"$tables" "$base.in.md" "$base.json" "$work/pipeline.json" "$base.md" "${part[@]}"
+echo "$base.json, $base.md${part:+, ${part[0]}}"

@@ -1,0 +1,213 @@
+//! Text with numbers of a run in it: a template's places in double braces are filled from the run's JSON (`trainer run -o json`) and its settings
+//! (`trainer config show -o json`). A number is rounded once, here.
+//!
+//! | place | becomes |
+//! |---|---|
+//! | `{{STAGE METRIC}}` | the value, with `±` half of its 95 % interval, or its standard deviation over sampling seeds, if the run has one |
+//! | `{{NAME_* METRIC}}` | mean ± standard deviation (n - 1) over the stages `NAME_1`, `NAME_2`, ...: trainings from other random draws |
+//! | `{{A METRIC / B METRIC}}` | the ratio; with `*` in both, of those with one number, then mean ± standard deviation |
+//! | `{{bare ...}}` | any of these without `±` |
+//! | `{{... :N}}` | with N decimals, 3 otherwise |
+//! | `{{set STAGE PATH}}` | a setting |
+//! | `{{core minutes}}` | what all stages took, one after the other |
+
+use serde_json::Value;
+
+/// Decimals where nothing else is said.
+const DECIMALS: usize = 3;
+
+/// What a template is filled from.
+#[derive(Debug)]
+pub struct Source {
+    /// `trainer run -o json`.
+    pub run: Value,
+    /// `trainer config show -o json`.
+    pub pipeline: Value,
+}
+
+/// A value and how far it may be off.
+struct Number {
+    value: f64,
+    spread: Option<f64>,
+}
+
+/// The template with its places filled.
+///
+/// # Errors
+/// The place that cannot be, with its line.
+pub fn render(template: &str, source: &Source) -> Result<String, String> {
+    let mut text = String::with_capacity(template.len());
+    for (i, line) in template.lines().enumerate() {
+        let mut rest = line;
+        while let Some((before, after)) = rest.split_once("{{") {
+            let wrong = |why: String| format!("line {}: `{line}`: {why}", i + 1);
+            let (place, after) = after.split_once("}}").ok_or_else(|| wrong("a place has no end".into()))?;
+            text.push_str(before);
+            text.push_str(&fill(place, source).map_err(|why| wrong(format!("`{{{{{place}}}}}`: {why}")))?);
+            rest = after;
+        }
+        text.push_str(rest);
+        text.push('\n');
+    }
+    Ok(text)
+}
+
+/// `text` with what stands between the lines `<!-- NAME: from here -->` and `<!-- NAME: to here -->` replaced.
+///
+/// # Errors
+/// If it does not have both.
+pub fn between(text: &str, name: &str, new: &str) -> Result<String, String> {
+    let (from, to) = (format!("<!-- {name}: from here -->\n"), format!("<!-- {name}: to here -->\n"));
+    let (before, rest) = text.split_once(&from).ok_or_else(|| format!("no line `{}`", from.trim()))?;
+    let (_, after) = rest.split_once(&to).ok_or_else(|| format!("no line `{}` behind it", to.trim()))?;
+    Ok(format!("{before}{from}{new}{to}{after}"))
+}
+
+fn fill(place: &str, source: &Source) -> Result<String, String> {
+    let mut words: Vec<&str> = place.split_whitespace().collect();
+    let decimals = match words.last().and_then(|word| word.strip_prefix(':')) {
+        Some(number) => {
+            words.pop();
+            number.parse().map_err(|_| format!("`:{number}` is no number of decimals"))?
+        }
+        None => DECIMALS,
+    };
+    let bare = words.first() == Some(&"bare");
+    if bare {
+        words.remove(0);
+    }
+    let number = match words[..] {
+        ["set", stage, path] => return setting(source, stage, path),
+        ["core", "minutes"] => Number { value: core_minutes(source), spread: None },
+        [stage, metric] => value(source, stage, metric)?,
+        [a, of_a, "/", b, of_b] => ratio(source, (a, of_a), (b, of_b))?,
+        _ => return Err("expected such as `STAGE METRIC`".into()),
+    };
+    let Number { value, spread } = number;
+    Ok(match spread {
+        Some(spread) if !bare => format!("{value:.decimals$} ± {spread:.decimals$}"),
+        _ => format!("{value:.decimals$}"),
+    })
+}
+
+fn setting(source: &Source, stage: &str, path: &str) -> Result<String, String> {
+    let stages = source.pipeline["stages"].as_array().ok_or("the pipeline has no stages")?;
+    let found = stages.iter().find(|one| one["name"] == stage).ok_or_else(|| format!("no stage `{stage}`"))?;
+    // Where settings stand beside the name, and where under it.
+    let under = [&found["settings"], found].into_iter();
+    let mut values = under.map(|settings| path.split('.').fold(settings, |value, key| &value[key]));
+    match values.find(|value| !value.is_null()) {
+        Some(Value::String(text)) => Ok(text.clone()),
+        Some(value) => Ok(value.to_string()),
+        None => Err(format!("`{stage}` has no setting `{path}`")),
+    }
+}
+
+fn core_minutes(source: &Source) -> f64 {
+    let stages = source.run["stages"].as_array().into_iter().flatten();
+    stages.filter_map(|stage| stage["wall_s"].as_f64()).sum::<f64>() / 60.0
+}
+
+/// The metrics of the stages that `name` stands for, with what stands in the place of its `*`.
+fn stages<'a>(source: &'a Source, name: &str) -> Result<Vec<(String, &'a Value)>, String> {
+    let all = source.run["stages"].as_array().ok_or("the run has no stages")?;
+    let (before, after) = name.split_once('*').unwrap_or((name, ""));
+    let matching = all.iter().filter_map(|stage| {
+        let own = stage["name"].as_str()?;
+        let number = own.strip_prefix(before)?.strip_suffix(after)?;
+        let fits = if name.contains('*') { number.parse::<u32>().is_ok() } else { number.is_empty() };
+        fits.then(|| (number.to_owned(), &stage["metrics"]))
+    });
+    let found: Vec<_> = matching.collect();
+    if found.is_empty() { Err(format!("no stage `{name}`")) } else { Ok(found) }
+}
+
+fn one(metrics: &Value, name: &str, metric: &str) -> Result<f64, String> {
+    metrics[metric].as_f64().ok_or_else(|| {
+        let have: Vec<&String> = metrics.as_object().into_iter().flat_map(|map| map.keys()).collect();
+        format!("`{name}` has no `{metric}`; it has {have:?}")
+    })
+}
+
+fn value(source: &Source, name: &str, metric: &str) -> Result<Number, String> {
+    let found = stages(source, name)?;
+    if name.contains('*') {
+        let values = found.iter().map(|(_, metrics)| one(metrics, name, metric)).collect::<Result<Vec<_>, _>>()?;
+        return Ok(of_seeds(&values));
+    }
+    let metrics = found[0].1;
+    let value = one(metrics, name, metric)?;
+    let interval = metrics[format!("{metric}.upper")].as_f64().map(|upper| upper - value);
+    let spread = interval.or_else(|| metrics[format!("{metric}_sd")].as_f64());
+    Ok(Number { value, spread })
+}
+
+fn ratio(source: &Source, (a, of_a): (&str, &str), (b, of_b): (&str, &str)) -> Result<Number, String> {
+    let (over, under) = (stages(source, a)?, stages(source, b)?);
+    let pair = |(number, metrics): &(String, &Value)| -> Result<f64, String> {
+        let other = under.iter().find(|(of, _)| of == number || under.len() == 1);
+        let (_, other) = other.ok_or_else(|| format!("`{b}` has no number {number}"))?;
+        Ok(one(metrics, a, of_a)? / one(other, b, of_b)?)
+    };
+    let ratios = over.iter().map(pair).collect::<Result<Vec<_>, _>>()?;
+    Ok(of_seeds(&ratios))
+}
+
+/// Mean and standard deviation; none of one value.
+fn of_seeds(values: &[f64]) -> Number {
+    let n = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / n;
+    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+    Number { value: mean, spread: (values.len() > 1).then(|| (squares / (n - 1.0)).sqrt()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    fn source() -> Source {
+        let run = json!({"stages": [
+            {"name": "a_1", "wall_s": 60.0, "metrics": {"fid": 1.0, "fid.lower": 0.5, "fid.upper": 1.5, "x": 4.3448}},
+            {"name": "a_2", "wall_s": 60.0, "metrics": {"fid": 3.0, "x": 1.0, "x_sd": 0.25}},
+            {"name": "b_1", "wall_s": 30.0, "metrics": {"fid": 2.0}},
+            {"name": "b_2", "wall_s": 0.0, "metrics": {"fid": 3.0}},
+            {"name": "other", "metrics": {"fid": 9.0}},
+        ]});
+        let pipeline = json!({"stages": [{"name": "a_1", "settings": {"steps": 12, "batch": {"global": 8}}}]});
+        Source { run, pipeline }
+    }
+
+    #[test]
+    fn places_are_filled_and_rounded_once() {
+        let filled = |place: &str| render(place, &source()).map(|text| text.trim_end().to_owned());
+        assert_eq!(filled("{{a_1 fid :1}} and {{bare a_1 fid :1}}").unwrap(), "1.0 ± 0.5 and 1.0");
+        assert_eq!(filled("{{a_1 x :2}} {{a_2 x}}").unwrap(), "4.34 1.000 ± 0.250");
+        assert_eq!(filled("| {{a_* fid :2}} |").unwrap(), "| 2.00 ± 1.41 |");
+        assert_eq!(filled("{{bare a_* fid / b_* fid :2}}").unwrap(), "0.75");
+        assert_eq!(filled("{{a_1 fid / other fid}}").unwrap(), "0.111");
+        assert_eq!(filled("{{set a_1 steps}} of {{set a_1 batch.global}}").unwrap(), "12 of 8");
+        assert_eq!(filled("{{core minutes :1}}").unwrap(), "2.5");
+        for (place, part) in [
+            ("one\n{{c fid}}", "line 2: `{{c fid}}`: `{{c fid}}`: no stage `c`"),
+            ("{{a_1 fdi}}", "`a_1` has no `fdi`"),
+            ("{{a_1}}", "STAGE METRIC"),
+            ("{{a_1 fid", "no end"),
+            ("{{set a_1 stepps}}", "no setting `stepps`"),
+            ("{{a_1 fid :x}}", "no number of decimals"),
+        ] {
+            let refused = filled(place).expect_err(place);
+            assert!(refused.contains(part), "{place}: {refused}");
+        }
+    }
+
+    #[test]
+    fn what_stands_between_two_lines_is_replaced() {
+        let text = "a\n<!-- x: from here -->\nold\n<!-- x: to here -->\nb\n";
+        let new = between(text, "x", "new\n").expect("both lines");
+        assert_eq!(new, "a\n<!-- x: from here -->\nnew\n<!-- x: to here -->\nb\n");
+        assert_eq!(between(&new, "x", "new\n"), Ok(new.clone()));
+        assert!(between("a\n", "x", "").expect_err("neither").contains("x: from here"));
+    }
+}
