@@ -46,6 +46,34 @@ fn p11_a_pipeline_with_mistakes() {
     refused(&bench, &["run", &path, "--set", "stages.nobody.lr=1"], &["nobody"]);
 }
 
+/// Stages of tokens that do not fit each other are found before the first of them trains.
+#[test]
+fn p11_tokens_and_decoders_that_do_not_fit() {
+    let bench = Bench::new(TRAINER);
+    let good = "name: p
+dataset: {format: synthetic, clips: 10}
+stages:
+  kit: {kind: data.open, format: kit, path: kit}
+  tokenizer: {kind: train.tokenizer}
+  other: {kind: train.tokenizer, codes: 64}
+  tokens: {kind: encode.tokens, tokenizer: tokenizer}
+  momask: {kind: train.tokens, generator: masked, tokenizer: tokenizer}
+  flow: {kind: train.discord, tokenizer: tokenizer, window: 64}
+  smooth: {kind: model.decoder, model: momask, decoder: flow}
+";
+    let path = bench.path().join("p.yaml");
+    for (from, to, parts) in [
+        ("masked, tokenizer: tokenizer", "masked, tokenizer: other", ["p.yaml:8:", "another codebook"]),
+        ("train.discord, tokenizer: tokenizer", "train.discord, tokenizer: other", ["p.yaml:10:", "another codebook"]),
+        ("kind: train.discord,", "kind: train.discord, dataset: kit,", ["p.yaml:9:", "21 joints (kit)"]),
+        ("window: 64", "window: 62", ["p.yaml:9:", "multiple of 4"]),
+    ] {
+        assert!(good.contains(from), "{from}");
+        fs::write(&path, good.replacen(from, to, 1)).expect("written");
+        refused(&bench, &["run", &path.display().to_string()], &parts);
+    }
+}
+
 /// A folder in the published layout with three good clips.
 fn folder(path: &Path) {
     let shared = std::env::var_os("STRIDE_SHARED").map_or_else(|| Bench::repository().join("../shared"), Into::into);

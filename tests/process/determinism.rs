@@ -38,7 +38,7 @@ fn start(bench: &Bench, workers: &str) -> Running {
 }
 
 /// Waits until a worker has begun `stage`, which its log says at once.
-fn begins(bench: &Bench, stage: &str) {
+pub(crate) fn begins(bench: &Bench, stage: &str) {
     let begun = format!("/{stage} attempt=");
     wait_for(&format!("stage {stage} to begin"), || {
         let logs = std::fs::read_dir(bench.store().join("workers")).ok()?;

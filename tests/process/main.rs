@@ -19,4 +19,5 @@ mod registry;
 mod results;
 mod storage;
 mod sweeps;
+mod tokens;
 mod verify;
