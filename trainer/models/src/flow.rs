@@ -31,6 +31,54 @@ impl Solver {
             Self::Midpoint => 2 * intervals,
         }
     }
+
+    /// One step of each sample of `x_btf` from its time in `from` to that in `to`.
+    pub fn step(
+        self,
+        x_btf: Tensor<3>,
+        from: &[f32],
+        to: &[f32],
+        mut velocity: impl FnMut(Tensor<3>, &[f32]) -> Tensor<3>,
+    ) -> Tensor<3> {
+        let device = x_btf.device();
+        let scaled = |v: Tensor<3>, share: f32| {
+            let steps: Vec<f32> = from.iter().zip(to).map(|(t, s)| share * (s - t)).collect();
+            v * Tensor::<3>::from_data(TensorData::new(steps, [from.len(), 1, 1]), &device)
+        };
+        let first = velocity(x_btf.clone(), from);
+        match self {
+            Self::Euler => x_btf + scaled(first, 1.0),
+            Self::Midpoint => {
+                let half: Vec<f32> = from.iter().zip(to).map(|(t, s)| t + 0.5 * (s - t)).collect();
+                let middle = x_btf.clone() + scaled(first, 0.5);
+                x_btf + scaled(velocity(middle, &half), 1.0)
+            }
+        }
+    }
+}
+
+/// Where a straight line from `x_btf` leads at time 1: `x + (1 - t) v`, for a time each.
+pub fn to_data(x_btf: Tensor<3>, velocity_btf: Tensor<3>, times: &[f32]) -> Tensor<3> {
+    let rest: Vec<f32> = times.iter().map(|t| 1.0 - t).collect();
+    let rest = Tensor::<3>::from_data(TensorData::new(rest, [times.len(), 1, 1]), &x_btf.device());
+    x_btf + velocity_btf * rest
+}
+
+/// Draws with a network whose line leads to the data from anywhere on the flow: in each of `steps` equal intervals a jump to the data, and back to
+/// the next one's beginning with `fresh` noise. One clip; the last jump is the result.
+pub fn jump(
+    steps: usize,
+    noise_btf: Tensor<3>,
+    velocity: impl Fn(Tensor<3>, f32) -> Tensor<3>,
+    mut fresh: impl FnMut(usize) -> Tensor<3>,
+) -> Tensor<3> {
+    let at = |k: usize| k as f32 / steps as f32;
+    let mut x = noise_btf;
+    for k in 0..steps {
+        let data = to_data(x.clone(), velocity(x, at(k)), &[at(k)]);
+        x = if k + 1 < steps { between(data, fresh(k), &[at(k + 1)]) } else { data };
+    }
+    x
 }
 
 /// Follows `velocity` from `noise_btf` at time 0 to 1 in equal intervals; `see` gets the state at each end of an interval, the noise first.
@@ -83,6 +131,16 @@ mod tests {
             (end.mean().into_scalar::<f32>() - std::f32::consts::E).abs()
         };
         assert!(grown(Solver::Midpoint, 8) < 0.1 * grown(Solver::Euler, 16));
+        // A step of a sample is the one that is followed; a jump along a straight line lands on the data from anywhere.
+        let one = Solver::Midpoint.step(noise.clone(), &[0.0], &[1.0], |x, _| x);
+        assert!(
+            (one - follow(Solver::Midpoint, 1, noise.clone(), |x, _| x, |_| ())).abs().max().into_scalar::<f32>()
+                < 1e-6
+        );
+        for steps in 1..3 {
+            let line = |x: Tensor<3>, t: f32| (data.clone() - x) / (1.0 - t);
+            assert!(off(jump(steps, noise.clone(), line, |_| noise.clone() * 3.0)) < 1e-6);
+        }
         assert_eq!((Solver::Euler.evaluations(16), Solver::Midpoint.evaluations(15)), (16, 30));
     }
 }

@@ -1,12 +1,16 @@
-//! Trained flow decoders out of artifacts: token ids to motion along a rectified flow. Source: DisCoRD (Cho et al., arXiv:2411.19527).
+//! Trained flow decoders out of artifacts: token ids or latents to motion along a rectified flow. Source: DisCoRD (Cho et al., arXiv:2411.19527).
 //!
 //! Arrays are those of [`crate::tokenizer`]: ids `[tokens, Q]`, normalised rows `[4 tokens, features]`. Clips are decoded one by one, so that
 //! nothing behind a clip's end flows into it.
+//!
+//! A latent of a VAE has no place in time. What stands for its codes is what the VAE's own decoder makes of it: of every four frames the
+//! normalised rows, one after the other, are a code. That is our choice; the paper decodes tokens alone.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
 use checkpoint::model::Parts;
-use models::flow::{Solver, follow};
+use models::flat::{self, Values};
+use models::flow::{Solver, follow, jump};
 use models::kernels::Dropout;
 use models::networks::{DitConfig, FlowDit, FlowUnet, Init, Projection, TimeFeatures, UnetConfig};
 use motion::Stream;
@@ -17,6 +21,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::artifacts;
 use crate::context::StageError;
+use crate::networks::Autoencoder;
 use crate::tokenizer::TrainedTokenizer;
 use crate::weights;
 
@@ -26,6 +31,8 @@ const MULTIPLES: [usize; 2] = [1, 2];
 const HEAD: usize = 32;
 /// Feed-forward width of the transformer, over its width.
 const RATE: usize = 4;
+/// Frames of a code.
+pub const UNIT: usize = 4;
 /// Base of the time's frequencies.
 const THETA: f64 = 10_000.0;
 
@@ -36,18 +43,50 @@ pub struct FlowMeta {
     pub format: DataFormat,
     /// Width of a feature vector.
     pub features: usize,
-    /// Width of a code.
+    /// Width of a code: four frames of a VAE.
     pub code_dim: usize,
     /// What the velocity is predicted by.
     pub backbone: FlowBackbone,
     /// Size.
     pub network: FlowNetwork,
-    /// How the flow is followed.
-    pub solver: FlowSolver,
+    /// How motion is decoded.
+    pub solver: FlowPath,
     /// Steps of the solver.
     pub steps: usize,
-    /// The part that it was trained with: the tokenizer whose codes it reads.
+    /// The part that it was trained with: the tokenizer, or the VAE, whose codes it reads.
     pub fits: Parts,
+}
+
+/// How motion is decoded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum FlowPath {
+    /// The flow is followed, with an evaluation of the network a step.
+    Euler,
+    /// With two.
+    Midpoint,
+    /// A student's jumps to the data, with fresh noise between them.
+    Jumps,
+}
+
+impl From<FlowSolver> for FlowPath {
+    fn from(solver: FlowSolver) -> Self {
+        match solver {
+            FlowSolver::Euler => Self::Euler,
+            FlowSolver::Midpoint => Self::Midpoint,
+        }
+    }
+}
+
+impl FlowPath {
+    /// What follows the flow, if it is followed.
+    pub fn followed(self) -> Option<Solver> {
+        match self {
+            Self::Euler => Some(Solver::Euler),
+            Self::Midpoint => Some(Solver::Midpoint),
+            Self::Jumps => None,
+        }
+    }
 }
 
 /// The network of either backbone.
@@ -104,6 +143,22 @@ impl FlowMeta {
 }
 
 impl Field {
+    /// Its parameters, in their order.
+    pub(crate) fn params(&self) -> Vec<f32> {
+        match self {
+            Self::Unet(network) => flat::read(network),
+            Self::Dit(network) => flat::read(network),
+        }
+    }
+
+    /// Takes over parameters.
+    pub(crate) fn take(&mut self, params: Values<'_>) {
+        match self {
+            Self::Unet(network) => params.assign(network),
+            Self::Dit(network) => params.assign(network),
+        }
+    }
+
     /// Velocity [B, T, F] at `times`, under codes [B, T / 4, d].
     pub(crate) fn velocity(
         &self,
@@ -128,22 +183,25 @@ pub struct FlowDecoder {
 }
 
 impl FlowDecoder {
-    /// Reads an artifact of kind `flow-decoder` for a tokenizer.
+    /// Reads an artifact of kind `flow-decoder` for a tokenizer, or a VAE: its role among parts, and its digest.
     ///
     /// # Errors
     /// If it was trained on another one.
     pub fn read(
         blobs: &dyn Blobs,
         manifest: &Manifest,
-        tokenizer: Digest,
+        (role, encoder): (&Role, Digest),
         device: &Device,
     ) -> Result<Self, StageError> {
         let meta: FlowMeta = artifacts::meta(manifest, "the flow decoder")?;
-        if meta.fits.get(&Role::TOKENIZER) != Some(&tokenizer) {
-            return Err(StageError::Input(
-                "the flow decoder was trained on the codes of another tokenizer; name the one that it was trained with"
-                    .into(),
-            ));
+        if meta.fits.get(role) != Some(&encoder) {
+            let what = match meta.fits.contains_key(role) {
+                true => format!("another {role}"),
+                false => meta.fits.keys().map(|other| format!("a {other}, not of a {role}")).collect(),
+            };
+            return Err(StageError::Input(format!(
+                "the flow decoder was trained on the codes of {what}; name the one that it was trained with"
+            )));
         }
         let device = device.clone().inner();
         let what = "the flow decoder's weights";
@@ -154,6 +212,11 @@ impl FlowDecoder {
         Ok(Self { field, meta, device })
     }
 
+    /// Its network, on the plain device.
+    pub(crate) fn into_field(self) -> Field {
+        self.field
+    }
+
     /// What it is.
     pub fn meta(&self) -> &FlowMeta {
         &self.meta
@@ -161,21 +224,38 @@ impl FlowDecoder {
 
     /// Normalised rows `[4 tokens, features]` of one motion's ids `[tokens, Q]`, from noise of `stream`.
     pub fn decode(&self, tokenizer: &TrainedTokenizer, ids: &[i64], stream: &mut Stream) -> Vec<f32> {
-        let codes = tokenizer.codes(ids);
+        self.decode_codes(tokenizer.codes(ids), stream)
+    }
+
+    /// Normalised rows `[frames, features]` of a VAE's latent `[N, d]`, from noise of `stream`.
+    pub fn decode_latent(&self, vae: &Autoencoder, z: Vec<f32>, frames: usize, stream: &mut Stream) -> Vec<f32> {
+        let mut rows = self.decode_codes(vae.decode(z, frames.next_multiple_of(UNIT)), stream);
+        rows.truncate(frames * self.meta.features);
+        rows
+    }
+
+    /// Normalised rows `[4 tokens, features]` of codes `[tokens, code_dim]`.
+    fn decode_codes(&self, codes: Vec<f32>, stream: &mut Stream) -> Vec<f32> {
         let tokens = codes.len() / self.meta.code_dim;
-        let frames = tokens * tokenizer.unit();
+        let frames = tokens * UNIT;
         let mut noise = vec![0.0; frames * self.meta.features];
         stream.fill_normal(&mut noise);
         let tensor =
             |values: Vec<f32>, shape: [usize; 3]| Tensor::<3>::from_data(TensorData::new(values, shape), &self.device);
         let codes = tensor(codes, [1, tokens, self.meta.code_dim]);
         let noise = tensor(noise, [1, frames, self.meta.features]);
-        let solver = match self.meta.solver {
-            FlowSolver::Euler => Solver::Euler,
-            FlowSolver::Midpoint => Solver::Midpoint,
-        };
         let velocity = |x, t| self.field.velocity(x, &[t], codes.clone(), &mut Dropout::off());
-        let rows = follow(solver, self.meta.steps, noise, velocity, |_| ());
+        let rows = match self.meta.solver.followed() {
+            Some(solver) => follow(solver, self.meta.steps, noise, velocity, |_| ()),
+            None => {
+                let fresh = |_| {
+                    let mut noise = vec![0.0; frames * self.meta.features];
+                    stream.fill_normal(&mut noise);
+                    tensor(noise, [1, frames, self.meta.features])
+                };
+                jump(self.meta.steps, noise, velocity, fresh)
+            }
+        };
         rows.into_data().try_into_vec::<f32>().expect("networks compute in f32")
     }
 }

@@ -1,12 +1,15 @@
 //! Tokenizers and what draws their tokens: end to end at toy sizes, and with members that come, go and are killed.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
+mod common;
+
 use std::collections::BTreeMap;
 
 use protocol::stage::{
-    Batch, CheckpointPolicy, DataSynthetic, Decay, EncodeTokens, EvaluateReconstruction, EvaluatorNetwork, FlowNetwork,
-    ModelDecoder, MovementPhase, Optimizer, Resets, Sampler, StageSettings, TextEmbed, TokenGenerator, TokenNetwork,
-    TokenizerNetwork, TrainDiscord, TrainEvaluator, TrainTokenizer, TrainTokens, Training,
+    Batch, CheckpointPolicy, DataSynthetic, Decay, DistillDiscord, EncodeTokens, EvaluateReconstruction,
+    EvaluatorNetwork, FlowNetwork, FlowProjection, FlowSolver, ModelDecoder, MovementPhase, Optimizer, Resets, Sampler,
+    StageSettings, TextEmbed, TokenGenerator, TokenNetwork, TokenizerNetwork, TrainDiscord, TrainEvaluator,
+    TrainTokenizer, TrainTokens, Training,
 };
 use protocol::{Digest, Seed, Steps};
 use stages::generate::Generator;
@@ -73,6 +76,18 @@ fn discord() -> StageSettings {
     })
 }
 
+/// A student of a flow decoder, of a VAE's latents if it is named.
+fn jumps(vae: &str, solver_steps: usize) -> StageSettings {
+    StageSettings::from(DistillDiscord {
+        vae: vae.into(),
+        window: 16,
+        intervals: 4,
+        solver_steps,
+        training: training(STEPS),
+        ..DistillDiscord::default()
+    })
+}
+
 fn evaluator() -> StageSettings {
     StageSettings::from(TrainEvaluator {
         network: EvaluatorNetwork { movement: 8, motion: 8, text: 8, embedding: 8, ..EvaluatorNetwork::default() },
@@ -83,6 +98,34 @@ fn evaluator() -> StageSettings {
 }
 
 type Link = (&'static str, StageSettings, Vec<(&'static str, &'static str)>);
+
+/// A VAE and a model of its latents, and the flow decoders that take the place of the VAE's own.
+fn of_latents(shards: usize) -> Vec<Link> {
+    let StageSettings::TrainDiscord(flow) = discord() else { unreachable!() };
+    // A code of four frames is wide, and the published projection grows with its square.
+    let network = FlowNetwork { projection: FlowProjection::Repeat, ..flow.network };
+    let flow = TrainDiscord { vae: "vae".into(), network, ..flow };
+    let measured = EvaluateReconstruction {
+        decoder: "decoder".into(),
+        evaluator: "evaluator".into(),
+        shards,
+        ..EvaluateReconstruction::default()
+    };
+    let vae = || vec![("dataset", "dataset"), ("vae", "vae")];
+    let wanted = |(name, ..): &Link| ["vae", "latents", "mld"].contains(name);
+    let mut links: Vec<Link> = common::chain(shards, [STEPS; 4]).into_iter().filter(wanted).collect();
+    links.extend([
+        ("latent-flow", flow.into(), vae()),
+        ("latent-jump", jumps("vae", 1), [vae(), vec![("teacher", "latent-flow")]].concat()),
+        ("smooth-mld", ModelDecoder::default().into(), vec![("model", "mld"), ("decoder", "latent-flow")]),
+        (
+            "latent-reconstruction",
+            measured.into(),
+            [vae(), vec![("decoder", "latent-jump"), ("evaluator", "evaluator")]].concat(),
+        ),
+    ]);
+    links
+}
 
 /// Everything from clips to models: a plain tokenizer with an autoregressive generator and MMM's, a residual one with a masked one.
 fn chain(shards: usize) -> Vec<Link> {
@@ -102,7 +145,7 @@ fn chain(shards: usize) -> Vec<Link> {
     let with = |tokenizer| vec![("dataset", "dataset"), ("tokenizer", tokenizer)];
     let model = |tokens, tokenizer| vec![("tokens", tokens), ("tokenizer", tokenizer), ("text", "text")];
     let clips = DataSynthetic { clips: 24, val: 0.1, test: 0.25, mirror: false };
-    vec![
+    let mut links = vec![
         ("dataset", clips.into(), vec![]),
         ("text", TextEmbed::default().into(), data()),
         ("evaluator", evaluator(), data()),
@@ -125,7 +168,11 @@ fn chain(shards: usize) -> Vec<Link> {
             smooth,
             [with("residual"), vec![("decoder", "discord"), ("evaluator", "evaluator")]].concat(),
         ),
-    ]
+        ("jumps", jumps("", 2), [with("residual"), vec![("teacher", "discord")]].concat()),
+        ("quick", ModelDecoder::default().into(), vec![("model", "momask"), ("decoder", "jumps")]),
+    ];
+    links.extend(of_latents(shards));
+    links
 }
 
 fn bench(members: usize) -> Bench {
@@ -176,6 +223,7 @@ fn p6_tokens_and_what_draws_them_have_the_same_bytes_for_any_number_of_members_a
     assert!(smooth["fid"] > 0.0 && !plain.contains_key("fid"), "{smooth:?}");
     assert_eq!((plain["used"], plain["perplexity"]), (smooth["used"], smooth["perplexity"]));
     assert_ne!(plain["sjpe"], smooth["sjpe"]);
+    assert!(one.metrics["latent-reconstruction"]["mu_mpjpe_mm"] > 0.0);
 }
 
 #[test]
@@ -184,6 +232,8 @@ fn models_of_tokens_draw_motions_as_all_others_do() {
     for (name, sampler) in [
         ("gpt", Sampler { steps: 1, guidance: 0.0, ..Sampler::default() }),
         ("smooth", Sampler { steps: 3, guidance: 1.0, ..Sampler::default() }),
+        ("quick", Sampler { steps: 3, guidance: 1.0, ..Sampler::default() }),
+        ("smooth-mld", Sampler { steps: 3, guidance: 2.0, ..Sampler::default() }),
         ("mmm", Sampler { steps: 4, guidance: 0.0, ..Sampler::default() }),
         ("momask", Sampler { steps: 4, guidance: 2.0, ..Sampler::default() }),
     ] {
@@ -253,7 +303,7 @@ fn masked_generators_draw_a_part_of_a_motion_and_keep_the_tokens_of_the_rest() {
 fn p5_p6_kills_joins_and_losses_change_no_byte() {
     let whole = run(1, 1);
     for (name, settings, inputs) in chain(1) {
-        if !["plain", "residual", "gpt", "momask", "mmm", "discord"].contains(&name) {
+        if !["plain", "residual", "gpt", "momask", "mmm", "discord", "jumps"].contains(&name) {
             continue;
         }
         let inputs = whole.inputs(&inputs);
@@ -293,6 +343,26 @@ fn run_up_to(name: &str) -> World {
     world
 }
 
+/// Over one interval the student's jump is the teacher's step of Euler, with which it starts; over shorter ones it has something to learn.
+#[test]
+fn a_student_starts_as_its_teachers_step() {
+    let mut world = run_up_to("discord");
+    let StageSettings::TrainDiscord(flow) = discord() else { unreachable!() };
+    let flow = TrainDiscord { solver: FlowSolver::Euler, ..flow };
+    let inputs = world.inputs(&[("dataset", "dataset"), ("tokenizer", "residual")]);
+    let teacher = world.bench.run("discord", &flow.into(), &inputs).unwrap().output();
+    let inputs = [&inputs[..], &[("teacher", teacher)]].concat();
+    let mut loss = |intervals| {
+        let StageSettings::DistillDiscord(settings) = jumps("", 1) else { unreachable!() };
+        let training = Training { lr: 1e-9, ..settings.training };
+        let settings = DistillDiscord { intervals, training, ..settings };
+        world.bench.forget("jumps");
+        world.bench.run("jumps", &settings.into(), &inputs).unwrap().metrics()["loss"]
+    };
+    let (one, four) = (loss(1), loss(4));
+    assert!(one < 1e-6 && four > 1e-4, "{one}, {four}");
+}
+
 #[test]
 fn what_does_not_fit_is_refused_with_a_reason() {
     let mut world = run_up_to("momask");
@@ -310,6 +380,19 @@ fn what_does_not_fit_is_refused_with_a_reason() {
     let layered = [("tokens", "residual-tokens"), ("tokenizer", "residual"), ("text", "text")];
     let error = refused(&mut world, generator(TokenGenerator::Autoregressive), &layered);
     assert!(error.contains("one codebook"), "{error}");
+    // A decoder of other codes, or of latents.
+    let mut decoders = run(1, 1);
+    for (decoder, model, words) in [
+        ("discord", "gpt", "another tokenizer"),
+        ("latent-flow", "gpt", "of a vae, not of a tokenizer"),
+        ("jumps", "mld", "of a tokenizer, not of a vae"),
+    ] {
+        let error = refused(&mut decoders, ModelDecoder::default().into(), &[("model", model), ("decoder", decoder)]);
+        assert!(error.contains(words), "{decoder} on {model}: {error}");
+    }
+    let taught = [("dataset", "dataset"), ("tokenizer", "residual"), ("teacher", "jumps")];
+    let error = refused(&mut decoders, jumps("", 2), &taught);
+    assert!(error.contains("a student itself"), "{error}");
     let StageSettings::TrainTokenizer(mut settings) = tokenizer(1, 8, Resets::Always) else { unreachable!() };
     settings.window = 4_000;
     let error = refused(&mut world, settings.into(), &[("dataset", "dataset")]);

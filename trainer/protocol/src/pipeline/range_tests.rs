@@ -53,6 +53,10 @@ fn stages() -> Vec<(String, StageSettings)> {
             StageSettings::ModelDecoder(ModelDecoder { model: "generator".into(), decoder: "train_discord".into() }),
         ),
         ("control", StageSettings::TrainControl(TrainControl::default())),
+        (
+            "jumps",
+            StageSettings::DistillDiscord(DistillDiscord { teacher: "train_discord".into(), ..Default::default() }),
+        ),
         ("evaluator", StageSettings::TrainEvaluator(TrainEvaluator::default())),
         ("imported", StageSettings::ImportEvaluator(ImportEvaluator { path: "t2m".into(), ..Default::default() })),
         ("t2m", StageSettings::EvaluateT2m(EvaluateT2m { model: "lcm".into(), sampler, ..EvaluateT2m::default() })),

@@ -51,6 +51,7 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("network.growth", Whole(1, 16), ""),
     ("network.condition", Whole(1, 16_384), "channels"),
     ("solver_steps", Whole(1, 1_000), "steps"),
+    ("intervals", Whole(1, 1_000), "intervals"),
     ("longest", Whole(1, 4_096), "tokens"),
     ("corruption", Real(0.0, 1.0), "of the tokens"),
     ("codes", Whole(2, 65_536), "codes"),

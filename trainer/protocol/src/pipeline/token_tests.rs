@@ -17,6 +17,12 @@ stages:
   mmm: {kind: train.tokens, generator: mmm, tokens: ids, tokenizer: plain}
   flow: {kind: train.discord, tokenizer: residual, window: 64}
   smooth: {kind: model.decoder, model: momask, decoder: flow}
+  vae: {kind: train.vae}
+  latents: {kind: encode.latents, vae: vae}
+  mld: {kind: train.mld}
+  latent_flow: {kind: train.discord, vae: vae}
+  jumps: {kind: distill.discord, tokenizer: residual, teacher: flow}
+  quick: {kind: model.decoder, model: mld, decoder: latent_flow}
   recon: {kind: evaluate.reconstruction, tokenizer: residual, decoder: flow, evaluator: judge}
   t2m: {kind: evaluate.t2m, model: mmm, evaluator: judge, sampler: {steps: 10, guidance: 0}}
 ";
@@ -28,6 +34,8 @@ fn what_fits_is_taken_and_only_what_is_read_is_an_input() {
         let stage = pipeline.stages.iter().find(|stage| stage.name.as_str() == name).expect("a stage");
         stage.inputs.iter().map(|input| input.field.clone()).collect()
     };
+    assert_eq!(inputs("latent_flow"), ["dataset", "vae"]);
+    assert_eq!(inputs("jumps"), ["dataset", "tokenizer", "teacher"]);
     assert_eq!(inputs("momask"), ["tokens", "tokenizer", "text"]);
     assert_eq!(inputs("mmm"), ["tokens", "tokenizer", "text", "dataset"]);
     assert_eq!(inputs("recon"), ["tokenizer", "decoder", "evaluator", "dataset"]);
@@ -40,9 +48,18 @@ fn what_does_not_fit_is_refused_where_it_stands() {
         ("tokens: tokens, tokenizer: residual", "tokens: ids, tokenizer: residual", 11, "was encoded with `plain`"),
         ("tokens: ids, tokenizer: plain", "tokens: tokens, tokenizer: residual", 12, "has 6 codebooks; expected 1"),
         ("model: momask, decoder", "model: mmm, decoder", 14, "`flow` reads the codes of `residual`"),
-        ("tokenizer: residual, decoder: flow", "tokenizer: plain, decoder: flow", 15, "the tokens are of `plain`"),
+        ("tokenizer: residual, decoder: flow", "tokenizer: plain, decoder: flow", 21, "is of `plain`"),
+        ("decoder: latent_flow", "decoder: flow", 20, "`flow` reads the codes of `residual`"),
+        ("model: momask, decoder: flow", "model: momask, decoder: latent_flow", 14, "reads the latents of `vae`"),
+        ("tokenizer: residual, teacher: flow", "tokenizer: plain, teacher: flow", 19, "is of `plain`"),
+        ("teacher: flow}", "teacher: latent_flow}", 19, "reads the latents of `vae`"),
         // Another skeleton.
-        ("{kind: train.discord, ", "{kind: train.discord, dataset: kit, ", 13, "clips of `kit` have 21 joints"),
+        (
+            "{kind: train.discord, tokenizer",
+            "{kind: train.discord, dataset: kit, tokenizer",
+            13,
+            "clips of `kit` have 21 joints",
+        ),
         (
             "{kind: encode.tokens, tokenizer: plain",
             "{kind: encode.tokens, dataset: kit, tokenizer: plain",
@@ -52,13 +69,13 @@ fn what_does_not_fit_is_refused_where_it_stands() {
         (
             "decoder: flow, evaluator",
             "decoder: flow, dataset: kit, evaluator",
-            15,
+            21,
             "`residual` is for skeletons of 22 joints",
         ),
         (
             "{kind: train.evaluator}",
             "{kind: train.evaluator, dataset: kit}",
-            15,
+            21,
             "`judge` is for skeletons of 21 joints",
         ),
         // Lengths that are no multiple of the down-sampling.
@@ -69,7 +86,7 @@ fn what_does_not_fit_is_refused_where_it_stands() {
         ("generator: mmm, ", "generator: mmm, text: words, ", 12, "embeds the captions of `kit`"),
         ("generator: mmm, ", "generator: mmm, dataset: kit, ", 12, "but `dataset` is `kit`"),
         ("generator: mmm, ", "generator: mmm, network: {word_blocks: 10}, ", 12, "`network.layers`, 9"),
-        ("guidance: 0}", "guidance: 2}", 16, "`mmm` has none"),
+        ("guidance: 0}", "guidance: 2}", 22, "`mmm` has none"),
         ("model: momask, decoder: flow", "model: judge, decoder: flow", 14, "needs a model"),
     ] {
         assert_eq!(GOOD.matches(from).count(), 1, "{from}");

@@ -198,13 +198,16 @@ impl<'a> Neighbours<'a> {
         }
     }
 
-    /// Refuses a decoder, or tokens, of another tokenizer than `tokenizer`; `field` names the stage `name` that gives them.
-    pub(crate) fn same_codes(&self, p: &mut Problems, (field, name): (&str, &str), tokenizer: &str) {
-        if let Some(other) = self.read_by(name, ArtifactKind::Tokenizer)
-            && other != tokenizer
-        {
-            let message = format!("`{name}` reads the codes of `{other}`, but the tokens are of `{tokenizer}`");
+    /// Refuses a flow decoder of other tokens than those of `encoder`, or of other latents; `field` names the stage `name` that gives it.
+    pub(crate) fn same_codes(&self, p: &mut Problems, (field, name): (&str, &str), encoder: &str) {
+        let decoded = |kind| self.read_by(name, kind).filter(|other| *other != encoder);
+        if let Some(other) = decoded(ArtifactKind::Tokenizer) {
+            let message = format!("`{name}` reads the codes of `{other}`, but what it is to decode is of `{encoder}`");
             p.add(field, message, "tokens of another codebook mean other motions; train both on one tokenizer");
+        } else if let Some(other) = decoded(ArtifactKind::Vae) {
+            let message =
+                format!("`{name}` reads the latents of `{other}`, but what it is to decode is of `{encoder}`");
+            p.add(field, message, "latents of another VAE mean other motions; train both on one VAE");
         }
     }
 

@@ -1,6 +1,7 @@
 //! Latent diffusion and its students: a denoiser draws a latent, a VAE turns it into motion. Source: MLD, MotionLCM, MotionPCM.
 //!
-//! Parts: `denoiser`, `vae`, `text`, and `control` where motions can be told where to go. The denoiser reads a caption's one vector.
+//! Parts: `denoiser`, `vae`, `text`, `control` where motions can be told where to go, and `decoder` if a flow decodes in the VAE's place. The
+//! denoiser reads a caption's one vector.
 
 use std::rc::Rc;
 
@@ -14,6 +15,7 @@ use protocol::{ArtifactKind, Digest};
 use super::{Batch, ControlRequest, Lap, LatentGenerator, MotionGenerator, Seeds, Text};
 use crate::context::StageError;
 use crate::control::{ControlMeta, TrainedControl};
+use crate::flow_decoder::{FlowDecoder, UNIT};
 use crate::networks::{Autoencoder, Conditions, Denoiser};
 use crate::parts::{self, model_error};
 use crate::text::{self, TextEncoder};
@@ -27,6 +29,7 @@ struct LatentDiffusion {
     vae: Autoencoder,
     /// The VAE's manifest.
     vae_digest: Digest,
+    decoder: Option<FlowDecoder>,
     text: Box<dyn TextEncoder>,
     control: Option<TrainedControl>,
     /// The empty caption.
@@ -77,7 +80,14 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
     }
     let null = text.pooled(&[""])?;
     let vae_digest = model.part(&Role::VAE).map_err(model_error)?;
-    Ok(Box::new(LatentDiffusion { denoiser, vae, vae_digest, text, control, null }))
+    let decoder = match model.parts.contains_key(&Role::DECODER) {
+        true => {
+            let manifest = part(&Role::DECODER, ArtifactKind::FlowDecoder)?;
+            Some(FlowDecoder::read(blobs, &manifest, (&Role::VAE, vae_digest), device)?)
+        }
+        false => None,
+    };
+    Ok(Box::new(LatentDiffusion { denoiser, vae, vae_digest, decoder, text, control, null }))
 }
 
 impl MotionGenerator for LatentDiffusion {
@@ -86,7 +96,9 @@ impl MotionGenerator for LatentDiffusion {
     }
 
     fn longest(&self) -> usize {
-        self.vae.max_frames()
+        let most = self.vae.max_frames();
+        // A flow decodes whole codes.
+        if self.decoder.is_some() { most / UNIT * UNIT } else { most }
     }
 
     fn family(&self) -> &Family {
@@ -105,7 +117,15 @@ impl MotionGenerator for LatentDiffusion {
     fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError> {
         let z = self.steered(batch.texts, batch.seeds, sampler, batch.control)?;
         lap(Lap::Sampled);
-        let mut motions = self.vae.decode_ragged(z, batch.lengths);
+        let mut motions = match &self.decoder {
+            None => self.vae.decode_ragged(z, batch.lengths),
+            Some(decoder) => {
+                let clips = z.chunks_exact(self.shape().tokens * self.shape().dim).zip(batch.lengths).enumerate();
+                // Behind the streams of all steps.
+                let noise = |b| (batch.seeds)(1 + sampler.steps, b);
+                clips.map(|(b, (z, n))| decoder.decode_latent(&self.vae, z.to_vec(), *n, &mut noise(b))).collect()
+            }
+        };
         motions.iter_mut().for_each(|motion| self.vae.denormalise(motion));
         lap(Lap::Decoded);
         Ok(motions)

@@ -181,7 +181,7 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
         true => {
             let manifest = part(&Role::DECODER, ArtifactKind::FlowDecoder)?;
             let tokenizer = model.part(&Role::TOKENIZER).map_err(parts::model_error)?;
-            Some(FlowDecoder::read(blobs, &manifest, tokenizer, device)?)
+            Some(FlowDecoder::read(blobs, &manifest, (&Role::TOKENIZER, tokenizer), device)?)
         }
         false => None,
     };

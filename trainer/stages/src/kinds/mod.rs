@@ -12,6 +12,8 @@ mod entry_draws;
 mod evaluator;
 mod feature_data;
 mod features;
+mod flow_data;
+mod flow_student;
 mod frequency;
 mod import;
 mod latent_data;
@@ -94,7 +96,7 @@ macro_rules! runners {
 runners! {
     Plain: DataOpen, DataSynthetic, TextEmbed, ImportEvaluator, ModelDecoder;
     Map: EncodeLatents, EncodeTokens, EvaluateReconstruction, EvaluateLatentFid, EvaluateT2m, EvaluateControl;
-    Gang: TrainVae, TrainMld, DistillLcm, DistillPcm, TrainEvaluator, TrainLength, TrainTokenizer, TrainTokens, TrainDiscord,
+    Gang: TrainVae, TrainMld, DistillLcm, DistillPcm, TrainEvaluator, TrainLength, TrainTokenizer, TrainTokens, TrainDiscord, DistillDiscord,
         TrainMdm, TrainStableMoFusion, TrainControl;
 }
 

@@ -1,4 +1,4 @@
-//! `model.decoder`: the parts of a model of tokens, and a flow decoder.
+//! `model.decoder`: the parts of a model of tokens, or of latents, and a flow decoder.
 
 use std::collections::BTreeMap;
 
@@ -11,7 +11,7 @@ use super::Plain;
 use crate::artifacts;
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::flow_decoder::FlowDecoder;
-use crate::generator::TOKENS;
+use crate::generator::{LATENT_DIFFUSION, TOKENS};
 use crate::parts::{self, model_error};
 
 impl Plain for ModelDecoder {
@@ -19,20 +19,23 @@ impl Plain for ModelDecoder {
         let blobs = cx.blobs();
         let (_, manifest) = artifacts::input(cx, "model", ArtifactKind::Model)?;
         let model = Model::read(&manifest).map_err(model_error)?;
-        if model.generator != TOKENS {
-            return Err(StageError::Input(format!(
-                "`model` is drawn by `{}`, which makes no tokens; name a model of `train.tokens`",
-                model.generator
-            )));
-        }
+        let role = match &model.generator[..] {
+            TOKENS => Role::TOKENIZER,
+            LATENT_DIFFUSION => Role::VAE,
+            other => {
+                return Err(StageError::Input(format!(
+                    "`model` is drawn by `{other}`, which makes neither tokens nor latents; there is nothing to decode"
+                )));
+            }
+        };
         let (_, decoder) = artifacts::input(cx, "decoder", ArtifactKind::FlowDecoder)?;
-        FlowDecoder::read(&*blobs, &decoder, model.part(&Role::TOKENIZER).map_err(model_error)?, &cx.device())?;
+        FlowDecoder::read(&*blobs, &decoder, (&role, model.part(&role).map_err(model_error)?), &cx.device())?;
         let part = |(role, digest): (&Role, &protocol::Digest)| {
             Ok((role.clone(), parts::manifest(&*blobs, *digest, &format!("the part `{role}`"))?))
         };
         let mut all = model.parts.iter().map(part).collect::<Result<BTreeMap<_, _>, StageError>>()?;
         all.insert(Role::DECODER, decoder);
-        let output = parts::publish_model(cx, TOKENS, model.format, &all)?;
+        let output = parts::publish_model(cx, &model.generator, model.format, &all)?;
         Ok(Outcome::Finished { output, metrics: BTreeMap::new() })
     }
 }

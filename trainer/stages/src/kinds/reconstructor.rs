@@ -1,7 +1,8 @@
-//! What makes something of real motion that is measured against it: a VAE, a tokenizer, a tokenizer with a flow decoder.
+//! What makes something of real motion that is measured against it: a VAE or a tokenizer, either with a flow decoder.
 
 use motion::Stream;
 use protocol::ArtifactKind;
+use protocol::artifact::Role;
 use protocol::stage::DataFormat;
 
 use crate::artifacts;
@@ -13,33 +14,36 @@ use crate::tokenizer::TrainedTokenizer;
 /// Encodes clips and decodes them again.
 #[expect(clippy::large_enum_variant, reason = "there is one of it")]
 pub(super) enum Reconstructor {
-    Vae(Autoencoder),
+    Vae(Autoencoder, Option<FlowDecoder>),
     Tokenizer(TrainedTokenizer, Option<FlowDecoder>),
 }
 
 impl Reconstructor {
-    /// Opens the inputs `vae`, or `tokenizer` and `decoder`, of which those are read that the stage has.
+    /// Opens the inputs `vae` or `tokenizer`, and `decoder`, of which those are read that the stage has.
     pub(super) fn read(cx: &dyn AttemptContext) -> Result<Self, StageError> {
         let blobs = cx.blobs();
         let has = |field: &str| cx.task().inputs.contains_key(field);
+        let decoder = |role: &Role, encoder| match has("decoder") {
+            true => {
+                let (_, manifest) = artifacts::input(cx, "decoder", ArtifactKind::FlowDecoder)?;
+                FlowDecoder::read(&*blobs, &manifest, (role, encoder), &cx.device()).map(Some)
+            }
+            false => Ok(None),
+        };
         if !has("tokenizer") {
-            let (_, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
-            return Autoencoder::read(&*blobs, &vae, &cx.device()).map(Self::Vae);
+            let (digest, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
+            let vae = Autoencoder::read(&*blobs, &vae, &cx.device())?;
+            return Ok(Self::Vae(vae, decoder(&Role::VAE, digest)?));
         }
         let (digest, manifest) = artifacts::input(cx, "tokenizer", ArtifactKind::Tokenizer)?;
         let tokenizer = TrainedTokenizer::read(&*blobs, &manifest, &cx.device())?;
-        if !has("decoder") {
-            return Ok(Self::Tokenizer(tokenizer, None));
-        }
-        let (_, manifest) = artifacts::input(cx, "decoder", ArtifactKind::FlowDecoder)?;
-        let decoder = FlowDecoder::read(&*blobs, &manifest, digest, &cx.device())?;
-        Ok(Self::Tokenizer(tokenizer, Some(decoder)))
+        Ok(Self::Tokenizer(tokenizer, decoder(&Role::TOKENIZER, digest)?))
     }
 
     /// Refuses data of another format than it was trained on.
     pub(super) fn check_format(&self, format: DataFormat) -> Result<(), StageError> {
         match self {
-            Self::Vae(vae) => vae.check_format(format),
+            Self::Vae(vae, _) => vae.check_format(format),
             Self::Tokenizer(tokenizer, _) => tokenizer.check_format(format),
         }
     }
@@ -58,21 +62,21 @@ impl Reconstructor {
     /// Mean and standard deviation of its training data.
     pub(super) fn statistics(&self) -> (&[f32], &[f32]) {
         match self {
-            Self::Vae(vae) => (&vae.meta().mean, &vae.meta().std),
+            Self::Vae(vae, _) => (&vae.meta().mean, &vae.meta().std),
             Self::Tokenizer(tokenizer, _) => (&tokenizer.meta().mean, &tokenizer.meta().std),
         }
     }
 
     pub(super) fn normalise(&self, rows: &mut [f32]) {
         match self {
-            Self::Vae(vae) => vae.normalise(rows),
+            Self::Vae(vae, _) => vae.normalise(rows),
             Self::Tokenizer(tokenizer, _) => tokenizer.normalise(rows),
         }
     }
 
     pub(super) fn denormalise(&self, rows: &mut [f32]) {
         match self {
-            Self::Vae(vae) => vae.denormalise(rows),
+            Self::Vae(vae, _) => vae.denormalise(rows),
             Self::Tokenizer(tokenizer, _) => tokenizer.denormalise(rows),
         }
     }
@@ -80,7 +84,10 @@ impl Reconstructor {
     /// What later stages see of normalised rows `[frames, D]`: a sample of the posterior decoded, or the clip's tokens decoded.
     pub(super) fn sample(&self, truth: &[f32], frames: usize, stream: &mut Stream) -> Vec<f32> {
         match self {
-            Self::Vae(vae) => vae.decode(vae.encode(truth.to_vec(), frames).sample(stream), frames),
+            Self::Vae(vae, decoder) => {
+                let z = vae.encode(truth.to_vec(), frames).sample(stream);
+                of_latent(vae, decoder.as_ref(), z, frames, stream)
+            }
             Self::Tokenizer(tokenizer, decoder) => {
                 let ids = tokenizer.encode(truth.to_vec());
                 decoded(tokenizer, decoder.as_ref(), &ids, stream)
@@ -97,10 +104,11 @@ impl Reconstructor {
         codes: &mut [Vec<u64>],
     ) -> (Vec<f32>, Option<Vec<f32>>) {
         match self {
-            Self::Vae(vae) => {
+            Self::Vae(vae, decoder) => {
                 let posterior = vae.encode(truth.to_vec(), frames);
                 let z = posterior.sample(stream);
-                (vae.decode(z, frames), Some(vae.decode(posterior.mu.clone(), frames)))
+                let mut decoded = |z| of_latent(vae, decoder.as_ref(), z, frames, stream);
+                (decoded(z), Some(decoded(posterior.mu)))
             }
             Self::Tokenizer(tokenizer, decoder) => {
                 let ids = tokenizer.encode(truth.to_vec());
@@ -115,9 +123,22 @@ impl Reconstructor {
     /// A count for each code of each codebook.
     pub(super) fn no_codes(&self) -> Vec<Vec<u64>> {
         match self {
-            Self::Vae(_) => Vec::new(),
+            Self::Vae(..) => Vec::new(),
             Self::Tokenizer(tokenizer, _) => vec![vec![0; tokenizer.meta().codes]; tokenizer.meta().quantizers],
         }
+    }
+}
+
+fn of_latent(
+    vae: &Autoencoder,
+    decoder: Option<&FlowDecoder>,
+    z: Vec<f32>,
+    frames: usize,
+    stream: &mut Stream,
+) -> Vec<f32> {
+    match decoder {
+        None => vae.decode(z, frames),
+        Some(decoder) => decoder.decode_latent(vae, z, frames, stream),
     }
 }
 

@@ -17,7 +17,7 @@ pub struct EvaluateReconstruction {
     pub vae: String,
     /// Stage that gives the tokenizer that is measured instead of a VAE; none if empty.
     pub tokenizer: String,
-    /// Stage that gives the flow decoder that decodes the tokenizer's tokens; the tokenizer's own if empty.
+    /// Stage that gives the flow decoder that decodes the tokenizer's tokens, or the VAE's latents; the tokenizer's own, or the VAE's, if empty.
     pub decoder: String,
     /// Stage that gives the evaluator in whose space FID is taken, of reconstructions against the clips themselves; no FID if empty.
     pub evaluator: String,
@@ -52,20 +52,16 @@ impl StageSpec for EvaluateReconstruction {
 
     fn refs(&mut self) -> Vec<Ref<'_>> {
         let of_vae = self.tokenizer.is_empty();
-        let flows = !of_vae && !self.decoder.is_empty();
         vec![
             Ref::stage("vae", &mut self.vae, ArtifactKind::Vae).only_if(of_vae),
             Ref::stage("tokenizer", &mut self.tokenizer, ArtifactKind::Tokenizer).optional(),
-            Ref::stage("decoder", &mut self.decoder, ArtifactKind::FlowDecoder).only_if(flows),
+            Ref::stage("decoder", &mut self.decoder, ArtifactKind::FlowDecoder).optional(),
             Ref::stage("evaluator", &mut self.evaluator, ArtifactKind::Evaluator).optional(),
             Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
         ]
     }
 
     fn check(&self, p: &mut Problems) {
-        if self.tokenizer.is_empty() && !self.decoder.is_empty() {
-            p.add("decoder", "`decoder` decodes tokens, but there is no `tokenizer`; expected both", "");
-        }
         p.shards(self.shards);
     }
 
@@ -78,8 +74,8 @@ impl StageSpec for EvaluateReconstruction {
         if !self.evaluator.is_empty() {
             stages.same_skeleton(p, ("evaluator", &self.evaluator), &self.dataset);
         }
-        if !self.tokenizer.is_empty() && !self.decoder.is_empty() {
-            stages.same_codes(p, ("decoder", &self.decoder), &self.tokenizer);
+        if !self.decoder.is_empty() {
+            stages.same_codes(p, ("decoder", &self.decoder), measured);
         }
     }
 

@@ -2,6 +2,7 @@
 
 mod data_open;
 mod data_synthetic;
+mod distill_discord;
 mod distill_lcm;
 mod distill_pcm;
 mod encode_latents;
@@ -27,6 +28,7 @@ mod train_vae;
 
 pub use data_open::DataOpen;
 pub use data_synthetic::DataSynthetic;
+pub use distill_discord::DistillDiscord;
 pub use distill_lcm::DistillLcm;
 pub use distill_pcm::DistillPcm;
 pub use encode_latents::EncodeLatents;
@@ -69,6 +71,7 @@ super::spec::stage_kinds! {
     EncodeTokens,
     TrainTokens,
     TrainDiscord,
+    DistillDiscord,
     ModelDecoder,
     TrainMdm,
     TrainStableMoFusion,

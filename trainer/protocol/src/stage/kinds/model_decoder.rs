@@ -1,18 +1,19 @@
-//! `model.decoder`: a model of tokens with a flow decoder in place of its tokenizer's own. Source: DisCoRD (Cho et al., arXiv:2411.19527).
+//! `model.decoder`: a model of tokens, or of latents, with a flow decoder in place of its tokenizer's, or its VAE's, own. Source: DisCoRD (Cho et
+//! al., arXiv:2411.19527).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
-use crate::stage::{Neighbours, Output, Problems, Ref, Shape, StageSpec};
+use crate::stage::{Family, Neighbours, Output, Problems, Ref, Shape, StageSpec};
 
-/// `model.decoder`: draws tokens as another model does, and decodes them along a flow.
+/// `model.decoder`: draws tokens or latents as another model does, and decodes them along a flow.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct ModelDecoder {
-    /// Stage that gives the model, of tokens.
+    /// Stage that gives the model, of tokens or of latents.
     pub model: String,
-    /// Stage that gives the decoder, trained on the tokenizer that the model has.
+    /// Stage that gives the decoder, trained on the tokenizer, or the VAE, that the model has.
     pub decoder: String,
 }
 
@@ -36,9 +37,9 @@ impl StageSpec for ModelDecoder {
 
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
         let (model, decoder) = (&self.model, &self.decoder);
-        if stages.family(model).is_some_and(|family| !family.draws_tokens()) {
-            let message = format!("`{model}` draws no tokens, and `{decoder}` decodes nothing else");
-            p.add("model", message, "name a `train.tokens` stage");
+        if matches!(stages.family(model), Some(Family::Features { .. })) {
+            let message = format!("`{model}` draws motion itself, and there is nothing that `{decoder}` could decode");
+            p.add("model", message, "name a model of tokens or of latents");
         }
         if let (Some(ours), Some(theirs)) = (stages.format(model), stages.format(decoder))
             && ours != theirs
@@ -46,8 +47,8 @@ impl StageSpec for ModelDecoder {
             let (ours, theirs) = (ours.skeleton(), theirs.skeleton());
             let message = format!("`{decoder}` decodes motions of {theirs}, but `{model}` draws those of {ours}");
             p.add("decoder", message, "train the decoder on the data set of the model");
-        } else if let Some(tokenizer) = stages.tokenizer_of_model(model) {
-            stages.same_codes(p, ("decoder", decoder), tokenizer);
+        } else if let Some(encoder) = stages.tokenizer_of_model(model).or_else(|| stages.vae_of_model(model)) {
+            stages.same_codes(p, ("decoder", decoder), encoder);
         }
     }
 }

@@ -1,4 +1,5 @@
-//! `train.discord`: a rectified flow that turns frozen tokens into motion. Source: DisCoRD (Cho et al., arXiv:2411.19527).
+//! `train.discord`: a rectified flow that turns frozen tokens, or the latents of a frozen VAE, into motion. Source: DisCoRD (Cho et al.,
+//! arXiv:2411.19527).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -78,14 +79,17 @@ impl Default for FlowNetwork {
     }
 }
 
-/// `train.discord`: a decoder of tokens that draws smooth motion.
+/// `train.discord`: a decoder of tokens, or of a VAE's latents, that draws smooth motion.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct TrainDiscord {
     /// Stage that gives the clips.
     pub dataset: String,
-    /// Stage that gives the tokenizer, which stays as it is.
+    /// Stage that gives the tokenizer, which stays as it is; not read if there is a VAE.
     pub tokenizer: String,
+    /// Stage that gives the VAE whose latents are decoded instead of tokens; none if empty. What its own decoder makes of a latent, four frames a
+    /// token, is what the flow is conditioned on, our choice: the paper compares with MLD, and has no decoder of its latents.
+    pub vae: String,
     /// What the velocity is predicted by.
     pub backbone: FlowBackbone,
     /// Size.
@@ -110,6 +114,7 @@ impl Default for TrainDiscord {
         Self {
             dataset: "dataset".into(),
             tokenizer: "tokenizer".into(),
+            vae: String::new(),
             backbone: FlowBackbone::Unet,
             network: FlowNetwork::default(),
             window: 64,
@@ -137,9 +142,11 @@ impl StageSpec for TrainDiscord {
     const OUTPUT: Output = Output { name: "decoder", kind: ArtifactKind::FlowDecoder };
 
     fn refs(&mut self) -> Vec<Ref<'_>> {
+        let of_tokens = self.vae.is_empty();
         vec![
             Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
-            Ref::stage("tokenizer", &mut self.tokenizer, ArtifactKind::Tokenizer),
+            Ref::stage("tokenizer", &mut self.tokenizer, ArtifactKind::Tokenizer).only_if(of_tokens),
+            Ref::stage("vae", &mut self.vae, ArtifactKind::Vae).optional(),
         ]
     }
 
@@ -178,7 +185,11 @@ impl StageSpec for TrainDiscord {
     }
 
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
-        stages.same_skeleton(p, ("tokenizer", &self.tokenizer), &self.dataset);
+        let decoded = match self.vae.is_empty() {
+            true => ("tokenizer", &self.tokenizer[..]),
+            false => ("vae", &self.vae[..]),
+        };
+        stages.same_skeleton(p, decoded, &self.dataset);
     }
 
     fn training(&mut self) -> Option<&mut Training> {
