@@ -59,7 +59,7 @@ enum Verb {
     /// Takes a paused, failed or cancelled run up again
     Resume(ResumeArgs),
     /// Makes a motion from a sentence
-    Generate(generate::GenerateArgs),
+    Generate(Box<generate::GenerateArgs>),
     /// Measures how long models take for a sentence (AITS), side by side
     Time(time::TimeArgs),
     /// Lists what this build and machine can compute on
@@ -242,7 +242,7 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Cancel(args) => remote::control(args, "cancel").await,
         Verb::Pause(args) => remote::control(args, "pause").await,
         Verb::Resume(args) => resume(args).await,
-        Verb::Generate(args) => generate::generate(args).await,
+        Verb::Generate(args) => generate::generate(*args).await,
         Verb::Time(args) => time::time(args).await,
         Verb::Devices(args) => Ok(config::devices(&args)),
         Verb::Config(verb) => config::config(&verb),

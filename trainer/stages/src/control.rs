@@ -184,9 +184,9 @@ impl NormalisedHints {
         let (mut values, mut given) = (vec![0.0; hints.len() * width], vec![false; hints.len() * width]);
         for (b, hint) in hints.iter().enumerate() {
             for (t, j, position) in hint.iter() {
-                for axis in 0..AXES {
+                for (axis, value) in position.iter().enumerate() {
                     let (at, of) = (b * width + (t * joints + j) * AXES + axis, j * AXES + axis);
-                    values[at] = (position[axis] - mean[of]) / std[of];
+                    values[at] = (value - mean[of]) / std[of];
                     given[at] = true;
                 }
             }

@@ -18,6 +18,9 @@ use stages::testing::{Bench, Script};
 
 const STEPS: u64 = 9;
 
+/// A stage: its name, its settings, and which stage gives each of its inputs.
+type Described<'a> = (&'a str, StageSettings, &'a [(&'a str, &'a str)]);
+
 fn training(steps: u64) -> Training {
     Training {
         steps: Steps(steps),
@@ -52,7 +55,7 @@ fn world(latent: LatentShape) -> (Bench, BTreeMap<&'static str, Digest>) {
     };
     let teacher: &[(&str, &str)] = &[("teacher", "mld"), ("latents", "latents"), ("text", "text")];
     let pcm = DistillPcm { phases: 2, distillation: distillation(), ..DistillPcm::default() };
-    let stages: [(&str, StageSettings, &[(&str, &str)]); 8] = [
+    let stages: [Described<'_>; 8] = [
         ("dataset", DataSynthetic { clips: 40, val: 0.1, test: 0.2, mirror: false }.into(), &[]),
         ("text", TextEmbed::default().into(), &[("dataset", "dataset")]),
         ("evaluator", evaluator.into(), &[("dataset", "dataset")]),

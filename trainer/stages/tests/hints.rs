@@ -31,7 +31,9 @@ fn array(file: &SafeTensors<'_>, name: &str) -> Option<(Vec<usize>, Vec<f64>)> {
     let data = view.data();
     let values = match view.dtype() {
         Dtype::F32 => data.chunks_exact(4).map(|b| f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]]))).collect(),
-        Dtype::I64 => data.chunks_exact(8).map(|b| i64::from_le_bytes(b.try_into().unwrap()) as f64).collect(),
+        Dtype::I64 => {
+            data.chunks_exact(8).map(|b| i64::from_le_bytes(b.try_into().expect("eight bytes")) as f64).collect()
+        }
         Dtype::BOOL | Dtype::U8 => data.iter().map(|b| f64::from(*b)).collect(),
         other => panic!("`{name}` has the type {other:?}"),
     };

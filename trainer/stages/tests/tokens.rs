@@ -1,5 +1,6 @@
 //! Tokenizers and what draws their tokens: end to end at toy sizes, and with members that come, go and are killed.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
+#![allow(clippy::single_range_in_vec_init, reason = "one span that is kept")]
 
 mod common;
 

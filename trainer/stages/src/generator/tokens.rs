@@ -123,7 +123,7 @@ enum Network {
     Autoregressive(Box<Gpt>),
     Masked(Box<MaskedTransformer>, Option<Box<ResidualTransformer>>),
     /// With the tokenizer's codes [K, d].
-    Mmm(Box<Mmm>, Tensor<2>),
+    Mmm(Box<Mmm>, Box<Tensor<2>>),
 }
 
 /// Ids `[tokens, Q]` of a motion, of which those that are `kept` stay.
@@ -220,7 +220,7 @@ fn network(
         Family::Mmm => {
             let fresh = Mmm::new(&meta.mmm(tokenizer.meta().code_dim), &mut init);
             let network = weights::load(fresh, blobs, manifest, what)?;
-            Ok(Network::Mmm(Box::new(network), codebook(tokenizer, device)))
+            Ok(Network::Mmm(Box::new(network), Box::new(codebook(tokenizer, device))))
         }
         _ => Err(StageError::Input("the token generator's manifest says that it draws no tokens".into())),
     }
