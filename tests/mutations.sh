@@ -13,9 +13,9 @@ log=$copy/mutation.log
 wanted=("$@")
 missed=0
 
-# mutation NAME FILE PERL CRATES: PERL changes FILE, and a test of CRATES must fail.
+# mutation NAME FILE PERL CRATES: PERL changes FILE, and a test of one of CRATES must fail; the first that has one ends the search.
 mutation() {
-    local name=$1 file=$2 change=$3 crates=$4 options=() crate
+    local name=$1 file=$2 change=$3 crates=$4 crate
     if [ ${#wanted[@]} -gt 0 ] && [[ ! " ${wanted[*]} " == *" $name "* ]]; then return; fi
     perl -0pi -e "$change" "$file"
     if git diff --quiet; then
@@ -23,17 +23,20 @@ mutation() {
         missed=1
         return
     fi
-    for crate in $crates; do options+=(-p "$crate"); done
-    if cargo test --quiet --locked --no-fail-fast "${options[@]}" --lib --tests >"$log" 2>&1; then
-        echo "$name: NO TEST FAILS"
-        missed=1
-    elif ! grep -q '^test result: FAILED' "$log"; then
-        echo "$name: does not compile"
-        tail -20 "$log"
-        missed=1
-    else
-        echo "$name: $(grep -E '^    [a-z_:0-9]+$' "$log" | sort -u | tr -s ' \n' ' ')"
-    fi
+    for crate in $crates; do
+        if cargo test --quiet --locked --no-fail-fast -p "$crate" --lib --tests >"$log" 2>&1; then continue; fi
+        if grep -q '^test result: FAILED' "$log"; then
+            echo "$name: $(grep -E '^    [a-z_:0-9]+$' "$log" | sort -u | tr -s ' \n' ' ')"
+        else
+            echo "$name: does not compile"
+            tail -20 "$log"
+            missed=1
+        fi
+        git checkout --quiet -- .
+        return
+    done
+    echo "$name: NO TEST FAILS"
+    missed=1
     git checkout --quiet -- .
 }
 
