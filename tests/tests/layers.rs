@@ -72,6 +72,7 @@ fn dependencies_point_one_way() {
     never("registry", &["burn", "coordinator", "stages", "models", "worker"]);
     never("coordinator", &["burn", "stages", "models", "worker"]);
     never("motion", &["burn", "tokio", "sqlx", "axum", "registry", "checkpoint"]);
+    never("mocap", &["burn", "tokio", "sqlx", "axum", "registry", "checkpoint"]);
     never("models", &["tokio", "sqlx", "axum", "reqwest", "registry", "checkpoint", "stages"]);
     never("stages", &["sqlx", "axum", "reqwest", "registry", "coordinator", "worker"]);
     never("worker", &["sqlx", "coordinator", "registry"]);

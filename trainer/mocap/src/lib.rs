@@ -1,0 +1,1 @@
+//! Motion of other programs: recordings in, animations out. No tensors, no stages.
