@@ -1,0 +1,219 @@
+//! BVH: a skeleton as nested joints, and a row of channel values for each frame.
+//!
+//! The format has no standard; what is read here is what the common programs write. The file is UTF-8 text of two parts.
+//!
+//! ```text
+//! HIERARCHY
+//! ROOT name { OFFSET x y z  CHANNELS n channel...  JOINT name { ... }  End Site { OFFSET x y z } }
+//! MOTION
+//! Frames: T
+//! Frame Time: seconds
+//! (T lines with a number for each channel, joints in the order of the file)
+//! ```
+//!
+//! Blanks, tabs, blank lines and line ends (LF, CRLF) separate words, and braces need none around them. A name is the rest of
+//! its line up to a brace, so it may contain blanks. Words of the grammar are read in any case.
+//!
+//! Meaning, in column vectors and degrees: a joint's rotation is the product of its rotation channels in their order, so that `Zrotation Xrotation
+//! Yrotation` is Rz Rx Ry. A position channel replaces that component of `OFFSET`, for any joint, and is in the parent's frame wherever it stands in
+//! the list. The file says nothing of unit and axes.
+//!
+//! What is refused is said with file and line. Limits, all checked before memory is taken: [`MAX_BYTES`], [`MAX_NODES`], [`MAX_DEPTH`], [`MAX_VALUES`]. A number of frames in a
+//! file is a claim; rows are stored as they are read.
+
+mod parse;
+mod write;
+
+pub use write::{ROTATIONS, angles};
+
+use std::path::{Path, PathBuf};
+
+use motion::files;
+use motion::quaternion::{self as quat, Quat, Vec3};
+
+/// Bytes of a file that is read.
+pub const MAX_BYTES: u64 = 256 << 20;
+/// Joints and end sites of a file.
+pub const MAX_NODES: usize = 4_096;
+/// Joints inside one another.
+pub const MAX_DEPTH: usize = 512;
+/// Frames times channels, and frames times nodes.
+pub const MAX_VALUES: usize = 32 << 20;
+
+/// Why a file is not read.
+#[derive(Debug, thiserror::Error)]
+pub enum BvhError {
+    /// The file system refused.
+    #[error("{}: {source}", file.display())]
+    Io {
+        file: PathBuf,
+        /// What it said.
+        source: std::io::Error,
+    },
+    /// The text is no BVH, or beyond a limit.
+    #[error("{}:{line}: {what}", file.display())]
+    Text {
+        file: PathBuf,
+        /// From 1.
+        line: usize,
+        /// What was found, and what was expected.
+        what: String,
+    },
+}
+
+/// One of a joint's degrees of freedom.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Channel {
+    /// The offset along axis 0, 1 or 2, in place of the rest offset's component.
+    Position(usize),
+    /// A rotation about axis 0, 1 or 2, in degrees.
+    Rotation(usize),
+}
+
+impl Channel {
+    /// All six, by the name that files use.
+    pub const NAMES: [(&'static str, Channel); 6] = [
+        ("Xposition", Channel::Position(0)),
+        ("Yposition", Channel::Position(1)),
+        ("Zposition", Channel::Position(2)),
+        ("Xrotation", Channel::Rotation(0)),
+        ("Yrotation", Channel::Rotation(1)),
+        ("Zrotation", Channel::Rotation(2)),
+    ];
+
+    /// As in a file.
+    pub fn name(self) -> &'static str {
+        Self::NAMES.iter().find(|(_, channel)| *channel == self).map_or("", |(name, _)| name)
+    }
+}
+
+/// A joint, or the end of one.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Node {
+    /// Of an end site: its joint's name and `_end`.
+    pub name: String,
+    /// Index of the parent, which is smaller than the node's own; `None` for the root.
+    pub parent: Option<usize>,
+    /// From the parent, in the parent's frame, when no position channel says otherwise.
+    pub offset: Vec3,
+    /// In the order of a row. An end site has none.
+    pub channels: Vec<Channel>,
+    /// Whether it is an `End Site`.
+    pub end: bool,
+}
+
+/// A file.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Bvh {
+    /// In the order of the file: parents before children.
+    pub nodes: Vec<Node>,
+    /// Seconds between frames, as written.
+    pub frame_time: f64,
+    /// Frames per second: a usual rate whose frame time rounds to the written digits, else `1 / frame_time`.
+    pub rate: f64,
+    /// T.
+    pub frames: usize,
+    /// `[T, channels]`, channels of all nodes in order.
+    pub values: Vec<f64>,
+}
+
+impl Bvh {
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// With file and line.
+    pub fn read(file: &Path) -> Result<Self, BvhError> {
+        let bytes = files::read(file, MAX_BYTES).map_err(|source| BvhError::Io { file: file.into(), source })?;
+        Self::parse(file, &bytes)
+    }
+
+    /// Numbers in a row.
+    pub fn channels(&self) -> usize {
+        self.nodes.iter().map(|node| node.channels.len()).sum()
+    }
+
+    /// Offset and rotation of each node relative to its parent in a frame, `[nodes]`.
+    pub fn pose(&self, frame: usize) -> Vec<(Vec3, Quat)> {
+        let channels = self.channels();
+        let mut row = self.values[frame * channels..(frame + 1) * channels].iter();
+        let mut pose = Vec::with_capacity(self.nodes.len());
+        for node in &self.nodes {
+            let (mut offset, mut rotation) = (node.offset, quat::IDENTITY);
+            for (channel, value) in node.channels.iter().zip(row.by_ref()) {
+                match channel {
+                    Channel::Position(axis) => offset[*axis] = *value,
+                    Channel::Rotation(axis) => {
+                        rotation = quat::mul(rotation, quat::about(unit_axis(*axis), value.to_radians()))
+                    }
+                }
+            }
+            pose.push((offset, rotation));
+        }
+        pose
+    }
+
+    /// Where every node is in every frame, `[T, nodes, 3]`, in the file's unit and axes.
+    pub fn positions(&self) -> Vec<f64> {
+        let mut positions = Vec::with_capacity(self.frames * self.nodes.len() * 3);
+        let mut global: Vec<(Vec3, Quat)> = Vec::with_capacity(self.nodes.len());
+        for frame in 0..self.frames {
+            global.clear();
+            for (node, (offset, rotation)) in self.nodes.iter().zip(self.pose(frame)) {
+                let placed = match node.parent.map(|parent| global[parent]) {
+                    None => (offset, rotation),
+                    Some((at, turned)) => (quat::add(at, quat::rotate(turned, offset)), quat::mul(turned, rotation)),
+                };
+                positions.extend(placed.0);
+                global.push(placed);
+            }
+        }
+        positions
+    }
+}
+
+fn unit_axis(axis: usize) -> Vec3 {
+    [0, 1, 2].map(|k| if k == axis { 1.0 } else { 0.0 })
+}
+
+/// Frame rates that recordings have. A frame time is printed with few digits, so the rate is the usual one that rounds to it.
+const USUAL_RATES: [f64; 32] = [
+    5.0,
+    6.0,
+    8.0,
+    10.0,
+    12.0,
+    12.5,
+    15.0,
+    20.0,
+    24_000.0 / 1001.0,
+    24.0,
+    25.0,
+    30_000.0 / 1001.0,
+    30.0,
+    40.0,
+    48.0,
+    50.0,
+    60_000.0 / 1001.0,
+    60.0,
+    72.0,
+    75.0,
+    80.0,
+    90.0,
+    100.0,
+    120.0,
+    144.0,
+    150.0,
+    180.0,
+    200.0,
+    240.0,
+    300.0,
+    480.0,
+    500.0,
+];
+
+/// The rate of a frame time whose last written digit stands for `digit` seconds.
+fn nominal_rate(frame_time: f64, digit: f64) -> f64 {
+    let apart = |rate: &f64| (1.0 / rate - frame_time).abs();
+    let nearest = USUAL_RATES.into_iter().min_by(|a, b| apart(a).total_cmp(&apart(b)));
+    nearest.filter(|rate| apart(rate) <= 0.5001 * digit).unwrap_or(1.0 / frame_time)
+}
