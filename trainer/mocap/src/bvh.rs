@@ -16,7 +16,7 @@
 //!
 //! Meaning, in column vectors and degrees: a joint's rotation is the product of its rotation channels in their order, so that `Zrotation Xrotation
 //! Yrotation` is Rz Rx Ry. A position channel replaces that component of `OFFSET`, for any joint, and is in the parent's frame wherever it stands in
-//! the list. The file says nothing of unit and axes.
+//! the list. The file says nothing of unit and axes; see [`crate::detect`].
 //!
 //! What is refused is said with file and line. Limits, all checked before memory is taken: [`MAX_BYTES`], [`MAX_NODES`], [`MAX_DEPTH`], [`MAX_VALUES`]. A number of frames in a
 //! file is a claim; rows are stored as they are read.

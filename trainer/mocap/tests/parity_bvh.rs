@@ -5,6 +5,8 @@ mod shared;
 use std::path::{Path, PathBuf};
 
 use mocap::bvh::Bvh;
+use mocap::joint_map::{JointMap, Source};
+use mocap::take::{self, Reading, Take, resample};
 use motion::Skeleton;
 use protocol::stage::DataFormat;
 use serde_json::Value;
@@ -122,4 +124,69 @@ fn our_files_give_the_joints_back() {
     }
     println!("rotations {worst_rig:.1e} m, through a file {worst_file:.1e} m");
     assert!(worst_rig <= 1e-3 && worst_file <= 1e-3);
+}
+
+/// The joints of a file at 20 fps, f64.
+fn joints22(bvh: &Bvh, map: Option<JointMap>) -> Vec<f64> {
+    let take = Take::of_bvh(bvh, &Reading { map, ..Reading::default() }).unwrap();
+    resample(&take.joints, 66, take.rate, 20.0)
+}
+
+#[test]
+fn five_spellings_end_in_the_same_joints() {
+    for folder in folders() {
+        let (config, expected) = (json(&folder.join("config.json")), json(&folder.join("expected.json")));
+        let motion = load(&folder.join("joints22_20fps.npy")).data;
+        for name in names(&config["same_motion"]) {
+            let bvh = read(&folder.join(&name));
+            let case = &expected[&name];
+            let how = take::read(&bvh, &Reading::default()).unwrap();
+            println!("{name}: {how}");
+            assert!(how.shipped.is_some());
+            let same = (how.metres_per_unit - case["metres_per_unit"].as_f64().unwrap()).abs() < 1e-12;
+            assert!(same && how.detected.unit == case["unit"], "{how}");
+            assert_eq!(how.up.to_string(), case["up"].as_str().unwrap());
+            for (joint, node) in case["joint_map"].as_object().unwrap() {
+                match (node.as_str(), &how.map.joints[joint]) {
+                    (Some(node), source) => assert_eq!(*source, Source::Node(node.into()), "{name}: {joint}"),
+                    (None, source) => assert!(!matches!(source, Source::Node(_)), "{name}: {joint}"),
+                }
+            }
+            let own = load(&folder.join(name.replace(".bvh", "_joints22_20fps.npy"))).data;
+            let found = joints22(&bvh, None);
+            let error = worst(found.iter().copied(), &own);
+            let interpolated = case["max_abs_difference_to_joints22_20fps"].as_f64().unwrap();
+            let off = worst(found, &motion);
+            println!("  {error:.1e} m from the file's joints, {off:.1e} m from the motion ({interpolated:.1e} is due)");
+            assert!(error <= 1e-4, "{name}: {error:.1e} m");
+            assert!(off <= interpolated + 1e-4, "{name}: {off:.1e} m");
+        }
+    }
+}
+
+/// The same files under names that say nothing.
+#[test]
+fn a_skeleton_without_known_names_is_mapped_by_its_shape() {
+    for folder in folders() {
+        let config = json(&folder.join("config.json"));
+        for name in names(&config["same_motion"]) {
+            let mut bvh = read(&folder.join(&name));
+            let expected = joints22(&bvh, None);
+            for (i, node) in bvh.nodes.iter_mut().enumerate() {
+                node.name = format!("n{i}");
+            }
+            let proposal = JointMap::propose(&bvh).unwrap_or_else(|e| panic!("{name}: {e}"));
+            assert_eq!(proposal.shipped, None, "{name}");
+            let map = JointMap::parse(Path::new("proposed.yaml"), &proposal.map.to_yaml()).unwrap();
+            let found = joints22(&bvh, Some(map));
+            let expected: Vec<f32> = expected.iter().map(|v| *v as f32).collect();
+            // Spines of two joints have no third one to find; all else is exact.
+            let off = worst(found, &expected);
+            println!("{name}: {off:.1e} m");
+            assert!(off < 0.1, "{name}: {off} m, {}", proposal.map.to_yaml());
+        }
+        let mut chain = read(&folder.join("odd.bvh"));
+        chain.nodes.iter_mut().enumerate().for_each(|(i, node)| node.name = format!("n{i}"));
+        println!("{}", JointMap::propose(&chain).unwrap_err());
+    }
 }

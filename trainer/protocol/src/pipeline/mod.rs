@@ -26,6 +26,7 @@ pub use diagnostic::{Diagnostic, Diagnostics};
 pub use read::read;
 pub use reference::{json_schema, markdown};
 pub use rules::broken_rules;
+pub use yaml::yaml_as_json;
 
 #[cfg(test)]
 mod range_tests;

@@ -210,6 +210,17 @@ pub(super) fn parse(text: &str, source: usize, budget: &mut Budget) -> Result<No
     }
 }
 
+/// A YAML text of somebody's as JSON, for small files other than pipelines: one document, unique keys, within a pipeline's [`limits`].
+///
+/// # Errors
+/// Each mistake as `line:column: what`.
+pub fn yaml_as_json(text: &str) -> Result<Value, Vec<String>> {
+    let shown = |at: Position, what: &str| format!("{}:{}: {what}", at.line, at.column);
+    let node = parse(text, 0, &mut Budget::default())
+        .map_err(|errors| errors.iter().map(|e| shown(e.at, &e.message)).collect::<Vec<_>>())?;
+    node.to_json().ok_or_else(|| vec![shown(node.at, "a number in the text is not finite")])
+}
+
 enum Stop {
     Scan(ScanError),
     /// A limit was passed; the mistake is recorded.

@@ -1,0 +1,142 @@
+//! A recording as the 22 joints of HumanML3D, in metres, y up.
+
+use motion::quaternion::Vec3;
+
+use crate::bvh::Bvh;
+use crate::detect::{Detected, Up, detect};
+use crate::joint_map::{JointMap, MapError};
+
+/// Frames that unit and axis are detected from.
+const LOOKED_AT: usize = 200;
+
+/// What a user says of files; what is `None` is found out.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Reading {
+    pub map: Option<JointMap>,
+    pub metres_per_unit: Option<f64>,
+    pub up: Option<Up>,
+}
+
+/// A recording.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Take {
+    /// `[T, J, 3]`, metres, y up, the left at +x of whom faces +z.
+    pub joints: Vec<f64>,
+    /// Frames per second.
+    pub rate: f64,
+    /// How the file was read, for people.
+    pub said: String,
+}
+
+/// How a file was read.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Read {
+    pub map: JointMap,
+    /// The shipped map that was proposed; `None` for a user's or one by shape.
+    pub shipped: Option<&'static str>,
+    /// What was found out, whether used or not.
+    pub detected: Detected,
+    pub metres_per_unit: f64,
+    pub up: Up,
+}
+
+/// Finds out how to read a file, or takes a user's word for it.
+///
+/// # Errors
+/// No map fits.
+pub fn read(bvh: &Bvh, reading: &Reading) -> Result<Read, MapError> {
+    let (map, shipped) = match &reading.map {
+        Some(map) => (map.clone(), None),
+        None => {
+            let proposal = JointMap::propose(bvh)?;
+            (proposal.map, proposal.shipped)
+        }
+    };
+    let places = map.resolve(bvh)?;
+    let positions = bvh.positions();
+    let step = bvh.frames.div_ceil(LOOKED_AT);
+    let frames: Vec<Vec<Vec3>> =
+        positions.chunks_exact(3 * bvh.nodes.len()).step_by(step).map(|frame| places.joints(frame, 1.0)).collect();
+    let detected = detect(frames.iter().map(Vec::as_slice));
+    let metres_per_unit = reading.metres_per_unit.unwrap_or(detected.metres_per_unit);
+    let up = reading.up.unwrap_or(detected.up);
+    Ok(Read { map, shipped, detected, metres_per_unit, up })
+}
+
+impl Take {
+    /// The joints of a file at its own rate.
+    ///
+    /// # Errors
+    /// No map fits, or the given one does not.
+    pub fn of_bvh(bvh: &Bvh, reading: &Reading) -> Result<Self, MapError> {
+        let how = read(bvh, reading)?;
+        let places = how.map.resolve(bvh)?;
+        let mut joints = Vec::with_capacity(bvh.frames * 66);
+        for frame in bvh.positions().chunks_exact(3 * bvh.nodes.len()) {
+            let placed = places.joints(frame, how.metres_per_unit);
+            joints.extend(placed.into_iter().flat_map(|v| how.up.to_y(v)).map(|v| v * how.metres_per_unit));
+        }
+        Ok(Self { joints, rate: bvh.rate, said: how.to_string() })
+    }
+}
+
+impl std::fmt::Display for Read {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Detected { unit, metres_per_unit, leg, up, sure_of_up } = &self.detected;
+        let how = match self.shipped {
+            Some(_) => "fits the names",
+            None if self.map.name == "by shape" => "proposed from the skeleton's shape; look at it",
+            None => "given",
+        };
+        write!(f, "joint map `{}` ({how}), ", self.map.name)?;
+        if self.metres_per_unit == *metres_per_unit {
+            write!(f, "unit {unit} (legs of {:.2} m), ", leg * metres_per_unit)?;
+        } else {
+            let legs = leg * self.metres_per_unit;
+            write!(f, "unit {} m as told (legs of {legs:.2} m; {unit} would be likelier), ", self.metres_per_unit)?;
+        }
+        let guess = if *sure_of_up || self.up != *up { "" } else { " (a guess: the figure does not stand)" };
+        let told = if self.up == *up { "" } else { " as told" };
+        write!(f, "{} up{told}{guess}", self.up)
+    }
+}
+
+/// Frames `[T, width]` at another rate: frame k is what was at k / `to` seconds, in between by the line through its neighbours. Nothing is made up behind the last frame.
+pub fn resample(joints: &[f64], width: usize, from: f64, to: f64) -> Vec<f64> {
+    let frames: Vec<&[f64]> = joints.chunks_exact(width).collect();
+    let Some(last) = frames.len().checked_sub(1) else { return vec![] };
+    // A rate that divides the other one must hit its frames in spite of rounding.
+    let count = (last as f64 * to / from + 1e-6).floor() as usize + 1;
+    let mut out = Vec::with_capacity(count * width);
+    for k in 0..count {
+        let time = k as f64 * from / to;
+        let first = ((time + 1e-6).floor() as usize).min(last);
+        let part = (time - first as f64).max(0.0);
+        let next = frames[(first + 1).min(last)];
+        if part < 1e-6 {
+            out.extend_from_slice(frames[first]);
+        } else {
+            out.extend(frames[first].iter().zip(next).map(|(a, b)| a + part * (b - a)));
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::resample;
+
+    #[test]
+    fn frames_are_hit_or_interpolated_and_none_is_made_up() {
+        let track: Vec<f64> = (0..61).map(f64::from).collect();
+        let expected = |step: f64, n: usize| -> Vec<f64> { (0..n).map(|k| k as f64 * step).collect() };
+        assert_eq!(resample(&track, 1, 60.0, 20.0), expected(3.0, 21));
+        assert_eq!(resample(&track, 1, 20.0, 20.0), track);
+        let close = |a: Vec<f64>, b: Vec<f64>| a.len() == b.len() && a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-9);
+        assert!(close(resample(&track, 1, 30.0, 20.0), expected(1.5, 41)));
+        assert!(close(resample(&track, 1, 30.0, 12.5), expected(2.4, 26)));
+        assert!(close(resample(&track, 1, 20.0, 30.0), expected(2.0 / 3.0, 91)));
+        assert_eq!(resample(&[1.0, 2.0], 2, 30.0, 20.0), [1.0, 2.0]);
+        assert!(resample(&[], 1, 30.0, 20.0).is_empty());
+    }
+}
