@@ -73,6 +73,7 @@ fn dependencies_point_one_way() {
     never("coordinator", &["burn", "stages", "models", "worker"]);
     never("motion", &["burn", "tokio", "sqlx", "axum", "registry", "checkpoint"]);
     never("mocap", &["burn", "tokio", "sqlx", "axum", "registry", "checkpoint"]);
+    never("text-models", &["burn", "tokio", "sqlx", "axum", "reqwest", "hf-hub", "onig", "registry", "checkpoint"]);
     never("models", &["tokio", "sqlx", "axum", "reqwest", "registry", "checkpoint", "stages"]);
     never("stages", &["sqlx", "axum", "reqwest", "registry", "coordinator", "worker"]);
     never("worker", &["sqlx", "coordinator", "registry"]);

@@ -1,0 +1,391 @@
+//! A folder with a published encoder, in the layout of Hugging Face or of sentence-transformers.
+//!
+//! Read are `config.json`; `tokenizer.json`, or for CLIP `vocab.json` and `merges.txt`; `tokenizer_config.json` and `special_tokens_map.json` for
+//! lengths and special tokens; the weights. Of sentence-transformers also `modules.json`, which says where the parts are, and of Sentence-T5
+//! `sentence_bert_config.json`, the pooling and the dense layer. What else is there, such as CLIP's vision tower, is passed over.
+
+use std::collections::BTreeMap;
+use std::path::{Component, Path, PathBuf};
+
+use motion::files;
+use protocol::Digest;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use crate::error::EncoderError;
+use crate::network::{Network, POSITIONS, TensorSpec};
+use crate::rules::Rules;
+use crate::tokenizer::{TOKENIZER_BYTES, Tokenizer, clip_from_parts};
+use crate::weights::{StoredTensor, Weights, packed};
+
+/// Bytes of a configuration.
+const CONFIG_BYTES: u64 = 4 << 20;
+/// Tokens of a T5 caption where nothing says otherwise: what it was trained with.
+const T5_TOKENS: usize = 512;
+/// Stands before the names of the dense layer's weights.
+const DENSE: &str = "dense.";
+
+/// Which encoder is in a folder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// CLIP's text tower.
+    Clip,
+    /// T5's encoder.
+    T5,
+    /// The same with mean pooling, a dense layer and a norm.
+    SentenceT5,
+}
+
+/// How captions become CLIP's ids.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TokenIds {
+    /// As the folder's tokenizer says; padded with what it pads with.
+    HuggingFace,
+    /// As OpenAI's package has it: repaired first, padded with zeros.
+    OpenAi,
+}
+
+/// What is asked of a folder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Request {
+    /// Which encoder.
+    pub kind: Kind,
+    /// How captions become ids; only of CLIP.
+    pub ids: TokenIds,
+    /// Ids of a caption at most; 0 takes what the folder says.
+    pub most: usize,
+}
+
+/// What comes behind the network of a sentence encoder, after the mean over a caption's tokens.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Head {
+    /// Width of the caption's vector.
+    pub width: usize,
+    /// Whether there is a dense layer.
+    pub dense: bool,
+    /// Whether it has a bias.
+    pub bias: bool,
+    /// Whether the vector is divided by its length.
+    pub normalise: bool,
+}
+
+impl Head {
+    /// The tensors of the dense layer behind states of `width`.
+    pub fn tensors(&self, width: usize) -> Vec<TensorSpec> {
+        let spec = |name: &str, shape: &[usize]| TensorSpec { name: name.into(), shape: shape.to_vec() };
+        let weight = self.dense.then(|| spec("linear.weight", &[self.width, width]));
+        let bias = (self.dense && self.bias).then(|| spec("linear.bias", &[self.width]));
+        weight.into_iter().chain(bias).collect()
+    }
+}
+
+/// All that is known of an encoder besides its tokenizer and its weights.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Description {
+    /// The network.
+    #[serde(flatten)]
+    pub network: Network,
+    /// What comes behind it; of a sentence encoder.
+    #[serde(default)]
+    pub head: Option<Head>,
+    /// How captions become ids.
+    pub rules: Rules,
+}
+
+/// An encoder in its folder.
+#[derive(Debug)]
+pub struct EncoderFolder {
+    path: PathBuf,
+    /// What it is.
+    pub description: Description,
+    /// Its tokenizer as a `tokenizer.json`.
+    pub tokenizer_json: Vec<u8>,
+    tensors: BTreeMap<String, StoredTensor>,
+    /// Names of tensors that are there and not of the encoder.
+    pub skipped: Vec<String>,
+}
+
+impl EncoderFolder {
+    /// Reads all but the weights' values.
+    ///
+    /// # Errors
+    /// Which file is missing or not what it should be, and what to do.
+    pub fn open(path: &Path, request: &Request) -> Result<Self, EncoderError> {
+        if !path.is_dir() {
+            let what = if path.exists() { "is no folder" } else { "no such folder" };
+            return Err(EncoderError::at(path, format!("{what}; expected one with a published text encoder")));
+        }
+        let modules = Modules::read(path)?;
+        let root = modules.as_ref().map_or_else(|| path.to_owned(), |modules| modules.first.clone());
+        let file = root.join("config.json");
+        let config = json(&file)?;
+        let network = match request.kind {
+            Kind::Clip => Network::clip(&config),
+            Kind::T5 | Kind::SentenceT5 => Network::t5(&config),
+        };
+        let network = network.map_err(|what| EncoderError::at(&file, what))?;
+        let (place, tokenizer_json) = tokenizer(&root, request.kind)?;
+        let rules = rules(&root, request, &network, (&place, &tokenizer_json))?;
+        Tokenizer::new(&place, &tokenizer_json, &rules, network.rows())?;
+
+        let mut weights = Weights::open(&root)?;
+        // One table under two names, of which a file may have either.
+        weights.alias("encoder.embed_tokens.weight", "shared.weight");
+        let mut tensors = weights.take(&root, &network.tensors(), "")?;
+        let mut skipped = weights.left();
+        let head = match request.kind {
+            Kind::Clip | Kind::T5 => None,
+            Kind::SentenceT5 => {
+                let modules = modules.ok_or_else(|| {
+                    let what = "no `modules.json`; expected the layout of sentence-transformers, or set `encoder: t5`";
+                    EncoderError::at(path, what)
+                })?;
+                let (head, dense, left) = modules.head(network.width())?;
+                tensors.extend(dense);
+                skipped.extend(left);
+                Some(head)
+            }
+        };
+        let description = Description { network, head, rules };
+        Ok(Self { path: path.to_owned(), description, tokenizer_json, tensors, skipped })
+    }
+
+    /// The tokenizer.
+    ///
+    /// # Errors
+    /// As [`Tokenizer::new`].
+    pub fn tokenizer(&self) -> Result<Tokenizer, EncoderError> {
+        let Description { network, rules, .. } = &self.description;
+        Tokenizer::new(&self.path.display().to_string(), &self.tokenizer_json, rules, network.rows())
+    }
+
+    /// The encoder's weights as the pieces of one safetensors file, in the type that they are stored in.
+    ///
+    /// # Errors
+    /// Which file cannot be read.
+    pub fn weights(&self) -> Result<Vec<Vec<u8>>, EncoderError> {
+        packed(&self.path, &self.tensors)
+    }
+
+    /// The digest of all that captions' vectors depend on, whose weights are `weights`.
+    pub fn digest(&self, weights: &[Vec<u8>]) -> Digest {
+        let parts = [&self.tokenizer_json].into_iter().chain(weights);
+        let parts: Vec<Digest> = parts.map(|part| Digest::of(part)).collect();
+        protocol::canonical::digest(&(&self.description, parts))
+    }
+
+    /// Where tensors are that were passed over, a line: the first part of their names, and how many there are.
+    pub fn skipped_line(&self) -> Option<String> {
+        let mut parts: BTreeMap<&str, usize> = BTreeMap::new();
+        for name in &self.skipped {
+            *parts.entry(name.split('.').next().unwrap_or(name)).or_default() += 1;
+        }
+        let parts: Vec<String> =
+            parts.iter().take(8).map(|(part, count)| format!("{}* ({count})", part.escape_debug())).collect();
+        (!parts.is_empty()).then(|| {
+            format!(
+                "{}: {} tensors are not of the text encoder: {}",
+                self.path.display(),
+                self.skipped.len(),
+                parts.join(", ")
+            )
+        })
+    }
+}
+
+fn json(file: &Path) -> Result<Value, EncoderError> {
+    let refuse = |what: String| EncoderError::at(file, what);
+    let bytes = files::read(file, CONFIG_BYTES).map_err(|e| refuse(e.to_string()))?;
+    serde_json::from_slice(&bytes).map_err(|e| refuse(format!("{e}; expected JSON")))
+}
+
+/// A file that may be missing.
+fn json_if_there(file: &Path) -> Result<Value, EncoderError> {
+    if file.symlink_metadata().is_ok() { json(file) } else { Ok(Value::Null) }
+}
+
+/// The bytes of a `tokenizer.json`, and which file to name in errors.
+fn tokenizer(root: &Path, kind: Kind) -> Result<(String, Vec<u8>), EncoderError> {
+    let read = |name: &str| {
+        let file = root.join(name);
+        files::read(&file, TOKENIZER_BYTES).map_err(|e| EncoderError::at(&file, e.to_string()))
+    };
+    let is_there = |name: &str| root.join(name).symlink_metadata().is_ok();
+    let shown = |name: &str| root.join(name).display().to_string();
+    if is_there("tokenizer.json") {
+        return Ok((shown("tokenizer.json"), read("tokenizer.json")?));
+    }
+    if kind == Kind::Clip && is_there("vocab.json") && is_there("merges.txt") {
+        let (vocab, merges) = (read("vocab.json")?, read("merges.txt")?);
+        let json = clip_from_parts((&shown("vocab.json"), &vocab), (&shown("merges.txt"), &merges))?;
+        return Ok((shown("vocab.json"), json));
+    }
+    let folder = root.display();
+    let make = format!(
+        "make one with `python -c \"from transformers import AutoTokenizer as A; A.from_pretrained('{folder}').save_pretrained('{folder}')\"`"
+    );
+    let what = match kind {
+        Kind::Clip => {
+            format!("no `tokenizer.json`, and no `vocab.json` with `merges.txt`; download one of them, or {make}")
+        }
+        _ if is_there("spiece.model") => format!("no `tokenizer.json`; a `spiece.model` alone is not read: {make}"),
+        _ => format!("no `tokenizer.json`; download it, or {make}"),
+    };
+    Err(EncoderError::at(root, what))
+}
+
+/// How captions become the ids that published models read.
+fn rules(root: &Path, request: &Request, network: &Network, tokenizer: (&str, &[u8])) -> Result<Rules, EncoderError> {
+    let config = json_if_there(&root.join("tokenizer_config.json"))?;
+    let special = json_if_there(&root.join("special_tokens_map.json"))?;
+    let word = |key: &str, fallback: &str| {
+        let found =
+            [&special[key], &config[key]].into_iter().find_map(|value| value["content"].as_str().or(value.as_str()));
+        found.unwrap_or(fallback).to_owned()
+    };
+    let id = |word: &str| Tokenizer::id(tokenizer.0, tokenizer.1, word);
+    // Files that know no limit say 1e30.
+    let own = |value: &Value| value.as_f64().filter(|most| (1.0..1e6).contains(most)).map(|most| most as usize);
+    let own_most = own(&config["model_max_length"]);
+    let most = |own: usize, highest: usize| match request.most {
+        0 => Ok(own.min(highest)),
+        asked if asked <= highest => Ok(asked),
+        asked => Err(EncoderError::at(root, format!("has {highest} positions, but {asked} tokens are asked for"))),
+    };
+    match network {
+        Network::Clip(sizes) => {
+            let end_word = word("eos_token", "<|endoftext|>");
+            let (first, end) = (id(&word("bos_token", "<|startoftext|>"))?, id(&end_word)?);
+            if ![2, end as usize].contains(&sizes.eos_token_id) {
+                let (said, is) = (sizes.eos_token_id, end_word.escape_debug());
+                let what = format!("`eos_token_id` is {said}; expected 2, or {end}, which is `{is}` of the tokenizer");
+                return Err(EncoderError::at(&root.join("config.json"), what));
+            }
+            let is_openai = request.ids == TokenIds::OpenAi;
+            let pad = if is_openai { 0 } else { id(&word("pad_token", &end_word))? };
+            let positions = sizes.max_position_embeddings;
+            let most = most(own_most.unwrap_or(positions), positions)?;
+            Ok(Rules { repair: is_openai, strip: false, lower: false, first: Some(first), end, pad, most })
+        }
+        Network::T5(sizes) => {
+            let file = root.join("sentence_bert_config.json");
+            let sentence = if request.kind == Kind::SentenceT5 { json_if_there(&file)? } else { Value::Null };
+            let own = own(&sentence["max_seq_length"]).or(own_most).unwrap_or(T5_TOKENS);
+            let lower = sentence["do_lower_case"].as_bool().unwrap_or(false);
+            let (end, pad) = (id(&word("eos_token", "</s>"))?, sizes.pad_token_id);
+            Ok(Rules { repair: false, strip: true, lower, first: None, end, pad, most: most(own, POSITIONS)? })
+        }
+    }
+}
+
+/// What `modules.json` lists.
+#[derive(Debug)]
+struct Modules {
+    file: PathBuf,
+    /// Where the network is.
+    first: PathBuf,
+    /// What comes behind it: class, folder.
+    others: Vec<(String, PathBuf)>,
+}
+
+impl Modules {
+    /// None if the folder has no `modules.json`.
+    fn read(path: &Path) -> Result<Option<Self>, EncoderError> {
+        #[derive(Deserialize)]
+        struct Module {
+            path: String,
+            #[serde(rename = "type")]
+            class: String,
+        }
+        let file = path.join("modules.json");
+        let value = json_if_there(&file)?;
+        if value.is_null() {
+            return Ok(None);
+        }
+        let refuse = |what: String| EncoderError::at(&file, what);
+        let listed: Vec<Module> = serde_json::from_value(value)
+            .map_err(|e| refuse(format!("{e}; expected a list of modules with `path` and `type`")))?;
+        let mut all = Vec::new();
+        for Module { path: below, class } in listed {
+            if !Path::new(&below).components().all(|part| matches!(part, Component::Normal(_))) {
+                return Err(refuse(format!("`{}` is not a folder below it", below.escape_debug())));
+            }
+            let class = class.rsplit('.').next().unwrap_or_default().to_owned();
+            all.push((class, path.join(below)));
+        }
+        if all.is_empty() || all.len() > 16 {
+            return Err(refuse(format!("lists {} modules; expected 1 to 16", all.len())));
+        }
+        let (_, first) = all.remove(0);
+        Ok(Some(Self { file, first, others: all }))
+    }
+
+    /// What comes behind states of `width`, its weights, and the names of what is not of them.
+    #[expect(clippy::type_complexity, reason = "three things of one reading")]
+    fn head(&self, width: usize) -> Result<(Head, BTreeMap<String, StoredTensor>, Vec<String>), EncoderError> {
+        let refuse = |what: String| EncoderError::at(&self.file, what);
+        let mut head = Head { width, dense: false, bias: false, normalise: false };
+        let (mut weights, mut left) = (BTreeMap::new(), Vec::new());
+        let classes: Vec<&str> = self.others.iter().map(|(class, _)| class.as_str()).collect();
+        let known =
+            [&["Pooling"][..], &["Pooling", "Normalize"], &["Pooling", "Dense"], &["Pooling", "Dense", "Normalize"]];
+        if !known.contains(&&classes[..]) {
+            let found = classes.join(", ");
+            return Err(refuse(format!(
+                "lists {} behind the network; expected Pooling, then maybe Dense, then maybe Normalize",
+                found.escape_debug()
+            )));
+        }
+        for (class, folder) in &self.others {
+            match class.as_str() {
+                "Pooling" => check_pooling(&folder.join("config.json"), width)?,
+                "Dense" => {
+                    let file = folder.join("config.json");
+                    let config = json(&file)?;
+                    (head.width, head.bias) = dense(&config, width).map_err(|what| EncoderError::at(&file, what))?;
+                    head.dense = true;
+                    let mut stored = Weights::open(folder)?;
+                    weights = stored.take(folder, &head.tensors(width), DENSE)?;
+                    left = stored.left();
+                }
+                _ => head.normalise = true,
+            }
+        }
+        Ok((head, weights, left))
+    }
+}
+
+/// Refuses pooling of another kind than the mean over tokens.
+fn check_pooling(file: &Path, width: usize) -> Result<(), EncoderError> {
+    let config = json(file)?;
+    let refuse = |what: String| EncoderError::at(file, what);
+    let modes = config.as_object().into_iter().flatten().filter(|(key, _)| key.starts_with("pooling_mode"));
+    let on: Vec<&str> = modes
+        .filter(|(_, value)| value.as_bool() == Some(true) || value.is_string())
+        .map(|(key, value)| value.as_str().unwrap_or(key))
+        .collect();
+    if on != ["pooling_mode_mean_tokens"] && on != ["mean"] {
+        let on = on.join(", ");
+        return Err(refuse(format!("pools by `{}`; expected the mean of the tokens", on.escape_debug())));
+    }
+    match config["word_embedding_dimension"].as_u64() {
+        Some(said) if said != width as u64 => Err(refuse(format!("pools {said} numbers, the network gives {width}"))),
+        _ => Ok(()),
+    }
+}
+
+/// Width and bias of the dense layer.
+fn dense(config: &Value, width: usize) -> Result<(usize, bool), String> {
+    let number =
+        |key: &str| config[key].as_u64().and_then(|n| usize::try_from(n).ok()).filter(|n| (1..=65_536).contains(n));
+    if number("in_features") != Some(width) {
+        return Err(format!("`in_features` is {}; expected {width}, the width of the network", config["in_features"]));
+    }
+    let out = number("out_features").ok_or("`out_features` is missing; expected 1 to 65536")?;
+    let activation = config["activation_function"].as_str().unwrap_or("Identity");
+    if !activation.ends_with("Identity") {
+        let found = activation.escape_debug();
+        return Err(format!("`activation_function` is `{found}`; expected `torch.nn.modules.linear.Identity`"));
+    }
+    Ok((out, config["bias"].as_bool().unwrap_or(true)))
+}

@@ -1,0 +1,243 @@
+//! Safetensors as bytes that are read tensor by tensor, in the type that they are stored in.
+
+use std::collections::BTreeMap;
+
+use safetensors::tensor::{Dtype, Metadata, TensorInfo};
+
+/// The largest header; that of a thousand tensors has a hundred kilobytes.
+const HEADER_BYTES: u64 = 16 << 20;
+
+/// What a number is stored as.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Element {
+    /// 32 bits.
+    F32,
+    /// 16 bits, IEEE.
+    F16,
+    /// The upper 16 bits of 32.
+    Bf16,
+}
+
+impl Element {
+    /// Bytes of a number.
+    pub fn bytes(self) -> usize {
+        match self {
+            Self::F32 => 4,
+            Self::F16 | Self::Bf16 => 2,
+        }
+    }
+
+    pub(crate) fn dtype(self) -> Dtype {
+        match self {
+            Self::F32 => Dtype::F32,
+            Self::F16 => Dtype::F16,
+            Self::Bf16 => Dtype::BF16,
+        }
+    }
+
+    fn of(dtype: Dtype) -> Option<Self> {
+        match dtype {
+            Dtype::F32 => Some(Self::F32),
+            Dtype::F16 => Some(Self::F16),
+            Dtype::BF16 => Some(Self::Bf16),
+            _ => None,
+        }
+    }
+}
+
+/// Little-endian numbers as f32.
+///
+/// # Panics
+/// If there are not as many as `out` has.
+pub fn widen(element: Element, bytes: &[u8], out: &mut [f32]) {
+    assert_eq!(bytes.len(), out.len() * element.bytes(), "bytes for as many numbers");
+    let halves = || bytes.as_chunks::<2>().0.iter().map(|b| u16::from_le_bytes(*b));
+    match element {
+        Element::F32 => {
+            out.iter_mut().zip(bytes.as_chunks::<4>().0).for_each(|(out, b)| *out = f32::from_le_bytes(*b));
+        }
+        Element::F16 => out.iter_mut().zip(halves()).for_each(|(out, half)| *out = from_half(half)),
+        Element::Bf16 => {
+            out.iter_mut().zip(halves()).for_each(|(out, half)| *out = f32::from_bits(u32::from(half) << 16));
+        }
+    }
+}
+
+/// IEEE's 16 bits as 32, exactly.
+fn from_half(bits: u16) -> f32 {
+    let sign = u32::from(bits >> 15) << 31;
+    let (exponent, fraction) = (u32::from(bits >> 10 & 0x1f), u32::from(bits & 0x3ff));
+    match exponent {
+        // Below the smallest normal one: a multiple of 2^-24.
+        0 => {
+            let size = fraction as f32 * f32::from_bits(103 << 23);
+            f32::from_bits(size.to_bits() | sign)
+        }
+        31 => f32::from_bits(sign | 0xff << 23 | fraction << 13),
+        _ => f32::from_bits(sign | (exponent + 112) << 23 | fraction << 13),
+    }
+}
+
+/// Bytes that are read where they are needed.
+pub trait ReadAt {
+    /// How many.
+    fn bytes(&self) -> u64;
+
+    /// Fills `out` with those at `offset`.
+    ///
+    /// # Errors
+    /// Why they cannot be had.
+    fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), String>;
+}
+
+impl ReadAt for [u8] {
+    fn bytes(&self) -> u64 {
+        self.len() as u64
+    }
+
+    fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), String> {
+        let start = usize::try_from(offset).ok();
+        let range = start.and_then(|start| Some(start..start.checked_add(out.len())?));
+        out.copy_from_slice(range.and_then(|range| self.get(range)).ok_or("it ends before that")?);
+        Ok(())
+    }
+}
+
+/// Where a tensor of a file is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TensorFile {
+    /// What its numbers are stored as; none if they are no floats of at most 32 bits.
+    pub element: Option<Element>,
+    /// Its shape.
+    pub shape: Vec<usize>,
+    /// Where it begins.
+    pub offset: u64,
+}
+
+/// A safetensors file whose header was read.
+#[derive(Debug)]
+pub struct WeightsFile<R> {
+    pub(crate) source: R,
+    /// By name.
+    pub tensors: BTreeMap<String, TensorFile>,
+}
+
+impl<R: ReadAt> WeightsFile<R> {
+    /// Reads the header and holds it against the length.
+    ///
+    /// # Errors
+    /// What is wrong with it, without the file's name.
+    pub fn open(source: R) -> Result<Self, String> {
+        let bytes = source.bytes();
+        let bad = |what: &str| format!("{what}; expected a safetensors file");
+        let mut length = [0; 8];
+        if bytes < 8 {
+            return Err(bad("is shorter than a header"));
+        }
+        source.read_at(0, &mut length)?;
+        let length = u64::from_le_bytes(length);
+        if length > HEADER_BYTES.min(bytes - 8) {
+            return Err(bad(&format!("says that its header has {length} bytes, of {bytes}")));
+        }
+        let mut json = vec![0; usize::try_from(length).unwrap_or_default()];
+        source.read_at(8, &mut json)?;
+        let header: Metadata = serde_json::from_slice(&json).map_err(|e| bad(&e.to_string()))?;
+        if header.data_len() as u64 != bytes - 8 - length {
+            let said = header.data_len();
+            return Err(bad(&format!("says that its tensors take {said} bytes, and has {}", bytes - 8 - length)));
+        }
+        let place = |info: &TensorInfo| TensorFile {
+            element: Element::of(info.dtype),
+            shape: info.shape.clone(),
+            offset: 8 + length + info.data_offsets.0 as u64,
+        };
+        let tensors = header.tensors().into_iter().map(|(name, info)| (name, place(info))).collect();
+        Ok(Self { source, tensors })
+    }
+
+    /// The numbers of the tensor `name`, as many as `out` has.
+    ///
+    /// # Errors
+    /// If there is no such tensor of floats of that size, or it cannot be read.
+    pub fn read(&self, name: &str, out: &mut [f32]) -> Result<(), String> {
+        let missing = || format!("no tensor `{name}` of {} numbers", out.len());
+        let tensor = self.tensors.get(name).ok_or_else(missing)?;
+        let element = tensor.element.ok_or_else(missing)?;
+        if tensor.shape.iter().product::<usize>() != out.len() {
+            return Err(missing());
+        }
+        let mut bytes = vec![0; out.len() * element.bytes()];
+        self.source.read_at(tensor.offset, &mut bytes)?;
+        widen(element, &bytes, out);
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+
+    #[test]
+    fn halves_are_widened_exactly() {
+        for (bits, value) in [
+            (0x0000_u16, 0.0_f32),
+            (0x8000, -0.0),
+            (0x3c00, 1.0),
+            (0xc000, -2.0),
+            (0x7bff, 65_504.0),
+            (0x0400, 2.0_f32.powi(-14)),
+            (0x0001, 2.0_f32.powi(-24)),
+            (0x83ff, -1023.0 * 2.0_f32.powi(-24)),
+            (0x7c00, f32::INFINITY),
+        ] {
+            assert_eq!(from_half(bits).to_bits(), value.to_bits(), "{bits:#x}");
+        }
+        assert!(from_half(0x7e01).is_nan());
+        let mut out = [0.0; 2];
+        widen(Element::Bf16, &[0x80, 0x3f, 0x49, 0xc0], &mut out);
+        assert_eq!(out, [1.0, -3.140_625]);
+    }
+
+    pub(crate) fn file(header: &str, data: &[u8]) -> Vec<u8> {
+        [&(header.len() as u64).to_le_bytes()[..], header.as_bytes(), data].concat()
+    }
+
+    #[test]
+    fn headers_are_held_against_the_file() {
+        let good = file(r#"{"a":{"dtype":"F16","shape":[2],"data_offsets":[0,4]}}"#, &[0, 0x3c, 0, 0xc0]);
+        let open = |bytes: &[u8]| WeightsFile::open(Bytes(bytes.to_vec()));
+        let mut out = [0.0; 2];
+        open(&good).unwrap().read("a", &mut out).unwrap();
+        assert_eq!(out, [1.0, -2.0]);
+        assert!(open(&good).unwrap().read("a", &mut [0.0; 3]).unwrap_err().contains("no tensor `a` of 3"));
+        let mut long = good.clone();
+        long[..8].copy_from_slice(&u64::MAX.to_le_bytes());
+        for (bytes, part) in [
+            (long, "its header has"),
+            (good[..6].to_vec(), "shorter than a header"),
+            (good[..good.len() - 1].to_vec(), "take 4 bytes, and has 3"),
+            (file(r#"{"a":{"dtype":"F32","shape":[9],"data_offsets":[0,4]}}"#, &[0; 4]), "expected a safetensors"),
+            (
+                file(r#"{"a":{"dtype":"F32","shape":[4611686018427387904,4],"data_offsets":[0,4]}}"#, &[0; 4]),
+                "expected a",
+            ),
+            (file("[", &[]), "expected a safetensors"),
+        ] {
+            let said = open(&bytes).unwrap_err();
+            assert!(said.contains(part), "{said}");
+        }
+    }
+
+    #[derive(Debug)]
+    pub(crate) struct Bytes(pub(crate) Vec<u8>);
+
+    impl ReadAt for Bytes {
+        fn bytes(&self) -> u64 {
+            self.0.len() as u64
+        }
+
+        fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), String> {
+            self.0[..].read_at(offset, out)
+        }
+    }
+}

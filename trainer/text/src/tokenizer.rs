@@ -1,0 +1,379 @@
+//! Captions as ids: the `tokenizers` crate under the [`Rules`] of a published model.
+//!
+//! The crate takes what a file says on trust, so a file is looked at first. Refused are: a network's table that is shorter than the vocabulary,
+//! dropout (ids would be drawn), and steps before the cutting that make much text of little. What the file says of truncation and padding is
+//! replaced by the rules. A panic of the crate is an error here.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+use protocol::limits;
+use serde::Deserialize;
+use serde_json::{Value, json};
+use tokenizers::{PostProcessor as _, TruncationParams};
+
+use crate::error::EncoderError;
+use crate::rules::Rules;
+
+/// Bytes of a tokenizer's file; that of the papers' encoders has at most two and a half million.
+pub(crate) const TOKENIZER_BYTES: u64 = 32 << 20;
+/// Steps that a file may take before a text is cut.
+const STEPS: usize = 16;
+/// Of those that put text in the place of other text, and the bytes that they put there.
+const REPLACEMENTS: (usize, usize) = (4, 8);
+/// Bytes that a character may become in a table of SentencePiece's.
+const MAPPED_BYTES: usize = 64;
+
+/// The parts of `tokenizer.json` that are looked at; vocabulary and merges are passed over.
+#[derive(Deserialize)]
+struct Looked {
+    #[serde(default)]
+    normalizer: Value,
+    model: LookedModel,
+}
+
+#[derive(Deserialize)]
+struct LookedModel {
+    #[serde(default)]
+    dropout: Option<f64>,
+}
+
+/// A tokenizer under a model's rules.
+#[derive(Debug)]
+pub struct Tokenizer {
+    inner: tokenizers::Tokenizer,
+    rules: Rules,
+    rows: usize,
+}
+
+impl Tokenizer {
+    /// Of the bytes of a `tokenizer.json`, for a token table of `rows` rows; `place` names the file in errors.
+    ///
+    /// # Errors
+    /// What is wrong with the file, or with the rules.
+    pub fn new(place: &str, json: &[u8], rules: &Rules, rows: usize) -> Result<Self, EncoderError> {
+        let refuse = |what: String| EncoderError::new(place, what);
+        let inner = parsed(place, json)?;
+        let known = inner.get_vocab(true);
+        if let Some((word, id)) = known.iter().filter(|(_, id)| **id as usize >= rows).min() {
+            let word = word.escape_debug();
+            return Err(refuse(format!(
+                "the token `{word}` has the id {id}, but the table of the weights has {rows} rows; take both from one model"
+            )));
+        }
+        if let Some(id) = [rules.end, rules.pad].into_iter().chain(rules.first).find(|id| *id as usize >= rows) {
+            return Err(refuse(format!("the id {id} is needed, but the table of the weights has {rows} rows")));
+        }
+        if rules.most <= rules.added() {
+            return Err(refuse(format!("{} tokens a caption leave no room for one; expected at least 3", rules.most)));
+        }
+        let added = inner.get_post_processor().map_or(0, |post| post.added_tokens(false));
+        if added != rules.added() {
+            return Err(refuse(format!(
+                "adds {added} tokens to a caption; expected {}, the end and what this model has before the first",
+                rules.added()
+            )));
+        }
+        let mut inner = inner;
+        inner.with_padding(None);
+        let cut = TruncationParams { max_length: rules.most, ..TruncationParams::default() };
+        inner.with_truncation(Some(cut)).map_err(|e| refuse(e.to_string()))?;
+        Ok(Self { inner, rules: rules.clone(), rows })
+    }
+
+    /// The id of a token in a `tokenizer.json`.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new), and if there is no such token.
+    pub(crate) fn id(place: &str, json: &[u8], token: &str) -> Result<u32, EncoderError> {
+        let tokenizer = parsed(place, json)?;
+        tokenizer.token_to_id(token).ok_or_else(|| {
+            EncoderError::new(place, format!("no token `{}`, which every caption needs", token.escape_debug()))
+        })
+    }
+
+    /// What it does besides cutting.
+    pub fn rules(&self) -> &Rules {
+        &self.rules
+    }
+
+    /// The ids of a caption, its end last, without padding: at least one.
+    ///
+    /// # Errors
+    /// If the caption is too long to be one, or the tokenizer breaks.
+    pub fn ids(&self, caption: &str) -> Result<Vec<u32>, EncoderError> {
+        let shown: String = caption.chars().take(40).collect();
+        let refuse = |what: String| EncoderError::new(format!("the caption `{}`", shown.escape_debug()), what);
+        if caption.len() > limits::CAPTION_BYTES {
+            let (found, most) = (caption.len(), limits::CAPTION_BYTES);
+            return Err(refuse(format!("has {found} bytes; expected at most {most}")));
+        }
+        let text = self.rules.prepared(caption);
+        let encoded = catch_unwind(AssertUnwindSafe(|| self.inner.encode_fast(text.as_str(), true)))
+            .map_err(|_| refuse("the tokenizer broke; its file is damaged".into()))?
+            .map_err(|e| refuse(format!("the tokenizer says: {e}")))?;
+        let ids = encoded.get_ids().to_vec();
+        let sound = ids.len() <= self.rules.most
+            && ids.iter().all(|id| (*id as usize) < self.rows)
+            && ids.last() == Some(&self.rules.end)
+            && self.rules.first.is_none_or(|first| ids.first() == Some(&first));
+        if !sound {
+            return Err(refuse(format!("became the ids {ids:?}, which are not those of a caption of this model")));
+        }
+        Ok(ids)
+    }
+
+    /// The ids of a caption, padded to `length`, and how many of them are its own.
+    ///
+    /// # Errors
+    /// As [`ids`](Self::ids).
+    pub fn padded(&self, caption: &str, length: usize) -> Result<(Vec<u32>, usize), EncoderError> {
+        let mut ids = self.ids(caption)?;
+        let own = ids.len();
+        ids.resize(length.max(own), self.rules.pad);
+        Ok((ids, own))
+    }
+}
+
+/// The tokenizer of a file that was looked at.
+fn parsed(place: &str, json: &[u8]) -> Result<tokenizers::Tokenizer, EncoderError> {
+    let refuse = |what: String| EncoderError::new(place, what);
+    let expected = "expected a `tokenizer.json` as Hugging Face's tokenizers write it";
+    let looked: Looked = serde_json::from_slice(json).map_err(|e| refuse(format!("{e}; {expected}")))?;
+    if looked.model.dropout.is_some_and(|share| share != 0.0) {
+        return Err(refuse("`model.dropout` is set, so that ids would be drawn by chance; set it to null".into()));
+    }
+    let mut steps = (0, 0);
+    check_normalizer(&looked.normalizer, &mut steps).map_err(refuse)?;
+    catch_unwind(|| tokenizers::Tokenizer::from_bytes(json))
+        .map_err(|_| refuse(format!("cannot be read; {expected}")))?
+        .map_err(|e| refuse(format!("{e}; {expected}")))
+}
+
+/// Refuses steps that would make much text of little; `met` counts steps, and those of them that replace.
+fn check_normalizer(step: &Value, met: &mut (usize, usize)) -> Result<(), String> {
+    let kind = match step["type"].as_str() {
+        Some(kind) => kind,
+        None if step.is_null() => return Ok(()),
+        None => return Err("a step of `normalizer` has no `type`".into()),
+    };
+    met.0 += 1;
+    let text = |key: &str| step[key].as_str().unwrap_or_default();
+    match kind {
+        "Sequence" => {
+            for step in step["normalizers"].as_array().into_iter().flatten() {
+                check_normalizer(step, met)?;
+            }
+        }
+        "Replace" | "Prepend" => {
+            met.1 += 1;
+            let longest = text("content").len().max(text("prepend").len());
+            if met.1 > REPLACEMENTS.0 || longest > REPLACEMENTS.1 {
+                let (times, bytes) = REPLACEMENTS;
+                return Err(format!("`normalizer` replaces more than {times} times, or by more than {bytes} bytes"));
+            }
+        }
+        "Precompiled" => check_character_map(text("precompiled_charsmap"))?,
+        _ => {}
+    }
+    if met.0 > STEPS { Err(format!("`normalizer` has more than {STEPS} steps")) } else { Ok(()) }
+}
+
+/// SentencePiece's table in base64: the bytes of a trie of 32-bit units, the trie, and texts with a zero behind each.
+fn check_character_map(text: &str) -> Result<(), String> {
+    let broken = || "`precompiled_charsmap` of `normalizer` is damaged".to_owned();
+    let bytes = from_base64(text).ok_or_else(broken)?;
+    let (head, rest) = bytes.split_first_chunk::<4>().ok_or_else(broken)?;
+    let trie = u32::from_le_bytes(*head) as usize;
+    if trie % 4 != 0 || trie > rest.len() {
+        return Err(broken());
+    }
+    let longest = rest[trie..].split(|byte| *byte == 0).map(<[u8]>::len).max().unwrap_or_default();
+    if longest > MAPPED_BYTES {
+        return Err(format!(
+            "`precompiled_charsmap` makes {longest} bytes of a character; expected at most {MAPPED_BYTES}"
+        ));
+    }
+    Ok(())
+}
+
+fn from_base64(text: &str) -> Option<Vec<u8>> {
+    let text = text.trim_end_matches('=');
+    let mut out = Vec::with_capacity(text.len() / 4 * 3 + 3);
+    let (mut bits, mut held) = (0_u32, 0);
+    for c in text.bytes() {
+        let value = match c {
+            b'A'..=b'Z' => c - b'A',
+            b'a'..=b'z' => c - b'a' + 26,
+            b'0'..=b'9' => c - b'0' + 52,
+            b'+' => 62,
+            b'/' => 63,
+            _ => return None,
+        };
+        bits = bits << 6 | u32::from(value);
+        held += 6;
+        if held >= 8 {
+            held -= 8;
+            out.push((bits >> held) as u8);
+            bits &= (1 << held) - 1;
+        }
+    }
+    Some(out)
+}
+
+/// CLIP's `tokenizer.json` out of its `vocab.json` and `merges.txt`, for folders that have no other.
+///
+/// Source: the converter of `CLIPTokenizer` in Hugging Face's transformers.
+///
+/// # Errors
+/// Which file is not what it should be.
+pub(crate) fn clip_from_parts(vocab: (&str, &[u8]), merges: (&str, &[u8])) -> Result<Vec<u8>, EncoderError> {
+    let table: serde_json::Map<String, Value> = serde_json::from_slice(vocab.1)
+        .map_err(|e| EncoderError::new(vocab.0, format!("{e}; expected a mapping from tokens to ids")))?;
+    let id = |token: &str| {
+        table
+            .get(token)
+            .and_then(Value::as_u64)
+            .ok_or_else(|| EncoderError::new(vocab.0, format!("no token `{token}`, which every caption needs")))
+    };
+    let (start, end) = ("<|startoftext|>", "<|endoftext|>");
+    let (first, last) = (id(start)?, id(end)?);
+    let text = std::str::from_utf8(merges.1).map_err(|e| EncoderError::new(merges.0, e.to_string()))?;
+    // The last line may be without an end, or there may be an empty one behind it.
+    let lines = text.lines().filter(|line| !line.starts_with("#version") && !line.is_empty());
+    let mut pairs = Vec::new();
+    for line in lines {
+        let Some((left, right)) = line.split_once(' ').filter(|(_, right)| !right.contains(' ')) else {
+            let line = line.chars().take(40).collect::<String>();
+            let what = format!("the line `{}` is no merge; expected two tokens", line.escape_debug());
+            return Err(EncoderError::new(merges.0, what));
+        };
+        pairs.push(json!([left, right]));
+    }
+    let special = |id: u64, token: &str| json!({"id": id, "content": token, "single_word": false, "lstrip": false, "rstrip": false, "normalized": true, "special": true});
+    let words = "'s|'t|'re|'ve|'m|'ll|'d|[\\p{L}]+|[\\p{N}]|[^\\s\\p{L}\\p{N}]+";
+    let whole = json!({
+        "version": "1.0",
+        "truncation": null,
+        "padding": null,
+        "added_tokens": [special(first, start), special(last, end)],
+        "normalizer": {"type": "Sequence", "normalizers": [
+            {"type": "NFC"},
+            {"type": "Replace", "pattern": {"Regex": "\\s+"}, "content": " "},
+            {"type": "Lowercase"},
+        ]},
+        "pre_tokenizer": {"type": "Sequence", "pretokenizers": [
+            {"type": "Split", "pattern": {"Regex": words}, "behavior": "Removed", "invert": true},
+            {"type": "ByteLevel", "add_prefix_space": false, "trim_offsets": true, "use_regex": true},
+        ]},
+        "post_processor": {
+            "type": "RobertaProcessing", "sep": [end, last], "cls": [start, first], "trim_offsets": false, "add_prefix_space": false,
+        },
+        "decoder": null,
+        "model": {
+            "type": "BPE", "dropout": null, "unk_token": end, "continuing_subword_prefix": "", "end_of_word_suffix": "</w>",
+            "fuse_unk": false, "byte_fallback": false, "ignore_merges": false, "vocab": table, "merges": pairs,
+        },
+    });
+    Ok(whole.to_string().into_bytes())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rules() -> Rules {
+        Rules { repair: false, strip: false, lower: false, first: Some(4), end: 5, pad: 5, most: 6 }
+    }
+
+    fn clip() -> Value {
+        let vocab =
+            json!({"a": 0, "b": 1, "a</w>": 2, "ab</w>": 3, "<|startoftext|>": 4, "<|endoftext|>": 5, "b</w>": 6});
+        let merges = "#version: 0.2\na b</w>\n";
+        let json = clip_from_parts(("v", vocab.to_string().as_bytes()), ("m", merges.as_bytes())).unwrap();
+        serde_json::from_slice(&json).unwrap()
+    }
+
+    fn refused(file: &Value, rules: &Rules, rows: usize) -> String {
+        Tokenizer::new("t", file.to_string().as_bytes(), rules, rows).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn captions_are_cut_between_their_ends() {
+        let tokenizer = Tokenizer::new("t", clip().to_string().as_bytes(), &rules(), 7).unwrap();
+        let ids = |caption: &str| tokenizer.ids(caption).unwrap();
+        assert_eq!(ids("AB  a"), [4, 3, 2, 5]);
+        assert_eq!(ids(""), [4, 5]);
+        assert_eq!(ids("a a a a a a"), [4, 2, 2, 2, 2, 5], "the end stays");
+        assert_eq!(tokenizer.padded("ab", 5).unwrap(), (vec![4, 3, 5, 5, 5], 3));
+        let long = tokenizer.ids(&"a ".repeat(5_000)).unwrap_err().to_string();
+        assert!(long.contains("has 10000 bytes; expected at most 8192"), "{long}");
+    }
+
+    #[test]
+    fn files_that_would_break_what_follows_are_refused() {
+        let with = |change: &dyn Fn(&mut Value)| {
+            let mut file = clip();
+            change(&mut file);
+            file
+        };
+        assert!(
+            refused(&clip(), &rules(), 6).contains("`b</w>` has the id 6, but the table of the weights has 6 rows")
+        );
+        let drawn = with(&|file| file["model"]["dropout"] = json!(0.1));
+        assert!(refused(&drawn, &rules(), 7).contains("drawn by chance"));
+        let bare = with(&|file| file["post_processor"] = Value::Null);
+        assert!(refused(&bare, &rules(), 7).contains("adds 0 tokens to a caption; expected 2"));
+        let doubling = with(&|file| {
+            let step = json!({"type": "Replace", "pattern": {"String": "a"}, "content": "aa"});
+            file["normalizer"] = json!({"type": "Sequence", "normalizers": vec![step; 9]});
+        });
+        assert!(refused(&doubling, &rules(), 7).contains("replaces more than 4 times"));
+        // An empty trie, and a text of seventy bytes.
+        let map = format!("AAAAAEFB{}", "QUFB".repeat(24));
+        let wide = with(&|file| file["normalizer"] = json!({"type": "Precompiled", "precompiled_charsmap": map}));
+        assert!(refused(&wide, &rules(), 7).contains("of a character"), "{}", refused(&wide, &rules(), 7));
+        let broken = with(&|file| file["normalizer"] = json!({"type": "Precompiled", "precompiled_charsmap": "////"}));
+        assert!(refused(&broken, &rules(), 7).contains("is damaged"));
+        let merge = with(&|file| file["model"]["merges"] = json!([["a", "zzz"]]));
+        assert!(refused(&merge, &rules(), 7).contains("t: "));
+        let short = Rules { most: 2, ..rules() };
+        assert!(refused(&clip(), &short, 7).contains("leave no room"));
+        for text in ["", "{", "[]", "{\"model\": 3}", "\"\\ud800\"", &"[".repeat(10_000)] {
+            let said = Tokenizer::new("t", text.as_bytes(), &rules(), 7).unwrap_err().to_string();
+            assert!(said.starts_with("t: "), "{said}");
+        }
+        let merges = clip_from_parts(("v", clip()["model"]["vocab"].to_string().as_bytes()), ("m", b"a b c"));
+        assert!(merges.unwrap_err().to_string().contains("m: the line `a b c` is no merge"));
+        let none = clip_from_parts(("v", b"{}"), ("m", b"")).unwrap_err().to_string();
+        assert!(none.contains("v: no token `<|startoftext|>`"));
+    }
+
+    /// Overwritten, cut and doubled bytes: any answer will do, but no panic and no id that the table does not have.
+    #[test]
+    fn no_bytes_break_it() {
+        let whole = clip().to_string().into_bytes();
+        let mut state = 0x9e37_79b9_7f4a_7c15_u64;
+        let mut next = move |bound: usize| {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            (state % bound.max(1) as u64) as usize
+        };
+        for _ in 0..2_000 {
+            let mut bytes = whole.clone();
+            for _ in 0..=next(3) {
+                let at = next(bytes.len());
+                match next(4) {
+                    0 => bytes.truncate(at.max(1)),
+                    1 => bytes.splice(at..at, [b'9'; 3]).for_each(drop),
+                    _ => bytes[at] = [0, 0xff, b'9', b'0', b'"', b'}', b'a'][next(7)],
+                }
+            }
+            if let Ok(tokenizer) = Tokenizer::new("t", &bytes, &rules(), 7)
+                && let Ok(ids) = tokenizer.ids("ab a b \u{1f600}")
+            {
+                assert!(ids.iter().all(|id| *id < 7));
+            }
+        }
+    }
+}

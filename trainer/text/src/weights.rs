@@ -1,0 +1,332 @@
+//! Weights where they lie: safetensors, one file or several, and torch's pickles. Read tensor by tensor, in the type that they are stored in.
+//!
+//! Nothing of a pickle is run. An archive is not unpacked if that would make more of it than it is.
+
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{Read as _, Seek as _, SeekFrom};
+use std::path::Path;
+use std::rc::Rc;
+
+use motion::files;
+use protocol::limits;
+use pytorch_reader::{DType, PytorchReader};
+use safetensors::tensor::{Metadata, TensorInfo};
+use serde::Deserialize;
+
+use crate::error::EncoderError;
+use crate::network::TensorSpec;
+use crate::tensor_file::{Element, ReadAt, TensorFile, WeightsFile};
+
+/// Files of sharded weights.
+const SHARDS: usize = 256;
+/// Bytes of the list of shards.
+const INDEX_BYTES: u64 = 16 << 20;
+/// Names in an error.
+const SHOWN: usize = 8;
+
+/// A file of somebody else's.
+#[derive(Debug)]
+struct OnDisk {
+    file: RefCell<File>,
+    bytes: u64,
+}
+
+impl ReadAt for OnDisk {
+    fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), String> {
+        let mut file = self.file.borrow_mut();
+        file.seek(SeekFrom::Start(offset)).and_then(|_| file.read_exact(out)).map_err(|e| e.to_string())
+    }
+}
+
+/// Where a tensor's bytes come from.
+#[derive(Clone)]
+enum Place {
+    Safe(Rc<OnDisk>, u64),
+    Torch(pytorch_reader::Tensor),
+}
+
+/// A tensor in a folder.
+#[derive(Clone)]
+pub struct StoredTensor {
+    /// What its numbers are stored as.
+    pub element: Element,
+    /// Its shape.
+    pub shape: Vec<usize>,
+    place: Place,
+}
+
+impl std::fmt::Debug for StoredTensor {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{:?} {:?}", self.element, self.shape)
+    }
+}
+
+impl StoredTensor {
+    /// Its bytes, little-endian.
+    fn read(&self) -> Result<Vec<u8>, String> {
+        let length = self.shape.iter().product::<usize>() * self.element.bytes();
+        match &self.place {
+            Place::Safe(file, offset) => {
+                let mut bytes = vec![0; length];
+                file.read_at(*offset, &mut bytes)?;
+                Ok(bytes)
+            }
+            Place::Torch(tensor) => {
+                let mut bytes = tensor.read().map_err(|e| e.to_string())?;
+                if cfg!(target_endian = "big") {
+                    bytes.chunks_exact_mut(self.element.bytes()).for_each(<[u8]>::reverse);
+                }
+                Ok(bytes)
+            }
+        }
+    }
+}
+
+/// Tensors by name, of which nothing is read yet.
+#[derive(Debug, Default)]
+pub struct Weights {
+    tensors: BTreeMap<String, StoredTensor>,
+    /// Tensors that are there and hold no floats of at most 32 bits.
+    others: BTreeMap<String, String>,
+}
+
+impl Weights {
+    /// The weights of a folder: `model.safetensors`, the shards of `model.safetensors.index.json`, or `pytorch_model.bin`.
+    ///
+    /// # Errors
+    /// Which file is not what it should be.
+    pub fn open(folder: &Path) -> Result<Self, EncoderError> {
+        let is_there = |name: &str| folder.join(name).symlink_metadata().is_ok();
+        let mut weights = Self::default();
+        if is_there("model.safetensors") {
+            weights.add_safetensors(&folder.join("model.safetensors"))?;
+        } else if is_there("model.safetensors.index.json") {
+            for shard in shards(&folder.join("model.safetensors.index.json"))? {
+                weights.add_safetensors(&folder.join(shard))?;
+            }
+        } else if is_there("pytorch_model.bin") {
+            weights.add_torch(&folder.join("pytorch_model.bin"))?;
+        } else {
+            let what = "no `model.safetensors`, `model.safetensors.index.json` or `pytorch_model.bin`; download the model's weights too";
+            return Err(EncoderError::at(folder, what));
+        }
+        Ok(weights)
+    }
+
+    fn add_safetensors(&mut self, path: &Path) -> Result<(), EncoderError> {
+        let refuse = |what: String| EncoderError::at(path, what);
+        let (file, bytes) = files::open(path).map_err(|e| refuse(e.to_string()))?;
+        let file = WeightsFile::open(OnDisk { file: file.into(), bytes }).map_err(refuse)?;
+        let source = Rc::new(file.source);
+        for (name, TensorFile { element, shape, offset }) in file.tensors {
+            match element {
+                Some(element) => {
+                    let tensor = StoredTensor { element, shape, place: Place::Safe(Rc::clone(&source), offset) };
+                    if self.tensors.insert(name.clone(), tensor).is_some() {
+                        let name = name.escape_debug();
+                        return Err(refuse(format!("the tensor `{name}` is in another file too")));
+                    }
+                }
+                None => {
+                    self.others.insert(name, "no float of at most 32 bits".into());
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn add_torch(&mut self, path: &Path) -> Result<(), EncoderError> {
+        let refuse = |what: String| EncoderError::at(path, what);
+        let length = archive_length(path).map_err(refuse)?;
+        let reader = PytorchReader::new(path).map_err(|e| refuse(e.to_string()))?;
+        let mut declared = 0_u64;
+        for (name, tensor) in reader.into_tensors() {
+            let element = match tensor.dtype() {
+                DType::F32 => Element::F32,
+                DType::F16 => Element::F16,
+                DType::BF16 => Element::Bf16,
+                other => {
+                    self.others.insert(name, format!("{other:?}"));
+                    continue;
+                }
+            };
+            declared = declared.saturating_add(tensor.byte_len() as u64);
+            self.tensors
+                .insert(name, StoredTensor { element, shape: tensor.shape().to_vec(), place: Place::Torch(tensor) });
+        }
+        // A tensor may repeat one number, and several may share one storage.
+        if declared > length.saturating_mul(2) {
+            return Err(refuse(format!("its tensors take {declared} bytes, the file has {length}")));
+        }
+        Ok(())
+    }
+
+    /// Renames a tensor, if it is there and nothing has the other name.
+    pub(crate) fn alias(&mut self, from: &str, to: &str) {
+        if !self.tensors.contains_key(to)
+            && let Some(tensor) = self.tensors.remove(from)
+        {
+            self.tensors.insert(to.to_owned(), tensor);
+        }
+    }
+
+    /// Takes the tensors of `specs`, `prefix` before the names of what is given; the names of those that are left over stay.
+    ///
+    /// # Errors
+    /// The names and shapes that are missing, and what is in their place.
+    pub(crate) fn take(
+        &mut self,
+        place: &Path,
+        specs: &[TensorSpec],
+        prefix: &str,
+    ) -> Result<BTreeMap<String, StoredTensor>, EncoderError> {
+        let (mut found, mut missing) = (BTreeMap::new(), Vec::new());
+        for TensorSpec { name, shape } in specs {
+            match self.tensors.remove(name) {
+                Some(tensor) if tensor.shape == *shape => {
+                    found.insert(format!("{prefix}{name}"), tensor);
+                }
+                Some(tensor) => missing.push(format!("`{name}` {shape:?} (there with the shape {:?})", tensor.shape)),
+                None => match self.others.get(name) {
+                    Some(what) => missing.push(format!("`{name}` {shape:?} (there as {what})")),
+                    None => missing.push(format!("`{name}` {shape:?}")),
+                },
+            }
+        }
+        if missing.is_empty() {
+            return Ok(found);
+        }
+        let all = missing.len();
+        missing.truncate(SHOWN);
+        let more = if all > SHOWN { format!(" and {} more", all - SHOWN) } else { String::new() };
+        let what = format!(
+            "the weights are not those that `config.json` describes; missing: {}{more}; of others there are {}",
+            missing.join(", "),
+            self.tensors.len()
+        );
+        Err(EncoderError::at(place, what))
+    }
+
+    /// The names of all tensors that were not taken.
+    pub(crate) fn left(&self) -> Vec<String> {
+        self.tensors.keys().chain(self.others.keys()).cloned().collect()
+    }
+}
+
+/// Files named by a list of shards, each once.
+fn shards(path: &Path) -> Result<Vec<String>, EncoderError> {
+    #[derive(Deserialize)]
+    struct Index {
+        weight_map: BTreeMap<String, String>,
+    }
+    let refuse = |what: String| EncoderError::at(path, what);
+    let bytes = files::read(path, INDEX_BYTES).map_err(|e| refuse(e.to_string()))?;
+    let index: Index = serde_json::from_slice(&bytes).map_err(|e| refuse(format!("{e}; expected `weight_map`")))?;
+    let mut names: Vec<String> = index.weight_map.into_values().collect();
+    names.sort();
+    names.dedup();
+    // A list may name no file outside its folder.
+    if let Some(name) =
+        names.iter().find(|name| name.is_empty() || name.contains(['/', '\\', '\0']) || name.starts_with('.'))
+    {
+        return Err(refuse(format!("`{}` is not the name of a file beside it", name.escape_debug())));
+    }
+    if names.is_empty() || names.len() > SHARDS {
+        return Err(refuse(format!("names {} files; expected 1 to {SHARDS}", names.len())));
+    }
+    Ok(names)
+}
+
+/// The length of a file that a pickle reader may open: a regular file, not too large, and no archive that unpacks to more than it is.
+/// `torch.save` writes archives that are not compressed.
+fn archive_length(path: &Path) -> Result<u64, String> {
+    let (mut file, length) = files::open(path).map_err(|e| e.to_string())?;
+    if length > limits::WEIGHTS_BYTES {
+        return Err(format!("has {length} bytes; at most {} are read", limits::WEIGHTS_BYTES));
+    }
+    let mut magic = [0; 2];
+    if file.read_exact(&mut magic).is_err() || &magic != b"PK" {
+        return Ok(length);
+    }
+    let mut archive = zip::ZipArchive::new(file).map_err(|e| e.to_string())?;
+    let mut unpacked = 0_u64;
+    for i in 0..archive.len() {
+        unpacked = unpacked.saturating_add(archive.by_index_raw(i).map_err(|e| e.to_string())?.size());
+    }
+    if unpacked > length {
+        return Err(format!(
+            "unpacks to {unpacked} bytes, but has {length}; expected an archive as `torch.save` writes it"
+        ));
+    }
+    Ok(length)
+}
+
+/// Tensors as the pieces of one safetensors file, in the order of their names.
+pub(crate) fn packed(place: &Path, tensors: &BTreeMap<String, StoredTensor>) -> Result<Vec<Vec<u8>>, EncoderError> {
+    let mut end = 0;
+    let info = |(name, tensor): (&String, &StoredTensor)| {
+        let begin = end;
+        end += tensor.shape.iter().product::<usize>() * tensor.element.bytes();
+        let info =
+            TensorInfo { dtype: tensor.element.dtype(), shape: tensor.shape.clone(), data_offsets: (begin, end) };
+        (name.clone(), info)
+    };
+    let refuse = |what: String| EncoderError::at(place, what);
+    let header = Metadata::new(None, tensors.iter().map(info).collect()).map_err(|e| refuse(e.to_string()))?;
+    let mut json = serde_json::to_vec(&header).map_err(|e| refuse(e.to_string()))?;
+    json.resize(json.len().next_multiple_of(8), b' ');
+    let mut pieces = vec![[&(json.len() as u64).to_le_bytes()[..], &json].concat()];
+    for (name, tensor) in tensors {
+        pieces.push(tensor.read().map_err(|e| refuse(format!("`{name}`: {e}")))?);
+    }
+    Ok(pieces)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tensor_file::tests::{Bytes, file};
+
+    #[test]
+    fn a_list_of_shards_names_files_beside_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let index = folder.path().join("model.safetensors.index.json");
+        for (text, part) in [
+            (r#"{"weight_map": {"a": "../x"}}"#, "`../x` is not the name of a file beside it"),
+            (r#"{"weight_map": {"a": "..", "b": "x"}}"#, "`..` is not"),
+            (r#"{"weight_map": {}}"#, "names 0 files"),
+            (r#"{"weights": {}}"#, "expected `weight_map`"),
+            ("", "expected `weight_map`"),
+        ] {
+            std::fs::write(&index, text).unwrap();
+            let said = Weights::open(folder.path()).unwrap_err().to_string();
+            assert!(said.contains(part), "{said}");
+        }
+        std::fs::write(&index, r#"{"weight_map": {"a": "one", "b": "two"}}"#).unwrap();
+        for (name, tensor) in [("one", "a"), ("two", "a")] {
+            let header = format!(r#"{{"{tensor}":{{"dtype":"BF16","shape":[1],"data_offsets":[0,2]}}}}"#);
+            std::fs::write(folder.path().join(name), file(&header, &[0x80, 0x3f])).unwrap();
+        }
+        let said = Weights::open(folder.path()).unwrap_err().to_string();
+        assert!(said.contains("`a` is in another file too"), "{said}");
+        let header = r#"{"b":{"dtype":"I64","shape":[1],"data_offsets":[0,8]}}"#;
+        std::fs::write(folder.path().join("two"), file(header, &[0; 8])).unwrap();
+        let mut weights = Weights::open(folder.path()).unwrap();
+        let spec = |name: &str| TensorSpec { name: name.into(), shape: vec![1] };
+        let said = weights.take(folder.path(), &[spec("b")], "").unwrap_err().to_string();
+        assert!(said.contains("missing: `b` [1] (there as no float"), "{said}");
+        let taken = weights.take(folder.path(), &[spec("a")], "x.").unwrap();
+        assert_eq!(taken.keys().collect::<Vec<_>>(), ["x.a"]);
+        let pieces = packed(folder.path(), &taken).unwrap().concat();
+        let mut out = [0.0];
+        WeightsFile::open(Bytes(pieces)).unwrap().read("x.a", &mut out).unwrap();
+        assert_eq!(out, [1.0]);
+        assert_eq!(weights.left(), ["b"]);
+    }
+}
