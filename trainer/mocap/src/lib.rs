@@ -1,7 +1,15 @@
 //! Motion of other programs: recordings in, animations out. No tensors, no stages.
 
+mod base64;
+pub mod body;
 pub mod bvh;
 pub mod detect;
+pub mod export;
+pub mod glb;
+pub mod html;
 pub mod joint_map;
+pub mod requests;
 pub mod rotations;
 pub mod take;
+
+pub use body::Body;

@@ -113,6 +113,60 @@ fn told(canvas: &mut Canvas, view: &View, waypoints: &[Waypoint], t: usize) {
     }
 }
 
+/// Width and height of a film in pixels.
+pub const FILM: [usize; 2] = [400, 400];
+
+/// Draws every frame of a motion, the camera following the root, `title` above.
+fn film(
+    joints: &[f32],
+    skeleton: &Skeleton,
+    title: &str,
+    waypoints: &[Waypoint],
+    mut each: impl FnMut(&Canvas, usize) -> io::Result<()>,
+) -> io::Result<()> {
+    let [width, height] = FILM;
+    let frames = frames_of(joints, skeleton)?;
+    let lines = font::wrap(title, width / 12 - 2);
+    let path: Vec<[f64; 3]> = (0..frames).map(|t| frame(joints, skeleton, t)[0]).collect();
+    for t in 0..frames {
+        let pose = frame(joints, skeleton, t);
+        let view = View {
+            scale: 145.0,
+            centre: [width as f64 / 2.0, height as f64 * 0.60],
+            looking_at: [follow(&path, t, 0), 0.80, follow(&path, t, 2)],
+        };
+        let mut canvas = Canvas::new(width, height, PAPER);
+        ground(&mut canvas, &view, 3.5);
+        for pair in path[..=t].windows(2) {
+            let flat = |p: [f64; 3]| view.project([p[0], 0.0, p[2]]).0;
+            canvas.line(flat(pair[0]), flat(pair[1]), 2.5, TRAIL);
+        }
+        told(&mut canvas, &view, waypoints, t);
+        figure(&mut canvas, &view, skeleton, &pose, 1.0);
+        for (i, line) in lines.iter().enumerate() {
+            font::draw(&mut canvas, line, [12.0, 12.0 + 20.0 * i as f64], 2, INK);
+        }
+        let clock = format!("{:.1} s", t as f64 / skeleton.fps);
+        font::draw(&mut canvas, &clock, [width as f64 - 60.0, height as f64 - 20.0], 1, INK);
+        each(&canvas, t)?;
+    }
+    Ok(())
+}
+
+/// Writes the frames of a film one after another, [`FILM`] pixels of red, green and blue each, for an encoder of video.
+///
+/// # Errors
+/// When `out` refuses, or the joints are not a whole number of frames.
+pub fn rgb_along_to(
+    joints: &[f32],
+    skeleton: &Skeleton,
+    title: &str,
+    waypoints: &[Waypoint],
+    mut out: impl Write,
+) -> io::Result<()> {
+    film(joints, skeleton, title, waypoints, |canvas, _| out.write_all(canvas.bytes()))
+}
+
 /// Writes an animated GIF: the motion at its own speed, the camera following the root, `title` above.
 ///
 /// # Errors
@@ -132,42 +186,19 @@ pub fn gif_along_to(
     waypoints: &[Waypoint],
     out: impl Write,
 ) -> io::Result<()> {
-    const WIDTH: usize = 400;
-    const HEIGHT: usize = 400;
+    let [width, height] = FILM.map(|pixels| pixels as u16);
     let frames = frames_of(joints, skeleton)?;
     let palette = raster::palette(&[PAPER, INK, GRID, TRAIL, SHADOW, BODY, LEFT, RIGHT, TOLD]);
     let failed = |e: gif::EncodingError| io::Error::other(e.to_string());
-    let mut encoder = gif::Encoder::new(out, WIDTH as u16, HEIGHT as u16, &palette.bytes).map_err(failed)?;
+    let mut encoder = gif::Encoder::new(out, width, height, &palette.bytes).map_err(failed)?;
     encoder.set_repeat(gif::Repeat::Infinite).map_err(failed)?;
-    let lines = font::wrap(title, WIDTH / 12 - 2);
-    let path: Vec<[f64; 3]> = (0..frames).map(|t| frame(joints, skeleton, t)[0]).collect();
-    for t in 0..frames {
-        let pose = frame(joints, skeleton, t);
-        let view = View {
-            scale: 145.0,
-            centre: [WIDTH as f64 / 2.0, HEIGHT as f64 * 0.60],
-            looking_at: [follow(&path, t, 0), 0.80, follow(&path, t, 2)],
-        };
-        let mut canvas = Canvas::new(WIDTH, HEIGHT, PAPER);
-        ground(&mut canvas, &view, 3.5);
-        for pair in path[..=t].windows(2) {
-            let flat = |p: [f64; 3]| view.project([p[0], 0.0, p[2]]).0;
-            canvas.line(flat(pair[0]), flat(pair[1]), 2.5, TRAIL);
-        }
-        told(&mut canvas, &view, waypoints, t);
-        figure(&mut canvas, &view, skeleton, &pose, 1.0);
-        for (i, line) in lines.iter().enumerate() {
-            font::draw(&mut canvas, line, [12.0, 12.0 + 20.0 * i as f64], 2, INK);
-        }
-        let clock = format!("{:.1} s", t as f64 / skeleton.fps);
-        font::draw(&mut canvas, &clock, [WIDTH as f64 - 60.0, HEIGHT as f64 - 20.0], 1, INK);
-        let mut image = gif::Frame::from_indexed_pixels(WIDTH as u16, HEIGHT as u16, palette.indices(&canvas), None);
+    film(joints, skeleton, title, waypoints, |canvas, t| {
+        let mut image = gif::Frame::from_indexed_pixels(width, height, palette.indices(canvas), None);
         // Hundredths of a second; rounded over the whole clip, so that its length is right.
         let ends = |t: usize| (t as f64 * 100.0 / skeleton.fps).round() as u16;
         image.delay = if t + 1 == frames { 60 } else { ends(t + 1).wrapping_sub(ends(t)) };
-        encoder.write_frame(&image).map_err(failed)?;
-    }
-    Ok(())
+        encoder.write_frame(&image).map_err(failed)
+    })
 }
 
 /// [`gif_to`] a file.

@@ -31,6 +31,15 @@ fn a_gif_plays_as_long_as_the_motion() {
     assert_eq!(frames, joints.len() / 66);
     assert_eq!(hundredths, (frames - 1) * 5 + 60);
     assert!(blue > 100 * frames && red > 100 * frames, "{blue} and {red} pixels in {frames} frames");
+
+    let mut film = vec![];
+    draw::rgb_along_to(&joints[..10 * 66], skeleton, &title, &[], &mut film).unwrap();
+    let size: usize = draw::FILM.iter().product();
+    assert_eq!(film.len(), 3 * size * 10);
+    let pictures: Vec<&[u8]> = film.chunks(3 * size).collect();
+    assert!(pictures[0] != pictures[9], "the figure moves");
+    let left = pictures[0].chunks(3).filter(|p| **p == [36, 110, 200]).count();
+    assert!(left > 100, "{left} pixels of the left side");
 }
 
 #[test]

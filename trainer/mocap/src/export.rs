@@ -1,0 +1,443 @@
+//! Motions to files, in the form that a file's name ends in, and motions of arrays back.
+//!
+//! `.html` and `.png` hold several motions, all others one. `.bvh` (centimetres) and `.glb` (metres) have constant bone lengths, so joints of a figure whose bones change lie where
+//! directions and mean lengths lead; [`Written`] says how far off. `.npy` has features where there are some, else positions. `.mp4` is made by an `ffmpeg` on the
+//! machine.
+
+use std::fs::{self, File};
+use std::io::{self, BufWriter};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use motion::features::recover_joints;
+use motion::npy::{self, NpyError};
+use motion::waypoints::Waypoint;
+use motion::{Skeleton, draw};
+use protocol::stage::DataFormat;
+
+use crate::body::Body;
+use crate::glb::{self, GlbError};
+use crate::html::{Page, PageError, Panel, Section};
+use crate::rotations::{Rig, RigError};
+
+/// Poses of one motion on a sheet.
+const POSES: usize = 10;
+
+/// Motions on a sheet of poses, whose picture is in memory: 70 MB.
+const MOST_ROWS: usize = 100;
+
+/// What a file can be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Form {
+    /// A skeleton and its rotations, for animation programs.
+    Bvh,
+    /// An animated figure, for animation programs and viewers of 3D scenes.
+    Glb,
+    /// A moving picture.
+    Gif,
+    /// A sheet of poses.
+    Png,
+    /// A page to look at motions from all sides.
+    Html,
+    /// An array.
+    Npy,
+    /// A video.
+    Mp4,
+}
+
+impl Form {
+    /// All, by the endings of their names.
+    pub const ALL: [(&'static str, Form); 7] = [
+        ("bvh", Form::Bvh),
+        ("glb", Form::Glb),
+        ("gif", Form::Gif),
+        ("png", Form::Png),
+        ("html", Form::Html),
+        ("npy", Form::Npy),
+        ("mp4", Form::Mp4),
+    ];
+
+    /// The form of a file by its name.
+    ///
+    /// # Errors
+    /// Another ending, with those that there are.
+    pub fn of(path: &Path) -> Result<Self, ExportError> {
+        let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default().to_lowercase();
+        let found = Self::ALL.iter().find(|(word, _)| *word == ending);
+        found.map(|(_, form)| *form).ok_or_else(|| ExportError::Ending(path.into()))
+    }
+
+    /// Whether a file holds several motions.
+    pub fn holds_several(self) -> bool {
+        matches!(self, Self::Png | Self::Html)
+    }
+}
+
+/// Why a file is not read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum ExportError {
+    /// The name says no form.
+    #[error(
+        "cannot write `{}`: expected a name that ends in .bvh, .glb, .gif, .png, .html, .npy or .mp4",
+        .0.display()
+    )]
+    Ending(PathBuf),
+    /// A form of one motion, and several motions or none; a sheet of too many.
+    #[error("cannot write `{}`: {count} motions, expected {expected}", file.display())]
+    Count {
+        file: PathBuf,
+        /// Motions given.
+        count: usize,
+        /// How many it takes.
+        expected: &'static str,
+    },
+    /// The file system, or what draws.
+    #[error("cannot write `{}`: {source}", file.display())]
+    Io { file: PathBuf, source: io::Error },
+    /// Joints that have no rotations.
+    #[error("cannot write `{}`: {source}", file.display())]
+    Rig { file: PathBuf, source: RigError },
+    /// A motion that has no animation.
+    #[error("cannot write `{}`: {source}", file.display())]
+    Glb { file: PathBuf, source: GlbError },
+    /// Motions that make no page.
+    #[error("cannot write `{}`: {source}", file.display())]
+    Page { file: PathBuf, source: PageError },
+    /// There is no encoder of video.
+    #[error("cannot write `{}`: there is no program `{program}` on this machine; install it, or write a .gif", file.display())]
+    NoEncoder {
+        file: PathBuf,
+        /// What was looked for.
+        program: String,
+    },
+    /// The encoder of video failed.
+    #[error("cannot write `{}`: ffmpeg failed: {said}", file.display())]
+    Encoder {
+        file: PathBuf,
+        /// The end of what it said.
+        said: String,
+    },
+    /// An array that is no motion.
+    #[error(transparent)]
+    Npy(#[from] NpyError),
+    /// An array of another shape, or with numbers that are not finite.
+    #[error("{}: {what}", file.display())]
+    Array {
+        file: PathBuf,
+        /// What was found, and what was expected.
+        what: String,
+    },
+}
+
+/// A motion to write.
+#[derive(Debug, Clone)]
+pub struct Motion {
+    /// What it is, such as the sentence that it was drawn for.
+    pub caption: String,
+    /// Where it is from, such as model and seed.
+    pub note: String,
+    /// Whose joints these are.
+    pub skeleton: &'static Skeleton,
+    /// Positions `[T, J, 3]` in the skeleton's unit.
+    pub joints: Vec<f32>,
+    /// Features `[L, D]` in the data's scale, where there are some.
+    pub features: Option<Vec<f32>>,
+    /// What it was told.
+    pub waypoints: Vec<Waypoint>,
+}
+
+/// A file that was written.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Written {
+    /// Its name.
+    pub path: PathBuf,
+    /// How far the joints of its skeleton are from the motion's at most, in metres; `None` for a form that has positions.
+    pub off_metres: Option<f64>,
+}
+
+impl Motion {
+    /// Reads an array: features `[L, 263]` or `[L, 251]`, or positions `[T, 22, 3]` or `[T, 21, 3]`.
+    ///
+    /// # Errors
+    /// A file that is no array, of another shape, or with numbers that are not finite.
+    pub fn read_npy(file: &Path) -> Result<Self, ExportError> {
+        let array = npy::read_any_float(file)?;
+        let refuse = |what: String| ExportError::Array { file: file.into(), what };
+        let known = [DataFormat::Humanml3d, DataFormat::Kit].map(Skeleton::of);
+        let fits = |skeleton: &&&Skeleton| match array.shape[..] {
+            [_, width] => width == skeleton.features,
+            [_, joints, 3] => joints == skeleton.joints,
+            _ => false,
+        };
+        let Some(skeleton) = known.iter().find(fits).copied().filter(|_| array.shape[0] > 0) else {
+            return Err(refuse(format!(
+                "has shape {:?}; expected features [frames, 263] or [frames, 251], or positions [frames, 22, 3] or [frames, 21, 3]",
+                array.shape
+            )));
+        };
+        let width = array.data.len() / array.shape[0];
+        if let Some(at) = array.data.iter().position(|value| !value.is_finite()) {
+            return Err(refuse(format!("frame {} holds a number that is not finite", at / width)));
+        }
+        let (joints, features) = match array.shape.len() {
+            2 => (recover_joints(&array.data, skeleton), Some(array.data)),
+            _ => (array.data, None),
+        };
+        let name = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        Ok(Self { caption: name, note: String::new(), skeleton, joints, features, waypoints: Vec::new() })
+    }
+
+    /// T.
+    pub fn frames(&self) -> usize {
+        self.joints.len() / (3 * self.skeleton.joints)
+    }
+
+    /// Writes it alone.
+    ///
+    /// # Errors
+    /// A motion that the form cannot hold, or a file that refuses.
+    pub fn write(&self, path: &Path) -> Result<Written, ExportError> {
+        let form = Form::of(path)?;
+        let io = |source| ExportError::Io { file: path.into(), source };
+        let mut off_metres = None;
+        let mut rig = || {
+            let rig = Rig::fit(&self.joints, self.skeleton);
+            let rig = rig.map_err(|source| ExportError::Rig { file: path.into(), source })?;
+            off_metres = Some(rig.error * self.skeleton.metres_per_unit);
+            Ok::<_, ExportError>(rig)
+        };
+        let Skeleton { fps, metres_per_unit, .. } = *self.skeleton;
+        match form {
+            Form::Bvh => fs::write(path, rig()?.to_bvh(fps, 100.0 * metres_per_unit).to_text()).map_err(io)?,
+            Form::Glb => {
+                let bytes = glb::to_bytes(&rig()?, fps, metres_per_unit, &self.caption);
+                fs::write(path, bytes.map_err(|source| ExportError::Glb { file: path.into(), source })?).map_err(io)?;
+            }
+            Form::Gif => {
+                draw::gif_along(&self.joints, self.skeleton, &self.caption, &self.waypoints, path).map_err(io)?;
+            }
+            Form::Npy => match &self.features {
+                Some(features) => {
+                    let width = self.skeleton.features;
+                    npy::write(path, &[features.len() / width, width], features)?;
+                }
+                None => npy::write(path, &[self.frames(), self.skeleton.joints, 3], &self.joints)?,
+            },
+            Form::Mp4 => self.mp4(path, "ffmpeg")?,
+            Form::Png | Form::Html => {
+                let sections = [(String::new(), vec![self])];
+                write_all(&self.caption, &sections, path)?;
+            }
+        }
+        Ok(Written { path: path.into(), off_metres })
+    }
+
+    /// Writes a video through `program`, which is called as ffmpeg is.
+    fn mp4(&self, path: &Path, program: &str) -> Result<(), ExportError> {
+        let io = |source| ExportError::Io { file: path.into(), source };
+        let [width, height] = draw::FILM;
+        // A name that begins with a dash, or that looks like a protocol, is a file all the same.
+        let mut name = std::ffi::OsString::from("file:");
+        name.push(path);
+        let mut encoder = Command::new(program);
+        encoder.args([
+            "-hide_banner",
+            "-loglevel",
+            "error",
+            "-nostdin",
+            "-y",
+            "-f",
+            "rawvideo",
+            "-pixel_format",
+            "rgb24",
+        ]);
+        encoder.args(["-video_size", &format!("{width}x{height}"), "-framerate", &self.skeleton.fps.to_string()]);
+        encoder.args(["-i", "pipe:0", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]).arg(name);
+        encoder.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
+        let mut encoder = encoder.spawn().map_err(|error| match error.kind() {
+            io::ErrorKind::NotFound => ExportError::NoEncoder { file: path.into(), program: program.to_owned() },
+            _ => io(error),
+        })?;
+        let stdin = encoder.stdin.take().ok_or_else(|| io(io::Error::other("the encoder has no input")))?;
+        let (drawn, output) = std::thread::scope(|scope| {
+            // Beside what it says, so that neither waits for the other.
+            let draws = scope.spawn(|| {
+                draw::rgb_along_to(&self.joints, self.skeleton, &self.caption, &self.waypoints, BufWriter::new(stdin))
+            });
+            let output = encoder.wait_with_output();
+            (draws.join().unwrap_or_else(|_| Err(io::Error::other("the drawing failed"))), output)
+        });
+        let output = output.map_err(io)?;
+        if !output.status.success() {
+            let said = String::from_utf8_lossy(&output.stderr);
+            let said = said.lines().next_back().unwrap_or("it said nothing").to_owned();
+            return Err(ExportError::Encoder { file: path.into(), said });
+        }
+        drawn.map_err(io)
+    }
+}
+
+/// Writes motions on one page or sheet, in sections with a title each.
+///
+/// # Errors
+/// A form that holds one motion, too many of them, or a file that refuses.
+pub fn write_all(title: &str, sections: &[(String, Vec<&Motion>)], path: &Path) -> Result<Written, ExportError> {
+    let form = Form::of(path)?;
+    let motions = || sections.iter().flat_map(|(_, motions)| motions.iter().copied());
+    let count = motions().count();
+    let io = |source| ExportError::Io { file: path.into(), source };
+    let refuse = |expected| Err(ExportError::Count { file: path.into(), count, expected });
+    match form {
+        Form::Html => {
+            let mut bodies: Vec<(&Skeleton, Body)> = Vec::new();
+            for motion in motions() {
+                if bodies.iter().all(|(skeleton, _)| *skeleton != motion.skeleton) {
+                    bodies.push((motion.skeleton, Body::of(motion.skeleton)));
+                }
+            }
+            let mut page = Page { title: title.to_owned(), sections: Vec::new() };
+            for (title, motions) in sections {
+                let panels = motions.iter().filter_map(|motion| panel(motion, &bodies)).collect();
+                page.sections.push(Section { title: title.clone(), panels });
+            }
+            let failed = |source| ExportError::Page { file: path.into(), source };
+            page.write(BufWriter::new(File::create(path).map_err(io)?)).map_err(failed)?;
+        }
+        Form::Png => {
+            let Some(first) = motions().next() else { return refuse("at least one") };
+            if count > MOST_ROWS {
+                return refuse("at most 100 on a sheet");
+            }
+            if motions().any(|motion| motion.skeleton != first.skeleton) {
+                return refuse("motions of one skeleton");
+            }
+            let rows: Vec<(String, Vec<f32>)> = motions().map(|m| (m.caption.clone(), m.joints.clone())).collect();
+            draw::strip_png_along(&rows, POSES, first.skeleton, &first.waypoints, path).map_err(io)?;
+        }
+        Form::Bvh | Form::Glb | Form::Gif | Form::Npy | Form::Mp4 => {
+            let Some(first) = motions().next().filter(|_| count == 1) else { return refuse("one") };
+            return first.write(path);
+        }
+    }
+    Ok(Written { path: path.into(), off_metres: None })
+}
+
+/// A motion on a page, with its body of those that the page has.
+fn panel<'a>(motion: &'a Motion, bodies: &'a [(&Skeleton, Body)]) -> Option<Panel<'a>> {
+    let (_, body) = bodies.iter().find(|(skeleton, _)| *skeleton == motion.skeleton)?;
+    let Motion { caption, note, joints, waypoints, .. } = motion;
+    Some(Panel { caption: caption.clone(), note: note.clone(), body, joints, waypoints })
+}
+
+/// The name of the file of one of several motions: `walk.bvh` becomes `walk-03.bvh`.
+pub fn numbered(path: &Path, number: usize, count: usize) -> PathBuf {
+    if count < 2 {
+        return path.into();
+    }
+    let digits = count.to_string().len().max(2);
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    let ending = path.extension().unwrap_or_default().to_string_lossy();
+    path.with_file_name(format!("{stem}-{number:0digits$}.{ending}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use motion::synthetic;
+    use protocol::Seed;
+    use protocol::stage::DataSynthetic;
+
+    use super::*;
+
+    fn motion() -> Motion {
+        let dataset = synthetic::generate(&DataSynthetic { clips: 1, ..DataSynthetic::default() }, Seed(1));
+        let features = dataset.clips[0].features.to_vec();
+        Motion {
+            caption: "a person walks forward.".into(),
+            note: "seed 1".into(),
+            skeleton: dataset.skeleton(),
+            joints: recover_joints(&features, dataset.skeleton()),
+            features: Some(features),
+            waypoints: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn each_form_is_written_and_arrays_come_back() {
+        let folder = tempfile::tempdir().unwrap();
+        let motion = motion();
+        for (ending, begins) in [
+            ("bvh", &b"HIERARCHY"[..]),
+            ("glb", b"glTF"),
+            ("gif", b"GIF89a"),
+            ("PNG", b"\x89PNG"),
+            ("html", b"<!DOCTYPE html>"),
+            ("npy", b"\x93NUMPY"),
+        ] {
+            let file = folder.path().join(format!("walk.{ending}"));
+            let written = motion.write(&file).unwrap();
+            assert!(fs::read(&file).unwrap().starts_with(begins), "{ending}");
+            assert_eq!(written.off_metres.is_some(), ["bvh", "glb"].contains(&ending), "{ending}");
+            assert!(written.off_metres.is_none_or(|off| off < 1e-3), "{ending}: {:?} m", written.off_metres);
+        }
+        let back = Motion::read_npy(&folder.path().join("walk.npy")).unwrap();
+        assert_eq!((&back.joints, &back.features, back.caption.as_str()), (&motion.joints, &motion.features, "walk"));
+        let file = folder.path().join("joints.npy");
+        Motion { features: None, ..motion.clone() }.write(&file).unwrap();
+        let back = Motion::read_npy(&file).unwrap();
+        assert_eq!((back.joints, back.features), (motion.joints, None));
+    }
+
+    #[test]
+    fn several_go_on_one_page_or_get_numbers() {
+        let folder = tempfile::tempdir().unwrap();
+        let motion = motion();
+        let at = |name: &str| folder.path().join(name);
+        let sections = [("one".to_owned(), vec![&motion, &motion]), ("two".to_owned(), vec![&motion])];
+        write_all("three", &sections, &at("all.html")).unwrap();
+        assert_eq!(fs::read_to_string(at("all.html")).unwrap().matches("<figure>").count(), 3);
+        write_all("three", &sections, &at("all.png")).unwrap();
+        let refused = write_all("three", &sections, &at("all.bvh")).unwrap_err().to_string();
+        assert!(refused.contains("3 motions, expected one"), "{refused}");
+        let many = [(String::new(), vec![&motion; 101])];
+        assert!(write_all("x", &many, &at("x.png")).unwrap_err().to_string().contains("at most 100"));
+        assert_eq!(numbered(Path::new("a/walk.bvh"), 3, 12), Path::new("a/walk-03.bvh"));
+        assert_eq!(numbered(Path::new("walk.tar.bvh"), 3, 100), Path::new("walk.tar-003.bvh"));
+        assert_eq!(numbered(Path::new("walk.bvh"), 1, 1), Path::new("walk.bvh"));
+    }
+
+    #[test]
+    fn a_video_is_made_where_there_is_an_encoder() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut motion = motion();
+        motion.joints.truncate(20 * 66);
+        let file = folder.path().join("-walk.mp4");
+        let refused = motion.mp4(&file, "no-such-encoder").unwrap_err().to_string();
+        assert!(refused.contains("`no-such-encoder`") && refused.contains(".gif"), "{refused}");
+        let refused = motion.mp4(&file, "false").unwrap_err().to_string();
+        assert!(refused.contains("it said nothing"), "{refused}");
+        match motion.write(&file) {
+            Ok(_) => assert_eq!(&fs::read(&file).unwrap()[4..8], b"ftyp"),
+            Err(ExportError::NoEncoder { .. }) => eprintln!("SKIPPED: there is no ffmpeg here to make a video with"),
+            Err(error) => panic!("{error}"),
+        }
+    }
+
+    #[test]
+    fn what_is_no_motion_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("a.npy");
+        for (shape, values) in [(&[4, 100][..], 400), (&[2, 3, 22], 132), (&[0, 263], 0), (&[263], 263)] {
+            npy::write(&file, shape, &vec![0.0; values]).unwrap();
+            let refused = Motion::read_npy(&file).unwrap_err().to_string();
+            assert!(refused.contains("a.npy") && refused.contains("[frames, 263]"), "{refused}");
+        }
+        npy::write(&file, &[2, 22, 3], &[f32::NAN; 132]).unwrap();
+        assert!(Motion::read_npy(&file).unwrap_err().to_string().contains("frame 0"));
+        for name in ["walk", "walk.fbx", "walk.npy.zip"] {
+            let refused = motion().write(Path::new(name)).unwrap_err().to_string();
+            assert!(refused.contains(".bvh, .glb"), "{refused}");
+        }
+        let refused = motion().write(&folder.path().join("none/walk.glb")).unwrap_err().to_string();
+        assert!(refused.contains("none/walk.glb"), "{refused}");
+    }
+}

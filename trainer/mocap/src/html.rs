@@ -1,0 +1,253 @@
+//! Motions on one page: a viewer that is one file, needs no network and no program but a browser.
+//!
+//! What is drawn: each motion as a figure on a floor, seen from a point that a drag moves, all on one time line that plays, stops and is scrubbed;
+//! its caption above, left bones blue and right ones orange, the waypoints that it was told. `page.html#t=1.5` opens at that second, stopped.
+//!
+//! Layout of the file: captions and notes stand in it as text. Positions stand in a block of JSON: per motion the bytes of `T x J x 3` numbers of 16 bits
+//! (little-endian, base64), `step` and `origin`; a coordinate is `origin + step * number` metres. `step` is [`STEP`], or as much larger as a motion
+//! needs that is wider than 6.5 m, so that a coordinate is at most half a step off.
+//!
+//! Captions come from people and files that nobody vouches for. They are escaped, control characters and marks that turn the reading direction are shown as their
+//! numbers, and the page's policy lets no script and no style run but the two that its digests name, and lets nothing be fetched.
+
+use std::io::{self, Write};
+
+use motion::waypoints::Waypoint;
+use protocol::{Digest, printable};
+use serde_json::{Value, json};
+
+use crate::base64;
+use crate::body::{Body, Side};
+
+const SCRIPT: &str = include_str!("html/viewer.js");
+const STYLE: &str = include_str!("html/page.css");
+const CONTROLS: &str = include_str!("html/controls.html");
+
+/// Metres between neighbouring numbers.
+pub const STEP: f64 = 1e-4;
+
+/// Motions on a page.
+pub const MOST_PANELS: usize = 512;
+
+/// Coordinates on a page: 40 MB of text.
+pub const MOST_COORDINATES: usize = 15_000_000;
+
+/// Metres beyond which a coordinate is a mistake.
+const FARTHEST: f64 = 1e4;
+
+/// A motion on the page.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Panel<'a> {
+    /// Above it, such as the sentence that it was drawn for.
+    pub caption: String,
+    /// In small letters, such as model and seed.
+    pub note: String,
+    /// Whose joints these are.
+    pub body: &'a Body,
+    /// Positions `[T, J, 3]` in the body's unit.
+    pub joints: &'a [f32],
+    /// What the motion was told, in metres.
+    pub waypoints: &'a [Waypoint],
+}
+
+/// Motions that belong together, side by side.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Section<'a> {
+    /// Above them; may be empty.
+    pub title: String,
+    /// In reading order.
+    pub panels: Vec<Panel<'a>>,
+}
+
+/// A page.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Page<'a> {
+    /// Its heading.
+    pub title: String,
+    /// From top to bottom.
+    pub sections: Vec<Section<'a>>,
+}
+
+/// Why a page cannot be made.
+#[derive(Debug, thiserror::Error)]
+pub enum PageError {
+    /// There is nothing to show.
+    #[error("a page without motions; give at least one")]
+    Empty,
+    /// Too much for one page.
+    #[error(
+        "{panels} motions with {coordinates} coordinates; a page takes at most {MOST_PANELS} with {MOST_COORDINATES}"
+    )]
+    TooMuch {
+        /// Motions.
+        panels: usize,
+        /// Their coordinates.
+        coordinates: usize,
+    },
+    /// Not a whole number of frames, or none.
+    #[error("motion {panel} has {values} coordinates, expected frames of {joints} joints x 3")]
+    Shape {
+        /// Which one, from 1.
+        panel: usize,
+        /// Coordinates.
+        values: usize,
+        /// J.
+        joints: usize,
+    },
+    /// NaN, infinity, or farther away than any motion goes.
+    #[error("frame {frame} of motion {panel} has a coordinate of {value} m; expected less than 10 km")]
+    NotFinite {
+        /// Which one, from 1.
+        panel: usize,
+        /// Which frame, from 0.
+        frame: usize,
+        /// What it is.
+        value: f64,
+    },
+    /// The file refused.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+}
+
+impl Page<'_> {
+    /// Writes the page.
+    ///
+    /// # Errors
+    /// Joints that are no motion, more than a page takes, or a file that refuses.
+    pub fn write(&self, mut out: impl Write) -> Result<(), PageError> {
+        let panels = || self.sections.iter().flat_map(|section| &section.panels);
+        let (count, coordinates) = (panels().count(), panels().map(|panel| panel.joints.len()).sum());
+        if count == 0 {
+            return Err(PageError::Empty);
+        }
+        if count > MOST_PANELS || coordinates > MOST_COORDINATES {
+            return Err(PageError::TooMuch { panels: count, coordinates });
+        }
+        let mut bodies: Vec<&Body> = Vec::new();
+        let mut motions = Vec::with_capacity(count);
+        for (i, panel) in panels().enumerate() {
+            let known = bodies.iter().position(|body| *body == panel.body);
+            let body = known.unwrap_or_else(|| {
+                bodies.push(panel.body);
+                bodies.len() - 1
+            });
+            motions.push(motion(i + 1, panel, body)?);
+        }
+        let data = json!({"bodies": bodies.into_iter().map(describe).collect::<Vec<_>>(), "motions": motions});
+        // No `<` is left, so nothing in the block can end it.
+        let data = data.to_string().replace('<', "\\u003c");
+        self.head(&mut out)?;
+        self.figures(&mut out)?;
+        out.write_all(CONTROLS.as_bytes())?;
+        writeln!(out, "<script type=\"application/json\" id=\"motions\">{data}</script>")?;
+        writeln!(out, "<script>{SCRIPT}</script>\n</body>\n</html>")?;
+        out.flush()?;
+        Ok(())
+    }
+
+    fn head(&self, out: &mut impl Write) -> io::Result<()> {
+        let digest = |text: &str| base64::encode(Digest::of(text.as_bytes()).as_bytes());
+        let title = text(&self.title);
+        write!(
+            out,
+            "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+             <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; script-src 'sha256-{}'; style-src 'sha256-{}'; \
+             img-src data:; base-uri 'none'; form-action 'none'\">\n\
+             <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<meta name=\"color-scheme\" content=\"light dark\">\n\
+             <link rel=\"icon\" href=\"data:,\">\n<title>{title}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n\
+             <header><h1 dir=\"auto\">{title}</h1></header>\n",
+            digest(SCRIPT),
+            digest(STYLE),
+        )
+    }
+
+    fn figures(&self, out: &mut impl Write) -> io::Result<()> {
+        let mut number = 0;
+        writeln!(out, "<main>")?;
+        for section in &self.sections {
+            writeln!(out, "<section>")?;
+            if !section.title.is_empty() {
+                writeln!(out, "<h2 dir=\"auto\">{}</h2>", text(&section.title))?;
+            }
+            writeln!(out, "<div class=\"row\">")?;
+            for panel in &section.panels {
+                let (caption, note) = (text(&panel.caption), text(&panel.note));
+                let (frames, fps) = (panel.joints.len() / (3 * panel.body.joints()), panel.body.fps);
+                writeln!(
+                    out,
+                    "<figure><figcaption id=\"c{number}\"><span dir=\"auto\">{caption}</span><small dir=\"auto\">{note}</small>\
+                     <small>{frames} frames at {fps} fps</small></figcaption>\
+                     <canvas tabindex=\"0\" role=\"img\" aria-labelledby=\"c{number}\"></canvas></figure>"
+                )?;
+                number += 1;
+            }
+            writeln!(out, "</div>\n</section>")?;
+        }
+        writeln!(out, "</main>")
+    }
+}
+
+/// Text of somebody else inside of an element.
+fn text(untrusted: &str) -> String {
+    let mut escaped = String::with_capacity(untrusted.len());
+    for c in printable(untrusted).chars() {
+        match c {
+            '&' => escaped.push_str("&amp;"),
+            '<' => escaped.push_str("&lt;"),
+            '>' => escaped.push_str("&gt;"),
+            '"' => escaped.push_str("&quot;"),
+            '\'' => escaped.push_str("&#39;"),
+            c => escaped.push(c),
+        }
+    }
+    escaped
+}
+
+/// A body as the script reads it.
+fn describe(body: &Body) -> Value {
+    let letter = |side: &Side| match side {
+        Side::Middle => 'm',
+        Side::Left => 'l',
+        Side::Right => 'r',
+    };
+    json!({
+        "parents": body.parents,
+        "sides": body.sides.iter().map(letter).collect::<String>(),
+        "head": body.head,
+    })
+}
+
+/// Positions in steps, and what the motion was told.
+fn motion(number: usize, panel: &Panel<'_>, body: usize) -> Result<Value, PageError> {
+    let Panel { joints, body: Body { fps, metres_per_unit, .. }, .. } = panel;
+    let width = 3 * panel.body.joints();
+    if width == 0 || joints.is_empty() || !joints.len().is_multiple_of(width) {
+        return Err(PageError::Shape { panel: number, values: joints.len(), joints: panel.body.joints() });
+    }
+    let metres = |v: f32| f64::from(v) * metres_per_unit;
+    let mut bounds = [[f64::INFINITY, f64::NEG_INFINITY]; 3];
+    for (at, value) in joints.iter().enumerate() {
+        let value = metres(*value);
+        if value.is_nan() || value.abs() > FARTHEST {
+            return Err(PageError::NotFinite { panel: number, frame: at / width, value });
+        }
+        let [low, high] = &mut bounds[at % 3];
+        (*low, *high) = (low.min(value), high.max(value));
+    }
+    let origin = bounds.map(|[low, high]| (low + high) / 2.0);
+    let reach = bounds.iter().map(|[low, high]| (high - low) / 2.0).fold(0.0, f64::max);
+    let step = STEP.max(reach / f64::from(i16::MAX));
+    #[expect(clippy::cast_possible_truncation, reason = "a step is so large that the farthest has the largest number")]
+    let number_of = |(at, v): (usize, &f32)| ((metres(*v) - origin[at % 3]) / step).round() as i16;
+    let bytes: Vec<u8> = joints.iter().enumerate().map(number_of).flat_map(i16::to_le_bytes).collect();
+    let told = panel.waypoints.iter().map(|w| json!([w.frame, w.joint, w.position[0], w.position[1], w.position[2]]));
+    Ok(json!({
+        "body": body,
+        "fps": fps,
+        "frames": joints.len() / width,
+        "step": step,
+        "origin": origin,
+        "joints": base64::encode(&bytes),
+        "waypoints": told.collect::<Vec<_>>(),
+    }))
+}
