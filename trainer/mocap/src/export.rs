@@ -16,9 +16,12 @@ use motion::{Skeleton, draw};
 use protocol::stage::DataFormat;
 
 use crate::body::Body;
+use crate::bvh::{Bvh, BvhError};
 use crate::glb::{self, GlbError};
 use crate::html::{Page, PageError, Panel, Section};
+use crate::joint_map::MapError;
 use crate::rotations::{Rig, RigError};
+use crate::take::{self, Reading, Take};
 
 /// Poses of one motion on a sheet.
 const POSES: usize = 10;
@@ -120,7 +123,13 @@ pub enum ExportError {
     /// An array that is no motion.
     #[error(transparent)]
     Npy(#[from] NpyError),
-    /// An array of another shape, or with numbers that are not finite.
+    /// A recording that does not read.
+    #[error(transparent)]
+    Bvh(#[from] BvhError),
+    /// A recording whose joints are not found.
+    #[error("{}: {source}", file.display())]
+    Map { file: PathBuf, source: MapError },
+    /// An array of another shape, numbers that are not finite, or a name that says no form that is read.
     #[error("{}: {what}", file.display())]
     Array {
         file: PathBuf,
@@ -156,6 +165,36 @@ pub struct Written {
 }
 
 impl Motion {
+    /// Reads a file: an array as [`Motion::read_npy`] does, or a recording in BVH, mapped to the 22 joints of HumanML3D and sampled at its 20 frames per second. `reading` is what a user
+    /// says of a recording; the note says how it was read.
+    ///
+    /// # Errors
+    /// A file that is neither, or broken.
+    pub fn read(file: &Path, reading: &Reading) -> Result<Self, ExportError> {
+        match Form::of(file) {
+            Ok(Form::Npy) => Self::read_npy(file),
+            Ok(Form::Bvh) => {
+                let bvh = Bvh::read(file)?;
+                let take = Take::of_bvh(&bvh, reading);
+                let take = take.map_err(|source| ExportError::Map { file: file.into(), source })?;
+                let skeleton = Skeleton::of(DataFormat::Humanml3d);
+                let joints = take::resample(&take.joints, 3 * skeleton.joints, take.rate, skeleton.fps);
+                let joints = joints.into_iter().map(|v| v as f32).collect();
+                Ok(Self { note: take.said, ..Self::of(file, skeleton, joints, None) })
+            }
+            _ => {
+                let what = "expected an array, .npy, or a recording, .bvh".to_owned();
+                Err(ExportError::Array { file: file.into(), what })
+            }
+        }
+    }
+
+    /// A motion of a file, by whose name it goes.
+    fn of(file: &Path, skeleton: &'static Skeleton, joints: Vec<f32>, features: Option<Vec<f32>>) -> Self {
+        let caption = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        Self { caption, note: String::new(), skeleton, joints, features, waypoints: Vec::new() }
+    }
+
     /// Reads an array: features `[L, 263]` or `[L, 251]`, or positions `[T, 22, 3]` or `[T, 21, 3]`.
     ///
     /// # Errors
@@ -183,8 +222,7 @@ impl Motion {
             2 => (recover_joints(&array.data, skeleton), Some(array.data)),
             _ => (array.data, None),
         };
-        let name = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        Ok(Self { caption: name, note: String::new(), skeleton, joints, features, waypoints: Vec::new() })
+        Ok(Self::of(file, skeleton, joints, features))
     }
 
     /// T.
@@ -381,6 +419,12 @@ mod tests {
         }
         let back = Motion::read_npy(&folder.path().join("walk.npy")).unwrap();
         assert_eq!((&back.joints, &back.features, back.caption.as_str()), (&motion.joints, &motion.features, "walk"));
+        let bvh = Motion::read(&folder.path().join("walk.bvh"), &Reading::default()).unwrap();
+        assert!(bvh.note.contains("centimetre") && bvh.frames() == motion.frames(), "{}", bvh.note);
+        let worst = bvh.joints.iter().zip(&motion.joints).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        println!("a .bvh of ours comes back to {worst:.1e} m");
+        assert!(worst < 1e-3, "{worst}");
+        assert!(Motion::read(&folder.path().join("walk.gif"), &Reading::default()).is_err());
         let file = folder.path().join("joints.npy");
         Motion { features: None, ..motion.clone() }.write(&file).unwrap();
         let back = Motion::read_npy(&file).unwrap();
