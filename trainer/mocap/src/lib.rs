@@ -1,15 +1,20 @@
 //! Motion of other programs: recordings in, animations out. No tensors, no stages.
 
+pub mod arrays;
 mod base64;
 pub mod body;
 pub mod bvh;
+pub mod captions;
+pub mod corpus;
 pub mod detect;
 pub mod export;
 pub mod glb;
 pub mod html;
 pub mod joint_map;
+pub mod listing;
 pub mod requests;
 pub mod rotations;
+pub mod sample;
 pub mod take;
 
 pub use body::Body;

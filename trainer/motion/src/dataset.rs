@@ -14,8 +14,8 @@ use std::fmt;
 use protocol::stage::DataFormat;
 use serde::{Deserialize, Serialize};
 
-pub(crate) use open::{MANY_PROBLEMS, is_clip_id};
-pub use open::{OpenError, OpenReport, Problem, ProblemKind, Skip, SkipReason};
+pub(crate) use open::MANY_PROBLEMS;
+pub use open::{OpenError, OpenReport, Problem, ProblemKind, Skip, SkipReason, is_clip_id};
 pub use pack::PackError;
 pub use statistics::statistics;
 

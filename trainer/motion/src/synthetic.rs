@@ -11,6 +11,8 @@ mod body;
 mod gait;
 mod words;
 
+pub use words::tokens;
+
 use std::fs;
 use std::io;
 use std::path::Path;

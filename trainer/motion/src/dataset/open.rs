@@ -470,7 +470,7 @@ fn read_list(file: &Path) -> Result<Vec<String>, Vec<Problem>> {
 }
 
 /// Whether `id` with an ending is the name of a file in a folder, and can be shown.
-pub(crate) fn is_clip_id(id: &str) -> bool {
+pub fn is_clip_id(id: &str) -> bool {
     id.len() <= limits::CLIP_NAME_BYTES
         && !id.starts_with('.')
         && !id.contains(|c: char| matches!(c, '/' | '\\') || c.is_control())

@@ -49,7 +49,7 @@ fn token(word: &str) -> Option<String> {
 }
 
 /// Tokens of a sentence; words that the dictionary lacks get the tag `X`.
-pub(super) fn tokens(text: &str) -> Vec<String> {
+pub fn tokens(text: &str) -> Vec<String> {
     text.split(|c: char| !c.is_ascii_alphabetic())
         .filter(|word| !word.is_empty())
         .map(|word| token(word).unwrap_or_else(|| format!("{word}/X")))

@@ -1,0 +1,437 @@
+//! Recordings to a dataset: joints, features, mirrored twins, splits and statistics.
+//!
+//! Source of the steps: the published HumanML3D procedure (20 fps, uniform skeleton, features, `M` clips, Mean and Std over all clips of all splits). KIT-ML: 12.5 fps and
+//! 21 joints, made of the 22 as `kit_joints` says. Departs: clips that are too long for the loaders are cut into equal parts instead of left out, and a split
+//! takes whole recordings, so that no part and no mirrored twin of a test clip is trained on.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+use std::path::Path;
+
+use motion::dataset::{Clip, Entry, Split, statistics};
+use motion::features::{extract, mirror_joints};
+use motion::quaternion::{self as quat, Vec3};
+use motion::random::Stream;
+use motion::text::Caption;
+use motion::{Dataset, Skeleton};
+use protocol::Seed;
+use protocol::stage::DataFormat;
+use serde::{Deserialize, Serialize};
+
+use crate::arrays;
+use crate::bvh::Bvh;
+use crate::captions::mirrored;
+use crate::detect::{Up, detect};
+use crate::listing::ClipFile;
+use crate::take::{Reading, Take, resample};
+
+/// How recordings become clips.
+#[derive(Debug, Clone)]
+pub struct Recipe {
+    pub format: DataFormat,
+    /// Joint map, unit and axis; what is `None` is found out for each file.
+    pub reading: Reading,
+    /// Frames per second of arrays that do not say it; `None` is 20 for 22 joints and 12.5 for KIT-ML's 21, as in the published sets.
+    pub rate: Option<f64>,
+    /// Bone lengths `[J]` of the uniform skeleton; `None` is the format's own.
+    pub target: Option<Vec<f64>>,
+    /// Adds the mirrored twin of every clip.
+    pub mirror: bool,
+    /// Whether clips that are too long are cut; else they are left out.
+    pub cut: bool,
+}
+
+/// A clip with its features.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Made {
+    pub id: String,
+    /// The recording that it is a part of.
+    pub source: String,
+    pub listed: Option<Split>,
+    pub captions: Vec<Caption>,
+    pub frames: usize,
+    /// `[frames, D]`; stored apart.
+    #[serde(skip)]
+    pub features: Vec<f32>,
+}
+
+/// What a file gave.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct FromFile {
+    pub clips: Vec<Made>,
+    /// How it was read.
+    pub said: String,
+    /// Why it, or a part of it, gave no clip by the rules.
+    pub left_out: Vec<String>,
+}
+
+/// Reads the joints of a file, `[T, J, 3]` of the format's skeleton at its rate, and how it was read.
+///
+/// # Errors
+/// In words, with the file.
+pub fn joints(file: &Path, recipe: &Recipe) -> Result<(Vec<f32>, String), String> {
+    let skeleton = Skeleton::of(recipe.format);
+    let is_bvh = file.extension().is_some_and(|e| e.eq_ignore_ascii_case("bvh"));
+    let (take, width) = if is_bvh {
+        let bvh = Bvh::read(file).map_err(|e| e.to_string())?;
+        (Take::of_bvh(&bvh, &recipe.reading).map_err(|e| format!("{}: {e}", file.display()))?, 66)
+    } else {
+        of_array(file, recipe)?
+    };
+    let joints = resample(&take.joints, width, take.rate, skeleton.fps);
+    let joints: Vec<f64> = match (width / 3 == skeleton.joints, recipe.format) {
+        (true, _) => joints,
+        (false, DataFormat::Kit) => joints.chunks_exact(66).flat_map(kit_joints).collect(),
+        (false, DataFormat::Humanml3d) => {
+            return Err(format!(
+                "{}: 21 joints, which are KIT-ML's; expected at least 22, or format kit",
+                file.display()
+            ));
+        }
+    };
+    let rate = if (take.rate - skeleton.fps).abs() < 1e-9 {
+        String::new()
+    } else {
+        format!(", {} fps to {}", take.rate, skeleton.fps)
+    };
+    Ok((joints.into_iter().map(|v| v as f32).collect(), take.said + &rate))
+}
+
+/// Arrays are taken as they are in `.npy`, metres and y up, unless told otherwise; `.npz` have either axis up.
+fn of_array(file: &Path, recipe: &Recipe) -> Result<(Take, usize), String> {
+    let found = arrays::read(file)?;
+    let format = if found.joints == 21 { DataFormat::Kit } else { DataFormat::Humanml3d };
+    let rate = found.rate.or(recipe.rate).unwrap_or(Skeleton::of(format).fps);
+    let wide: Vec<f64> = found.data.iter().map(|v| f64::from(*v)).collect();
+    let points = |frame: &[f64]| -> Vec<Vec3> { frame.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect() };
+    let zipped = file.extension().is_some_and(|e| e.eq_ignore_ascii_case("npz"));
+    let mut up = recipe.reading.up.unwrap_or(Up::Y);
+    let mut said = format!("{} joints, {up} up", found.joints);
+    if found.joints == 22 {
+        let step = wide.len().div_ceil(66 * 200);
+        let frames: Vec<Vec<Vec3>> = wide.chunks_exact(66).step_by(step).map(points).collect();
+        let detected = detect(frames.iter().map(Vec::as_slice));
+        if zipped && recipe.reading.up.is_none() && detected.sure_of_up {
+            up = detected.up;
+        }
+        said = format!("22 joints, {up} up");
+        if detected.sure_of_up && detected.up != up {
+            said += &format!(" (the figure stands along {}; set `up` if that is wrong)", detected.up);
+        }
+    }
+    let unit = recipe.reading.metres_per_unit.unwrap_or(1.0);
+    let joints = wide.chunks_exact(3).flat_map(|p| up.to_y([p[0], p[1], p[2]])).map(|v| v * unit).collect();
+    Ok((Take { joints, rate, said }, 3 * found.joints))
+}
+
+/// The 21 joints of KIT-ML's skeleton, of the 22 `[22, 3]`: hip centre, spine, arms and legs with right before left, and a midfoot two fifths from the ankle to the foot.
+fn kit_joints(frame: &[f64]) -> Vec<f64> {
+    let at = |j: usize| -> Vec3 { [frame[3 * j], frame[3 * j + 1], frame[3 * j + 2]] };
+    let between = |a: usize, b: usize, part: f64| quat::add(at(a), quat::scale(quat::sub(at(b), at(a)), part));
+    let leg =
+        |side: usize| [at(1 + side), at(4 + side), at(7 + side), between(7 + side, 10 + side, 0.4), at(10 + side)];
+    let arm = |side: usize| [at(16 + side), at(18 + side), at(20 + side)];
+    let body = [between(1, 2, 0.5), at(3), at(9), at(12), at(15)];
+    body.into_iter().chain(arm(1)).chain(arm(0)).chain(leg(1)).chain(leg(0)).flatten().collect()
+}
+
+/// The clips of a file: its parts, and the mirrored twin of each.
+///
+/// # Errors
+/// A file that is broken, or whose figure has no features, in words.
+pub fn clips_of(file: &ClipFile, recipe: &Recipe) -> Result<FromFile, String> {
+    let skeleton = Skeleton::of(recipe.format);
+    let (joints, said) = joints(&file.path, recipe)?;
+    let width = 3 * skeleton.joints;
+    let frames = (joints.len() / width).saturating_sub(1);
+    let mut made = FromFile { said, ..FromFile::default() };
+    if frames < skeleton.min_frames {
+        made.left_out
+            .push(format!("{}: {frames} frames at {} fps, needs {}", file.id, skeleton.fps, skeleton.min_frames));
+        return Ok(made);
+    }
+    // The longest length that an example may have.
+    let most = skeleton.max_frames - skeleton.unit;
+    let parts = if frames < skeleton.max_frames { 1 } else { frames.div_ceil(most) };
+    if parts > 1 && !recipe.cut {
+        made.left_out.push(format!("{}: {frames} frames, must be below {}", file.id, skeleton.max_frames));
+        return Ok(made);
+    }
+    for part in 0..parts {
+        let (start, end) = (frames * part / parts, frames * (part + 1) / parts);
+        // The frame behind the last gives velocities.
+        let part_joints = &joints[start * width..(end + 1) * width];
+        let id = if parts == 1 { file.id.clone() } else { format!("{}-{}", file.id, part + 1) };
+        let captions =
+            captions_within(&file.captions, start as f64 / skeleton.fps, end as f64 / skeleton.fps, parts > 1);
+        if captions.is_empty() {
+            made.left_out.push(format!("{id}: no caption"));
+            continue;
+        }
+        let versions = [false, true].into_iter().filter(|twin| !twin || recipe.mirror);
+        for twin in versions {
+            let (id, captions, of_twin) = match twin {
+                false => (id.clone(), captions.clone(), None),
+                true => (
+                    format!("M{id}"),
+                    captions.iter().map(mirrored).collect(),
+                    Some(mirror_joints(part_joints, skeleton)),
+                ),
+            };
+            let features = extract(of_twin.as_deref().unwrap_or(part_joints), skeleton, recipe.target.as_deref())
+                .map_err(|e| format!("{}: clip `{id}`: {e}", file.path.display()))?;
+            let frames = features.len() / skeleton.features;
+            made.clips.push(Made { id, source: file.source.clone(), listed: file.listed, captions, frames, features });
+        }
+    }
+    Ok(made)
+}
+
+/// Captions of a part of a recording. One that describes all of it is every part's; others move with the part, and end where it ends.
+fn captions_within(captions: &[Caption], from: f64, to: f64, cut: bool) -> Vec<Caption> {
+    let within = |caption: &Caption| {
+        if !cut || caption.is_whole() {
+            return Some(caption.clone());
+        }
+        let (from_s, to_s) = ((caption.from_s - from).max(0.0), caption.to_s.min(to) - from);
+        (from_s < to_s).then(|| Caption { from_s, to_s, ..caption.clone() })
+    };
+    captions.iter().filter_map(within).collect()
+}
+
+/// How clips are divided.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Division {
+    /// By the folder's lists.
+    Lists,
+    /// Whole recordings, drawn by their names.
+    Sources {
+        seed: Seed,
+        /// Shares of the clips.
+        val: f64,
+        test: f64,
+    },
+}
+
+/// What became of a folder.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Report {
+    /// Files by how they were read, with one of them.
+    pub read: BTreeMap<String, (usize, String)>,
+    pub left_out: Vec<String>,
+    pub notes: Vec<String>,
+    /// Recordings and clips of each split.
+    pub splits: BTreeMap<Split, (usize, usize)>,
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (said, (files, one)) in &self.read {
+            writeln!(f, "{files} file(s) such as {one}: {said}")?;
+        }
+        for (split, (sources, clips)) in &self.splits {
+            writeln!(f, "{split}: {clips} clips of {sources} recordings")?;
+        }
+        for note in &self.notes {
+            writeln!(f, "note: {note}")?;
+        }
+        writeln!(f, "left out: {}", self.left_out.len())?;
+        self.left_out.iter().try_for_each(|what| writeln!(f, "  {what}"))
+    }
+}
+
+impl Report {
+    /// Counts a file, and passes on what was left out of it.
+    pub fn add(&mut self, id: &str, said: &str, left_out: Vec<String>) {
+        self.read.entry(said.to_owned()).or_insert_with(|| (0, id.to_owned())).0 += 1;
+        self.left_out.extend(left_out);
+    }
+
+    /// Says so if some files were read with another axis up than most: a figure that lies is easily taken for one that stands.
+    pub fn compare_axes(&mut self) {
+        let axis = |said: &str| {
+            said.split(", ")
+                .find_map(|part| part.split(" up").next().filter(|_| part.contains(" up")).map(str::to_owned))
+        };
+        let mut counts: BTreeMap<String, (usize, String)> = BTreeMap::new();
+        for (said, (files, one)) in &self.read {
+            if let Some(axis) = axis(said) {
+                counts.entry(axis).or_insert_with(|| (0, one.clone())).0 += files;
+            }
+        }
+        let Some((most, _)) =
+            counts.iter().max_by_key(|(_, (files, _))| *files).map(|(axis, count)| (axis.clone(), count.0))
+        else {
+            return;
+        };
+        for (axis, (files, one)) in counts.into_iter().filter(|(axis, _)| *axis != most) {
+            self.notes.push(format!(
+                "{files} file(s) such as {one} were read with {axis} up, most with {most}; set `up` if that is wrong"
+            ));
+        }
+    }
+}
+
+/// Makes a dataset of clips. Their order is kept; entries are sorted by split. By the loaders' rules a caption with times is an entry of its own if its frames are enough.
+///
+/// # Errors
+/// Clips of one recording in two lists, clips in none, or nothing to train on.
+pub fn assemble(
+    format: DataFormat,
+    made: Vec<Made>,
+    division: Division,
+    report: &mut Report,
+) -> Result<Dataset, String> {
+    let skeleton = Skeleton::of(format);
+    let splits = divide(&made, division)?;
+    let mut dataset = Dataset { format, mean: vec![], std: vec![], clips: vec![], captions: vec![], entries: vec![] };
+    let mut sources: BTreeMap<Split, BTreeSet<String>> = BTreeMap::new();
+    for (made, split) in made.into_iter().zip(splits) {
+        let Some(split) = split else {
+            report.left_out.push(format!("{}: in none of train.txt, val.txt and test.txt", made.id));
+            continue;
+        };
+        let clip = dataset.clips.len();
+        let (mut whole, mut parts) = (vec![], vec![]);
+        for (i, caption) in made.captions.into_iter().enumerate() {
+            let index = dataset.captions.len();
+            let range = caption.frames(skeleton.fps).map(|(from, to)| (from.min(made.frames), to.min(made.frames)));
+            match range {
+                None => whole.push(index),
+                Some((from, to)) if (skeleton.min_frames..skeleton.max_frames).contains(&to.saturating_sub(from)) => {
+                    let mut id = format!("{}@{from}-{to}", made.id);
+                    if parts.iter().any(|part: &Entry| part.id == id) {
+                        id = format!("{id}.{}", i + 1);
+                    }
+                    parts.push(Entry { id, clip, start: from, len: to - from, captions: vec![index], split });
+                }
+                Some((from, to)) => {
+                    let what =
+                        format!("{}: caption {} describes frames {from} to {to}, too few or too many", made.id, i + 1);
+                    report.left_out.push(what);
+                    continue;
+                }
+            }
+            dataset.captions.push(caption);
+        }
+        if whole.is_empty() && parts.is_empty() {
+            report.left_out.push(format!("{}: no usable caption", made.id));
+            continue;
+        }
+        if !whole.is_empty() {
+            dataset.entries.push(Entry {
+                id: made.id.clone(),
+                clip,
+                start: 0,
+                len: made.frames,
+                captions: whole,
+                split,
+            });
+        }
+        dataset.entries.extend(parts);
+        sources.entry(split).or_default().insert(made.source);
+        dataset.clips.push(Clip { id: made.id, frames: made.frames, features: made.features.into() });
+        report.splits.entry(split).or_default().1 += 1;
+    }
+    for (split, sources) in sources {
+        report.splits.entry(split).or_default().0 = sources.len();
+    }
+    dataset.entries.sort_by_key(|entry| entry.split);
+    if dataset.entries.first().is_none_or(|entry| entry.split != Split::Train) {
+        return Err(format!("no usable training clip\n{report}"));
+    }
+    let (mean, std) = statistics(skeleton, dataset.clips.iter().map(|clip| &*clip.features));
+    dataset.mean = mean.into_iter().map(|v| v as f32).collect();
+    dataset.std = std.into_iter().map(|v| v as f32).collect();
+    Ok(dataset)
+}
+
+/// The split of each clip.
+fn divide(made: &[Made], division: Division) -> Result<Vec<Option<Split>>, String> {
+    let Division::Sources { seed, val, test } = division else {
+        let mut of: BTreeMap<&str, (Split, &str)> = BTreeMap::new();
+        for clip in made {
+            let Some(split) = clip.listed else { continue };
+            let (other, id) = *of.entry(&clip.source).or_insert((split, &clip.id));
+            if other != split {
+                return Err(format!(
+                    "`{id}` ({other}) and `{}` ({split}) are of one recording, `{}`; set `splits: source`, or take one of them off the lists",
+                    clip.id, clip.source
+                ));
+            }
+        }
+        return Ok(made.iter().map(|clip| clip.listed).collect());
+    };
+    let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
+    for clip in made {
+        *counts.entry(&clip.source).or_default() += 1;
+    }
+    // Each recording draws by its name, so that a new one among them moves few others.
+    let mut order: Vec<(u64, &str)> = counts
+        .keys()
+        .map(|source| (Stream::new(seed, &format!("mocap/split/{source}"), 0, 0).bits(), *source))
+        .collect();
+    order.sort_unstable();
+    let share = |part: f64| (part * made.len() as f64).round() as usize;
+    let (val, test) = (share(val), share(test));
+    let mut splits = BTreeMap::new();
+    let mut given = 0;
+    for (_, source) in order {
+        let split = match given {
+            given if given < test => Split::Test,
+            given if given < test + val => Split::Val,
+            _ => Split::Train,
+        };
+        given += counts[source];
+        splits.insert(source, split);
+    }
+    Ok(made.iter().map(|clip| splits.get(clip.source.as_str()).copied()).collect())
+}
+
+/// The scales of the published evaluators: those of the set, with turn, velocity and height of the root and the contacts divided by 25, so that they weigh more.
+///
+/// Source: the text-to-motion evaluators' `feat_bias`; the published files have ratios of 24.9 to 25.3.
+pub fn evaluator_std(skeleton: &Skeleton, std: &[f32]) -> Vec<f32> {
+    const BIAS: f32 = 25.0;
+    let layout = skeleton.layout();
+    let mut std = std.to_vec();
+    for group in [layout.yaw, layout.root_velocity, layout.root_height, layout.contacts] {
+        std[group].iter_mut().for_each(|v| *v /= BIAS);
+    }
+    std
+}
+
+/// How many of a folder's clips a listing shows in a picture, evenly spread.
+pub fn spread(count: usize, most: usize) -> Vec<usize> {
+    let shown = count.min(most);
+    (0..shown).map(|i| i * count / shown.max(1)).collect()
+}
+
+/// Reads a table of bone lengths: `.npy` of offsets `[J, 3]` or lengths `[J]`.
+///
+/// # Errors
+/// In words, with the file.
+pub fn read_target(file: &Path, skeleton: &Skeleton) -> Result<Vec<f64>, String> {
+    let array = motion::npy::read_any_float(file).map_err(|e| e.to_string())?;
+    let joints = skeleton.joints;
+    let lengths = match array.shape[..] {
+        [n, 3] if n == joints => skeleton.lengths_of_offsets(&array.data),
+        [n] if n == joints => array.data.iter().map(|v| f64::from(*v)).collect(),
+        _ => {
+            return Err(format!(
+                "{}: shape {:?}, expected offsets [{joints}, 3] or lengths [{joints}]",
+                file.display(),
+                array.shape
+            ));
+        }
+    };
+    match (1..joints).find(|j| !(lengths[*j].is_finite() && lengths[*j] > 0.0)) {
+        None => Ok(lengths),
+        Some(j) => Err(format!(
+            "{}: the bone to `{}` has the length {}, expected a positive number",
+            file.display(),
+            skeleton.names[j],
+            lengths[j]
+        )),
+    }
+}

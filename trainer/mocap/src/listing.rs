@@ -1,0 +1,309 @@
+//! What a folder of recordings holds: clips, their captions, and which recording each is a part of.
+//!
+//! Clips are the `.bvh`, `.npy` and `.npz` files of the folder and below it, or of its `joints/` (else `new_joints/`) alone if it has one, as a HumanML3D folder does. A clip's id is its path without the
+//! ending, folders joined by `_`. Captions come from `texts/ID.txt`, from the file of the same name with the ending `.txt`, and from tables: the given one, else
+//! `captions.csv` or `captions.json`. A table, or `index.csv`, may name each clip's source; a file without one is a recording of its own.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use motion::dataset::{Split, is_clip_id};
+use motion::files;
+use motion::text::Caption;
+use protocol::limits;
+
+use crate::captions;
+
+/// Endings of clips.
+const ENDINGS: [&str; 3] = ["bvh", "npy", "npz"];
+/// Arrays of a HumanML3D folder that are no clips.
+const NO_CLIPS: [&str; 4] = ["Mean", "Std", "mean", "std"];
+/// Mistakes that are shown.
+const SHOWN: usize = 40;
+
+/// A clip before it is read.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ClipFile {
+    pub id: String,
+    pub path: PathBuf,
+    /// The recording that it is a part of.
+    pub source: String,
+    pub captions: Vec<Caption>,
+    /// By the folder's own lists, if it has them.
+    pub listed: Option<Split>,
+}
+
+/// A folder's clips.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Listing {
+    /// Sorted by id.
+    pub clips: Vec<ClipFile>,
+    /// What was passed over, for people.
+    pub notes: Vec<String>,
+    /// Whether the folder has `train.txt`, `val.txt` and `test.txt`.
+    pub has_lists: bool,
+}
+
+/// Everything that is wrong with a folder.
+#[derive(Debug)]
+pub struct ListError {
+    pub folder: PathBuf,
+    pub problems: Vec<String>,
+}
+
+impl fmt::Display for ListError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: {} problem(s) in the folder of recordings", self.folder.display(), self.problems.len())?;
+        for problem in self.problems.iter().take(SHOWN) {
+            write!(f, "\n  {problem}")?;
+        }
+        if self.problems.len() > SHOWN {
+            write!(f, "\n  ... and {} more", self.problems.len() - SHOWN)?;
+        }
+        Ok(())
+    }
+}
+
+impl std::error::Error for ListError {}
+
+/// Looks through a folder; `table` is a file of captions, relative to the working directory.
+///
+/// # Errors
+/// All mistakes of the folder together.
+pub fn list(folder: &Path, table: Option<&Path>) -> Result<Listing, ListError> {
+    let fail = |problems| ListError { folder: folder.into(), problems };
+    let root = ["joints", "new_joints"].iter().map(|name| folder.join(name)).find(|path| path.is_dir());
+    let root = root.unwrap_or_else(|| folder.to_owned());
+    let found = files::tree(&root).map_err(|e| fail(vec![e.to_string()]))?;
+    let (mut problems, mut clips) = (vec![], BTreeMap::new());
+    for path in found {
+        let ending = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).unwrap_or_default();
+        let id = id_of(path.strip_prefix(&root).unwrap_or(&path));
+        if !ENDINGS.contains(&ending.as_str()) || NO_CLIPS.contains(&id.as_str()) || id == "tgt_offsets" {
+            continue;
+        }
+        if !is_clip_id(&id) {
+            problems.push(format!(
+                "{}: not the name of a clip; rename it without control characters and dots in front",
+                path.display()
+            ));
+            continue;
+        }
+        let clip = ClipFile { source: id.clone(), id: id.clone(), path, captions: vec![], listed: None };
+        if let Some(other) = clips.insert(id.clone(), clip) {
+            problems
+                .push(format!("{}: another file gives the clip `{id}` too; rename one of them", other.path.display()));
+        }
+    }
+    if clips.is_empty() && problems.is_empty() {
+        problems.push(format!("no file that ends in .bvh, .npy or .npz in {}", root.display()));
+    }
+    if clips.len() > limits::CLIPS {
+        problems.push(format!("{} clips, at most {} are read", clips.len(), limits::CLIPS));
+        return Err(fail(problems));
+    }
+    let mut notes = vec![];
+    for clip in clips.values_mut() {
+        if let Err(problem) = texts(folder, clip) {
+            problems.push(problem);
+        }
+    }
+    for (file, required) in tables(folder, table) {
+        match read_text(&file) {
+            Ok(Some(text)) => match captions::of_table(&file, &text) {
+                Ok(rows) => apply(&file, rows, &mut clips, &mut notes, &mut problems),
+                Err(problem) => problems.push(problem),
+            },
+            Ok(None) if required => problems.push(format!("{}: no such file", file.display())),
+            Ok(None) => {}
+            Err(problem) => problems.push(problem),
+        }
+    }
+    let has_lists = lists(folder, &mut clips, &mut problems);
+    if problems.is_empty() {
+        Ok(Listing { clips: clips.into_values().collect(), notes, has_lists })
+    } else {
+        Err(fail(problems))
+    }
+}
+
+/// The path without ending, folders joined by `_`.
+fn id_of(path: &Path) -> String {
+    let parts = path.with_extension("");
+    parts.iter().map(|part| part.to_string_lossy()).collect::<Vec<_>>().join("_")
+}
+
+fn read_text(file: &Path) -> Result<Option<String>, String> {
+    match files::read(file, limits::CLIP_LIST_BYTES) {
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
+        Err(e) => Err(format!("{}: {e}", file.display())),
+        Ok(bytes) => String::from_utf8(bytes).map(Some).map_err(|_| format!("{}: not UTF-8 text", file.display())),
+    }
+}
+
+/// The captions in a file of the clip's own.
+fn texts(folder: &Path, clip: &mut ClipFile) -> Result<(), String> {
+    for file in [folder.join("texts").join(format!("{}.txt", clip.id)), clip.path.with_extension("txt")] {
+        if let Some(text) = read_text(&file)? {
+            clip.captions = captions::of_text(&file, &text)?;
+            break;
+        }
+    }
+    Ok(())
+}
+
+fn tables(folder: &Path, table: Option<&Path>) -> Vec<(PathBuf, bool)> {
+    let own = match table {
+        Some(table) => vec![(table.to_owned(), true)],
+        None => vec![(folder.join("captions.csv"), false), (folder.join("captions.json"), false)],
+    };
+    own.into_iter().chain([(folder.join("index.csv"), false)]).collect()
+}
+
+/// Gives each row's captions and source to its clip, which it names by id, by path, or by file name if that is one clip's alone.
+fn apply(
+    file: &Path,
+    rows: Vec<captions::Row>,
+    clips: &mut BTreeMap<String, ClipFile>,
+    notes: &mut Vec<String>,
+    problems: &mut Vec<String>,
+) {
+    let mut by_stem: BTreeMap<String, Vec<String>> = BTreeMap::new();
+    for clip in clips.values() {
+        let stem = clip.path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        by_stem.entry(stem).or_default().push(clip.id.clone());
+    }
+    let mut unknown = BTreeSet::new();
+    for row in rows {
+        let path = Path::new(&row.clip);
+        let known = path.extension().is_some_and(|e| ENDINGS.iter().any(|ending| e.eq_ignore_ascii_case(ending)));
+        let bare = if known { path.with_extension("") } else { path.to_owned() };
+        let id = bare.iter().map(|part| part.to_string_lossy()).collect::<Vec<_>>().join("_");
+        let stem = bare.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let id = match by_stem.get(&stem) {
+            _ if clips.contains_key(&id) => id,
+            Some(ids) if ids.len() == 1 => ids[0].clone(),
+            Some(ids) => {
+                problems.push(format!(
+                    "{}: `{}` may be {}; write the path",
+                    file.display(),
+                    row.clip,
+                    ids.join(" or ")
+                ));
+                continue;
+            }
+            None => {
+                unknown.insert(row.clip);
+                continue;
+            }
+        };
+        if let Some(clip) = clips.get_mut(&id) {
+            for caption in row.captions {
+                if !clip.captions.contains(&caption) {
+                    clip.captions.push(caption);
+                }
+            }
+            clip.source = row.source.unwrap_or_else(|| clip.source.clone());
+        }
+    }
+    if !unknown.is_empty() {
+        let some: Vec<&str> = unknown.iter().map(String::as_str).take(5).collect();
+        notes.push(format!(
+            "{}: {} rows are of clips that the folder has not, such as {}",
+            file.display(),
+            unknown.len(),
+            some.join(", ")
+        ));
+    }
+}
+
+/// Reads the folder's own lists, if all three are there.
+fn lists(folder: &Path, clips: &mut BTreeMap<String, ClipFile>, problems: &mut Vec<String>) -> bool {
+    let mut texts = vec![];
+    for split in Split::ALL {
+        match read_text(&folder.join(format!("{split}.txt"))) {
+            Ok(Some(text)) => texts.push((split, text)),
+            Ok(None) => return false,
+            Err(problem) => problems.push(problem),
+        }
+    }
+    for (split, text) in texts {
+        for id in text.lines().map(str::trim).filter(|id| !id.is_empty()) {
+            if let Some(clip) = clips.get_mut(id) {
+                if clip.listed.is_some_and(|listed| listed != split) {
+                    problems.push(format!("`{id}` is in more than one of train.txt, val.txt and test.txt"));
+                }
+                clip.listed = Some(split);
+            }
+        }
+    }
+    true
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    fn folder(files: &[(&str, &str)]) -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        for (name, content) in files {
+            let path = folder.path().join(name);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, content).unwrap();
+        }
+        folder
+    }
+
+    #[test]
+    fn captions_and_sources_find_their_clips() {
+        let folder = folder(&[
+            ("a/walk.bvh", ""),
+            ("a/run.BVH", ""),
+            ("b/walk.npz", ""),
+            ("Mean.npy", ""),
+            ("notes.md", ""),
+            ("a/walk.txt", "someone walks\n"),
+            ("texts/a_run.txt", "a man runs#a/DET#0.0#0.0\n"),
+            ("captions.csv", "file,caption,source\nb/walk.npz,walks on,take\nrun,runs,take\nnone,x,\n"),
+        ]);
+        let listing = list(folder.path(), None).unwrap();
+        let ids: Vec<&str> = listing.clips.iter().map(|clip| clip.id.as_str()).collect();
+        assert_eq!(ids, ["a_run", "a_walk", "b_walk"]);
+        let captions: Vec<Vec<&str>> =
+            listing.clips.iter().map(|c| c.captions.iter().map(|c| c.text.as_str()).collect()).collect();
+        assert_eq!(captions, [vec!["a man runs", "runs"], vec!["someone walks"], vec!["walks on"]]);
+        let sources: Vec<&str> = listing.clips.iter().map(|clip| clip.source.as_str()).collect();
+        assert_eq!(sources, ["take", "a_walk", "take"]);
+        assert!(listing.notes[0].contains("1 rows") && listing.notes[0].contains("none") && !listing.has_lists);
+        let said = list(folder.path(), Some(Path::new("gone.csv"))).unwrap_err().to_string();
+        assert!(said.contains("gone.csv: no such file"), "{said}");
+    }
+
+    #[test]
+    fn all_mistakes_of_a_folder_come_together() {
+        let folder = folder(&[
+            ("a/b.bvh", ""),
+            ("a_b.npy", ""),
+            ("c/b.npz", ""),
+            ("d/b.npz", ""),
+            ("a_b.txt", "x\ny#z\n"),
+            ("captions.json", "{\"b\": \"x\"}"),
+            ("train.txt", "c_b"),
+            ("val.txt", "c_b"),
+            ("test.txt", ""),
+        ]);
+        let said = list(folder.path(), None).unwrap_err();
+        let text = said.to_string();
+        for part in
+            ["gives the clip `a_b` too", "a_b.txt:1: 1 field", "`b` may be c_b or d_b", "`c_b` is in more than one"]
+        {
+            assert!(text.contains(part), "{part}: {text}");
+        }
+        let empty = tempfile::tempdir().unwrap();
+        assert!(list(empty.path(), None).unwrap_err().to_string().contains("no file that ends in .bvh"));
+        assert!(list(&empty.path().join("gone"), None).unwrap_err().to_string().contains("gone"));
+    }
+}
