@@ -18,7 +18,7 @@
 //! Yrotation` is Rz Rx Ry. A position channel replaces that component of `OFFSET`, for any joint, and is in the parent's frame wherever it stands in
 //! the list. The file says nothing of unit and axes; see [`crate::detect`].
 //!
-//! What is refused is said with file and line. Limits, all checked before memory is taken: [`MAX_BYTES`], [`MAX_NODES`], [`MAX_DEPTH`], [`MAX_VALUES`]. A number of frames in a
+//! What is refused is said with file and line. Limits, all checked before memory is taken: [`MAX_BYTES`], [`MAX_NODES`], [`MAX_DEPTH`], [`MAX_VALUES`], [`MAX_SECONDS`]. A number of frames in a
 //! file is a claim; rows are stored as they are read.
 
 mod parse;
@@ -38,7 +38,9 @@ pub const MAX_NODES: usize = 4_096;
 /// Joints inside one another.
 pub const MAX_DEPTH: usize = 512;
 /// Frames times channels, and frames times nodes.
-pub const MAX_VALUES: usize = 32 << 20;
+pub const MAX_VALUES: usize = 16 << 20;
+/// Seconds that a recording lasts: what it takes at another rate follows from them.
+pub const MAX_SECONDS: f64 = 6.0 * 3600.0;
 
 /// Why a file is not read.
 #[derive(Debug, thiserror::Error)]
@@ -152,22 +154,21 @@ impl Bvh {
         pose
     }
 
-    /// Where every node is in every frame, `[T, nodes, 3]`, in the file's unit and axes.
-    pub fn positions(&self) -> Vec<f64> {
-        let mut positions = Vec::with_capacity(self.frames * self.nodes.len() * 3);
+    /// Where every node is in a frame, `[nodes, 3]`, in the file's unit and axes.
+    pub fn placed(&self, frame: usize) -> Vec<f64> {
         let mut global: Vec<(Vec3, Quat)> = Vec::with_capacity(self.nodes.len());
-        for frame in 0..self.frames {
-            global.clear();
-            for (node, (offset, rotation)) in self.nodes.iter().zip(self.pose(frame)) {
-                let placed = match node.parent.map(|parent| global[parent]) {
-                    None => (offset, rotation),
-                    Some((at, turned)) => (quat::add(at, quat::rotate(turned, offset)), quat::mul(turned, rotation)),
-                };
-                positions.extend(placed.0);
-                global.push(placed);
-            }
+        for (node, (offset, rotation)) in self.nodes.iter().zip(self.pose(frame)) {
+            global.push(match node.parent.map(|parent| global[parent]) {
+                None => (offset, rotation),
+                Some((at, turned)) => (quat::add(at, quat::rotate(turned, offset)), quat::mul(turned, rotation)),
+            });
         }
-        positions
+        global.iter().flat_map(|(at, _)| *at).collect()
+    }
+
+    /// [`Bvh::placed`] of all frames, `[T, nodes, 3]`.
+    pub fn positions(&self) -> Vec<f64> {
+        (0..self.frames).flat_map(|frame| self.placed(frame)).collect()
     }
 }
 

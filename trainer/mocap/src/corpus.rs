@@ -19,7 +19,7 @@ use protocol::stage::DataFormat;
 use serde::{Deserialize, Serialize};
 
 use crate::arrays;
-use crate::bvh::Bvh;
+use crate::bvh::{Bvh, MAX_SECONDS};
 use crate::captions::mirrored;
 use crate::detect::{Up, detect};
 use crate::listing::ClipFile;
@@ -61,15 +61,17 @@ pub struct FromFile {
     pub clips: Vec<Made>,
     /// How it was read.
     pub said: String,
+    /// The axis that was up in it.
+    pub up: String,
     /// Why it, or a part of it, gave no clip by the rules.
     pub left_out: Vec<String>,
 }
 
-/// Reads the joints of a file, `[T, J, 3]` of the format's skeleton at its rate, and how it was read.
+/// Reads the joints of a file, `[T, J, 3]` of the format's skeleton at its rate; and how it was read, with the axis that was up.
 ///
 /// # Errors
 /// In words, with the file.
-pub fn joints(file: &Path, recipe: &Recipe) -> Result<(Vec<f32>, String), String> {
+pub fn joints(file: &Path, recipe: &Recipe) -> Result<(Vec<f32>, String, Up), String> {
     let skeleton = Skeleton::of(recipe.format);
     let is_bvh = file.extension().is_some_and(|e| e.eq_ignore_ascii_case("bvh"));
     let (take, width) = if is_bvh {
@@ -94,7 +96,7 @@ pub fn joints(file: &Path, recipe: &Recipe) -> Result<(Vec<f32>, String), String
     } else {
         format!(", {} fps to {}", take.rate, skeleton.fps)
     };
-    Ok((joints.into_iter().map(|v| v as f32).collect(), take.said + &rate))
+    Ok((joints.into_iter().map(|v| v as f32).collect(), take.said + &rate, take.up))
 }
 
 /// Arrays are taken as they are in `.npy`, metres and y up, unless told otherwise; `.npz` have either axis up.
@@ -102,6 +104,13 @@ fn of_array(file: &Path, recipe: &Recipe) -> Result<(Take, usize), String> {
     let found = arrays::read(file)?;
     let format = if found.joints == 21 { DataFormat::Kit } else { DataFormat::Humanml3d };
     let rate = found.rate.or(recipe.rate).unwrap_or(Skeleton::of(format).fps);
+    let seconds = found.data.len() as f64 / (3 * found.joints) as f64 / rate;
+    if seconds > MAX_SECONDS {
+        return Err(format!(
+            "{}: at {rate} fps it lasts {seconds:.0} s, at most {MAX_SECONDS} s are read",
+            file.display()
+        ));
+    }
     let wide: Vec<f64> = found.data.iter().map(|v| f64::from(*v)).collect();
     let points = |frame: &[f64]| -> Vec<Vec3> { frame.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect() };
     let zipped = file.extension().is_some_and(|e| e.eq_ignore_ascii_case("npz"));
@@ -121,7 +130,7 @@ fn of_array(file: &Path, recipe: &Recipe) -> Result<(Take, usize), String> {
     }
     let unit = recipe.reading.metres_per_unit.unwrap_or(1.0);
     let joints = wide.chunks_exact(3).flat_map(|p| up.to_y([p[0], p[1], p[2]])).map(|v| v * unit).collect();
-    Ok((Take { joints, rate, said }, 3 * found.joints))
+    Ok((Take { joints, rate, up, said }, 3 * found.joints))
 }
 
 /// The 21 joints of KIT-ML's skeleton, of the 22 `[22, 3]`: hip centre, spine, arms and legs with right before left, and a midfoot two fifths from the ankle to the foot.
@@ -141,10 +150,10 @@ fn kit_joints(frame: &[f64]) -> Vec<f64> {
 /// A file that is broken, or whose figure has no features, in words.
 pub fn clips_of(file: &ClipFile, recipe: &Recipe) -> Result<FromFile, String> {
     let skeleton = Skeleton::of(recipe.format);
-    let (joints, said) = joints(&file.path, recipe)?;
+    let (joints, said, up) = joints(&file.path, recipe)?;
     let width = 3 * skeleton.joints;
     let frames = (joints.len() / width).saturating_sub(1);
-    let mut made = FromFile { said, ..FromFile::default() };
+    let mut made = FromFile { said, up: up.to_string(), ..FromFile::default() };
     if frames < skeleton.min_frames {
         made.left_out
             .push(format!("{}: {frames} frames at {} fps, needs {}", file.id, skeleton.fps, skeleton.min_frames));
@@ -218,6 +227,8 @@ pub enum Division {
 pub struct Report {
     /// Files by how they were read, with one of them.
     pub read: BTreeMap<String, (usize, String)>,
+    /// Files by the axis that was up, with one of them.
+    pub axes: BTreeMap<String, (usize, String)>,
     pub left_out: Vec<String>,
     pub notes: Vec<String>,
     /// Recordings and clips of each split.
@@ -242,32 +253,19 @@ impl fmt::Display for Report {
 
 impl Report {
     /// Counts a file, and passes on what was left out of it.
-    pub fn add(&mut self, id: &str, said: &str, left_out: Vec<String>) {
-        self.read.entry(said.to_owned()).or_insert_with(|| (0, id.to_owned())).0 += 1;
-        self.left_out.extend(left_out);
+    pub fn add(&mut self, id: &str, file: &FromFile) {
+        self.read.entry(file.said.clone()).or_insert_with(|| (0, id.to_owned())).0 += 1;
+        self.axes.entry(file.up.clone()).or_insert_with(|| (0, id.to_owned())).0 += 1;
+        self.left_out.extend(file.left_out.iter().cloned());
     }
 
     /// Says so if some files were read with another axis up than most: a figure that lies is easily taken for one that stands.
     pub fn compare_axes(&mut self) {
-        let axis = |said: &str| {
-            said.split(", ")
-                .find_map(|part| part.split(" up").next().filter(|_| part.contains(" up")).map(str::to_owned))
-        };
-        let mut counts: BTreeMap<String, (usize, String)> = BTreeMap::new();
-        for (said, (files, one)) in &self.read {
-            if let Some(axis) = axis(said) {
-                counts.entry(axis).or_insert_with(|| (0, one.clone())).0 += files;
-            }
-        }
-        let Some((most, _)) =
-            counts.iter().max_by_key(|(_, (files, _))| *files).map(|(axis, count)| (axis.clone(), count.0))
-        else {
-            return;
-        };
-        for (axis, (files, one)) in counts.into_iter().filter(|(axis, _)| *axis != most) {
-            self.notes.push(format!(
-                "{files} file(s) such as {one} were read with {axis} up, most with {most}; set `up` if that is wrong"
-            ));
+        let most = self.axes.iter().max_by_key(|(_, (files, _))| *files).map(|(axis, _)| axis.clone());
+        let Some(most) = most else { return };
+        for (axis, (files, one)) in self.axes.iter().filter(|(axis, _)| **axis != most) {
+            let few = format!("{files} file(s) such as {one} were read with {axis} up, most with {most}");
+            self.notes.push(format!("{few}; set `up` if that is wrong"));
         }
     }
 }

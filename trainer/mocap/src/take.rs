@@ -24,7 +24,9 @@ pub struct Take {
     pub joints: Vec<f64>,
     /// Frames per second.
     pub rate: f64,
-    /// How the file was read, for people.
+    /// The axis that was up in the file.
+    pub up: Up,
+    /// How the file was read, for people; the same for files of one kind.
     pub said: String,
 }
 
@@ -53,10 +55,9 @@ pub fn read(bvh: &Bvh, reading: &Reading) -> Result<Read, MapError> {
         }
     };
     let places = map.resolve(bvh)?;
-    let positions = bvh.positions();
-    let step = bvh.frames.div_ceil(LOOKED_AT);
+    let step = bvh.frames.div_ceil(LOOKED_AT).max(1);
     let frames: Vec<Vec<Vec3>> =
-        positions.chunks_exact(3 * bvh.nodes.len()).step_by(step).map(|frame| places.joints(frame, 1.0)).collect();
+        (0..bvh.frames).step_by(step).map(|frame| places.joints(&bvh.placed(frame), 1.0)).collect();
     let detected = detect(frames.iter().map(Vec::as_slice));
     let metres_per_unit = reading.metres_per_unit.unwrap_or(detected.metres_per_unit);
     let up = reading.up.unwrap_or(detected.up);
@@ -72,11 +73,24 @@ impl Take {
         let how = read(bvh, reading)?;
         let places = how.map.resolve(bvh)?;
         let mut joints = Vec::with_capacity(bvh.frames * 66);
-        for frame in bvh.positions().chunks_exact(3 * bvh.nodes.len()) {
-            let placed = places.joints(frame, how.metres_per_unit);
+        for frame in 0..bvh.frames {
+            let placed = places.joints(&bvh.placed(frame), how.metres_per_unit);
             joints.extend(placed.into_iter().flat_map(|v| how.up.to_y(v)).map(|v| v * how.metres_per_unit));
         }
-        Ok(Self { joints, rate: bvh.rate, said: how.to_string() })
+        Ok(Self { joints, rate: bvh.rate, up: how.up, said: how.in_short() })
+    }
+}
+
+impl Read {
+    /// Without what differs between recordings of one program.
+    fn in_short(&self) -> String {
+        let unit = self.detected.unit;
+        let unit = if self.metres_per_unit == self.detected.metres_per_unit {
+            unit.to_owned()
+        } else {
+            format!("{} m", self.metres_per_unit)
+        };
+        format!("joint map `{}`, unit {unit}, {} up", self.map.name, self.up)
     }
 }
 

@@ -38,7 +38,7 @@ fn make(listing: &Listing, recipe: &Recipe) -> (Vec<Made>, Report) {
     });
     let mut made = vec![];
     for (clip, file) in listing.clips.iter().zip(files) {
-        report.add(&clip.id, &file.said, file.left_out);
+        report.add(&clip.id, &file);
         made.extend(file.clips);
     }
     (made, report)
@@ -162,7 +162,7 @@ fn a_folder_of_bvh_gives_the_features_of_its_clips() {
     let listing = list(out.path(), None).unwrap();
     let (made, report) = make(&listing, &recipe(DataFormat::Humanml3d, None));
     println!("{error:.1e} m\n{report}");
-    assert!(report.read.keys().next().unwrap().contains("joint map `smpl` (fits the names), unit centimetre"));
+    assert!(report.read.keys().next().unwrap().contains("joint map `smpl`, unit centimetre, y up"));
     let clips = synthetic::generate(&DataSynthetic { clips: 6, val: 0.0, test: 0.0, mirror: false }, Seed(5));
     for made in &made {
         let entry = clips.entries.iter().find(|entry| entry.id == made.id).unwrap();

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use motion::quaternion::Vec3;
 
-use super::{Bvh, BvhError, Channel, MAX_DEPTH, MAX_NODES, MAX_VALUES, Node, nominal_rate};
+use super::{Bvh, BvhError, Channel, MAX_DEPTH, MAX_NODES, MAX_SECONDS, MAX_VALUES, Node, nominal_rate};
 
 /// Bytes of a word that are shown in an error.
 const SHOWN: usize = 40;
@@ -263,6 +263,10 @@ fn motion(reader: &mut Reader<'_>, nodes: Vec<Node>) -> Result<Bvh, Fault> {
     if frame_time <= 0.0 {
         return reader.fault(format!("frame time {}, expected seconds above 0", shown(word)));
     }
+    let seconds = frames as f64 * frame_time;
+    if seconds > MAX_SECONDS {
+        return reader.fault(format!("{frames} frames last {seconds:.0} s, at most {MAX_SECONDS} s are read"));
+    }
     let rate = nominal_rate(frame_time, last_digit(word));
     let values = rows(reader, frames, channels)?;
     Ok(Bvh { nodes, frame_time, rate, frames, values })
@@ -376,6 +380,7 @@ mod tests {
             ("Frames: 2", "Frames: 99999999999999999999999", "whole number that can be counted to"),
             ("Frames: 2", "Frames: 99999999999", "at most"),
             (".0333", "0", "expected seconds above 0"),
+            (".0333", "1e30", "at most 21600 s are read"),
             ("-90", "1e39", "value 1 of frame 1 is `1e39`"),
             ("-90", "-90 3", "frame 1 has more than 2 numbers"),
             ("2 -90", "2", "x.bvh:7: frame 1 has 1 numbers, expected 2"),
