@@ -13,7 +13,7 @@
 //!
 //! A name is looked up as it is written, else by its [`key`], which leaves out prefixes, case and how the side is spelt. Maps that ship are in [`SHIPPED`].
 
-mod topology;
+mod propose;
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -213,21 +213,6 @@ impl JointMap {
             let _ = writeln!(text, "  {name}: {source}");
         }
         text
-    }
-
-    /// The map that fits a file: a shipped one by names, else one by the skeleton's shape.
-    ///
-    /// # Errors
-    /// The skeleton has no shape of a figure either.
-    pub fn propose(bvh: &Bvh) -> Result<Proposal, MapError> {
-        for (name, text) in SHIPPED {
-            let map = Self::parse(Path::new(name), text)?;
-            if let Ok(map) = map.renamed(bvh) {
-                return Ok(Proposal { map, shipped: Some(name) });
-            }
-        }
-        let map = topology::propose(bvh).map_err(|what| MapError::None { what })?;
-        Ok(Proposal { map, shipped: None })
     }
 
     /// The same map in the names that a file has.

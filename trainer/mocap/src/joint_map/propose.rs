@@ -1,15 +1,33 @@
-//! A joint map from a skeleton's shape, for names that nobody knows.
+//! A joint map for a file: a shipped one whose names it has, else one by the skeleton's shape.
 //!
-//! The pelvis is the first node with three long branches, of which the two whose bones are most alike are the legs; the other one leads to the chest, the next node with
+//! By shape, the pelvis is the first node with three long branches, of which the two whose bones are most alike are the legs; the other one leads to the chest, the next node with
 //! three, of which the two most alike are the arms. A leg is hip, knee, ankle, foot, an arm collar, shoulder, elbow, wrist. Left is where up x forward points in
 //! frame 0, with feet ahead of ankles. Nodes that lie on their parent are passed over.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use motion::quaternion::{self as quat, Vec3};
 
-use super::{Along, JointMap, Source};
+use super::{Along, JointMap, MapError, Proposal, SHIPPED, Source};
 use crate::bvh::Bvh;
+
+impl JointMap {
+    /// The map that fits a file: a shipped one by names, else one by the skeleton's shape.
+    ///
+    /// # Errors
+    /// The skeleton has no shape of a figure either.
+    pub fn propose(bvh: &Bvh) -> Result<Proposal, MapError> {
+        for (name, text) in SHIPPED {
+            let map = Self::parse(Path::new(name), text)?;
+            if let Ok(map) = map.renamed(bvh) {
+                return Ok(Proposal { map, shipped: Some(name) });
+            }
+        }
+        let map = by_shape(bvh).map_err(|what| MapError::None { what })?;
+        Ok(Proposal { map, shipped: None })
+    }
+}
 
 struct Shape<'a> {
     bvh: &'a Bvh,
@@ -20,7 +38,7 @@ struct Shape<'a> {
     depth: Vec<usize>,
 }
 
-pub(super) fn propose(bvh: &Bvh) -> Result<JointMap, String> {
+fn by_shape(bvh: &Bvh) -> Result<JointMap, String> {
     let shape = Shape::new(bvh);
     let pelvis = shape.fork(0, 4).ok_or("no node with two legs and a spine")?;
     let (legs, rest) = shape.pair(pelvis, 4).ok_or("no two legs of four joints each")?;
