@@ -106,6 +106,7 @@ impl Tries<'_> {
         match settings {
             StageSettings::Register(_) => return Ok(Estimate::default()),
             StageSettings::DataOpen(data) => return self.stand_in(stage, |cx| stand_in::dataset(cx, data.format)),
+            StageSettings::DataFeatures(data) => return self.stand_in(stage, |cx| stand_in::dataset(cx, data.format)),
             StageSettings::DataSynthetic(_) => {
                 return self.stand_in(stage, |cx| stand_in::dataset(cx, DataFormat::Humanml3d));
             }

@@ -26,6 +26,7 @@ fn stages() -> Vec<(String, StageSettings)> {
     let sampler = Sampler { steps: 1, guidance: 7.5, timesteps: vec![999], ..Sampler::default() };
     let mut stages = vec![
         ("folder", StageSettings::DataOpen(DataOpen { path: "data".into(), ..DataOpen::default() })),
+        ("recorded", StageSettings::DataFeatures(DataFeatures { path: "mocap".into(), ..DataFeatures::default() })),
         ("made", StageSettings::DataSynthetic(DataSynthetic::default())),
         ("words", StageSettings::TextEmbed(TextEmbed::default())),
         ("vae", StageSettings::TrainVae(TrainVae::default())),

@@ -26,6 +26,8 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("clips", Whole(1, 100_000), "clips"),
     ("val", Real(0.0, 1.0), "of the clips"),
     ("test", Real(0.0, 1.0), "of the clips"),
+    ("metres_per_unit", Real(0.0, 1000.0), "metres"),
+    ("fps", Real(0.0, 10_000.0), "frames a second"),
     ("crops", Whole(1, 256), "crops of an entry"),
     ("shards", Whole(1, limits::SHARDS), "shards"),
     // Networks.

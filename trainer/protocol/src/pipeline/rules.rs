@@ -36,7 +36,7 @@ mod tests {
             let fields: Vec<String> =
                 stage(&settings, &Placement::default()).into_iter().map(|problem| problem.field).collect();
             let expected: &[&str] = match settings.kind() {
-                "data.open" | "import.evaluator" => &["path"],
+                "data.open" | "data.features" | "import.evaluator" => &["path"],
                 "register" => &["model", "from"],
                 _ => &[],
             };

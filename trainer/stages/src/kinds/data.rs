@@ -22,7 +22,7 @@ impl Plain for DataOpen {
         let (dataset, report) =
             Dataset::open(Path::new(&self.path), self.format).map_err(|e| StageError::Input(e.to_string()))?;
         log_report(cx, &report);
-        pack(cx, &dataset, report.skips.len(), report.to_string())
+        pack(cx, &dataset, report.skips.len(), report.to_string(), vec![])
     }
 }
 
@@ -43,11 +43,21 @@ impl Plain for DataSynthetic {
         }
         let dataset = motion::synthetic::generate(self, cx.task().seed);
         let text = format!("made by the program: {} clips, {} captions\n", dataset.clips.len(), dataset.captions.len());
-        pack(cx, &dataset, 0, text)
+        pack(cx, &dataset, 0, text, vec![])
     }
 }
 
-fn pack(cx: &mut dyn AttemptContext, dataset: &Dataset, skipped: usize, report: String) -> Result<Outcome, StageError> {
+/// A file besides those of every dataset.
+pub(super) type Extra = (&'static str, Vec<u8>);
+
+/// Uploads a dataset with its report and other files.
+pub(super) fn pack(
+    cx: &mut dyn AttemptContext,
+    dataset: &Dataset,
+    skipped: usize,
+    report: String,
+    extras: Vec<Extra>,
+) -> Result<Outcome, StageError> {
     let meta = DatasetMeta {
         format: dataset.format,
         clips: dataset.clips.len(),
@@ -64,6 +74,9 @@ fn pack(cx: &mut dyn AttemptContext, dataset: &Dataset, skipped: usize, report: 
 
     let mut draft = Draft::new(cx, ArtifactKind::Dataset, to_meta(&meta));
     draft.add(REPORT_FILE, report.into_bytes())?;
+    for (name, bytes) in extras {
+        draft.add(name, bytes)?;
+    }
     dataset.write_files::<Failure>(|name, bytes| draft.add(&name, bytes).map_err(Failure::Store)).map_err(
         |e| match e {
             Failure::Store(e) => e,

@@ -26,6 +26,7 @@ mod model_decoder;
 mod pcm;
 mod reconstruction;
 mod reconstructor;
+mod recordings;
 mod t2m;
 mod text;
 mod token_data;
@@ -95,7 +96,7 @@ macro_rules! runners {
 // The list of what runs. It is held against `protocol`'s list of kinds by a test below.
 runners! {
     Plain: DataOpen, DataSynthetic, TextEmbed, ImportEvaluator, ModelDecoder;
-    Map: EncodeLatents, EncodeTokens, EvaluateReconstruction, EvaluateLatentFid, EvaluateT2m, EvaluateControl;
+    Map: DataFeatures, EncodeLatents, EncodeTokens, EvaluateReconstruction, EvaluateLatentFid, EvaluateT2m, EvaluateControl;
     Gang: TrainVae, TrainMld, DistillLcm, DistillPcm, TrainEvaluator, TrainLength, TrainTokenizer, TrainTokens, TrainDiscord, DistillDiscord,
         TrainMdm, TrainStableMoFusion, TrainControl;
 }

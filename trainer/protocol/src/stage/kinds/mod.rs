@@ -1,5 +1,6 @@
 //! The list of stage kinds. A kind is its file here, its file in `stages::kinds` that runs it, and a line in each of the two lists.
 
+mod data_features;
 mod data_open;
 mod data_synthetic;
 mod distill_discord;
@@ -26,6 +27,7 @@ mod train_tokenizer;
 mod train_tokens;
 mod train_vae;
 
+pub use data_features::{DataFeatures, Splits, UpAxis};
 pub use data_open::DataOpen;
 pub use data_synthetic::DataSynthetic;
 pub use distill_discord::DistillDiscord;
@@ -57,6 +59,7 @@ use super::StageSpec;
 super::spec::stage_kinds! {
     DataOpen,
     DataSynthetic,
+    DataFeatures,
     TextEmbed,
     TrainVae,
     EncodeLatents,
