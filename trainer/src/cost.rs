@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use protocol::StageName;
 use protocol::pipeline::Pipeline;
-use protocol::stage::{DataFormat, DataOpen, DataSynthetic};
+use protocol::stage::{DataFeatures, DataFormat, DataOpen, DataSynthetic};
 use stages::estimate::{Entries, Estimate, estimate};
 
 /// How long stages are tried; the one that is being tried then is the last.
@@ -19,11 +19,11 @@ pub(crate) fn estimates(pipeline: &Pipeline) -> BTreeMap<StageName, Estimate> {
         .stages
         .iter()
         .filter_map(|stage| {
-            let entries = match (stage.settings.get::<DataOpen>(), stage.settings.get::<DataSynthetic>()) {
-                (Some(open), _) => listed(open),
-                (_, Some(made)) => synthetic(made),
-                _ => return None,
-            };
+            let settings = &stage.settings;
+            let open = settings.get::<DataOpen>().map(listed);
+            let made = || settings.get::<DataSynthetic>().map(synthetic);
+            let recorded = || settings.get::<DataFeatures>().map(recorded);
+            let entries = open.or_else(made).or_else(recorded)?;
             Some((stage.name.clone(), entries))
         })
         .collect();
@@ -52,7 +52,17 @@ fn listed(data: &DataOpen) -> Entries {
 }
 
 fn synthetic(data: &DataSynthetic) -> Entries {
-    let clips = (data.clips * if data.mirror { 2 } else { 1 }) as f64;
+    divided(data.clips, data.mirror, data.val, data.test)
+}
+
+/// As many clips as the folder has files; a hundred if it is not there.
+fn recorded(data: &DataFeatures) -> Entries {
+    let files = mocap::listing::list(Path::new(&data.path), None).map_or(100, |listing| listing.clips.len());
+    divided(files, data.mirror, data.val, data.test)
+}
+
+fn divided(clips: usize, mirror: bool, val: f64, test: f64) -> Entries {
+    let clips = (clips * if mirror { 2 } else { 1 }) as f64;
     let share = |share: f64| (clips * share).round() as usize;
-    Entries { train: share(1.0 - data.val - data.test), val: share(data.val), test: share(data.test) }
+    Entries { train: share(1.0 - val - test), val: share(val), test: share(test) }
 }

@@ -3,6 +3,7 @@
 mod args;
 mod config;
 mod control;
+mod data;
 mod generate;
 mod keep;
 mod model;
@@ -60,6 +61,9 @@ enum Verb {
     Resume(ResumeArgs),
     /// Makes a motion from a sentence
     Generate(Box<generate::GenerateArgs>),
+    /// Recordings of motion
+    #[command(subcommand)]
+    Data(data::DataVerb),
     /// Measures how long models take for a sentence (AITS), side by side
     Time(time::TimeArgs),
     /// Lists what this build and machine can compute on
@@ -216,6 +220,7 @@ impl Verb {
             Self::Logs(args) => args.output,
             Self::Cancel(args) | Self::Pause(args) => args.output,
             Self::Sweep(verb) => verb.output(),
+            Self::Data(verb) => verb.output(),
             Self::Resume(args) => args.output,
             Self::Generate(args) => args.report,
             Self::Time(args) => args.output,
@@ -243,6 +248,7 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Pause(args) => remote::control(args, "pause").await,
         Verb::Resume(args) => resume(args).await,
         Verb::Generate(args) => generate::generate(*args).await,
+        Verb::Data(verb) => data::data(&verb),
         Verb::Time(args) => time::time(args).await,
         Verb::Devices(args) => Ok(config::devices(&args)),
         Verb::Config(verb) => config::config(&verb),

@@ -112,7 +112,8 @@ impl StageSpec for DataFeatures {
     fn refs(&mut self) -> Vec<Ref<'_>> {
         let map_is_file = self.map_is_file();
         let mut refs = vec![
-            Ref::folder("path", &mut self.path).holding(&[], "recordings of your own"),
+            Ref::folder("path", &mut self.path)
+                .holding(&[], "recordings of your own, or `trainer data sample --format bvh`"),
             Ref::folder("captions", &mut self.captions),
             Ref::folder("target", &mut self.target),
         ];

@@ -1,0 +1,144 @@
+//! `trainer data`: what a recording is, and recordings to try things with.
+
+use std::path::{Path, PathBuf};
+
+use clap::{Args, Subcommand, ValueEnum};
+use mocap::arrays;
+use mocap::bvh::Bvh;
+use mocap::detect::Up;
+use mocap::joint_map::JointMap;
+use mocap::take::{self, Reading};
+use protocol::Seed;
+use serde_json::json;
+
+use crate::print::{self, Output};
+use crate::problem::{Problem, Result};
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum DataVerb {
+    /// Says what a recording (.bvh, .npy, .npz) is and how it would be read, and proposes a joint map
+    Inspect(InspectArgs),
+    /// Writes synthetic clips as recordings with captions beside them
+    Sample(SampleArgs),
+}
+
+impl DataVerb {
+    pub(super) fn output(&self) -> Output {
+        match self {
+            Self::Inspect(args) => args.output,
+            Self::Sample(_) => Output::Table,
+        }
+    }
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct InspectArgs {
+    /// The recording
+    file: PathBuf,
+    /// A joint map to try: the name of a shipped one, or a YAML file
+    #[arg(long, value_name = "MAP")]
+    map: Option<String>,
+    /// How the answer is printed; as a table, the map is YAML on stdout and all else on stderr
+    #[arg(short, long, value_enum, default_value_t)]
+    output: Output,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct SampleArgs {
+    /// The folder to write to, which must be empty or not there
+    folder: PathBuf,
+    /// The format of the files
+    #[arg(long, value_enum)]
+    format: SampleFormat,
+    /// How many
+    #[arg(long, default_value_t = 30, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    clips: u32,
+    /// Other clips for another number
+    #[arg(long, default_value_t = 7, value_name = "N")]
+    seed: u64,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum SampleFormat {
+    /// Skeletons and their rotations, in centimetres
+    Bvh,
+}
+
+pub(crate) fn data(verb: &DataVerb) -> Result<u8> {
+    match verb {
+        DataVerb::Inspect(args) => inspect(args),
+        DataVerb::Sample(args) => sample(args),
+    }
+}
+
+fn inspect(args: &InspectArgs) -> Result<u8> {
+    if !args.file.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("bvh")) {
+        return inspect_array(&args.file, args.output);
+    }
+    let bvh = Bvh::read(&args.file).map_err(Problem::usage)?;
+    let map = args.map.as_deref().map(JointMap::load).transpose().map_err(Problem::usage)?;
+    let seconds = bvh.frames as f64 / bvh.rate;
+    let joints = bvh.nodes.iter().filter(|node| !node.end).count();
+    let size = format!("{joints} joints, {} frames at {} fps ({seconds:.1} s)", bvh.frames, bvh.rate);
+    let how = take::read(&bvh, &Reading { map, ..Reading::default() }).map_err(|error| {
+        let names: Vec<&str> = bvh.nodes.iter().filter(|node| !node.end).map(|node| node.name.as_str()).collect();
+        Problem::usage(format!("{}: {size}; {error}", args.file.display())).hint(format!(
+            "its joints are {}; a map has the form of `trainer data inspect` on another file",
+            names.join(", ")
+        ))
+    })?;
+    if args.output == Output::Json {
+        let sources = serde_json::to_value(&how.map.joints).map_err(Problem::failed)?;
+        print::json(&json!({
+            "file": args.file, "joints": joints, "frames": bvh.frames, "fps": bvh.rate, "seconds": seconds,
+            "unit": how.detected.unit, "metres_per_unit": how.metres_per_unit, "up": how.up.to_string(),
+            "sure_of_up": how.detected.sure_of_up, "shipped_map": how.shipped, "map": sources,
+        }));
+        return Ok(0);
+    }
+    print::note(&format!("{}: {size}", args.file.display()));
+    print::note(&how.to_string());
+    if how.shipped.is_some() {
+        print::note("the map need not be named: files with these names find it");
+    } else {
+        print::note("keep the map in a file that ends in .yaml and name that as `map` of data.features");
+    }
+    print::out(how.map.to_yaml().trim_end());
+    Ok(0)
+}
+
+fn inspect_array(file: &Path, output: Output) -> Result<u8> {
+    let joints = arrays::read(file).map_err(Problem::usage)?;
+    let frames = joints.data.len() / (3 * joints.joints);
+    if output == Output::Json {
+        print::json(&json!({"file": file, "joints": joints.joints, "frames": frames, "fps": joints.rate}));
+        return Ok(0);
+    }
+    let rate = joints.rate.map_or("it does not say its rate".to_owned(), |rate| format!("at {rate} fps"));
+    print::out(&format!("{}: {frames} frames of {} joints, {rate}", file.display(), joints.joints));
+    if joints.joints == 22 {
+        let points: Vec<[f64; 3]> = joints.data.chunks_exact(3).map(|p| [p[0], p[1], p[2]].map(f64::from)).collect();
+        let found = mocap::detect::detect(points.chunks_exact(22).take(200));
+        let up = if found.sure_of_up { found.up } else { Up::Y };
+        let guess = if found.sure_of_up { "" } else { " (a guess: the figure does not stand)" };
+        print::out(&format!("unit {} (legs of {:.2}), {up} up{guess}", found.unit, found.leg));
+    }
+    Ok(0)
+}
+
+fn sample(args: &SampleArgs) -> Result<u8> {
+    let SampleFormat::Bvh = args.format;
+    let taken = std::fs::read_dir(&args.folder).is_ok_and(|mut entries| entries.next().is_some());
+    if taken {
+        return Err(Problem::usage(format!("{}: the folder is not empty; name another one", args.folder.display())));
+    }
+    let worst = mocap::sample::write_bvh_folder(&args.folder, args.clips as usize, Seed(args.seed))
+        .map_err(|error| Problem::failed(format!("{}: {error}", args.folder.display())))?;
+    print::out(&format!(
+        "{}: {} clips in BVH with captions in TXT; joints at most {:.2} mm from the clips'",
+        args.folder.display(),
+        args.clips,
+        1000.0 * worst
+    ));
+    Ok(0)
+}
