@@ -18,8 +18,9 @@ use protocol::stage::DataFormat;
 use crate::body::Body;
 use crate::bvh::{Bvh, BvhError};
 use crate::glb::{self, GlbError};
-use crate::html::{Page, PageError, Panel, Section};
+use crate::html::{MOST_PANELS, Page, PageError, Panel, Section};
 use crate::joint_map::MapError;
+use crate::plant::plant;
 use crate::rotations::{Rig, RigError};
 use crate::take::{self, Reading, Take};
 
@@ -28,6 +29,9 @@ const POSES: usize = 10;
 
 /// Motions on a sheet of poses, whose picture is in memory: 70 MB.
 const MOST_ROWS: usize = 100;
+
+/// What makes videos.
+const ENCODER: &str = "ffmpeg";
 
 /// What a file can be.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -225,6 +229,12 @@ impl Motion {
         Ok(Self::of(file, skeleton, joints, features))
     }
 
+    /// The motion with its standing feet in their places; see [`plant`](crate::plant). It has positions alone.
+    #[must_use]
+    pub fn planted(self) -> Self {
+        Self { joints: plant(&self.joints, self.skeleton), features: None, ..self }
+    }
+
     /// T.
     pub fn frames(&self) -> usize {
         self.joints.len() / (3 * self.skeleton.joints)
@@ -261,7 +271,7 @@ impl Motion {
                 }
                 None => npy::write(path, &[self.frames(), self.skeleton.joints, 3], &self.joints)?,
             },
-            Form::Mp4 => self.mp4(path, "ffmpeg")?,
+            Form::Mp4 => self.mp4(path, ENCODER)?,
             Form::Png | Form::Html => {
                 let sections = [(String::new(), vec![self])];
                 write_all(&self.caption, &sections, path)?;
@@ -360,6 +370,68 @@ pub fn write_all(title: &str, sections: &[(String, Vec<&Motion>)], path: &Path) 
     Ok(Written { path: path.into(), off_metres: None })
 }
 
+/// Files that a known number of motions go to: one for each motion, or one for all, as their forms want it.
+#[derive(Debug, Clone)]
+pub struct Outs {
+    alone: Vec<PathBuf>,
+    together: Vec<PathBuf>,
+    count: usize,
+}
+
+impl Outs {
+    /// Looks at the names before anything is drawn, and whether a video can be made here.
+    ///
+    /// # Errors
+    /// A name that says no form, more motions than a form holds, no encoder of video.
+    pub fn new(paths: &[PathBuf], count: usize) -> Result<Self, ExportError> {
+        let mut outs = Self { alone: Vec::new(), together: Vec::new(), count };
+        for path in paths {
+            let form = Form::of(path)?;
+            let most = match form {
+                Form::Png => (MOST_ROWS, "at most 100 on a sheet"),
+                Form::Html => (MOST_PANELS, "at most 512 on a page"),
+                _ => (usize::MAX, ""),
+            };
+            if count > most.0 {
+                return Err(ExportError::Count { file: path.clone(), count, expected: most.1 });
+            }
+            if form == Form::Mp4 && !is_here(ENCODER) {
+                return Err(ExportError::NoEncoder { file: path.clone(), program: ENCODER.to_owned() });
+            }
+            if form.holds_several() { &mut outs.together } else { &mut outs.alone }.push(path.clone());
+        }
+        Ok(outs)
+    }
+
+    /// Whether motions are needed again when all of them are drawn.
+    pub fn wants_all(&self) -> bool {
+        !self.together.is_empty()
+    }
+
+    /// Writes the files of one motion; `number` counts from 1.
+    ///
+    /// # Errors
+    /// As [`Motion::write`].
+    pub fn write(&self, number: usize, motion: &Motion) -> Result<Vec<Written>, ExportError> {
+        self.alone.iter().map(|path| motion.write(&numbered(path, number, self.count))).collect()
+    }
+
+    /// Writes the files of all motions.
+    ///
+    /// # Errors
+    /// As [`write_all`].
+    pub fn finish(&self, title: &str, sections: &[(String, Vec<&Motion>)]) -> Result<Vec<Written>, ExportError> {
+        self.together.iter().map(|path| write_all(title, sections, path)).collect()
+    }
+}
+
+/// Whether a program can be started.
+fn is_here(program: &str) -> bool {
+    let mut command = Command::new(program);
+    command.arg("-version").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+    command.status().is_ok()
+}
+
 /// A motion on a page, with its body of those that the page has.
 fn panel<'a>(motion: &'a Motion, bodies: &'a [(&Skeleton, Body)]) -> Option<Panel<'a>> {
     let (_, body) = bodies.iter().find(|(skeleton, _)| *skeleton == motion.skeleton)?;
@@ -444,6 +516,13 @@ mod tests {
         assert!(refused.contains("3 motions, expected one"), "{refused}");
         let many = [(String::new(), vec![&motion; 101])];
         assert!(write_all("x", &many, &at("x.png")).unwrap_err().to_string().contains("at most 100"));
+        let outs = Outs::new(&[at("n.npy"), at("n.html"), at("n.glb")], 2).unwrap();
+        let written = outs.write(2, &motion).unwrap();
+        let names: Vec<&Path> = written.iter().map(|written| written.path.as_path()).collect();
+        assert_eq!(names, [at("n-02.npy"), at("n-02.glb")]);
+        assert!(outs.wants_all() && outs.finish("two", &sections[..1]).unwrap()[0].path == at("n.html"));
+        assert!(Outs::new(&[at("n.html")], 513).unwrap_err().to_string().contains("at most 512"));
+        assert!(Outs::new(&[at("n.fbx")], 1).is_err() && !is_here("no-such-program"));
         assert_eq!(numbered(Path::new("a/walk.bvh"), 3, 12), Path::new("a/walk-03.bvh"));
         assert_eq!(numbered(Path::new("walk.tar.bvh"), 3, 100), Path::new("walk.tar-003.bvh"));
         assert_eq!(numbered(Path::new("walk.bvh"), 1, 1), Path::new("walk.bvh"));

@@ -38,7 +38,7 @@ const FARTHEST: f64 = 1e4;
 /// A motion on the page.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Panel<'a> {
-    /// Above it, such as the sentence that it was drawn for.
+    /// Above it, such as the sentence that it was drawn for; left out where page or section have it as their title.
     pub caption: String,
     /// In small letters, such as model and seed.
     pub note: String,
@@ -171,7 +171,9 @@ impl Page<'_> {
             }
             writeln!(out, "<div class=\"row\">")?;
             for panel in &section.panels {
-                let (caption, note) = (text(&panel.caption), text(&panel.note));
+                // What stands above already is not said again.
+                let said = panel.caption == self.title || panel.caption == section.title;
+                let (caption, note) = (if said { String::new() } else { text(&panel.caption) }, text(&panel.note));
                 let (frames, fps) = (panel.joints.len() / (3 * panel.body.joints()), panel.body.fps);
                 writeln!(
                     out,

@@ -12,6 +12,7 @@ pub mod glb;
 pub mod html;
 pub mod joint_map;
 pub mod listing;
+pub mod plant;
 pub mod requests;
 pub mod rotations;
 pub mod sample;

@@ -15,9 +15,9 @@ fn motion() -> Vec<f32> {
 
 fn page(caption: &str, body: &Body, joints: &[f32], waypoints: &[Waypoint]) -> Result<String, String> {
     let panel = Panel { caption: caption.into(), note: caption.into(), body, joints, waypoints };
-    let sections = vec![Section { title: caption.into(), panels: vec![panel.clone(), panel] }];
+    let sections = vec![Section { title: format!("of {caption}"), panels: vec![panel.clone(), panel] }];
     let mut bytes = Vec::new();
-    Page { title: caption.into(), sections }.write(&mut bytes).map_err(|error| error.to_string())?;
+    Page { title: format!("about {caption}"), sections }.write(&mut bytes).map_err(|error| error.to_string())?;
     Ok(String::from_utf8(bytes).unwrap())
 }
 
@@ -90,6 +90,13 @@ fn a_caption_stays_text() {
     let shown = "&lt;img src=x onerror=&#39;alert(2)&#39;&gt;&quot; &amp; \\u202e\\u001b[2J&lt;/title&gt;走";
     assert_eq!(page.matches(shown).count(), 7, "title, heading, section, two captions with their notes");
     assert_eq!(page.matches("<title>").count(), 1);
+
+    let (body, joints) = (Body::of(Skeleton::of(DataFormat::Humanml3d)), motion());
+    let panel = Panel { caption: "walks".into(), note: "seed 1".into(), body: &body, joints: &joints, waypoints: &[] };
+    let sections = vec![Section { title: "walks".into(), panels: vec![panel] }];
+    let mut bytes = Vec::new();
+    Page { title: "x".into(), sections }.write(&mut bytes).unwrap();
+    assert_eq!(String::from_utf8(bytes).unwrap().matches(">walks<").count(), 1, "a title is not said twice");
 }
 
 #[test]
