@@ -13,6 +13,8 @@ fi
 export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$root/target/gpu}
 export STRIDE_TEST_BACKEND=$backend XDG_RUNTIME_DIR=${XDG_RUNTIME_DIR:-/tmp}
 cd "$root"
-cargo run --locked -p trainer --features "$backend" -- devices
-cargo test --locked -p trainer -p models --features "trainer/$backend,models/$backend" --test process --test backends -- --nocapture --test-threads 1 \
-    backend a_training_step a_lone_bias
+# One selection of packages, and so one build: `cargo run` alone would turn on other features of third parties and compile all of it again.
+tests=(cargo test --locked -p trainer -p models --features "trainer/$backend,models/$backend" --test process --test backends)
+"${tests[@]}" --no-run
+"$CARGO_TARGET_DIR/debug/trainer" devices
+"${tests[@]}" -- --nocapture --test-threads 1 backend a_training_step a_lone_bias

@@ -2,9 +2,10 @@
 //! build has. `tests/gpu.sh` does it on accelerators.
 
 use std::collections::BTreeSet;
+use std::time::Duration;
 
 use cluster_tests::cluster::{Cluster, stage_of};
-use cluster_tests::{Bench, digests, wait_for};
+use cluster_tests::{Bench, PATIENCE, digests, wait_within};
 use protocol::stage::StageSettings;
 use serde_json::Value;
 
@@ -17,6 +18,11 @@ fn other() -> String {
     std::env::var("STRIDE_TEST_BACKEND").unwrap_or_else(|_| "ndarray".to_owned())
 }
 
+/// Software Vulkan compiles and tunes kernels for minutes before a kind's first step.
+fn patience() -> Duration {
+    PATIENCE * if std::env::var_os("STRIDE_TEST_BACKEND").is_some() { 24 } else { 1 }
+}
+
 fn config() -> std::path::PathBuf {
     Bench::repository().join("tests/process/kinds.yaml")
 }
@@ -27,7 +33,7 @@ fn run(backend: &str, sets: &[&str]) -> (Cluster, String, Value) {
     cluster.join_by("w1", &[], &["--backend", backend]);
     let choice = format!("backend={backend}");
     let run = cluster.submit(&config(), &[&["--set", &choice][..], sets].concat());
-    let view = cluster.wait_end(&run);
+    let view = cluster.wait_end_within(patience(), &run);
     assert_eq!(view["state"], "finished", "on {backend}: {view:#}\n{}", cluster.everything());
     (cluster, run, view)
 }
@@ -79,9 +85,9 @@ fn p5_a_kill_on_another_backend_changes_no_byte() {
     cluster.join_by("w1", &dies, &["--backend", &other()]);
     let choice = format!("backend={}", other());
     let id = cluster.submit(&config(), &[&["--set", &choice][..], &sets].concat());
-    wait_for("the worker to die", || (!cluster.alive("w1")).then_some(()));
+    wait_within(patience(), "the worker to die", || (!cluster.alive("w1")).then_some(()));
     cluster.join_by("w2", &[], &["--backend", &other()]);
-    let view = cluster.wait_end(&id);
+    let view = cluster.wait_end_within(patience(), &id);
     assert!(cluster.said("w2").contains("goes on from the checkpoint after step 3"), "{}", cluster.said("w2"));
     assert_eq!(digests(&view), digests(&whole));
 }
@@ -98,7 +104,7 @@ fn the_smoke_pipeline_on_another_backend() {
         let choice = format!("backend={backend}");
         let config = Bench::repository().join("configs/smoke.yaml");
         let run = cluster.submit(&config, &[&["--set", &choice][..], &until].concat());
-        let view = cluster.wait_end(&run);
+        let view = cluster.wait_end_within(patience(), &run);
         assert_eq!(view["state"], "finished", "on {backend}: {view:#}\n{}", cluster.everything());
         (cluster.metrics(&run, "vae"), view)
     };

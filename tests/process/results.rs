@@ -22,6 +22,8 @@ stages:
   latents: {kind: encode.latents, vae: vae_1, crops: 2, shards: 1}
   mld: {kind: train.mld, vae: vae_1, network: {width: 16, layers: 3, heads: 2, feed_forward: 32}, steps: 2, batch: {global: 4, slices: 1}}
   lcm: {kind: distill.lcm, guidance: [1, 3], steps: 2, batch: {global: 4, slices: 1}}
+  control: {kind: train.control, network: {width: 16, layers: 3, heads: 2, feed_forward: 32}, embedding: 16, steps: 2, batch: {global: 4, slices: 1}}
+  told: {kind: evaluate.control, joints: [pelvis], percent: [100, 25], frames: [5], sampler: {steps: 1, guidance: 2}, repeats: 2, split: test, all_if_small: true, shards: 1}
   recon: {kind: evaluate.reconstruction, vae: vae_1, shards: 1}
   fid: {kind: evaluate.latent_fid, model: lcm, teacher: mld, sampler: {steps: 1, guidance: 2}, repeats: 2, components: 4, shards: 1}
   real: {kind: evaluate.t2m, real: true, pools: [8], repeats: 2, split: test, shards: 1}
@@ -67,7 +69,15 @@ fn tables_are_made_from_a_run_and_again_from_what_it_stored() {
     assert_eq!(readme, format!("a\n<!-- toy: from here -->\n{text}<!-- toy: to here -->\nb\n"));
     assert_eq!(regenerate(dir, &bench.store(), &tables), text, "nothing is computed again");
 
-    the_shipped_template_can_be_filled(&bench, &run);
+    let folder = Bench::repository().join("docs/results");
+    let mut shipped = 0;
+    for file in fs::read_dir(&folder).expect("a folder").map(|file| file.expect("a file").file_name()) {
+        if let Some(name) = file.to_str().and_then(|file| file.strip_suffix(".in.md")) {
+            a_shipped_template_can_be_filled(&bench, &run, &folder.join(name));
+            shipped += 1;
+        }
+    }
+    assert!(shipped > 0, "{shipped} templates");
 }
 
 fn metrics<'a>(run: &'a Value, stage: &str) -> &'a Value {
@@ -75,10 +85,9 @@ fn metrics<'a>(run: &'a Value, stage: &str) -> &'a Value {
     &stages.iter().find(|one| one["name"] == stage).unwrap_or_else(|| panic!("no stage `{stage}`"))["metrics"]
 }
 
-/// `mini.in.md` quotes stages of `mini.yaml`, and of them metrics that such evaluations give.
-fn the_shipped_template_can_be_filled(bench: &Bench, toy: &Value) {
-    let folder = Bench::repository().join("docs/results");
-    let pipeline = folder.join("mini.yaml").display().to_string();
+/// A template quotes stages of the pipeline beside it, and of them metrics that such evaluations give.
+fn a_shipped_template_can_be_filled(bench: &Bench, toy: &Value, path: &Path) {
+    let pipeline = path.with_extension("yaml").display().to_string();
     let pipeline = bench.run(&["config", "show", &pipeline, "-o", "json"]).expect_code(0).json();
     let with = |stage: &str, more: &[&str]| -> BTreeMap<String, f64> {
         let names = metrics(toy, stage).as_object().expect("metrics").keys().cloned();
@@ -89,6 +98,7 @@ fn the_shipped_template_can_be_filled(bench: &Bench, toy: &Value) {
         let metrics = match own["kind"].as_str().expect("a kind") {
             "evaluate.reconstruction" => with("recon", &[]),
             "evaluate.latent_fid" => with("fid", &[]),
+            "evaluate.control" => with("told", &[]),
             "evaluate.t2m" if own["real"] == true => with("real", &[]),
             "evaluate.t2m" if own["vae"] != "" => with("t2m_vae_1", &[]),
             "evaluate.t2m" => with("t2m", &[]),
@@ -97,17 +107,17 @@ fn the_shipped_template_can_be_filled(bench: &Bench, toy: &Value) {
         json!({"name": stage["name"], "metrics": metrics, "wall_s": 1.0})
     });
     let run = json!({"stages": stages.collect::<Vec<_>>()});
-    let template = fs::read_to_string(folder.join("mini.in.md")).expect("the template");
+    let template = fs::read_to_string(path.with_extension("in.md")).expect("the template");
     let text = render(&template, &Source { run, pipeline: pipeline.clone() }).unwrap_or_else(|why| panic!("{why}"));
     let columns: BTreeSet<usize> =
         text.lines().filter(|line| line.starts_with("| ")).map(|l| l.matches('|').count()).collect();
     assert!(!text.contains("{{") && columns.iter().all(|columns| (4..=9).contains(columns)), "{columns:?}");
 
     // What README shows is what the stored run gives.
-    if let Ok(stored) = fs::read_to_string(folder.join("mini.json")) {
-        let run = serde_json::from_str(&stored).expect("mini.json is JSON");
+    if let Ok(stored) = fs::read_to_string(path.with_extension("json")) {
+        let run = serde_json::from_str(&stored).expect("it is JSON");
         let text = render(&template, &Source { run, pipeline }).unwrap_or_else(|why| panic!("{why}"));
         let readme = fs::read_to_string(Bench::repository().join("README.md")).expect("README.md");
-        assert!(readme.contains(&text), "README is not what docs/results/mini.json gives; run regenerate.sh");
+        assert!(readme.contains(&text), "README is not what {}.json gives; run regenerate.sh", path.display());
     }
 }

@@ -11,7 +11,7 @@ use std::time::Duration;
 use nix::sys::signal::Signal;
 use serde_json::Value;
 
-use crate::{Bench, Running, signal, wait_for};
+use crate::{Bench, PATIENCE, Running, signal, wait_for, wait_within};
 
 /// What the coordinator wants to be shown.
 pub const TOKEN: &str = "a-token-of-tests-only";
@@ -252,7 +252,13 @@ impl Cluster {
     /// Waits for the end of the run and gives it.
     #[track_caller]
     pub fn wait_end(&self, run: &str) -> Value {
-        let view = wait_for("the run to end", || {
+        self.wait_end_within(PATIENCE, run)
+    }
+
+    /// The same on a machine that may take longer: one that compiles and tunes kernels first.
+    #[track_caller]
+    pub fn wait_end_within(&self, patience: Duration, run: &str) -> Value {
+        let view = wait_within(patience, "the run to end", || {
             let view = self.view(run);
             let over = matches!(view["state"].as_str(), Some("finished" | "failed" | "cancelled"));
             over.then_some(view)

@@ -10,7 +10,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
 use checkpoint::model::Parts;
 use models::diffusion::{
-    DpmPath, Form, Last, Schedule, ddim_sample_to_data, ddpm_sample, ddpm_timesteps, dpm_sample, guided,
+    DpmPath, Form, Last, Schedule, affine_one, ddim_sample_to_data, ddpm_sample, ddpm_timesteps, dpm_sample, guided,
     leading_timesteps,
 };
 use models::kernels::Dropout;
@@ -259,18 +259,33 @@ impl MotionDenoiser {
         drawing: Drawing<'_>,
         noise: &dyn Fn(usize, usize, &mut [f32]),
     ) -> Result<Vec<Vec<f32>>, StageError> {
+        self.draw_seen(drawing, noise, &mut |_, _| {})
+    }
+
+    /// As [`draw`](Self::draw); `see` is told each step's timestep and a function that gives the clean motions predicted there.
+    pub fn draw_seen(
+        &self,
+        drawing: Drawing<'_>,
+        noise: &dyn Fn(usize, usize, &mut [f32]),
+        see: &mut dyn FnMut(usize, &dyn Fn() -> Vec<Vec<f32>>),
+    ) -> Result<Vec<Vec<f32>>, StageError> {
         self.meta.family.accepts(drawing.sampler).map_err(StageError::Input)?;
         let frames = if self.meta.draws_whole() { self.meta.max_frames } else { drawing.frames };
         let drawn = match &self.network {
-            Network::Mdm(network) => self.sample(network, drawing, frames, noise)?,
-            Network::StableMoFusion(network) => self.sample(network, drawing, frames, noise)?,
+            Network::Mdm(network) => self.sample(network, drawing, frames, noise, see)?,
+            Network::StableMoFusion(network) => self.sample(network, drawing, frames, noise, see)?,
         };
-        let width = self.meta.mean.len();
+        Ok(self.motions(drawn, drawing.frames))
+    }
+
+    /// Motions of `frames` frames in the data's own scale, out of [B, T, F].
+    fn motions(&self, drawn: Tensor<3>, frames: usize) -> Vec<Vec<f32>> {
+        let [_, whole, width] = drawn.dims();
         let values = drawn.into_data().try_into_vec::<f32>().expect("networks compute in f32");
         let mut motions: Vec<Vec<f32>> =
-            values.chunks_exact(frames * width).map(|motion| motion[..drawing.frames * width].to_vec()).collect();
+            values.chunks_exact(whole * width).map(|motion| motion[..frames * width].to_vec()).collect();
         motions.iter_mut().for_each(|motion| self.denormalise(motion));
-        Ok(motions)
+        motions
     }
 
     fn sample<N: MotionNetwork>(
@@ -279,6 +294,7 @@ impl MotionDenoiser {
         drawing: Drawing<'_>,
         frames: usize,
         noise: &dyn Fn(usize, usize, &mut [f32]),
+        see: &mut dyn FnMut(usize, &dyn Fn() -> Vec<Vec<f32>>),
     ) -> Result<Tensor<3>, StageError> {
         let (batch, width) = (drawing.captions.rows.len(), self.meta.mean.len());
         let fill = |k: usize| {
@@ -288,12 +304,16 @@ impl MotionDenoiser {
         };
         let off = &mut Dropout::off();
         let condition = network.condition(drawing.captions, self.meta.text_dim, &self.device, off);
+        let see = std::cell::RefCell::new(see);
         // All are of one length, so that a mask would cover nothing.
         let out = |z: Tensor<3>, t: usize| {
             let times = vec![t; batch];
             let off = &mut Dropout::off();
             let with = network.predict(z.clone(), &times, Some(&condition), None, off);
-            guided(with, network.predict(z, &times, None, None, off), drawing.sampler.guidance)
+            let out = guided(with, network.predict(z.clone(), &times, None, None, off), drawing.sampler.guidance);
+            let clean = || affine_one(z.clone(), out.clone(), self.schedule.clean(t));
+            (see.borrow_mut())(t, &|| self.motions(clean(), drawing.frames));
+            out
         };
         let (schedule, steps, step_noise) = (&self.schedule, drawing.sampler.steps, |j: usize| fill(1 + j));
         let dpm = |path: &DpmPath, form| dpm_sample(schedule, path, form, fill(0), step_noise, out);

@@ -6,8 +6,8 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
 use models::diffusion::{
-    DpmPath, Form, Grid, LcmTimesteps, Phases, Schedule, TIMESTEPS, ddim_sample, dpm_sample, guided, lcm_sample,
-    lcm_timesteps, pcm_sample,
+    DpmPath, Form, Grid, LcmTimesteps, Phases, Schedule, TIMESTEPS, affine_one, ddim_sample, dpm_sample, guided,
+    lcm_sample, lcm_timesteps, pcm_sample,
 };
 use models::kernels::Dropout;
 use models::networks::{self, Control, DenoiserConfig, Init, POSITIONS, Vae, VaeConfig, guidance_embedding};
@@ -228,6 +228,22 @@ impl Denoiser {
         steering: Option<&Steering<'_>>,
         step_noise: &mut dyn FnMut(usize) -> Vec<f32>,
     ) -> Result<Vec<f32>, StageError> {
+        self.sample_seen(conditions, sampler, steering, step_noise, &mut |_, _| {})
+    }
+
+    /// As [`sample`](Self::sample); `see` is told each step's timestep and a function that gives the clean latents predicted there.
+    pub fn sample_seen(
+        &self,
+        conditions: &Conditions,
+        sampler: &Sampler,
+        steering: Option<&Steering<'_>>,
+        step_noise: &mut dyn FnMut(usize) -> Vec<f32>,
+        see: &mut dyn FnMut(usize, &dyn Fn() -> Vec<f32>),
+    ) -> Result<Vec<f32>, StageError> {
+        let mut seen = |z: &Tensor<3>, t: usize, out: &Tensor<3>| {
+            let clean = || host(affine_one(z.clone(), out.clone(), self.schedule.clean(t)));
+            see(t, &clean);
+        };
         self.meta.family.accepts(sampler).map_err(StageError::Input)?;
         let (latent, text_dim) = (self.meta.latent, self.meta.text_dim);
         let batch = conditions.noise.len() / (latent.tokens * latent.dim);
@@ -241,10 +257,12 @@ impl Denoiser {
                 let text = on_device(text, [2 * batch, 1, text_dim]);
                 let [_, tokens, dim] = shape;
                 let out = |z: Tensor<3>, t: usize| {
-                    let both = Tensor::cat(vec![z.clone(), z], 0);
+                    let both = Tensor::cat(vec![z.clone(), z.clone()], 0);
                     let noise = self.predict(both, &vec![t; 2 * batch], text.clone(), None, steering);
                     let half = |from: usize| noise.clone().slice([from..from + batch, 0..tokens, 0..dim]);
-                    guided(half(0), half(batch), sampler.guidance)
+                    let out = guided(half(0), half(batch), sampler.guidance);
+                    seen(&z, t, &out);
+                    out
                 };
                 let form = match self.meta.family.solver(sampler.solver) {
                     Some(Solver::DpmSolver) => Some(Form::Noise),
@@ -264,7 +282,11 @@ impl Denoiser {
                 let mut eps = self.student(conditions, sampler, batch, steering);
                 let timesteps = lcm_path(skip, sampler);
                 let fresh: Vec<_> = (1..timesteps.len()).map(|j| on_device(step_noise(j - 1), shape)).collect();
-                lcm_sample(&self.schedule, &timesteps, z, &fresh, &mut eps)
+                lcm_sample(&self.schedule, &timesteps, z, &fresh, |z, t| {
+                    let out = eps(z.clone(), t);
+                    seen(&z, t, &out);
+                    out
+                })
             }
             Family::Autoregressive | Family::Masked | Family::Mmm | Family::Features { .. } => {
                 return Err(StageError::Input(
@@ -273,7 +295,11 @@ impl Denoiser {
             }
             Family::Pcm { skip, phases, .. } => {
                 let mut eps = self.student(conditions, sampler, batch, steering);
-                pcm_sample(&self.schedule, &Phases::new(&Grid::new(skip), phases), z, &mut eps)
+                pcm_sample(&self.schedule, &Phases::new(&Grid::new(skip), phases), z, |z, t| {
+                    let out = eps(z.clone(), t);
+                    seen(&z, t, &out);
+                    out
+                })
             }
         }))
     }

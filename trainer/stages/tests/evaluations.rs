@@ -1,6 +1,7 @@
 //! Map stages on untrained networks: what they give must not depend on how the work was cut, and misfits are refused.
 
 use std::collections::BTreeMap;
+use std::rc::Rc;
 
 use checkpoint::Blobs;
 use checkpoint::model::{self, Parts};
@@ -10,12 +11,13 @@ use protocol::artifact::{FileEntry, Role};
 use protocol::stage::Diffusion;
 use protocol::stage::{
     Batch, CheckpointPolicy, DataFormat, DataSynthetic, EncodeLatents, EvaluateLatentFid, EvaluateReconstruction,
-    Family, Keep, LatentShape, Network, Positions, Sampler, Split, StageSettings, TextEmbed, TextEncoder, TrainLength,
-    TrainVae, Training,
+    EvaluateSpectrum, Family, Keep, LatentShape, Network, Positions, Sampler, Split, StageSettings, TextEmbed,
+    TextEncoder, TrainLength, TrainVae, Training,
 };
 use protocol::{ArtifactKind, Digest, Manifest, Seed, Steps};
 use stages::artifacts::{self, DenoiserMeta, Latents, MODEL_FILE, VaeMeta, to_meta};
 use stages::generate::Generator;
+use stages::generator::{self, Batch as Motions};
 use stages::testing::Bench;
 use stages::text;
 use stages::timing::{Times, WARM_UP, sentences, time};
@@ -377,4 +379,55 @@ fn a_model_with_a_length_estimator_says_how_long_a_motion_is() {
     other.meta["fits"]["text"] = serde_json::to_value(Digest::of(b"another encoder")).expect("a digest");
     let refused = with(&other).expect_err("another encoder").to_string();
     assert!(refused.contains("`length` was made for the `text`"), "{refused}");
+}
+
+/// What a student takes the motion for in its last step is the motion that it draws, and a teacher's steps are all seen.
+#[test]
+fn each_step_of_the_sampler_is_seen_down_to_the_motion_that_is_drawn() {
+    let bench = bench();
+    let vae = untrained_vae(&bench);
+    let lcm = Family::Lcm { skip: 100, guidance: (0.5, 5.0) };
+    for (family, steps, exact) in [(lcm, 1, true), (lcm, 4, true), (Family::Mld, 5, false)] {
+        let manifest = bench.manifest(untrained(&bench, vae, family)).expect("stored");
+        let model = generator::open(&manifest, &*bench.blobs(), &bench.device()).expect("it opens");
+        let sampler = Sampler { steps, guidance: 2.0, ..Sampler::default() };
+        let texts: Vec<_> = model.embed(&["a jump"]).expect("built in").into_iter().map(Rc::new).collect();
+        let seeds = |k: usize, i: usize| motion::Stream::new(Seed(5), "spectrum", k as u64, i as u64);
+        let batch = Motions { texts: &texts, lengths: &[44], seeds: &seeds, control: None };
+        let seen = model.predictions(batch, &sampler).expect("it denoises");
+        let drawn = generator::motions(&*model, batch, &sampler, &mut |_| ()).expect("a motion").concat();
+        assert_eq!(seen.len(), steps, "{family:?}");
+        assert!(seen.windows(2).all(|pair| pair[0].0 > pair[1].0), "timesteps fall");
+        assert!(seen.iter().all(|(_, motion)| motion.len() == drawn.len()));
+        let (_, last) = seen.last().expect("a step");
+        assert_eq!(*last == drawn, exact, "{family:?}: DDIM of a teacher ends a step above the data");
+    }
+}
+
+#[test]
+fn energy_by_band_is_measured_in_every_step() {
+    let mut bench = bench();
+    let (dataset, vae) = data(&mut bench);
+    let model = untrained(&bench, vae, Family::Mld);
+    let settings = EvaluateSpectrum {
+        bands: vec![0.5, 2.0],
+        sampler: Sampler { steps: 3, guidance: 2.0, ..Sampler::default() },
+        motions: 3,
+        split: Split::Test,
+        ..EvaluateSpectrum::default()
+    };
+    let inputs = [("dataset", dataset), ("model", model)];
+    let ran = bench.run("spectrum", &settings.clone().into(), &inputs).expect("the stage runs");
+    let metrics = ran.metrics();
+    assert_eq!(metrics.len(), 2 * 3 * 3, "two values, three bands, three steps: {metrics:?}");
+    for band in 1..=3 {
+        assert!(metrics[&format!("energy/{band}/1")] >= 0.0);
+        assert_eq!(metrics[&format!("settled/{band}/3")], 1.0, "the last step is what the others are compared with");
+        assert!(metrics[&format!("settled/{band}/1")] < 1.0);
+    }
+    let again = bench.run("spectrum", &settings.clone().into(), &inputs).expect("the stage runs");
+    assert_eq!(ran.output(), again.output());
+    let other = EvaluateSpectrum { motions: 2, ..settings };
+    let other = bench.run("spectrum", &other.into(), &inputs).expect("the stage runs");
+    assert_ne!(other.metrics(), metrics);
 }

@@ -128,6 +128,8 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("trajectory_lr", Real(0.0, 1e3), ""),
     ("percent", Real(0.0, 100.0), "percent of the frames"),
     ("frames", Whole(1, 10_000), "frames"),
+    ("bands", Real(1e-3, 1e3), "hertz"),
+    ("motions", Whole(1, 10_000), "motions"),
     ("threshold", Real(0.0, 1e3), "metres"),
     ("scale", Real(0.0, 1e3), ""),
     // Evaluation.

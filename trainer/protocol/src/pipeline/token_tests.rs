@@ -87,6 +87,19 @@ fn what_does_not_fit_is_refused_where_it_stands() {
         ("generator: mmm, ", "generator: mmm, dataset: kit, ", 12, "but `dataset` is `kit`"),
         ("generator: mmm, ", "generator: mmm, network: {word_blocks: 10}, ", 12, "`network.layers`, 9"),
         ("guidance: 0}", "guidance: 2}", 22, "`mmm` has none"),
+        // What needs denoising, or latents.
+        (
+            "kind: evaluate.t2m, model: mmm, evaluator: judge",
+            "kind: evaluate.spectrum, model: mmm",
+            22,
+            "no denoising steps",
+        ),
+        (
+            "kind: model.decoder, model: mld, decoder: latent_flow",
+            "kind: train.control, model: mmm",
+            20,
+            "no latent diffusion",
+        ),
         ("model: momask, decoder: flow", "model: judge, decoder: flow", 14, "needs a model"),
     ] {
         assert_eq!(GOOD.matches(from).count(), 1, "{from}");

@@ -156,6 +156,11 @@ impl Family {
         matches!(self, Self::Autoregressive | Self::Masked | Self::Mmm)
     }
 
+    /// Whether what it draws are latents of a VAE.
+    pub fn draws_latents(&self) -> bool {
+        matches!(self, Self::Mld | Self::Lcm { .. } | Self::Pcm { .. })
+    }
+
     /// What of `solver` it is that a model of this family draws with; `None` for one that it does not have.
     pub fn solver(&self, solver: Solver) -> Option<Solver> {
         match (self, solver) {

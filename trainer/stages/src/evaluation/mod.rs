@@ -10,4 +10,5 @@ pub mod procrustes;
 pub mod reconstruction;
 pub mod retrieval;
 pub mod skating;
+pub mod spectrum;
 pub mod spread;

@@ -69,6 +69,16 @@ impl MotionGenerator for FeatureDiffusion {
         Ok(pooled.chunks_exact(self.text.dim()).map(|row| Text { values: row.to_vec() }).collect())
     }
 
+    fn predictions(&self, batch: Batch<'_>, sampler: &Sampler) -> Result<Vec<(usize, Vec<f32>)>, StageError> {
+        let (rows, kept) = (vec![batch.texts[0].values.clone()], vec![true]);
+        let captions = CaptionRows { rows, kept };
+        let drawing = Drawing { captions: &captions, frames: batch.lengths[0], sampler };
+        let noise = |k: usize, i: usize, out: &mut [f32]| (batch.seeds)(k, i).fill_normal(out);
+        let mut all = Vec::new();
+        self.denoiser.draw_seen(drawing, &noise, &mut |t, clean| all.push((t, clean().concat())))?;
+        Ok(all)
+    }
+
     fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError> {
         // Those of one length are drawn together; those of a network that always draws all frames, all.
         let mut groups: BTreeMap<usize, Vec<usize>> = BTreeMap::new();

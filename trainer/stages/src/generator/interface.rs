@@ -78,6 +78,11 @@ pub trait MotionGenerator: std::fmt::Debug {
     /// decides on its own. The lengths and the sampler are ones that it has; [`motions`](super::motions) sees to that.
     fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError>;
 
+    /// What a denoising model takes the clean motion for in each step of the sampler, with the step's timestep, the last step last: of a batch of one motion.
+    fn predictions(&self, _: Batch<'_>, _: &Sampler) -> Result<Vec<(usize, Vec<f32>)>, StageError> {
+        Err(StageError::Input("the model draws without denoising, so that it has no steps to look at".into()))
+    }
+
     /// Its control part, if it has one, without which a batch has no `control`.
     fn control(&self) -> Option<&ControlMeta> {
         None

@@ -115,7 +115,7 @@ impl MotionGenerator for LatentDiffusion {
     }
 
     fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError> {
-        let z = self.steered(batch.texts, batch.seeds, sampler, batch.control)?;
+        let z = self.steered(batch.texts, batch.seeds, sampler, batch.control, &mut |_, _| {})?;
         lap(Lap::Sampled);
         let mut motions = match &self.decoder {
             None => self.vae.decode_ragged(z, batch.lengths),
@@ -129,6 +129,17 @@ impl MotionGenerator for LatentDiffusion {
         motions.iter_mut().for_each(|motion| self.vae.denormalise(motion));
         lap(Lap::Decoded);
         Ok(motions)
+    }
+
+    fn predictions(&self, batch: Batch<'_>, sampler: &Sampler) -> Result<Vec<(usize, Vec<f32>)>, StageError> {
+        let mut all = Vec::new();
+        let mut see = |t: usize, clean: &dyn Fn() -> Vec<f32>| {
+            let mut motion = self.vae.decode_ragged(clean(), batch.lengths).concat();
+            self.vae.denormalise(&mut motion);
+            all.push((t, motion));
+        };
+        self.steered(batch.texts, batch.seeds, sampler, batch.control, &mut see)?;
+        Ok(all)
     }
 
     fn control(&self) -> Option<&ControlMeta> {
@@ -147,6 +158,7 @@ impl LatentDiffusion {
         seeds: &Seeds<'_>,
         sampler: &Sampler,
         control: Option<ControlRequest<'_>>,
+        see: &mut dyn FnMut(usize, &dyn Fn() -> Vec<f32>),
     ) -> Result<Vec<f32>, StageError> {
         let size = self.shape().tokens * self.shape().dim;
         let fill = |k: usize| {
@@ -160,7 +172,7 @@ impl LatentDiffusion {
             (Some(request), Some(control)) => Some(control.steer(request.hints, request.scale)),
             _ => None,
         };
-        self.denoiser.sample(&conditions, sampler, steering.as_ref(), &mut |step| fill(1 + step))
+        self.denoiser.sample_seen(&conditions, sampler, steering.as_ref(), &mut |step| fill(1 + step), see)
     }
 }
 
@@ -174,6 +186,6 @@ impl LatentGenerator for LatentDiffusion {
     }
 
     fn sample(&self, texts: &[Rc<Text>], seeds: &Seeds<'_>, sampler: &Sampler) -> Result<Vec<f32>, StageError> {
-        self.steered(texts, seeds, sampler, None)
+        self.steered(texts, seeds, sampler, None, &mut |_, _| {})
     }
 }

@@ -27,6 +27,7 @@ mod pcm;
 mod reconstruction;
 mod reconstructor;
 mod recordings;
+mod spectrum;
 mod t2m;
 mod text;
 mod token_data;
@@ -95,7 +96,7 @@ macro_rules! runners {
 
 // The list of what runs. It is held against `protocol`'s list of kinds by a test below.
 runners! {
-    Plain: DataOpen, DataSynthetic, TextEmbed, ImportEvaluator, ModelDecoder;
+    Plain: DataOpen, DataSynthetic, TextEmbed, ImportEvaluator, ModelDecoder, EvaluateSpectrum;
     Map: DataFeatures, EncodeLatents, EncodeTokens, EvaluateReconstruction, EvaluateLatentFid, EvaluateT2m, EvaluateControl;
     Gang: TrainVae, TrainMld, DistillLcm, DistillPcm, TrainEvaluator, TrainLength, TrainTokenizer, TrainTokens, TrainDiscord, DistillDiscord,
         TrainMdm, TrainStableMoFusion, TrainControl;

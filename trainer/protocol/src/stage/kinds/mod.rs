@@ -11,6 +11,7 @@ mod encode_tokens;
 mod evaluate_control;
 mod evaluate_latent_fid;
 mod evaluate_reconstruction;
+mod evaluate_spectrum;
 mod evaluate_t2m;
 mod import_evaluator;
 mod model_decoder;
@@ -38,6 +39,7 @@ pub use encode_tokens::EncodeTokens;
 pub use evaluate_control::EvaluateControl;
 pub use evaluate_latent_fid::EvaluateLatentFid;
 pub use evaluate_reconstruction::EvaluateReconstruction;
+pub use evaluate_spectrum::EvaluateSpectrum;
 pub use evaluate_t2m::{EvaluateT2m, MultiModality};
 pub use import_evaluator::ImportEvaluator;
 pub use model_decoder::ModelDecoder;
@@ -80,6 +82,7 @@ super::spec::stage_kinds! {
     TrainStableMoFusion,
     TrainControl,
     EvaluateControl,
+    EvaluateSpectrum,
     ImportEvaluator,
     EvaluateT2m,
     Register,

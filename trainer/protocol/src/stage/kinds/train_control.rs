@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
 use crate::stage::control::check_skeleton;
-use crate::stage::{ControlHints, Family, Neighbours, Network, Output, Problems, Ref, Shape, StageSpec, Training};
+use crate::stage::{ControlHints, Neighbours, Network, Output, Problems, Ref, Shape, StageSpec, Training};
 
 /// How a joint's position is compared with the one that was told.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -145,7 +145,7 @@ impl StageSpec for TrainControl {
 
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
         let model = &self.model;
-        if let Some(Family::Autoregressive | Family::Masked | Family::Features { .. }) = stages.family(model) {
+        if stages.family(model).is_some_and(|family| !family.draws_latents()) {
             let message = format!("`{model}` is no latent diffusion, and only such a model has a ControlNet");
             p.add("model", message, "name a `train.mld`, `distill.lcm` or `distill.pcm` stage");
         }

@@ -1,0 +1,83 @@
+//! `evaluate.spectrum`: which frequencies of a motion settle when it is denoised. Source: Free-T2M (Chen et al., 2025, figure 4).
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::ArtifactKind;
+use crate::stage::{Neighbours, Output, Problems, Ref, Sampler, Shape, Split, StageSpec};
+
+/// `evaluate.spectrum`: energy by band of frequencies of the motion that is predicted in each denoising step. Metrics are called
+/// `energy/BAND/STEP`, as a share of the energy of real motion in that band, and `settled/BAND/STEP`, 1 less the share of the final motion's energy by
+/// which the prediction still differs from it; bands and steps count from 1.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct EvaluateSpectrum {
+    /// Stage that gives the model, which draws by denoising.
+    pub model: String,
+    /// Stage that gives the clips.
+    pub dataset: String,
+    /// Where bands end, in hertz, the lowest first; one more ends at half the frame rate.
+    pub bands: Vec<f64>,
+    /// Sampler.
+    pub sampler: Sampler,
+    /// Motions: one for each of so many entries, or for all if there are fewer.
+    pub motions: usize,
+    /// Clips.
+    pub split: Split,
+}
+
+impl Default for EvaluateSpectrum {
+    fn default() -> Self {
+        Self {
+            model: "mld".into(),
+            dataset: "dataset".into(),
+            bands: vec![0.5, 1.0, 2.0, 4.0],
+            sampler: Sampler::default(),
+            motions: 64,
+            split: Split::Val,
+        }
+    }
+}
+
+impl StageSpec for EvaluateSpectrum {
+    const KIND: &'static str = "evaluate.spectrum";
+    const SHAPE: Shape = Shape::Plain;
+    const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        vec![
+            Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
+            Ref::stage("model", &mut self.model, ArtifactKind::Model).measured_if(true),
+        ]
+    }
+
+    fn check(&self, p: &mut Problems) {
+        if self.bands.is_empty() || !self.bands.windows(2).all(|pair| pair[0] < pair[1]) {
+            let message = format!("`bands` is {:?}; expected frequencies in hertz, the lowest first", self.bands);
+            p.add("bands", message, "such as [0.5, 1, 2, 4]");
+        }
+        self.bands.iter().for_each(|band| p.above_zero("bands", *band));
+        self.sampler.check(p);
+        p.positive("motions", self.motions);
+    }
+
+    fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
+        let model = &self.model;
+        if stages.family(model).is_some_and(|family| family.draws_tokens()) {
+            p.add("model", format!("`{model}` draws tokens, and has no denoising steps"), "");
+        }
+        if let (Some(ours), Some(theirs)) = (stages.format(&self.dataset), stages.format(model))
+            && ours != theirs
+        {
+            let (theirs, ours) = (theirs.skeleton(), ours.skeleton());
+            let message =
+                format!("`{model}` makes motions of {theirs}, but the clips of `{}` have {ours}", self.dataset);
+            p.add("model", message, "measure a model on the format that it was trained on");
+        }
+        stages.check_sampler(p, model, &self.sampler);
+    }
+
+    fn sampler(&self) -> Option<&Sampler> {
+        Some(&self.sampler)
+    }
+}
