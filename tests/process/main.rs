@@ -14,6 +14,7 @@ mod determinism;
 mod documented;
 mod failpoints;
 mod memory;
+mod motions;
 mod reading;
 mod registry;
 mod results;

@@ -46,6 +46,7 @@ fn p10_promote_refuse_roll_back_and_generate() {
         said.expect_code(0);
         assert!(std::fs::metadata(bench.path().join(file)).expect("the motion is written").len() > 1000);
     }
+    crate::motions::are_written(&bench);
     let unknown = bench.run(&["generate", "a person walks", "--model", "smoke@nobody", "-o", "x.gif"]);
     assert_ne!(unknown.code, Some(0));
     assert!(unknown.stderr.contains("nobody"), "{}", unknown.stderr);

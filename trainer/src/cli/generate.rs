@@ -1,20 +1,25 @@
-//! `trainer generate`: a sentence to a moving stick figure, or to a part of a motion whose rest stays.
+//! `trainer generate`: sentences to moving figures, or to a part of a motion whose rest stays.
 
-use std::fmt;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use clap::Args;
+use mocap::export::{Motion, Outs, numbered};
+use mocap::requests::Request;
 use motion::{Skeleton, npy};
 use protocol::Seed;
-use stages::generate::{Generated, Generator};
+use protocol::stage::Sampler;
+use serde_json::{Value, json};
+use stages::generate::{Generated, Generator, Timing};
 
-use super::control::{ControlArgs, Told};
+use super::control::{ControlArgs, Missed, Told};
 use super::keep::Span;
 use super::model::{self, Found};
+use super::out::{self, OutArgs};
 use super::remote::check_parent;
 use super::sampler::SamplerArgs;
+use super::sentences::SentenceArgs;
 use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result};
@@ -22,8 +27,8 @@ use crate::reader::Reader;
 
 #[derive(Debug, Args)]
 pub(crate) struct GenerateArgs {
-    /// What the motion should be, in words; several sentences make one sheet, for `--out FILE.png`
-    #[arg(required = true)]
+    /// What the motion should be, in words; several sentences make several motions
+    #[arg(required_unless_present = "captions")]
     prompt: Vec<String>,
     /// MODEL@ALIAS, MODEL@best or MODEL:VERSION
     #[arg(short, long, required_unless_present = "stage", conflicts_with = "stage")]
@@ -39,24 +44,19 @@ pub(crate) struct GenerateArgs {
     steps: Option<usize>,
     #[command(flatten)]
     sampler: SamplerArgs,
-    /// Length in frames [default: what the model's length estimator says, 120 without one]
-    #[arg(long, value_name = "N")]
-    frames: Option<usize>,
+    #[command(flatten)]
+    sentences: SentenceArgs,
     /// A motion, features [frames, features] as `--out FILE.npy` writes them, of which a part is drawn anew: masked token models only
-    #[arg(long, value_name = "FILE.npy", requires = "keep", conflicts_with = "frames")]
+    #[arg(long, value_name = "FILE.npy", requires = "keep", conflicts_with_all = ["frames", "seconds"])]
     edit: Option<PathBuf>,
     /// What stays of it, FROM:TO in frames or seconds, from the end if negative: `0:1s,-1s:` keeps the first and the last second
     #[arg(long, value_name = "SPANS", value_delimiter = ',', requires = "edit", allow_hyphen_values = true)]
     keep: Vec<Span>,
-    /// Other seeds give other motions
-    #[arg(long, default_value_t = 0)]
-    seed: u64,
     /// Where to compute: flex, ndarray, wgpu or cuda [default: the first that this build and machine have]
     #[arg(long)]
     backend: Option<String>,
-    /// Where to write: `.gif` for a moving figure, `.png` for a sheet of poses, `.npy` for features
-    #[arg(short = 'o', long = "out", value_name = "FILE")]
-    out: PathBuf,
+    #[command(flatten)]
+    out: OutArgs,
     #[command(flatten)]
     control: ControlArgs,
     /// Also write joint positions [frames, joints, 3]
@@ -67,27 +67,72 @@ pub(crate) struct GenerateArgs {
     features: Option<PathBuf>,
     #[command(flatten)]
     target: Target,
-    /// How the report is printed
-    #[arg(long, value_enum, default_value_t)]
-    pub(super) report: Output,
+}
+
+/// A motion of the report.
+struct Row {
+    prompt: String,
+    seed: u64,
+    frames: usize,
+    seconds: f64,
+    /// Whether the model makes anything of the sentence.
+    known: bool,
+    kept: Vec<Range<usize>>,
+    timing: Timing,
+    missed: Option<Missed>,
+    files: Vec<String>,
+    /// How far the skeleton of a file is off the motion, in metres.
+    off: Option<f64>,
+}
+
+/// What all motions of the report share.
+struct Shared {
+    label: String,
+    sampler: Sampler,
+    loaded: Duration,
+}
+
+impl GenerateArgs {
+    /// How the report is printed.
+    pub(super) fn report(&self) -> Output {
+        self.out.report()
+    }
+
+    /// The files of a motion besides those of `--out`, by its number.
+    fn write_arrays(&self, motion: &Generated, number: usize, count: usize) -> Result<Vec<String>> {
+        let rows = motion.frames;
+        let width = |values: &[f32]| values.len() / rows.max(1);
+        let positions = [rows, width(&motion.joints) / 3, 3];
+        let features = [rows, width(&motion.features)];
+        let mut written = Vec::new();
+        for (path, shape, values) in
+            [(&self.features, &features[..], &motion.features), (&self.positions, &positions[..], &motion.joints)]
+        {
+            let Some(path) = path else { continue };
+            let path = numbered(path, number, count);
+            npy::write(&path, shape, values).map_err(Problem::failed)?;
+            written.push(path.display().to_string());
+        }
+        Ok(written)
+    }
+
+    fn check(&self, requests: &[Request]) -> Result<()> {
+        if requests.len() > 1 && self.control.given() {
+            return Err(Problem::usage("a path is of one motion: give one sentence with `--control`"));
+        }
+        if self.edit.is_some() && SentenceArgs::have_length(requests) {
+            return Err(Problem::usage("a motion that is edited keeps its length: give sentences without one"));
+        }
+        [&self.positions, &self.features].into_iter().flatten().try_for_each(|path| check_parent(path))
+    }
 }
 
 pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
-    let kind = |path: &Path| path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_lowercase();
-    let ending = kind(&args.out);
-    if !matches!(ending.as_str(), "gif" | "png" | "npy") {
-        let expected = "expected a name that ends in .gif, .png or .npy";
-        return Err(Problem::usage(format!("cannot write `{}`: {expected}", args.out.display())));
-    }
-    if args.prompt.len() > 1 && args.control.given() {
-        return Err(Problem::usage("a path is of one motion: give one sentence with `--control`"));
-    }
-    if args.prompt.len() > 1 && (ending != "png" || args.positions.is_some() || args.features.is_some()) {
-        return Err(Problem::usage("several sentences make one sheet: give `--out FILE.png` and no other file"));
-    }
-    for path in [Some(&args.out), args.positions.as_ref(), args.features.as_ref()].into_iter().flatten() {
-        check_parent(path)?;
-    }
+    let requests = args.sentences.requests(&args.prompt, &[])?;
+    let seeds = args.sentences.seeds();
+    let count = requests.len() * seeds.len();
+    args.check(&requests)?;
+    let outs = args.out.files(count)?;
     let start = Instant::now();
     let reader = Reader::open(&args.target).await?;
     let found = match (&args.stage, &args.model) {
@@ -96,6 +141,7 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
     };
     let found = args.control.completed(&reader, found).await?;
     let Found { manifest, blobs, label, measured } = found;
+    let label = label.to_string();
     reader.close().await;
     let (device, _) = model::device(args.backend.as_deref())?;
     let generator = Generator::load(&manifest, &blobs, &device).map_err(Problem::failed)?;
@@ -104,76 +150,207 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
     let sampler = args.sampler.sampler(args.steps, generator.sampler(), &measured);
     let sampler = sampler.map_err(|why| Problem::usage(format!("{label}: {why}")))?;
     let edit = args.edit.as_deref().map(|path| Edit::read(path, &args.keep, &generator)).transpose()?;
-    let told = args.control.told(&generator, &label.to_string(), args.frames)?;
-    let mut motions = Vec::new();
-    let mut kept = Vec::new();
-    for prompt in &args.prompt {
-        let seed = Seed(args.seed);
-        let motion = match (&edit, &told) {
-            (None, None) => generator.generate(prompt, args.frames, Some(&sampler), seed).map_err(model::refused)?,
-            (None, Some(told)) => {
-                generator.generate_controlled(prompt, Some(&sampler), seed, told.request()).map_err(model::refused)?
-            }
-            (Some(edit), _) => {
-                let edited = generator.edit(prompt, &edit.motion, &edit.keep, Some(&sampler), seed);
-                let edited = edited.map_err(model::refused)?;
-                kept = edited.kept;
-                edited.motion
-            }
-        };
-        motions.push((prompt.clone(), motion));
-    }
-    let written = write(&args, &motions, told.as_ref())?;
-    let (prompt, motion) = motions.last().expect("at least one sentence is required");
+    let skeleton = Skeleton::of(generator.format());
+    let length = |request: &Request| request.length.map(|length| length.frames(skeleton.fps));
+    let told = args.control.told(&generator, &label, requests.first().and_then(length))?;
+    let shared = Shared { label, sampler, loaded };
 
-    let missed = told.as_ref().and_then(|told| told.missed(motion));
-    let timing = motion.timing;
-    let milliseconds = |time: std::time::Duration| time.as_secs_f64() * 1e3;
-    match args.report {
-        Output::Json => print::json(&serde_json::json!({
+    let (mut rows, mut motions): (Vec<Row>, Vec<Vec<Motion>>) = (Vec::new(), Vec::new());
+    for request in &requests {
+        let known = is_known(&generator, &shared.label, &request.caption)?;
+        let mut drawn = Vec::new();
+        for seed in &seeds {
+            let (motion, kept) = draw(&generator, request, Seed(*seed), &shared.sampler, edit.as_ref(), told.as_ref())?;
+            let number = rows.len() + 1;
+            let arrays = args.write_arrays(&motion, number, count)?;
+            let (timing, missed) = (motion.timing, told.as_ref().and_then(|told| told.missed(&motion)));
+            let note = format!("{}, {}, seed {seed}", shared.label, shared.sampler);
+            let waypoints = told.as_ref().map(|told| told.waypoints.clone()).unwrap_or_default();
+            let motion = args.out.prepared(exported(&request.caption, note, motion, waypoints));
+            let written = outs.write(number, &motion).map_err(out::refused)?;
+            let frames = motion.frames();
+            rows.push(Row {
+                prompt: request.caption.clone(),
+                seed: *seed,
+                frames,
+                seconds: frames as f64 / skeleton.fps,
+                known,
+                kept,
+                timing,
+                missed,
+                files: out::names(&written).chain(arrays).collect(),
+                off: out::off_metres(&written),
+            });
+            if outs.wants_all() {
+                drawn.push(motion);
+            } else if let (Output::Json, Some(row)) = (args.report(), rows.last()) {
+                // Nothing is left to write for it, so nobody has to wait.
+                print::out(&row.json(&shared, &[]).to_string());
+            }
+        }
+        motions.push(drawn);
+    }
+    let together = write_together(&outs, &shared.label, &requests, &motions)?;
+    match args.report() {
+        Output::Json if outs.wants_all() => {
+            rows.iter().for_each(|row| print::out(&row.json(&shared, &together).to_string()));
+        }
+        Output::Json => {}
+        Output::Table => print::out(&table(&rows, &shared, &together, edit.as_ref())),
+    }
+    Ok(0)
+}
+
+/// Whether the model makes anything of a sentence; says so if it does not.
+pub(super) fn is_known(generator: &Generator, label: &str, caption: &str) -> Result<bool> {
+    let known = generator.knows(caption).map_err(model::refused)?;
+    if !known && caption.trim().is_empty() {
+        print::note(&format!("note: the sentence is empty: {label} draws without being told what"));
+    } else if !known {
+        print::note(&format!(
+            "note: the text encoder of {label} knows nothing of `{caption}`, which so gives the motion of an empty sentence"
+        ));
+    }
+    Ok(known)
+}
+
+/// A drawn motion, ready to be written.
+pub(super) fn exported(
+    caption: &str,
+    note: String,
+    motion: Generated,
+    waypoints: Vec<motion::waypoints::Waypoint>,
+) -> Motion {
+    Motion {
+        caption: caption.to_owned(),
+        note,
+        skeleton: Skeleton::of(motion.format),
+        joints: motion.joints,
+        features: Some(motion.features),
+        waypoints,
+    }
+}
+
+/// A motion, and which frames of an edited one stayed.
+fn draw(
+    generator: &Generator,
+    request: &Request,
+    seed: Seed,
+    sampler: &Sampler,
+    edit: Option<&Edit>,
+    told: Option<&Told>,
+) -> Result<(Generated, Vec<Range<usize>>)> {
+    let (prompt, sampler) = (request.caption.as_str(), Some(sampler));
+    let drawn = match (edit, told) {
+        (None, None) => {
+            let frames = request.length.map(|length| length.frames(Skeleton::of(generator.format()).fps));
+            generator.generate(prompt, frames, sampler, seed).map(|motion| (motion, Vec::new()))
+        }
+        (None, Some(told)) => {
+            let motion = generator.generate_controlled(prompt, sampler, seed, told.request());
+            motion.map(|motion| (motion, Vec::new()))
+        }
+        (Some(edit), _) => {
+            let edited = generator.edit(prompt, &edit.motion, &edit.keep, sampler, seed);
+            edited.map(|edited| (edited.motion, edited.kept))
+        }
+    };
+    drawn.map_err(model::refused)
+}
+
+/// Pages and sheets: a section for each sentence if it has several motions.
+fn write_together(outs: &Outs, label: &str, requests: &[Request], motions: &[Vec<Motion>]) -> Result<Vec<String>> {
+    let several = motions.len() > 1 && motions.iter().any(|drawn| drawn.len() > 1);
+    let sections: Vec<(String, Vec<&Motion>)> = if several {
+        let title = |request: &Request| request.caption.clone();
+        requests.iter().map(title).zip(motions.iter().map(|drawn| drawn.iter().collect())).collect()
+    } else {
+        vec![(String::new(), motions.iter().flatten().collect())]
+    };
+    let written = outs.finish(label, &sections).map_err(out::refused)?;
+    Ok(out::names(&written).collect())
+}
+
+/// Thousandths of a second.
+fn milliseconds(time: Duration) -> f64 {
+    time.as_secs_f64() * 1e3
+}
+
+impl Row {
+    /// The line of a motion, which lies in `together` too.
+    fn json(&self, shared: &Shared, together: &[String]) -> Value {
+        let Shared { label, sampler, loaded } = shared;
+        json!({
             "schema_version": 1,
-            "model": label.to_string(),
-            "prompt": prompt,
-            "frames": motion.frames,
-            "kept": kept.iter().map(|span| [span.start, span.end]).collect::<Vec<_>>(),
+            "model": label,
+            "prompt": self.prompt,
+            "known": self.known,
+            "frames": self.frames,
+            "seconds": self.seconds,
+            "kept": self.kept.iter().map(|span| [span.start, span.end]).collect::<Vec<_>>(),
             "sampler": sampler,
-            "seed": args.seed,
-            "files": written,
-            "sentence_ms": milliseconds(timing.total()),
-            "text_ms": milliseconds(timing.text),
-            "sampling_ms": milliseconds(timing.sampling),
-            "decoding_ms": milliseconds(timing.decoding),
-            "load_ms": milliseconds(loaded),
-            "control": missed.map(|missed| serde_json::json!({
+            "seed": self.seed,
+            "files": self.files.iter().chain(together).collect::<Vec<_>>(),
+            "skeleton_error_m": self.off,
+            "sentence_ms": milliseconds(self.timing.total()),
+            "text_ms": milliseconds(self.timing.text),
+            "sampling_ms": milliseconds(self.timing.sampling),
+            "decoding_ms": milliseconds(self.timing.decoding),
+            "load_ms": milliseconds(*loaded),
+            "control": self.missed.map(|missed| json!({
                 "told": missed.told,
                 "average_error_m": missed.average,
                 "worst_error_m": missed.worst,
                 "missed_by_50cm": missed.location,
             })),
-        })),
-        Output::Table => print::out(&format!(
-            "{} from {label}: {} frames{}, {}\n{:.1} ms per sentence (text {:.1}, sampling {:.1}, decoding {:.1}); the model loaded in {:.0} ms",
-            written.join(", "),
-            motion.frames,
-            edit.map(|edit| edit.describe(motion.frames, &kept)).unwrap_or_default(),
-            sampler,
-            milliseconds(timing.total()),
-            milliseconds(timing.text),
-            milliseconds(timing.sampling),
-            milliseconds(timing.decoding),
-            milliseconds(loaded),
-        )),
+        })
     }
-    if let (Some(missed), Output::Table) = (missed, args.report) {
-        print::out(&format!(
-            "{} positions told: {:.1} cm off in the mean, {:.1} cm at worst, {:.0} % missed by more than 50 cm",
+}
+
+/// The report for people.
+fn table(rows: &[Row], shared: &Shared, together: &[String], edit: Option<&Edit>) -> String {
+    let Shared { label, sampler, loaded } = shared;
+    let files = |row: &Row| row.files.iter().chain(together).cloned().collect::<Vec<_>>().join(", ");
+    let mut text = match rows {
+        [row] => {
+            let kept = edit.map(|edit| edit.describe(row.frames, &row.kept)).unwrap_or_default();
+            format!("{} from {label}: {} frames{kept}, {sampler}\n", files(row), row.frames)
+        }
+        rows => {
+            let cells = |row: &Row| {
+                vec![row.prompt.clone(), row.seed.to_string(), row.frames.to_string(), row.files.join(", ")]
+            };
+            let table = print::table(&["SENTENCE", "SEED", "FRAMES", "FILES"], rows.iter().map(cells).collect());
+            let all =
+                if together.is_empty() { String::new() } else { format!("{} with all of them, ", together.join(", ")) };
+            format!("{table}\n\n{all}{} motions from {label}, {sampler}\n", rows.len())
+        }
+    };
+    let mean = |part: fn(&Timing) -> Duration| {
+        rows.iter().map(|row| milliseconds(part(&row.timing))).sum::<f64>() / rows.len().max(1) as f64
+    };
+    text += &format!(
+        "{:.1} ms per sentence (text {:.1}, sampling {:.1}, decoding {:.1}); the model loaded in {:.0} ms",
+        mean(Timing::total),
+        mean(|timing| timing.text),
+        mean(|timing| timing.sampling),
+        mean(|timing| timing.decoding),
+        milliseconds(*loaded),
+    );
+    if let Some(off) = rows.iter().filter_map(|row| row.off).reduce(f64::max) {
+        text +=
+            &format!("\njoints of .bvh and .glb, whose bones keep their lengths, are up to {:.1} mm off", 1e3 * off);
+    }
+    for missed in rows.iter().filter_map(|row| row.missed) {
+        text += &format!(
+            "\n{} positions told: {:.1} cm off in the mean, {:.1} cm at worst, {:.0} % missed by more than 50 cm",
             missed.told,
             100.0 * missed.average,
             100.0 * missed.worst,
             100.0 * missed.location,
-        ));
+        );
     }
-    Ok(0)
+    text
 }
 
 /// A motion to edit.
@@ -215,41 +392,4 @@ impl Edit {
         };
         format!(" ({} stay{rest})", spans.join(", "))
     }
-}
-
-/// Poses of one motion on a sheet.
-const POSES: usize = 10;
-
-fn write(args: &GenerateArgs, motions: &[(String, Generated)], told: Option<&Told>) -> Result<Vec<String>> {
-    let waypoints = told.map_or(&[][..], |told| &told.waypoints);
-    let (prompt, motion) = &motions[0];
-    let failed =
-        |path: &Path, error: &dyn fmt::Display| Problem::failed(format!("cannot write `{}`: {error}", path.display()));
-    let skeleton = Skeleton::of(motion.format);
-    let (rows, width) = (motion.frames, motion.features.len() / motion.frames.max(1));
-    let mut written = Vec::new();
-    let mut features = args.features.iter().collect::<Vec<_>>();
-    let ends_in = |ending: &str| args.out.extension().is_some_and(|extension| extension.eq_ignore_ascii_case(ending));
-    if ends_in("npy") {
-        features.push(&args.out);
-    } else {
-        if ends_in("png") {
-            let rows: Vec<_> = motions.iter().map(|(prompt, motion)| (prompt.clone(), motion.joints.clone())).collect();
-            motion::draw::strip_png_along(&rows, POSES, skeleton, waypoints, &args.out)
-        } else {
-            motion::draw::gif_along(&motion.joints, skeleton, prompt, waypoints, &args.out)
-        }
-        .map_err(|error| failed(&args.out, &error))?;
-        written.push(args.out.display().to_string());
-    }
-    for path in features {
-        npy::write(path, &[rows, width], &motion.features).map_err(|error| failed(path, &error))?;
-        written.push(path.display().to_string());
-    }
-    if let Some(path) = &args.positions {
-        let joints = motion.joints.len() / 3 / rows.max(1);
-        npy::write(path, &[rows, joints, 3], &motion.joints).map_err(|error| failed(path, &error))?;
-        written.push(path.display().to_string());
-    }
-    Ok(written)
 }

@@ -4,11 +4,15 @@ mod args;
 mod config;
 mod control;
 mod data;
+mod export;
+mod gallery;
 mod generate;
 mod keep;
 mod model;
+mod out;
 mod remote;
 mod sampler;
+mod sentences;
 mod serve;
 pub(crate) mod sweep;
 mod time;
@@ -59,11 +63,15 @@ enum Verb {
     Pause(remote::ControlArgs),
     /// Takes a paused, failed or cancelled run up again
     Resume(ResumeArgs),
-    /// Makes a motion from a sentence
+    /// Makes motions from sentences
     Generate(Box<generate::GenerateArgs>),
     /// Recordings of motion
     #[command(subcommand)]
     Data(data::DataVerb),
+    /// Makes one page of what a run's models draw, side by side
+    Gallery(Box<gallery::GalleryArgs>),
+    /// Turns a motion or a recording into another form: BVH, GLB, a page, a picture, an array
+    Export(export::ExportArgs),
     /// Measures how long models take for a sentence (AITS), side by side
     Time(time::TimeArgs),
     /// Lists what this build and machine can compute on
@@ -222,7 +230,9 @@ impl Verb {
             Self::Sweep(verb) => verb.output(),
             Self::Data(verb) => verb.output(),
             Self::Resume(args) => args.output,
-            Self::Generate(args) => args.report,
+            Self::Generate(args) => args.report(),
+            Self::Gallery(args) => args.report,
+            Self::Export(args) => args.report(),
             Self::Time(args) => args.output,
             Self::Devices(args) => args.output,
             Self::Worker(WorkerVerb::List(args)) => args.output,
@@ -249,6 +259,8 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Resume(args) => resume(args).await,
         Verb::Generate(args) => generate::generate(*args).await,
         Verb::Data(verb) => data::data(&verb),
+        Verb::Gallery(args) => gallery::gallery(*args).await,
+        Verb::Export(args) => export::export(&args),
         Verb::Time(args) => time::time(args).await,
         Verb::Devices(args) => Ok(config::devices(&args)),
         Verb::Config(verb) => config::config(&verb),

@@ -118,8 +118,7 @@ pub(super) async fn version(reader: &Reader, name: &str) -> Result<Found> {
 pub(super) async fn stage(reader: &Reader, run: &RunView, name: &str) -> Result<Found> {
     let model = run.stages.iter().find(|stage| stage.name.as_str() == name).map(|stage| stage.outputs.get(MODEL));
     let Some(Some(model)) = model else {
-        let have = run.stages.iter().filter(|stage| stage.of.is_none() && stage.outputs.contains_key(MODEL));
-        let have: Vec<&str> = have.map(|stage| stage.name.as_str()).collect();
+        let have = stages(run);
         let why = if model.is_none() { "has no stage" } else { "has no model yet from stage" };
         let problem = Problem::new(exit::NOT_FOUND, anyhow::anyhow!("run `{}` {why} `{name}`", run.run));
         return Err(problem.hint(match have.as_slice() {
@@ -139,6 +138,12 @@ pub(super) async fn stage(reader: &Reader, run: &RunView, name: &str) -> Result<
     }
     let blobs = Fetched::files(reader, &manifest).await?;
     Ok(Found { manifest, blobs, label: Label::Stage(run.run.to_string(), name.to_owned()), measured })
+}
+
+/// Stages of a run that gave a model so far, but for the trials of sweeps.
+pub(super) fn stages(run: &RunView) -> Vec<&str> {
+    let have = run.stages.iter().filter(|stage| stage.of.is_none() && stage.outputs.contains_key(MODEL));
+    have.map(|stage| stage.name.as_str()).collect()
 }
 
 async fn manifest(reader: &Reader, digest: Digest) -> Result<Manifest> {

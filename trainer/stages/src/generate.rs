@@ -161,6 +161,13 @@ impl Generator {
         Ok(Edited { motion, kept: spans.filter(|(kept, _)| *kept).map(|(_, span)| span).collect() })
     }
 
+    /// Whether the model makes anything of `prompt`. What it knows nothing of it reads as the empty sentence, and so draws without being told what: the built-in encoder
+    /// has words of Latin letters and digits alone.
+    pub fn knows(&self, prompt: &str) -> Result<bool, StageError> {
+        let texts = self.model.embed(&[prompt, ""])?;
+        Ok(texts[0] != texts[1])
+    }
+
     /// Its control part, if it has one.
     pub fn control(&self) -> Option<&ControlMeta> {
         self.model.control()

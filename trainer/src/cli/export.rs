@@ -1,0 +1,100 @@
+//! `trainer export`: a motion of an array or a recording in another form.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use mocap::detect::Up;
+use mocap::export::Motion;
+use mocap::joint_map::JointMap;
+use mocap::take::Reading;
+use serde_json::json;
+
+use super::out::{self, OutArgs};
+use crate::print::{self, Output};
+use crate::problem::{Problem, Result};
+
+#[derive(Debug, Args)]
+pub(crate) struct ExportArgs {
+    /// Motions: `.npy` with features [frames, 263 or 251] or positions [frames, 22 or 21, 3], or recordings, `.bvh`
+    #[arg(required = true, value_name = "FILE")]
+    input: Vec<PathBuf>,
+    #[command(flatten)]
+    out: OutArgs,
+    /// What stands above pictures and pages [default: the file's name]
+    #[arg(long, value_name = "TEXT")]
+    caption: Option<String>,
+    /// Which joints of a recording are which: the name of a map that ships, or a file [default: found by the joints' names]
+    #[arg(long, value_name = "MAP")]
+    joint_map: Option<String>,
+    /// Metres in one unit of a recording [default: found by the length of its legs]
+    #[arg(long, value_name = "METRES")]
+    unit: Option<f64>,
+    /// Which axis of a recording points up: x, y, z, -x, -y or -z [default: where the neck is from the ankles]
+    #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true)]
+    up: Option<Up>,
+}
+
+fn up(word: &str) -> std::result::Result<Up, String> {
+    Up::parse(word).ok_or_else(|| "expected x, y, z, -x, -y or -z".to_owned())
+}
+
+impl ExportArgs {
+    /// How the report is printed.
+    pub(super) fn report(&self) -> Output {
+        self.out.report()
+    }
+
+    fn reading(&self) -> Result<Reading> {
+        let map = self.joint_map.as_deref().map(JointMap::load).transpose().map_err(Problem::usage)?;
+        if let Some(unit) = self.unit.filter(|unit| !(unit.is_finite() && *unit > 0.0)) {
+            return Err(Problem::usage(format!("`--unit {unit}`: expected metres, more than 0")));
+        }
+        Ok(Reading { map, metres_per_unit: self.unit, up: self.up })
+    }
+}
+
+pub(crate) fn export(args: &ExportArgs) -> Result<u8> {
+    let outs = args.out.files(args.input.len())?;
+    let reading = args.reading()?;
+    let (mut motions, mut lines) = (Vec::new(), Vec::new());
+    for (i, file) in args.input.iter().enumerate() {
+        let mut motion = args.out.prepared(Motion::read(file, &reading).map_err(out::refused)?);
+        if let Some(caption) = &args.caption {
+            motion.caption.clone_from(caption);
+        }
+        let written = outs.write(i + 1, &motion).map_err(out::refused)?;
+        lines.push((file, motion.frames(), motion.note.clone(), written));
+        if outs.wants_all() {
+            motions.push(motion);
+        }
+    }
+    let title = match motions.as_slice() {
+        [motion] => motion.caption.clone(),
+        motions => format!("{} motions", motions.len()),
+    };
+    let together = outs.finish(&title, &[(String::new(), motions.iter().collect())]).map_err(out::refused)?;
+    for (file, frames, said, written) in lines {
+        let files: Vec<String> = out::names(&written).chain(out::names(&together)).collect();
+        let off = out::off_metres(&written);
+        match args.report() {
+            Output::Json => print::out(
+                &json!({
+                    "schema_version": 1,
+                    "file": file.display().to_string(),
+                    "frames": frames,
+                    "read_as": said,
+                    "files": files,
+                    "skeleton_error_m": off,
+                })
+                .to_string(),
+            ),
+            Output::Table => {
+                let said = if said.is_empty() { said } else { format!("; {said}") };
+                let off = off.map(|off| format!("; joints up to {:.2} mm off, bones keep their lengths", 1e3 * off));
+                let off = off.unwrap_or_default();
+                print::out(&format!("{} from {}: {frames} frames{said}{off}", files.join(", "), file.display()));
+            }
+        }
+    }
+    Ok(0)
+}

@@ -1,0 +1,143 @@
+//! `trainer gallery`: what the models of a run draw for the same sentences from the same seeds, side by side on one page.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use mocap::export::{Motion, Outs, write_all};
+use motion::Skeleton;
+use protocol::Seed;
+use serde_json::json;
+use stages::generate::Generator;
+
+use super::generate::{exported, is_known};
+use super::model;
+use super::out;
+use super::remote::check_parent;
+use super::sampler::SamplerArgs;
+use super::sentences::SentenceArgs;
+use crate::client::Target;
+use crate::print::{self, Output};
+use crate::problem::{Problem, Result};
+use crate::reader::Reader;
+
+/// What is drawn when nobody says: movements that every set has.
+const SENTENCES: [&str; 6] = [
+    "a person walks forward",
+    "a person runs in a circle",
+    "a person jumps up",
+    "a person kicks with the right leg",
+    "a person waves with the left hand",
+    "a person sits down",
+];
+
+#[derive(Debug, Args)]
+pub(crate) struct GalleryArgs {
+    /// The run: its name, a unique beginning of it, or `@last`
+    #[arg(default_value = "@last")]
+    run: String,
+    /// Stages whose models are shown, in this order [default: all that gave one, in the order of the pipeline]
+    #[arg(long, value_name = "STAGE", value_delimiter = ',')]
+    stage: Vec<String>,
+    /// What is drawn, may be repeated [default: six movements]
+    #[arg(long = "prompt", value_name = "TEXT")]
+    prompts: Vec<String>,
+    /// Sampling steps of every model [default: as each was measured]
+    #[arg(long, value_name = "N")]
+    steps: Option<usize>,
+    #[command(flatten)]
+    sampler: SamplerArgs,
+    #[command(flatten)]
+    sentences: SentenceArgs,
+    /// Where to compute: flex, ndarray, wgpu or cuda [default: the first that this build and machine have]
+    #[arg(long)]
+    backend: Option<String>,
+    /// Where to write the page, or for a sheet of poses a `.png`
+    #[arg(short = 'o', long = "out", value_name = "FILE", default_value = "gallery.html")]
+    out: PathBuf,
+    #[command(flatten)]
+    target: Target,
+    /// How the report is printed
+    #[arg(long, value_enum, default_value_t)]
+    pub(super) report: Output,
+}
+
+pub(crate) async fn gallery(args: GalleryArgs) -> Result<u8> {
+    let requests = args.sentences.requests(&args.prompts, &SENTENCES)?;
+    let seeds = args.sentences.seeds();
+    check_parent(&args.out)?;
+    let reader = Reader::open(&args.target).await?;
+    let run = reader.find(&args.run).await?;
+    let all = model::stages(&run);
+    let names = if args.stage.is_empty() { all } else { args.stage.iter().map(String::as_str).collect() };
+    let count = requests.len() * seeds.len() * names.len();
+    let form = Outs::new(std::slice::from_ref(&args.out), count).map_err(out::refused)?;
+    if !form.wants_all() {
+        return Err(Problem::usage(format!("cannot write `{}`: expected .html or .png", args.out.display())));
+    }
+    if names.is_empty() {
+        return Err(Problem::usage(format!("no stage of run `{}` gave a model yet", run.run)));
+    }
+    let (device, _) = model::device(args.backend.as_deref())?;
+
+    // A row for each sentence and seed, a column for each model.
+    let mut rows: Vec<Vec<Motion>> = vec![Vec::new(); requests.len() * seeds.len()];
+    let mut lengths: Vec<Option<usize>> = vec![None; rows.len()];
+    let mut drawn = Vec::new();
+    for name in &names {
+        let found = model::stage(&reader, &run, name).await?;
+        let generator = Generator::load(&found.manifest, &found.blobs, &device).map_err(Problem::failed)?;
+        let sampler = match args.sampler.sampler(args.steps, generator.sampler(), &found.measured) {
+            Ok(sampler) => sampler,
+            // Measured in several ways: as the papers draw from its kind, which the page says.
+            Err(_) => args.sampler.sampler(args.steps, generator.sampler(), &[]).map_err(Problem::usage)?,
+        };
+        generator.check_sampler(&sampler).map_err(model::refused)?;
+        let fps = Skeleton::of(generator.format()).fps;
+        for (i, request) in requests.iter().enumerate() {
+            is_known(&generator, name, &request.caption)?;
+            for (k, seed) in seeds.iter().enumerate() {
+                let row = i * seeds.len() + k;
+                // As long for all models as the first one makes it, so that they compare.
+                let frames = match (request.length, lengths[row]) {
+                    (Some(length), _) => length.frames(fps),
+                    (None, Some(frames)) => frames,
+                    (None, None) => generator.frames(&request.caption, Seed(*seed)).map_err(model::refused)?,
+                };
+                lengths[row] = Some(frames);
+                let motion = generator.generate(&request.caption, Some(frames), Some(&sampler), Seed(*seed));
+                let motion = motion.map_err(model::refused)?;
+                let note = format!("{sampler}, {:.0} ms", motion.timing.total().as_secs_f64() * 1e3);
+                rows[row].push(exported(name, note, motion, Vec::new()));
+            }
+        }
+        drawn.push(json!({"stage": name, "sampler": sampler}));
+    }
+    reader.close().await;
+    let titles = requests.iter().flat_map(|request| {
+        let one = seeds.len() == 1;
+        seeds.iter().map(move |seed| match one {
+            true => request.caption.clone(),
+            false => format!("{} (seed {seed})", request.caption),
+        })
+    });
+    let sections: Vec<(String, Vec<&Motion>)> = titles.zip(rows.iter().map(|row| row.iter().collect())).collect();
+    write_all(&format!("Models of {}", run.run), &sections, &args.out).map_err(out::refused)?;
+    match args.report {
+        Output::Json => print::json(&json!({
+            "schema_version": 1,
+            "run": run.run,
+            "models": drawn,
+            "motions": count,
+            "files": [args.out.display().to_string()],
+        })),
+        Output::Table => print::out(&format!(
+            "{}: {count} motions, {} for {} sentence(s) and {} seed(s), of {}",
+            args.out.display(),
+            names.join(", "),
+            requests.len(),
+            seeds.len(),
+            run.run
+        )),
+    }
+    Ok(0)
+}

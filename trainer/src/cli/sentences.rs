@@ -1,0 +1,126 @@
+//! Sentences on a command line and in files, with lengths and seeds.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use mocap::requests::{self, Length, Request};
+
+use crate::problem::{Problem, Result};
+
+/// Motions that one command draws.
+const MOST: usize = 1_000;
+
+/// What to draw.
+#[derive(Debug, Args)]
+pub(super) struct SentenceArgs {
+    /// More sentences, of a file with one a line: text, with a length behind a `#` if wanted (`a person walks#120` frames, `a person walks#4.5s`), or JSON
+    /// lines, {"caption": "a person walks", "seconds": 4.5}; `-` is standard input
+    #[arg(long, value_name = "FILE")]
+    captions: Option<PathBuf>,
+    /// Length in frames: one for all sentences, or one for each [default: what the model's length estimator says, 120 without one]
+    #[arg(long, value_name = "N", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
+    frames: Vec<u32>,
+    /// Length in seconds, likewise
+    #[arg(long, value_name = "S", value_delimiter = ',', conflicts_with = "frames", value_parser = seconds)]
+    seconds: Vec<Length>,
+    /// Motions for each sentence, with seeds that follow one another
+    #[arg(short = 'n', long = "seeds", value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=1_000))]
+    seeds: u16,
+    /// Other seeds give other motions
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+}
+
+fn seconds(text: &str) -> std::result::Result<Length, String> {
+    format!("{text}s").parse()
+}
+
+impl SentenceArgs {
+    /// The sentences of the command line, then those of the file, each with its length; those of `others` if there are none.
+    ///
+    /// # Errors
+    /// A file that does not read, lengths for another number of sentences, too much.
+    pub(super) fn requests(&self, prompts: &[String], others: &[&str]) -> Result<Vec<Request>> {
+        let plain = |caption: String| Request { caption, length: None };
+        let mut requests: Vec<Request> = prompts.iter().cloned().map(plain).collect();
+        if let Some(file) = &self.captions {
+            requests.extend(requests::read(file).map_err(Problem::usage)?);
+        }
+        if requests.is_empty() {
+            requests.extend(others.iter().map(|caption| plain((*caption).to_owned())));
+        }
+        let frames = self.frames.iter().map(|frames| Length::Frames(*frames as usize));
+        let lengths: Vec<Length> = frames.chain(self.seconds.iter().copied()).collect();
+        match lengths.as_slice() {
+            [] => {}
+            [one] => requests.iter_mut().for_each(|request| request.length = request.length.or(Some(*one))),
+            each if each.len() == requests.len() => {
+                requests.iter_mut().zip(each).for_each(|(request, length)| request.length = Some(*length));
+            }
+            each => {
+                let (lengths, sentences) = (each.len(), requests.len());
+                return Err(Problem::usage(format!(
+                    "{lengths} lengths for {sentences} sentences; give one for all or one for each"
+                )));
+            }
+        }
+        let motions = requests.len() * self.seeds().len();
+        if motions > MOST {
+            return Err(Problem::usage(format!("{motions} motions; one command draws at most {MOST}")));
+        }
+        Ok(requests)
+    }
+
+    /// The seeds that each sentence is drawn with.
+    pub(super) fn seeds(&self) -> Vec<u64> {
+        (0..u64::from(self.seeds)).map(|k| self.seed.wrapping_add(k)).collect()
+    }
+
+    /// Whether somebody says how long motions should be.
+    pub(super) fn have_length(requests: &[Request]) -> bool {
+        requests.iter().any(|request| request.length.is_some())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn args() -> SentenceArgs {
+        SentenceArgs { captions: None, frames: vec![], seconds: vec![], seeds: 1, seed: 7 }
+    }
+
+    #[test]
+    fn lengths_are_for_all_or_for_each_and_a_files_own_come_first() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("a.txt");
+        std::fs::write(&file, "runs\njumps#2s\n").unwrap();
+        let lengths = |args: SentenceArgs| {
+            let requests = args.requests(&["walks".to_owned()], &["x"]).map_err(|problem| problem.error.to_string());
+            requests.map(|all| all.into_iter().map(|request| request.length).collect::<Vec<_>>())
+        };
+        let frames = |n| Some(Length::Frames(n));
+        let captions = Some(file);
+        assert_eq!(lengths(args()), Ok(vec![None]));
+        assert_eq!(lengths(SentenceArgs { frames: vec![80], ..args() }), Ok(vec![frames(80)]));
+        let all = SentenceArgs { captions: captions.clone(), frames: vec![80], ..args() };
+        assert_eq!(lengths(all), Ok(vec![frames(80), frames(80), Some(Length::Seconds(2.0))]));
+        let seconds = ["4", "1.5", "3"].map(|text| seconds(text).unwrap()).to_vec();
+        let each = SentenceArgs { captions: captions.clone(), seconds: seconds.clone(), ..args() };
+        assert_eq!(lengths(each), Ok(seconds.into_iter().map(Some).collect()));
+        let two = lengths(SentenceArgs { captions, frames: vec![1, 2], ..args() }).unwrap_err();
+        assert!(two.contains("2 lengths for 3 sentences"), "{two}");
+        let missing = lengths(SentenceArgs { captions: Some("none.txt".into()), ..args() }).unwrap_err();
+        assert!(missing.contains("none.txt"), "{missing}");
+    }
+
+    #[test]
+    fn seeds_follow_one_another_and_motions_are_bounded() {
+        assert_eq!(SentenceArgs { seeds: 3, seed: u64::MAX, ..args() }.seeds(), [u64::MAX, 0, 1]);
+        let others = args().requests(&[], &["walks", "runs"]).unwrap();
+        assert_eq!(others.len(), 2);
+        let many = SentenceArgs { seeds: 501, ..args() }.requests(&[], &["walks", "runs"]).unwrap_err();
+        assert!(many.error.to_string().contains("1002 motions"));
+        assert!(seconds("0").is_err() && seconds("soon").is_err() && seconds("nan").is_err());
+    }
+}
