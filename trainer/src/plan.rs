@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use coordinator::search::{Score, Search, Ticket};
 use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
-use protocol::stage::TextEmbed;
+use protocol::stage::{TextEmbed, TextEncoder};
 use protocol::sweep::{STATE_OUTPUT, rung_name};
 use protocol::{ArtifactKind, Digest, StageName, Steps, TaskId};
 use registry::{ReadStore, RunRow, StageResultRow};
@@ -65,9 +65,9 @@ impl Plan {
             for one in &self.missing {
                 text.push_str(&format!("  {}\n    {}\n", cut(&one.place(), COLUMNS - 2), cut(one.origin, COLUMNS - 4)));
             }
-            let built_in = pipeline.stages.iter().filter_map(|stage| stage.settings.get::<TextEmbed>());
-            for encoder in built_in.map(|text| text.encoder.name()).collect::<BTreeSet<_>>() {
-                text.push_str(&format!("  (the text encoder `{encoder}` is built in)\n"));
+            let mut encoders = pipeline.stages.iter().filter_map(|stage| stage.settings.get::<TextEmbed>());
+            if encoders.any(|text| text.encoder == TextEncoder::Hashed) {
+                text.push_str("  (the text encoder `hashed` is built in)\n");
             }
         }
         let known = |value: Option<String>| value.unwrap_or_default();
@@ -423,7 +423,8 @@ mod tests {
             "nowhere/data/HumanML3D: no such folder",
             "nowhere/deps/t2m/t2m: no such folder",
             "nowhere/deps/glove: no such folder",
-            "`hashed` is built in",
+            "nowhere/data/sentence-t5-large: no such folder",
+            "Sentence-T5, such as huggingface.co/",
             "flex (CPU",
             "1150000  18.06M      139 days",
             "about 139 days of one worker",

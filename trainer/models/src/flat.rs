@@ -100,7 +100,10 @@ pub fn write<M: Module>(module: M, mut flat: &[f32]) -> M {
 
 /// The module with the parameters that `fill` gives, one after the other; identities and gradient tracking stay. After an error it is
 /// asked no more.
-pub(crate) fn replace<M: Module, E>(module: M, fill: impl FnMut(&mut [f32]) -> Result<(), E>) -> Result<M, E> {
+///
+/// # Errors
+/// What `fill` says.
+pub fn replace<M: Module, E>(module: M, fill: impl FnMut(&mut [f32]) -> Result<(), E>) -> Result<M, E> {
     struct Replace<F, E> {
         fill: F,
         failed: Option<E>,

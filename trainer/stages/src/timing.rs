@@ -14,6 +14,7 @@ use protocol::stage::{DataSynthetic, Sampler};
 
 use crate::context::StageError;
 use crate::generate::Generator;
+use crate::text;
 
 pub use crate::generate::Timing;
 
@@ -93,6 +94,8 @@ pub fn time(
 ) -> Result<Vec<Vec<Timing>>, StageError> {
     side_by_side(models.len(), sentences.len(), WARM_UP, |model, sentence| {
         let (generator, sampler) = models[model];
+        // Sentences come again, and a model may have the encoder of another.
+        text::forget();
         let motion = generator.generate(&sentences[sentence], frames, Some(sampler), Seed(sentence as u64))?;
         done();
         Ok(motion.timing)

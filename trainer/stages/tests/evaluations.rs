@@ -12,7 +12,7 @@ use protocol::stage::Diffusion;
 use protocol::stage::{
     Batch, CheckpointPolicy, DataFormat, DataSynthetic, EncodeLatents, EvaluateLatentFid, EvaluateReconstruction,
     EvaluateSpectrum, Family, Keep, LatentShape, Network, Positions, Sampler, Split, StageSettings, TextEmbed,
-    TextEncoder, TrainLength, TrainVae, Training,
+    TrainLength, TrainVae, Training,
 };
 use protocol::{ArtifactKind, Digest, Manifest, Seed, Steps};
 use stages::artifacts::{self, DenoiserMeta, Latents, MODEL_FILE, VaeMeta, to_meta};
@@ -65,7 +65,7 @@ fn vae_of(bench: &Bench, std: f32) -> Digest {
 
 /// A model of latent diffusion.
 fn untrained_model(bench: &Bench, vae: Digest, family: Family, latent: LatentShape) -> Digest {
-    let text = text::manifest(TextEncoder::Hashed);
+    let text = text::built_in();
     bench.blobs().put(text.to_bytes()).expect("stored");
     let meta = DenoiserMeta {
         guidance_dim: if family == Family::Mld { 0 } else { 32 },

@@ -14,8 +14,8 @@ use protocol::message::FailureClass;
 use protocol::stage::Diffusion;
 use protocol::stage::{
     Batch, DataFormat, DataSynthetic, EvaluateT2m, EvaluatorNetwork, Family, ImportEvaluator, LatentShape,
-    MovementPhase, MultiModality, Network, Positions, Sampler, Split, StageSettings, TextEmbed, TextEncoder,
-    TrainEvaluator, TrainLength, Training,
+    MovementPhase, MultiModality, Network, Positions, Sampler, Split, StageSettings, TextEmbed, TrainEvaluator,
+    TrainLength, Training,
 };
 use protocol::{ArtifactKind, Digest, Manifest, Seed, Steps};
 use stages::artifacts::{self, DenoiserMeta, MODEL_FILE, VaeMeta, to_meta};
@@ -108,7 +108,7 @@ fn untrained_vae(bench: &Bench) -> Digest {
 
 /// An untrained model of a family.
 fn untrained(bench: &Bench, family: Family) -> Digest {
-    let text = text::manifest(TextEncoder::Hashed);
+    let text = text::built_in();
     bench.blobs().put(text.to_bytes()).expect("stored");
     let device = bench.device();
     let vae = untrained_vae(bench);

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::error::EncoderError;
-use crate::network::{Network, POSITIONS, TensorSpec};
+use crate::network::{Network, TensorSpec, WIDEST};
 use crate::rules::Rules;
 use crate::tokenizer::{TOKENIZER_BYTES, Tokenizer, clip_from_parts};
 use crate::weights::{StoredTensor, Weights, packed};
@@ -23,7 +23,7 @@ const CONFIG_BYTES: u64 = 4 << 20;
 /// Tokens of a T5 caption where nothing says otherwise: what it was trained with.
 const T5_TOKENS: usize = 512;
 /// Stands before the names of the dense layer's weights.
-const DENSE: &str = "dense.";
+pub const DENSE: &str = "dense.";
 
 /// Which encoder is in a folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -92,6 +92,26 @@ pub struct Description {
     pub rules: Rules,
 }
 
+impl Description {
+    /// Refuses sizes that no network has, and captions that have no room in it.
+    ///
+    /// # Errors
+    /// What is wrong.
+    pub fn check(&self) -> Result<(), String> {
+        self.network.check()?;
+        let (most, positions) = (self.rules.most, self.network.positions());
+        if most > positions {
+            return Err(format!("captions have up to {most} tokens, the network {positions} positions"));
+        }
+        match &self.head {
+            Some(Head { width, .. }) if !(1..=WIDEST).contains(width) => {
+                Err(format!("captions have vectors of {width} numbers; expected 1 to {WIDEST}"))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
 /// An encoder in its folder.
 #[derive(Debug)]
 pub struct EncoderFolder {
@@ -140,8 +160,8 @@ impl EncoderFolder {
                     let what = "no `modules.json`; expected the layout of sentence-transformers, or set `encoder: t5`";
                     EncoderError::at(path, what)
                 })?;
-                let (head, dense, left) = modules.head(network.width())?;
-                tensors.extend(dense);
+                let Behind { head, weights, left } = modules.behind(network.width())?;
+                tensors.extend(weights);
                 skipped.extend(left);
                 Some(head)
             }
@@ -263,7 +283,7 @@ fn rules(root: &Path, request: &Request, network: &Network, tokenizer: (&str, &[
             }
             let is_openai = request.ids == TokenIds::OpenAi;
             let pad = if is_openai { 0 } else { id(&word("pad_token", &end_word))? };
-            let positions = sizes.max_position_embeddings;
+            let positions = network.positions();
             let most = most(own_most.unwrap_or(positions), positions)?;
             Ok(Rules { repair: is_openai, strip: false, lower: false, first: Some(first), end, pad, most })
         }
@@ -273,9 +293,26 @@ fn rules(root: &Path, request: &Request, network: &Network, tokenizer: (&str, &[
             let own = own(&sentence["max_seq_length"]).or(own_most).unwrap_or(T5_TOKENS);
             let lower = sentence["do_lower_case"].as_bool().unwrap_or(false);
             let (end, pad) = (id(&word("eos_token", "</s>"))?, sizes.pad_token_id);
-            Ok(Rules { repair: false, strip: true, lower, first: None, end, pad, most: most(own, POSITIONS)? })
+            Ok(Rules {
+                repair: false,
+                strip: true,
+                lower,
+                first: None,
+                end,
+                pad,
+                most: most(own, network.positions())?,
+            })
         }
     }
+}
+
+/// What comes behind a network.
+struct Behind {
+    head: Head,
+    /// Of the dense layer.
+    weights: BTreeMap<String, StoredTensor>,
+    /// Names of tensors that are there and not of it.
+    left: Vec<String>,
 }
 
 /// What `modules.json` lists.
@@ -320,9 +357,8 @@ impl Modules {
         Ok(Some(Self { file, first, others: all }))
     }
 
-    /// What comes behind states of `width`, its weights, and the names of what is not of them.
-    #[expect(clippy::type_complexity, reason = "three things of one reading")]
-    fn head(&self, width: usize) -> Result<(Head, BTreeMap<String, StoredTensor>, Vec<String>), EncoderError> {
+    /// What comes behind states of `width`.
+    fn behind(&self, width: usize) -> Result<Behind, EncoderError> {
         let refuse = |what: String| EncoderError::at(&self.file, what);
         let mut head = Head { width, dense: false, bias: false, normalise: false };
         let (mut weights, mut left) = (BTreeMap::new(), Vec::new());
@@ -351,7 +387,7 @@ impl Modules {
                 _ => head.normalise = true,
             }
         }
-        Ok((head, weights, left))
+        Ok(Behind { head, weights, left })
     }
 }
 
@@ -377,7 +413,7 @@ fn check_pooling(file: &Path, width: usize) -> Result<(), EncoderError> {
 /// Width and bias of the dense layer.
 fn dense(config: &Value, width: usize) -> Result<(usize, bool), String> {
     let number =
-        |key: &str| config[key].as_u64().and_then(|n| usize::try_from(n).ok()).filter(|n| (1..=65_536).contains(n));
+        |key: &str| config[key].as_u64().and_then(|n| usize::try_from(n).ok()).filter(|n| (1..=WIDEST).contains(n));
     if number("in_features") != Some(width) {
         return Err(format!("`in_features` is {}; expected {width}, the width of the network", config["in_features"]));
     }

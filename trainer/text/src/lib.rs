@@ -16,7 +16,7 @@ mod tokenizer;
 mod weights;
 
 pub use error::EncoderError;
-pub use folder::{Description, EncoderFolder, Head, Kind, Request, TokenIds};
+pub use folder::{DENSE, Description, EncoderFolder, Head, Kind, Request, TokenIds};
 pub use network::{ClipSizes, Network, T5Sizes, TensorSpec};
 pub use repair::repaired;
 pub use rules::Rules;

@@ -7,11 +7,11 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 /// The largest value of any width; published ones stay below 11,000.
-const WIDEST: usize = 65_536;
+pub(crate) const WIDEST: usize = 65_536;
 /// Rows of a token table.
 const ROWS: usize = 4_000_000;
 /// Positions, and so tokens of a caption.
-pub(crate) const POSITIONS: usize = 4_096;
+const POSITIONS: usize = 4_096;
 
 /// A tensor that a network has.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -247,6 +247,14 @@ impl Network {
         match self {
             Self::Clip(sizes) => sizes.hidden_size,
             Self::T5(sizes) => sizes.d_model,
+        }
+    }
+
+    /// Tokens of a caption at most. T5 has no end, but attention that grows with the square of them.
+    pub fn positions(&self) -> usize {
+        match self {
+            Self::Clip(sizes) => sizes.max_position_embeddings,
+            Self::T5(_) => POSITIONS,
         }
     }
 

@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 
 use safetensors::tensor::{Dtype, Metadata, TensorInfo};
 
+use crate::network::TensorSpec;
+
 /// The largest header; that of a thousand tensors has a hundred kilobytes.
 const HEADER_BYTES: u64 = 16 << 20;
 
@@ -90,6 +92,16 @@ pub trait ReadAt {
     fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), String>;
 }
 
+impl<R: ReadAt + ?Sized> ReadAt for Box<R> {
+    fn bytes(&self) -> u64 {
+        (**self).bytes()
+    }
+
+    fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), String> {
+        (**self).read_at(offset, out)
+    }
+}
+
 impl ReadAt for [u8] {
     fn bytes(&self) -> u64 {
         self.len() as u64
@@ -155,6 +167,20 @@ impl<R: ReadAt> WeightsFile<R> {
         Ok(Self { source, tensors })
     }
 
+    /// Refuses a file without some of `specs`, whose names have `prefix` before them there: before a network of these sizes is made.
+    ///
+    /// # Errors
+    /// The first tensor that is missing or has another shape.
+    pub fn holds(&self, specs: &[TensorSpec], prefix: &str) -> Result<(), String> {
+        for TensorSpec { name, shape } in specs {
+            let found = self.tensors.get(&format!("{prefix}{name}")).filter(|tensor| tensor.element.is_some());
+            if found.is_none_or(|tensor| tensor.shape != *shape) {
+                return Err(format!("no tensor `{prefix}{name}` {shape:?}"));
+            }
+        }
+        Ok(())
+    }
+
     /// The numbers of the tensor `name`, as many as `out` has.
     ///
     /// # Errors
@@ -209,6 +235,10 @@ pub(crate) mod tests {
         let mut out = [0.0; 2];
         open(&good).unwrap().read("a", &mut out).unwrap();
         assert_eq!(out, [1.0, -2.0]);
+        let spec = |shape: &[usize]| [TensorSpec { name: "a".into(), shape: shape.to_vec() }];
+        open(&good).unwrap().holds(&spec(&[2]), "").unwrap();
+        assert_eq!(open(&good).unwrap().holds(&spec(&[1, 2]), "").unwrap_err(), "no tensor `a` [1, 2]");
+        assert!(open(&good).unwrap().holds(&spec(&[2]), "x.").is_err());
         assert!(open(&good).unwrap().read("a", &mut [0.0; 3]).unwrap_err().contains("no tensor `a` of 3"));
         let mut long = good.clone();
         long[..8].copy_from_slice(&u64::MAX.to_le_bytes());

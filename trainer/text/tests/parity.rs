@@ -40,7 +40,8 @@ fn ids(folder: &Path) -> BTreeMap<String, Vec<Vec<u32>>> {
     let stored = SafeTensors::deserialize(&bytes).expect("safetensors");
     let cases = stored.iter().filter_map(|(name, view)| Some((name.strip_suffix("/input_ids")?, view)));
     let rows = |data: &[u8], width: usize| -> Vec<Vec<u32>> {
-        let all: Vec<u32> = data.chunks_exact(8).map(|b| i64::from_le_bytes(b.try_into().unwrap()) as u32).collect();
+        let all: Vec<u32> =
+            data.chunks_exact(8).map(|b| i64::from_le_bytes(b.try_into().expect("eight bytes")) as u32).collect();
         all.chunks(width).map(<[u32]>::to_vec).collect()
     };
     cases.map(|(case, view)| (case.to_owned(), rows(view.data(), view.shape()[1]))).collect()
@@ -159,6 +160,44 @@ fn a_dense_layer_is_read_from_either_file() {
             values
         };
         assert_eq!(values(&folder), values(pickled.path()));
+    }
+}
+
+/// The older layout, with the network in a folder of its own and its weights in shards, is the same encoder.
+#[test]
+fn shards_in_a_folder_below_are_the_same_encoder() {
+    for folder in folders("09_text_t5") {
+        let request = Request { kind: Kind::SentenceT5, ids: TokenIds::HuggingFace, most: 0 };
+        let copy = copy_of(&folder, &["model.safetensors", "modules.json"]);
+        let below = copy.path().join("0_Transformer");
+        std::fs::create_dir(&below).expect("a folder");
+        for file in std::fs::read_dir(copy.path()).expect("a folder").map(|entry| entry.expect("an entry").path()) {
+            if file.is_file() {
+                std::fs::rename(&file, below.join(file.file_name().expect("a name"))).expect("it moves");
+            }
+        }
+        let mut modules = json(&folder.join("modules.json"));
+        modules[0]["path"] = "0_Transformer".into();
+        std::fs::write(copy.path().join("modules.json"), modules.to_string()).expect("a file");
+
+        let bytes = std::fs::read(folder.join("model.safetensors")).expect("a file of the fixture");
+        let stored = SafeTensors::deserialize(&bytes).expect("safetensors");
+        let mut shards = [Vec::new(), Vec::new()];
+        let mut places = serde_json::Map::new();
+        for (i, (name, view)) in stored.iter().enumerate() {
+            shards[i % 2].push((name, view));
+            places.insert(name.to_owned(), format!("model-{}.safetensors", i % 2).into());
+        }
+        for (i, shard) in shards.into_iter().enumerate() {
+            let bytes = safetensors::serialize(shard, None).expect("safetensors");
+            std::fs::write(below.join(format!("model-{i}.safetensors")), bytes).expect("a file");
+        }
+        let index = serde_json::json!({"metadata": {}, "weight_map": places});
+        std::fs::write(below.join("model.safetensors.index.json"), index.to_string()).expect("a file");
+
+        let opened = |path: &Path| EncoderFolder::open(path, &request).unwrap_or_else(|e| panic!("{e}"));
+        let (whole, parts) = (opened(&folder), opened(copy.path()));
+        assert_eq!(whole.digest(&whole.weights().unwrap()), parts.digest(&parts.weights().unwrap()));
     }
 }
 

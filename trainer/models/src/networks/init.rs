@@ -13,12 +13,18 @@ pub struct Init<'a> {
     stream: Stream,
     device: &'a Device,
     positions: Positions,
+    draws: bool,
 }
 
 impl<'a> Init<'a> {
     /// All parameters of one network of one stage. `purpose` keeps two networks of one stage apart.
     pub fn new(seed: Seed, purpose: &str, positions: Positions, device: &'a Device) -> Self {
-        Self { stream: Stream::new(seed, purpose, 0, 0), device, positions }
+        Self { stream: Stream::new(seed, purpose, 0, 0), device, positions, draws: true }
+    }
+
+    /// Zeros in place of all draws: of a network whose weights are read right after, for draws of a large one take longer than that.
+    pub fn blank(device: &'a Device) -> Self {
+        Self { draws: false, ..Self::new(Seed(0), "blank", Positions::Uniform, device) }
     }
 
     /// Where parameters are made.
@@ -33,7 +39,10 @@ impl<'a> Init<'a> {
     fn draw<const D: usize>(&mut self, low: f64, high: f64, shape: [usize; D]) -> Param<Tensor<D>> {
         let count = shape.iter().product();
         #[expect(clippy::cast_possible_truncation, reason = "parameters are f32")]
-        let values = (0..count).map(|_| self.stream.range(low, high) as f32).collect();
+        let values = match self.draws {
+            true => (0..count).map(|_| self.stream.range(low, high) as f32).collect(),
+            false => vec![0.0; count],
+        };
         self.param(values, shape)
     }
 
@@ -57,10 +66,7 @@ impl<'a> Init<'a> {
     )]
     pub fn xavier_normal<const D: usize>(&mut self, fans: usize, shape: [usize; D]) -> Param<Tensor<D>> {
         let deviation = (2.0 / fans as f64).sqrt() as f32;
-        let mut values = vec![0.0; shape.iter().product()];
-        self.stream.fill_normal(&mut values);
-        values.iter_mut().for_each(|v| *v *= deviation);
-        self.param(values, shape)
+        self.normal_times(deviation, shape)
     }
 
     /// Uniform within `±1 / sqrt(fan_in)`: PyTorch's default for a Linear's weight and bias.
@@ -72,16 +78,20 @@ impl<'a> Init<'a> {
 
     /// Standard normal.
     pub fn normal<const D: usize>(&mut self, shape: [usize; D]) -> Param<Tensor<D>> {
-        let mut values = vec![0.0; shape.iter().product()];
-        self.stream.fill_normal(&mut values);
-        self.param(values, shape)
+        self.normal_times(1.0, shape)
     }
 
     /// Normal with this deviation.
     pub fn scaled_normal<const D: usize>(&mut self, deviation: f64, shape: [usize; D]) -> Param<Tensor<D>> {
+        self.normal_times(deviation as f32, shape)
+    }
+
+    fn normal_times<const D: usize>(&mut self, deviation: f32, shape: [usize; D]) -> Param<Tensor<D>> {
         let mut values = vec![0.0; shape.iter().product()];
-        self.stream.fill_normal(&mut values);
-        values.iter_mut().for_each(|v| *v *= deviation as f32);
+        if self.draws {
+            self.stream.fill_normal(&mut values);
+            values.iter_mut().for_each(|v| *v *= deviation);
+        }
         self.param(values, shape)
     }
 

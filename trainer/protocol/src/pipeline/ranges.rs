@@ -30,6 +30,7 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("fps", Real(0.0, 10_000.0), "frames a second"),
     ("crops", Whole(1, 256), "crops of an entry"),
     ("shards", Whole(1, limits::SHARDS), "shards"),
+    ("max_tokens", Whole(0, 4_096), "tokens"),
     // Networks.
     ("latent.tokens", Whole(1, 4_096), "tokens"),
     ("latent.dim", Whole(1, 16_384), "numbers a token"),

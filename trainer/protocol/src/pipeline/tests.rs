@@ -61,7 +61,22 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
     ("clips: 10", "clips: 0", "3:37", &["`clips` is 0; expected at least 1"]),
     ("clips: 10", "clips: ten", "3:37", &["`clips` of `dataset` is the text `ten`; expected a whole number"]),
     ("clips: 10", "val: 0.6, test: 0.5", "", &["leave no clips to train on"]),
-    ("seed: 7", "text: {encoder: t5}", "2:17", &["the text `t5`; expected `hashed`"]),
+    (
+        "seed: 7",
+        "text: {encoder: sentence-t6}",
+        "2:17",
+        &["`hashed`, `clip`, `t5`, `sentence-t5`", "did you mean `sentence-t5`?"],
+    ),
+    ("seed: 7", "text: {encoder: t5}", "2:1", &["`path` is missing: the folder with the encoder `t5`", "download T5"]),
+    ("seed: 7", "text: {encoder: t5, path: x, ids: openai}", "2:35", &["`ids` is given, but `t5` has no choice"]),
+    ("seed: 7", "text: {encoder: t5, path: x, output: pooled}", "2:38", &["`output` is given, but `t5`"]),
+    (
+        "seed: 7",
+        "text: {encoder: clip, path: x, max_tokens: 2}",
+        "2:44",
+        &["`max_tokens` is 2; expected 0, or at least 3"],
+    ),
+    ("seed: 7", "text: {shards: 0}", "2:16", &["`shards` is 0; expected 1 to"]),
     ("seed: 7", "text: {dataset: vae}", "2:17", &["`vae` gives a VAE, but `dataset` needs a dataset"]),
     // Stages.
     (

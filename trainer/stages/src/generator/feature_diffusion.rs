@@ -35,8 +35,9 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
     if meta.fits.get(&Role::TEXT) != model.parts.get(&Role::TEXT) {
         return Err(StageError::Input("the denoiser was trained with another `text` than the model has".into()));
     }
-    if meta.text_dim != text.dim() {
-        let (wanted, found) = (meta.text_dim, text.dim());
+    let found = if meta.reads_tokens() { text.token_dim() } else { text.dim() };
+    if meta.text_dim != found {
+        let wanted = meta.text_dim;
         return Err(StageError::Input(format!(
             "the denoiser reads {wanted} numbers a vector, the encoder gives {found}"
         )));

@@ -171,6 +171,9 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
             ours.1, ours.0, theirs.1, theirs.0
         )));
     }
+    if meta.family == Family::Mmm {
+        text::expect_one_width(&*text)?;
+    }
     if meta.text_dim != text.dim() {
         let (wanted, found) = (meta.text_dim, text.dim());
         return Err(StageError::Input(format!(

@@ -144,7 +144,10 @@ impl FeatureData {
 
     /// Width of a caption's vector, or of its tokens.
     pub(super) fn text_dim(&self) -> usize {
-        self.text_meta.dim
+        match &self.words {
+            Words::Vectors(_) => self.text_meta.dim,
+            Words::Tokens(encoder) => encoder.token_dim(),
+        }
     }
 
     /// The encoder that embeds the captions.

@@ -4,7 +4,7 @@
 //! over all tokens, hidden or not, the end excepted: a mean of each clip, then over clips. Captions are never left out, so there is no guidance.
 //! A token is the frozen code of the tokenizer, a caption its one vector and a vector for each word.
 //!
-//! Departs: nothing is looked at behind a caption's last word, where upstream's encoder has always 77 of them.
+//! Departs with the built-in encoder: nothing is looked at behind a caption's last word, where CLIP has always 77 of them.
 
 use burn::tensor::{Device, Tensor};
 use models::kernels::Dropout;
@@ -59,6 +59,8 @@ impl WithWords {
         let (_, manifest) = artifacts::input(cx, "tokenizer", ArtifactKind::Tokenizer)?;
         let tokenizer = TrainedTokenizer::read(&*blobs, &manifest, &cx.device())?;
         let part = parts::manifest(&*blobs, data.embeddings.meta.text, "the text encoder")?;
+        let encoder = text::open(&part, &*blobs, &cx.device())?;
+        text::expect_one_width(&*encoder)?;
         let config = meta.mmm(tokenizer.meta().code_dim);
         Ok(Self {
             settings: settings.clone(),
@@ -66,7 +68,7 @@ impl WithWords {
             config,
             data,
             captions,
-            encoder: text::open(&part, &*blobs, &cx.device())?,
+            encoder,
             codes_kd: codebook(&tokenizer, &cx.device().autodiff()),
             dropout_seed: dropout_seed(cx),
             device: cx.device(),

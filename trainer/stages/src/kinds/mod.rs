@@ -96,8 +96,8 @@ macro_rules! runners {
 
 // The list of what runs. It is held against `protocol`'s list of kinds by a test below.
 runners! {
-    Plain: DataOpen, DataSynthetic, TextEmbed, ImportEvaluator, ModelDecoder, EvaluateSpectrum;
-    Map: DataFeatures, EncodeLatents, EncodeTokens, EvaluateReconstruction, EvaluateLatentFid, EvaluateT2m, EvaluateControl;
+    Plain: DataOpen, DataSynthetic, ImportEvaluator, ModelDecoder, EvaluateSpectrum;
+    Map: TextEmbed, DataFeatures, EncodeLatents, EncodeTokens, EvaluateReconstruction, EvaluateLatentFid, EvaluateT2m, EvaluateControl;
     Gang: TrainVae, TrainMld, DistillLcm, DistillPcm, TrainEvaluator, TrainLength, TrainTokenizer, TrainTokens, TrainDiscord, DistillDiscord,
         TrainMdm, TrainStableMoFusion, TrainControl;
 }

@@ -44,7 +44,7 @@ pub use evaluate_t2m::{EvaluateT2m, MultiModality};
 pub use import_evaluator::ImportEvaluator;
 pub use model_decoder::ModelDecoder;
 pub use register::{Promote, Register};
-pub use text_embed::{TextEmbed, TextEncoder};
+pub use text_embed::{ClipIds, ClipOutput, TextEmbed, TextEncoder};
 pub use train_control::{ControlDistance, ControlLoss, ControlMean, TrainControl};
 pub use train_discord::{FlowBackbone, FlowNetwork, FlowProjection, FlowSolver, TrainDiscord};
 pub use train_evaluator::{EvaluatorNetwork, MovementPhase, TrainEvaluator};

@@ -1,24 +1,57 @@
-//! `text.embed`: every caption of a dataset as a vector, computed once. `hashed` is ours.
+//! `text.embed`: every caption of a dataset as a vector, computed once. `hashed` is ours; the others are published encoders, read from their
+//! folders: CLIP (Radford et al., arXiv:2103.00020), T5 (Raffel et al., arXiv:1910.10683), Sentence-T5 (Ni et al., arXiv:2108.08877).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
-use crate::stage::{Output, Ref, Shape, StageSpec};
+use crate::stage::{Output, Problems, Ref, Shape, StageSpec};
 
-/// `text: {encoder: hashed}`.
+/// Of each encoder's folder what must be there; of several with `|` between them, one.
+const CLIP_FILES: [&str; 3] = [
+    "config.json|modules.json",
+    "tokenizer.json|vocab.json|modules.json",
+    "model.safetensors|model.safetensors.index.json|pytorch_model.bin|modules.json",
+];
+const T5_FILES: [&str; 3] = [
+    "config.json|modules.json",
+    "tokenizer.json|modules.json",
+    "model.safetensors|model.safetensors.index.json|pytorch_model.bin|modules.json",
+];
+const SENTENCE_T5_FILES: [&str; 1] = ["modules.json"];
+
+/// `text: {encoder: sentence-t5, path: data/sentence-t5-large}`, or `text: {encoder: hashed}`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct TextEmbed {
-    /// `hashed`: n-grams hashed to signed coordinates, unit norm; needs no weights.
+    /// Which encoder.
     pub encoder: TextEncoder,
+    /// Folder with the published encoder, in the layout of Hugging Face or of sentence-transformers; `hashed` has none. Not part of the key: the
+    /// content's digest is.
+    pub path: String,
+    /// Which vector of CLIP's a caption is; its words are the states of all tokens either way.
+    pub output: ClipOutput,
+    /// How captions become CLIP's token ids.
+    pub ids: ClipIds,
+    /// Tokens of a caption at most, its end among them; 0 takes what the encoder's folder says. MDM reads 22.
+    pub max_tokens: usize,
+    /// Shards.
+    pub shards: usize,
     /// Stage whose captions are embedded.
     pub dataset: String,
 }
 
 impl Default for TextEmbed {
     fn default() -> Self {
-        Self { encoder: TextEncoder::Hashed, dataset: "dataset".into() }
+        Self {
+            encoder: TextEncoder::Hashed,
+            path: String::new(),
+            output: ClipOutput::Projected,
+            ids: ClipIds::HuggingFace,
+            max_tokens: 0,
+            shards: 1,
+            dataset: "dataset".into(),
+        }
     }
 }
 
@@ -26,8 +59,36 @@ impl Default for TextEmbed {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum TextEncoder {
-    /// Words and word pairs hashed into 768 signed coordinates, L2-normalised.
+    /// Words and word pairs hashed into 768 signed coordinates, L2-normalised; needs no weights.
     Hashed,
+    /// CLIP's text tower: MLD, MDM, T2M-GPT, MoMask, MMM, StableMoFusion.
+    Clip,
+    /// T5's encoder: the states of the tokens, and their mean.
+    T5,
+    /// Sentence-T5: mean of the tokens, dense layer, L2-normalised. MotionLCM, MotionPCM.
+    SentenceT5,
+}
+
+/// Which vector of CLIP's a caption is; never normalised.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum ClipOutput {
+    /// The state of the end token, projected: what published models read.
+    Projected,
+    /// The same before the projection.
+    Pooled,
+}
+
+/// How captions become CLIP's token ids.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub enum ClipIds {
+    /// As the folder's tokenizer says, padded with the end token: MLD.
+    #[serde(rename = "huggingface")]
+    HuggingFace,
+    /// As OpenAI's package: the text repaired first, padded with zeros, which only states of tokens show: MDM, T2M-GPT, MoMask, MMM,
+    /// StableMoFusion.
+    #[serde(rename = "openai")]
+    OpenAi,
 }
 
 impl TextEncoder {
@@ -35,26 +96,75 @@ impl TextEncoder {
     pub fn name(self) -> &'static str {
         match self {
             Self::Hashed => "hashed",
+            Self::Clip => "clip",
+            Self::T5 => "t5",
+            Self::SentenceT5 => "sentence-t5",
         }
     }
 
     /// Whether enough of its vectors is left by a ReLU. A hashed word is one coordinate, as often -1 as +1, so that half of the words
     /// would mean nothing, and so would the empty caption.
     pub fn survives_relu(self) -> bool {
+        self != Self::Hashed
+    }
+
+    /// What its folder must have, and where it comes from.
+    fn folder(self) -> (&'static [&'static str], &'static str) {
         match self {
-            Self::Hashed => false,
+            Self::Hashed => (&[], ""),
+            Self::Clip => (
+                &CLIP_FILES,
+                "CLIP's text tower, such as huggingface.co/openai/clip-vit-base-patch32 (MLD: clip-vit-large-patch14)",
+            ),
+            Self::T5 => (&T5_FILES, "T5's encoder, such as huggingface.co/google-t5/t5-large"),
+            Self::SentenceT5 => {
+                (&SENTENCE_T5_FILES, "Sentence-T5, such as huggingface.co/sentence-transformers/sentence-t5-large")
+            }
         }
     }
 }
 
 impl StageSpec for TextEmbed {
     const KIND: &'static str = "text.embed";
-    // 2: with the encoder.
-    const VERSION: u32 = 2;
-    const SHAPE: Shape = Shape::Plain;
+    // 2: with the encoder. 3: published encoders, in shards.
+    const VERSION: u32 = 3;
+    const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "embeddings", kind: ArtifactKind::Embeddings };
 
     fn refs(&mut self) -> Vec<Ref<'_>> {
-        vec![Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset)]
+        let (files, origin) = self.encoder.folder();
+        let reads = self.encoder != TextEncoder::Hashed;
+        vec![
+            Ref::folder("path", &mut self.path).holding(files, origin).only_if(reads),
+            Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
+        ]
+    }
+
+    fn check(&self, p: &mut Problems) {
+        let name = self.encoder.name();
+        let (_, origin) = self.encoder.folder();
+        // `--set text.encoder=hashed` is how a recipe is tried without its encoder; what else is set means nothing then.
+        if self.encoder != TextEncoder::Hashed && self.path.trim().is_empty() {
+            let message = format!("`path` is missing: the folder with the encoder `{name}`");
+            p.add("path", message, &format!("download {origin}"));
+        }
+        let unused = |field: &str| format!("`{field}` is given, but `{name}` has no choice there");
+        if !matches!(self.encoder, TextEncoder::Clip | TextEncoder::Hashed) {
+            if self.output != ClipOutput::Projected {
+                p.add("output", unused("output"), "leave it out");
+            }
+            if self.ids != ClipIds::HuggingFace {
+                p.add("ids", unused("ids"), "leave it out");
+            }
+        }
+        if (1..=2).contains(&self.max_tokens) {
+            let message = format!("`max_tokens` is {}; expected 0, or at least 3", self.max_tokens);
+            p.add("max_tokens", message, "");
+        }
+        p.shards(self.shards);
+    }
+
+    fn shards(&self) -> usize {
+        self.shards
     }
 }

@@ -1,0 +1,169 @@
+//! Text encoders: how captions become what a generator is conditioned on.
+//!
+//! An encoder is an artifact of kind `text-encoder`. Caption embeddings hold the one that made them as their part `text`, a model that was
+//! trained on them holds it too, and so a model is always drawn with the encoder that it was trained with, weights and all. To add one: an
+//! implementation of [`TextEncoder`], a line in the table of [`open`], and its word in [`protocol::stage::TextEncoder`].
+
+mod clip;
+mod encoder;
+mod hashed;
+mod published;
+mod remembered;
+mod t5;
+
+use burn::tensor::Device;
+use checkpoint::Blobs;
+use protocol::stage::{TextEmbed, TextEncoder as Choice};
+use protocol::{ArtifactKind, Digest, Manifest};
+use serde_json::json;
+
+use crate::artifacts;
+use crate::context::{AttemptContext, StageError};
+
+pub use encoder::{TextEncoder, TextEncoderMeta};
+use hashed::Hashed;
+use published::{Published, Source};
+pub use remembered::forget;
+
+/// Opens an encoder of a manifest.
+type Open = fn(&Manifest, &dyn Blobs, &Device) -> Result<Box<dyn TextEncoder>, StageError>;
+
+/// Every encoder by its name in manifests.
+const ENCODERS: [(&str, Open); 4] = [
+    ("hashed", |_, _, _| Ok(Box::new(Hashed))),
+    ("clip", |manifest, blobs, device| clip::open(Published::of_artifact(manifest, blobs)?, device)),
+    ("t5", |manifest, blobs, device| t5::open(Published::of_artifact(manifest, blobs)?, device)),
+    ("sentence-t5", |manifest, blobs, device| t5::open(Published::of_artifact(manifest, blobs)?, device)),
+];
+
+/// The encoder of an artifact of kind `text-encoder`.
+pub fn open(manifest: &Manifest, blobs: &dyn Blobs, device: &Device) -> Result<Box<dyn TextEncoder>, StageError> {
+    artifacts::expect("the text encoder", manifest, ArtifactKind::TextEncoder)?;
+    let meta: TextEncoderMeta = artifacts::meta(manifest, "the text encoder")?;
+    let Some((_, open)) = ENCODERS.iter().find(|(name, _)| *name == meta.encoder) else {
+        let have: Vec<&str> = ENCODERS.iter().map(|(name, _)| *name).collect();
+        let wanted = meta.encoder;
+        return Err(StageError::Input(format!(
+            "text encoder `{wanted}` is not in this build, which has {}",
+            have.join(", ")
+        )));
+    };
+    let encoder = open(manifest, blobs, device)?;
+    if encoder.dim() != meta.dim {
+        let (found, said) = (encoder.dim(), meta.dim);
+        return Err(StageError::Input(format!("text encoder `{}` gives {found} numbers, not {said}", meta.encoder)));
+    }
+    Ok(encoder)
+}
+
+/// Refuses an encoder whose captions and tokens have vectors of two widths: of a network that reads both with one.
+///
+/// # Errors
+/// Both widths.
+pub fn expect_one_width(encoder: &dyn TextEncoder) -> Result<(), StageError> {
+    let (pooled, tokens) = (encoder.dim(), encoder.token_dim());
+    if pooled == tokens {
+        return Ok(());
+    }
+    Err(StageError::Input(format!(
+        "the text encoder gives {pooled} numbers a caption and {tokens} a token, and this network reads both with one width; take an \
+         encoder that has one, such as `clip-vit-base-patch32`, or set `output: pooled`"
+    )))
+}
+
+/// The manifest of the built-in encoder.
+pub fn built_in() -> Manifest {
+    let meta = json!({"encoder": Choice::Hashed.name(), "dim": Hashed.dim()});
+    Manifest::new(ArtifactKind::TextEncoder, meta)
+}
+
+/// The encoder that settings name, before it is an artifact.
+#[derive(Debug)]
+pub struct Named(Option<Source>);
+
+impl Named {
+    /// Reads its folder, if it has one.
+    ///
+    /// # Errors
+    /// Which file is missing or not what it should be.
+    pub fn open(settings: &TextEmbed) -> Result<Self, StageError> {
+        Ok(Self(Source::open(settings)?))
+    }
+
+    /// Of all that captions' vectors depend on.
+    pub fn digest(&self) -> Digest {
+        self.0.as_ref().map_or_else(|| built_in().digest(), Source::digest)
+    }
+
+    /// Tensors that are in its folder and not read, in a line.
+    pub fn skipped(&self) -> Option<String> {
+        self.0.as_ref().and_then(Source::skipped)
+    }
+
+    /// Uploads it.
+    ///
+    /// # Errors
+    /// If the store says no.
+    pub fn upload(&self, cx: &mut dyn AttemptContext) -> Result<Manifest, StageError> {
+        if let Some(source) = &self.0 {
+            return source.upload(cx);
+        }
+        let manifest = built_in();
+        cx.put_manifest(&manifest)?;
+        Ok(manifest)
+    }
+
+    /// Makes it ready to embed.
+    ///
+    /// # Errors
+    /// If its files are broken.
+    pub fn ready(self, settings: &TextEmbed, device: &Device) -> Result<Box<dyn TextEncoder>, StageError> {
+        let Some(source) = self.0 else { return Ok(Box::new(Hashed)) };
+        let published = source.into_published()?;
+        match settings.encoder {
+            Choice::Clip => clip::open(published, device),
+            _ => t5::open(published, device),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::MemoryBlobs;
+
+    #[test]
+    fn an_encoder_is_opened_by_its_manifest_alone() {
+        let blobs = MemoryBlobs::default();
+        let open = |manifest: &Manifest| super::open(manifest, &blobs, &Device::flex());
+        let encoder = open(&built_in()).expect("built in");
+        let captions = ["a man walks", ""];
+        let pooled = encoder.pooled(&captions).expect("built in");
+        assert_eq!(pooled.len(), 2 * encoder.dim());
+        let tokens = encoder.tokens(&captions).expect("built in");
+        assert_eq!(
+            tokens.iter().map(|rows| rows.len() / encoder.token_dim()).collect::<Vec<_>>(),
+            [4, 1],
+            "words and the end"
+        );
+        assert_eq!(tokens[1], pooled[encoder.dim()..], "an empty caption is its end alone");
+        assert_ne!(tokens[0], encoder.tokens(&["a walks man"]).expect("built in")[0], "in order");
+
+        let other = Manifest::new(ArtifactKind::TextEncoder, json!({"encoder": "bert", "dim": 512}));
+        let refused = open(&other).expect_err("not in this build").to_string();
+        assert!(refused.contains("`bert`") && refused.contains("hashed, clip, t5, sentence-t5"), "{refused}");
+        let bare = Manifest::new(ArtifactKind::TextEncoder, json!({"encoder": "clip", "dim": 512}));
+        let refused = open(&bare).expect_err("no sizes").to_string();
+        assert!(refused.contains("not one that this build writes"), "{refused}");
+        let refused = open(&Manifest::new(ArtifactKind::Vae, json!({}))).expect_err("a VAE").to_string();
+        assert!(refused.contains("Vae"), "{refused}");
+    }
+
+    /// Every word of the settings has an encoder.
+    #[test]
+    fn every_choice_is_in_the_table() {
+        for choice in [Choice::Hashed, Choice::Clip, Choice::T5, Choice::SentenceT5] {
+            assert!(ENCODERS.iter().any(|(name, _)| *name == choice.name()), "{choice:?}");
+        }
+    }
+}
