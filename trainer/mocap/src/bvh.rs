@@ -166,6 +166,15 @@ impl Bvh {
         global.iter().flat_map(|(at, _)| *at).collect()
     }
 
+    /// Where every node is when nothing is rotated and the root lies at its offset, `[nodes, 3]`.
+    pub fn rest(&self) -> Vec<f64> {
+        let mut at: Vec<Vec3> = Vec::with_capacity(self.nodes.len());
+        for node in &self.nodes {
+            at.push(node.parent.map_or(node.offset, |parent| quat::add(at[parent], node.offset)));
+        }
+        at.into_iter().flatten().collect()
+    }
+
     /// [`Bvh::placed`] of all frames, `[T, nodes, 3]`.
     pub fn positions(&self) -> Vec<f64> {
         (0..self.frames).flat_map(|frame| self.placed(frame)).collect()

@@ -1,7 +1,8 @@
 //! What a file does not say: its unit and its upward axis.
 //!
 //! The unit is the one in which thigh and shank together come nearest to a grown person's 82 cm; those that files are written in are a factor of two apart at least, so
-//! that short and tall people do not matter, but a small child or a giant has to be told about. Up is where the neck is from the ankles on average.
+//! that short and tall people do not matter, but a small child or a giant has to be told about. Up is where the neck is from the
+//! ankles on average; the rest pose may correct that ([`crate::take::read`]).
 
 use std::fmt;
 

@@ -58,7 +58,14 @@ pub fn read(bvh: &Bvh, reading: &Reading) -> Result<Read, MapError> {
     let step = bvh.frames.div_ceil(LOOKED_AT).max(1);
     let frames: Vec<Vec<Vec3>> =
         (0..bvh.frames).step_by(step).map(|frame| places.joints(&bvh.placed(frame), 1.0)).collect();
-    let detected = detect(frames.iter().map(Vec::as_slice));
+    let mut detected = detect(frames.iter().map(Vec::as_slice));
+    let rest = detect(std::iter::once(places.joints(&bvh.rest(), 1.0).as_slice()));
+    // Who crawls or lies looks like somebody who stands along another axis. A rest pose that stands along y or z knows better; others, whose bones all lie along
+    // one axis, do not.
+    if rest.sure_of_up && matches!(rest.up, Up::Y | Up::Z) && rest.up != detected.up {
+        detected.up = rest.up;
+        detected.sure_of_up = false;
+    }
     let metres_per_unit = reading.metres_per_unit.unwrap_or(detected.metres_per_unit);
     let up = reading.up.unwrap_or(detected.up);
     Ok(Read { map, shipped, detected, metres_per_unit, up })
@@ -109,7 +116,11 @@ impl std::fmt::Display for Read {
             let legs = leg * self.metres_per_unit;
             write!(f, "unit {} m as told (legs of {legs:.2} m; {unit} would be likelier), ", self.metres_per_unit)?;
         }
-        let guess = if *sure_of_up || self.up != *up { "" } else { " (a guess: the figure does not stand)" };
+        let guess = if *sure_of_up || self.up != *up {
+            ""
+        } else {
+            " (as in the rest pose, or a guess: the figure does not stand)"
+        };
         let told = if self.up == *up { "" } else { " as told" };
         write!(f, "{} up{told}{guess}", self.up)
     }
