@@ -49,37 +49,44 @@ fn every_kind_trains_on_another_backend_as_on_flex() {
     let (flex, run_on_flex, view) = run("flex", &[]);
     let (there, run_there, _) = run(&other(), &[]);
     let mut tried = BTreeSet::new();
-    let mut off = Vec::new();
+    let mut all_off = Vec::new();
     for (stage, kind) in kinds(&view) {
-        let expected = flex.metrics(&run_on_flex, &stage);
-        let found = there.metrics(&run_there, &stage);
-        assert_eq!(found.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>(), "{stage}");
-        for (name, points) in &expected {
-            assert_eq!(found[name].len(), points.len(), "{stage}: {name}");
-            for (found, expected) in found[name].iter().zip(points) {
-                let error = (found.1 - expected.1).abs() / expected.1.abs().max(1e-3);
-                off.push((error, format!("{stage}: {name} after step {}: {} and {}", expected.0, found.1, expected.1)));
-            }
-        }
-        if expected.contains_key("gradient_norm") {
+        if flex.metrics(&run_on_flex, &stage).contains_key("gradient_norm") {
             tried.insert(kind);
         }
+        all_off.extend(off(&stage, (&there, &run_there), (&flex, &run_on_flex)));
     }
     let trains = |kind: StageSettings| kind.training().is_some().then(|| kind.kind().to_owned());
     let all: BTreeSet<String> = StageSettings::all().into_iter().filter_map(trains).collect();
     assert_eq!(tried, all, "kinds.yaml has every kind that trains");
-    off.sort_by(|a, b| b.0.total_cmp(&a.0));
-    eprintln!("{} values on {}; the furthest off:", off.len(), other());
-    off.iter().take(5).for_each(|(error, what)| eprintln!("  {error:.1e} {what}"));
-    assert!(off[0].0 < TOLERANCE, "{:?}", off[0]);
+    all_off.sort_by(|a, b| b.0.total_cmp(&a.0));
+    eprintln!("{} values on {}; the furthest off:", all_off.len(), other());
+    all_off.iter().take(5).for_each(|(error, what)| eprintln!("  {error:.1e} {what}"));
+    assert!(all_off[0].0 < TOLERANCE, "{:?}", all_off[0]);
 }
 
-/// A worker is killed after a checkpoint; what it goes on to is what one that was not killed has. The same bits on one device: that is what
-/// keys rest on.
+/// How far a stage's values on one cluster are from those on another, the furthest first: relative to their size, and what it is about.
+fn off(stage: &str, found: (&Cluster, &str), expected: (&Cluster, &str)) -> Vec<(f64, String)> {
+    let (found, expected) = (found.0.metrics(found.1, stage), expected.0.metrics(expected.1, stage));
+    assert_eq!(found.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>(), "{stage}");
+    let mut off = Vec::new();
+    for (name, points) in &expected {
+        assert_eq!(found[name].len(), points.len(), "{stage}: {name}");
+        for (found, expected) in found[name].iter().zip(points) {
+            let error = (found.1 - expected.1).abs() / expected.1.abs().max(1e-3);
+            off.push((error, format!("{stage}: {name} after step {}: {} and {}", expected.0, found.1, expected.1)));
+        }
+    }
+    off.sort_by(|a, b| b.0.total_cmp(&a.0));
+    off
+}
+
+/// A worker is killed after a checkpoint; what it goes on to is what one that was not killed has. The same bits on a backend of the CPU: that
+/// is what keys rest on. An accelerator's picks its kernels by timing them, in each process anew, and so rounds otherwise in another process.
 #[test]
 fn p5_a_kill_on_another_backend_changes_no_byte() {
     let sets = ["--set", "stages.vae.steps=6", "--until", "vae"];
-    let (_, _, whole) = run(&other(), &sets);
+    let (undisturbed, run_undisturbed, whole) = run(&other(), &sets);
     let mut cluster = Cluster::start(TRAINER);
     let dies = ["env".to_owned(), "STRIDE_WORKER_FAILPOINT=checkpoint::after_commit@3".to_owned()];
     cluster.join_by("w1", &dies, &["--backend", &other()]);
@@ -89,7 +96,14 @@ fn p5_a_kill_on_another_backend_changes_no_byte() {
     cluster.join_by("w2", &[], &["--backend", &other()]);
     let view = cluster.wait_end_within(patience(), &id);
     assert!(cluster.said("w2").contains("goes on from the checkpoint after step 3"), "{}", cluster.said("w2"));
-    assert_eq!(digests(&view), digests(&whole));
+    let tuned = !["flex", "ndarray"].contains(&other().as_str());
+    if tuned {
+        let off = off("vae", (&cluster, &id), (&undisturbed, &run_undisturbed));
+        eprintln!("after a kill on {}, the furthest off: {:.1e} {}", other(), off[0].0, off[0].1);
+        assert!(off[0].0 < TOLERANCE, "{:?}", off[0]);
+    } else {
+        assert_eq!(digests(&view), digests(&whole));
+    }
 }
 
 /// The smoke pipeline, whose rate is an ordinary one: what differs in the last bits grows from step to step. Sampled: its first stage; all of

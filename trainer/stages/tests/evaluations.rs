@@ -386,9 +386,9 @@ fn a_model_with_a_length_estimator_says_how_long_a_motion_is() {
 fn each_step_of_the_sampler_is_seen_down_to_the_motion_that_is_drawn() {
     let bench = bench();
     let vae = untrained_vae(&bench);
-    let lcm = Family::Lcm { skip: 100, guidance: (0.5, 5.0) };
-    for (family, steps, exact) in [(lcm, 1, true), (lcm, 4, true), (Family::Mld, 5, false)] {
-        let manifest = bench.manifest(untrained(&bench, vae, family)).expect("stored");
+    let lcm = || Family::Lcm { skip: 100, guidance: (0.5, 5.0) };
+    for (family, steps, exact) in [(lcm(), 1, true), (lcm(), 4, true), (Family::Mld, 5, false)] {
+        let manifest = bench.manifest(untrained(&bench, vae, family.clone())).expect("stored");
         let model = generator::open(&manifest, &*bench.blobs(), &bench.device()).expect("it opens");
         let sampler = Sampler { steps, guidance: 2.0, ..Sampler::default() };
         let texts: Vec<_> = model.embed(&["a jump"]).expect("built in").into_iter().map(Rc::new).collect();
