@@ -1,5 +1,7 @@
 //! Writes a few synthetic motions in each form: `cargo run -p mocap --example motions -- FOLDER`.
 
+#![allow(clippy::print_stdout, reason = "an example talks to its user")]
+
 use std::path::PathBuf;
 
 use mocap::export::{Motion, write_all};

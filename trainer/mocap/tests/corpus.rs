@@ -20,7 +20,7 @@ fn recipe(format: DataFormat, target: Option<Vec<f64>>) -> Recipe {
 }
 
 fn target(folder: &Path, format: DataFormat) -> Option<Vec<f64>> {
-    Some(read_target(&folder.join("tgt_offsets.npy"), Skeleton::of(format)).unwrap())
+    Some(read_target(&folder.join("tgt_offsets.npy"), Skeleton::of(format)).expect("well formed"))
 }
 
 /// All clips of a folder, in order.
@@ -34,7 +34,7 @@ fn make(listing: &Listing, recipe: &Recipe) -> (Vec<Made>, Report) {
             .chunks(part)
             .map(|clips| scope.spawn(move || clips.iter().map(one).collect::<Vec<_>>()))
             .collect();
-        parts.into_iter().flat_map(|part| part.join().unwrap()).collect()
+        parts.into_iter().flat_map(|part| part.join().expect("well formed")).collect()
     });
     let mut made = vec![];
     for (clip, file) in listing.clips.iter().zip(files) {

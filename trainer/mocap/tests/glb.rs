@@ -11,11 +11,11 @@ use protocol::stage::{DataFormat, DataSynthetic};
 use serde_json::Value;
 
 fn number(bytes: &[u8]) -> usize {
-    u32::from_le_bytes(bytes.try_into().unwrap()) as usize
+    u32::from_le_bytes(bytes.try_into().expect("well formed")) as usize
 }
 
 fn index(value: &Value) -> usize {
-    usize::try_from(value.as_u64().unwrap_or_else(|| panic!("{value} is no index"))).unwrap()
+    usize::try_from(value.as_u64().unwrap_or_else(|| panic!("{value} is no index"))).expect("well formed")
 }
 
 fn list(value: &Value) -> &[Value] {
@@ -35,7 +35,7 @@ impl Gltf {
         let text = number(&file[12..16]);
         assert_eq!(&file[16..20], b"JSON");
         assert_eq!(text % 4, 0, "chunks end at multiples of four");
-        let document = serde_json::from_slice(&file[20..20 + text]).unwrap();
+        let document = serde_json::from_slice(&file[20..20 + text]).expect("well formed");
         let rest = &file[20 + text..];
         assert_eq!((number(&rest[..4]), &rest[4..8]), (rest.len() - 8, &b"BIN\0"[..]));
         assert_eq!(rest.len() % 4, 0);
@@ -48,7 +48,7 @@ impl Gltf {
         let view = &self.document["bufferViews"][index(&accessor["bufferView"])];
         let (begin, length) = (index(&view["byteOffset"]), index(&view["byteLength"]));
         let bytes = &self.bytes[begin..begin + length];
-        let width = match accessor["type"].as_str().unwrap() {
+        let width = match accessor["type"].as_str().expect("well formed") {
             "SCALAR" => 1,
             "VEC3" => 3,
             "VEC4" => 4,
@@ -56,8 +56,14 @@ impl Gltf {
             other => panic!("type {other}"),
         };
         let values: Vec<f64> = match index(&accessor["componentType"]) {
-            5126 => bytes.chunks_exact(4).map(|b| f64::from(f32::from_le_bytes(b.try_into().unwrap()))).collect(),
-            5123 => bytes.chunks_exact(2).map(|b| f64::from(u16::from_le_bytes(b.try_into().unwrap()))).collect(),
+            5126 => bytes
+                .chunks_exact(4)
+                .map(|b| f64::from(f32::from_le_bytes(b.try_into().expect("well formed"))))
+                .collect(),
+            5123 => bytes
+                .chunks_exact(2)
+                .map(|b| f64::from(u16::from_le_bytes(b.try_into().expect("well formed"))))
+                .collect(),
             other => panic!("component type {other}"),
         };
         assert_eq!(values.len(), width * index(&accessor["count"]), "a view is as long as its accessor");
@@ -80,7 +86,7 @@ impl Gltf {
             assert!(values.iter().all(|v| v.is_finite()));
             for (bound, pick) in [("min", f64::min as fn(f64, f64) -> f64), ("max", f64::max)] {
                 for (k, said) in list(&accessor[bound]).iter().enumerate() {
-                    let found = values.iter().skip(k).step_by(width).copied().reduce(pick).unwrap();
+                    let found = values.iter().skip(k).step_by(width).copied().reduce(pick).expect("well formed");
                     assert!(said.as_f64() == Some(found), "accessor {i}: {bound} is {said}, not {found}");
                 }
             }
@@ -104,7 +110,7 @@ impl Gltf {
     fn check_figure(&self) {
         let document = &self.document;
         let joints = list(&document["skins"][0]["joints"]);
-        let figure = list(&document["nodes"]).iter().find(|node| node.get("mesh").is_some()).unwrap();
+        let figure = list(&document["nodes"]).iter().find(|node| node.get("mesh").is_some()).expect("well formed");
         assert!(figure.get("skin").is_some() && figure.get("translation").is_none());
         let binds = self.numbers(index(&document["skins"][0]["inverseBindMatrices"])).0;
         assert_eq!(binds.len(), 16 * joints.len());
@@ -146,7 +152,8 @@ impl Gltf {
         let animation = &self.document["animations"][0];
         let mut targets = BTreeSet::new();
         for channel in list(&animation["channels"]) {
-            let (node, path) = (index(&channel["target"]["node"]), channel["target"]["path"].as_str().unwrap());
+            let (node, path) =
+                (index(&channel["target"]["node"]), channel["target"]["path"].as_str().expect("well formed"));
             assert!(targets.insert((node, path)), "one channel for each");
             let sampler = &animation["samplers"][index(&channel["sampler"])];
             let input = index(&sampler["input"]);
@@ -171,7 +178,7 @@ impl Gltf {
             .iter()
             .map(|node| {
                 let at = list(&node["translation"]);
-                (std::array::from_fn(|k| at.get(k).map_or(0.0, |v| v.as_f64().unwrap())), quat::IDENTITY)
+                (std::array::from_fn(|k| at.get(k).map_or(0.0, |v| v.as_f64().expect("well formed"))), quat::IDENTITY)
             })
             .collect();
         let animation = &self.document["animations"][0];
@@ -203,7 +210,7 @@ impl Gltf {
 fn clips() -> Vec<(String, Vec<f32>)> {
     let dataset = synthetic::generate(&DataSynthetic { clips: 28, ..DataSynthetic::default() }, Seed(7));
     let caption = |clip: usize| {
-        let entry = dataset.entries.iter().find(|entry| entry.clip == clip).unwrap();
+        let entry = dataset.entries.iter().find(|entry| entry.clip == clip).expect("well formed");
         dataset.captions[entry.captions[0]].text.clone()
     };
     let joints = |clip: usize| features::recover_joints(&dataset.clips[clip].features, dataset.skeleton());

@@ -18,7 +18,7 @@ fn page(caption: &str, body: &Body, joints: &[f32], waypoints: &[Waypoint]) -> R
     let sections = vec![Section { title: format!("of {caption}"), panels: vec![panel.clone(), panel] }];
     let mut bytes = Vec::new();
     Page { title: format!("about {caption}"), sections }.write(&mut bytes).map_err(|error| error.to_string())?;
-    Ok(String::from_utf8(bytes).unwrap())
+    Ok(String::from_utf8(bytes).expect("well formed"))
 }
 
 /// What stands between two marks.
@@ -28,7 +28,7 @@ fn between<'a>(text: &'a str, from: &str, to: &str) -> &'a str {
 }
 
 fn data(page: &str) -> Value {
-    serde_json::from_str(between(page, "id=\"motions\">", "</script>")).unwrap()
+    serde_json::from_str(between(page, "id=\"motions\">", "</script>")).expect("well formed")
 }
 
 fn decoded(text: &str) -> Vec<u8> {

@@ -128,7 +128,7 @@ fn our_files_give_the_joints_back() {
 
 /// The joints of a file at 20 fps, f64.
 fn joints22(bvh: &Bvh, map: Option<JointMap>) -> Vec<f64> {
-    let take = Take::of_bvh(bvh, &Reading { map, ..Reading::default() }).unwrap();
+    let take = Take::of_bvh(bvh, &Reading { map, ..Reading::default() }).expect("well formed");
     resample(&take.joints, 66, take.rate, 20.0)
 }
 

@@ -228,6 +228,9 @@ pub struct Drawing<'a> {
     pub sampler: &'a Sampler,
 }
 
+/// Is told the timestep of each step of a sampler, and a function that gives the clean motions predicted there.
+pub type SeeMotions<'a> = dyn FnMut(usize, &dyn Fn() -> Vec<Vec<f32>>) + 'a;
+
 impl MotionDenoiser {
     /// Reads an artifact of kind `denoiser`.
     pub fn read(blobs: &dyn Blobs, manifest: &Manifest, device: &Device) -> Result<Self, StageError> {
@@ -267,7 +270,7 @@ impl MotionDenoiser {
         &self,
         drawing: Drawing<'_>,
         noise: &dyn Fn(usize, usize, &mut [f32]),
-        see: &mut dyn FnMut(usize, &dyn Fn() -> Vec<Vec<f32>>),
+        see: &mut SeeMotions<'_>,
     ) -> Result<Vec<Vec<f32>>, StageError> {
         self.meta.family.accepts(drawing.sampler).map_err(StageError::Input)?;
         let frames = if self.meta.draws_whole() { self.meta.max_frames } else { drawing.frames };
@@ -294,7 +297,7 @@ impl MotionDenoiser {
         drawing: Drawing<'_>,
         frames: usize,
         noise: &dyn Fn(usize, usize, &mut [f32]),
-        see: &mut dyn FnMut(usize, &dyn Fn() -> Vec<Vec<f32>>),
+        see: &mut SeeMotions<'_>,
     ) -> Result<Tensor<3>, StageError> {
         let (batch, width) = (drawing.captions.rows.len(), self.meta.mean.len());
         let fill = |k: usize| {

@@ -202,6 +202,9 @@ pub struct Denoiser {
     device: Device,
 }
 
+/// Is told the timestep of each step of a sampler, and a function that gives the clean latents predicted there.
+pub type SeeLatents<'a> = dyn FnMut(usize, &dyn Fn() -> Vec<f32>) + 'a;
+
 impl Denoiser {
     /// Reads an artifact of kind `denoiser`.
     pub fn read(blobs: &dyn Blobs, manifest: &Manifest, device: &Device) -> Result<Self, StageError> {
@@ -238,7 +241,7 @@ impl Denoiser {
         sampler: &Sampler,
         steering: Option<&Steering<'_>>,
         step_noise: &mut dyn FnMut(usize) -> Vec<f32>,
-        see: &mut dyn FnMut(usize, &dyn Fn() -> Vec<f32>),
+        see: &mut SeeLatents<'_>,
     ) -> Result<Vec<f32>, StageError> {
         let mut seen = |z: &Tensor<3>, t: usize, out: &Tensor<3>| {
             let clean = || host(affine_one(z.clone(), out.clone(), self.schedule.clean(t)));

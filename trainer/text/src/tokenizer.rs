@@ -184,7 +184,7 @@ fn check_character_map(text: &str) -> Result<(), String> {
     let bytes = from_base64(text).ok_or_else(broken)?;
     let (head, rest) = bytes.split_first_chunk::<4>().ok_or_else(broken)?;
     let trie = u32::from_le_bytes(*head) as usize;
-    if trie % 4 != 0 || trie > rest.len() {
+    if !trie.is_multiple_of(4) || trie > rest.len() {
         return Err(broken());
     }
     let longest = rest[trie..].split(|byte| *byte == 0).map(<[u8]>::len).max().unwrap_or_default();

@@ -16,7 +16,7 @@ use super::{Batch, ControlRequest, Lap, LatentGenerator, MotionGenerator, Seeds,
 use crate::context::StageError;
 use crate::control::{ControlMeta, TrainedControl};
 use crate::flow_decoder::{FlowDecoder, UNIT};
-use crate::networks::{Autoencoder, Conditions, Denoiser};
+use crate::networks::{Autoencoder, Conditions, Denoiser, SeeLatents};
 use crate::parts::{self, model_error};
 use crate::text::{self, TextEncoder};
 
@@ -158,7 +158,7 @@ impl LatentDiffusion {
         seeds: &Seeds<'_>,
         sampler: &Sampler,
         control: Option<ControlRequest<'_>>,
-        see: &mut dyn FnMut(usize, &dyn Fn() -> Vec<f32>),
+        see: &mut SeeLatents<'_>,
     ) -> Result<Vec<f32>, StageError> {
         let size = self.shape().tokens * self.shape().dim;
         let fill = |k: usize| {
