@@ -75,7 +75,7 @@ stages:
 }
 
 /// A folder in the published layout with three good clips.
-fn folder(path: &Path) {
+pub(crate) fn folder(path: &Path) {
     let shared = std::env::var_os("STRIDE_SHARED").map_or_else(|| Bench::repository().join("../shared"), Into::into);
     let source = shared.join("data/humanml3d-mini");
     for sub in ["new_joint_vecs", "texts"] {

@@ -13,6 +13,7 @@ mod damage;
 mod determinism;
 mod documented;
 mod failpoints;
+mod kinds;
 mod memory;
 mod motions;
 mod reading;

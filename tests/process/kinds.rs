@@ -1,0 +1,133 @@
+//! Promises 1 and 4 for every stage kind there is: the digests are the same with 1, 2 and 3 workers, and with workers that die in every
+//! stage. A kind that is not in the pipeline fails the test, so that none is forgotten.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::PathBuf;
+use std::sync::OnceLock;
+
+use cluster_tests::cluster::Cluster;
+use cluster_tests::{Bench, digests, wait_for};
+use protocol::stage::StageSettings;
+use serde_json::Value;
+
+const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
+
+/// Kinds that read published files, for which a fixture stands.
+const OF_FIXTURES: [&str; 2] = ["data.open", "import.evaluator"];
+
+/// Real motion and the fixtures of parity, if they are on this machine.
+fn shared() -> Option<PathBuf> {
+    let root = std::env::var_os("STRIDE_SHARED").map_or_else(|| Bench::repository().join("../shared"), Into::into);
+    let there = root.join("data/parity/04_evaluator_humanml").is_dir() && root.join("data/humanml3d-mini").is_dir();
+    if !there {
+        eprintln!("SKIPPED for {OF_FIXTURES:?}: no fixtures under {} (set STRIDE_SHARED)", root.display());
+    }
+    there.then(|| root.join("data"))
+}
+
+/// Writes the pipeline and what it reads into the folder of `bench`.
+fn pipeline(bench: &Bench) -> PathBuf {
+    let read = |name: &str| fs::read_to_string(Bench::repository().join("tests/process").join(name)).expect(name);
+    let mut text = read("kinds.yaml") + &read("kinds-rest.yaml");
+    bench.run(&["data", "sample", "--format", "bvh", "--clips", "6", "recordings"]).expect_code(0);
+    if let Some(shared) = shared() {
+        super::bad_input::folder(&bench.path().join("folder"));
+        let model = bench.path().join("evaluator/text_mot_match/model");
+        let meta = bench.path().join("evaluator/Comp_v6_KLD01/meta");
+        [&model, &meta].into_iter().for_each(|folder| fs::create_dir_all(folder).expect("created"));
+        let pickle = shared.join("parity/04_evaluator_humanml/finest.tar");
+        fs::copy(pickle, model.join("finest.tar")).expect("copied");
+        for (from, to) in [("Mean.npy", "mean.npy"), ("Std.npy", "std.npy")] {
+            fs::copy(shared.join("humanml3d-mini").join(from), meta.join(to)).expect("copied");
+        }
+        text += "  folder: {kind: data.open, format: humanml3d, path: folder}\n";
+        text += "  imported: {kind: import.evaluator, path: evaluator}\n";
+    }
+    let path = bench.path().join("kinds.yaml");
+    fs::write(&path, text).expect("written");
+    path
+}
+
+fn kinds(view: &Value) -> BTreeSet<String> {
+    let stages = view["stages"].as_array().expect("stages");
+    stages.iter().map(|stage| stage["kind"].as_str().expect("a kind").to_owned()).collect()
+}
+
+fn run(workers: &str) -> Value {
+    let bench = Bench::new(TRAINER);
+    let path = pipeline(&bench).display().to_string();
+    bench.run(&["run", &path, "-o", "json", "--workers", workers]).expect_code(0).json()
+}
+
+/// The undisturbed run of one worker that all others are compared with. It has every kind.
+fn reference() -> &'static Value {
+    static REFERENCE: OnceLock<Value> = OnceLock::new();
+    REFERENCE.get_or_init(|| {
+        let report = run("1");
+        let all: BTreeSet<String> = StageSettings::all().iter().map(|stage| stage.kind().to_owned()).collect();
+        let mut tried = kinds(&report);
+        if shared().is_none() {
+            tried.extend(OF_FIXTURES.map(str::to_owned));
+        }
+        assert_eq!(tried, all, "kinds.yaml, kinds-rest.yaml and this file together have every kind");
+        report
+    })
+}
+
+#[test]
+fn p6_every_kind_has_the_same_digests_with_1_2_and_3_workers() {
+    for workers in ["2", "3"] {
+        assert_eq!(digests(&run(workers)), digests(reference()), "{workers} workers against 1");
+    }
+}
+
+/// Runs the pipeline with one worker at a time, each of which dies when it gets to `point` for the `nth` time; gives how many died.
+fn dies_at(point: &str, nth: u32) -> (Cluster, u32) {
+    let mut cluster = Cluster::start(TRAINER);
+    let path = pipeline(cluster.bench());
+    let dies = ["env".to_owned(), format!("STRIDE_WORKER_FAILPOINT={point}@{nth}")];
+    let id = cluster.submit(&path, &[]);
+    let mut deaths = 0;
+    loop {
+        cluster.join_by("w1", &dies, &[]);
+        let over = wait_for("the worker to die or the run to end", || {
+            let ended = ["finished", "failed"].contains(&cluster.view(&id)["state"].as_str().unwrap_or_default());
+            (ended || !cluster.alive("w1")).then_some(ended)
+        });
+        if over {
+            break;
+        }
+        deaths += 1;
+    }
+    let view = cluster.wait_end(&id);
+    assert_eq!(digests(&view), digests(reference()), "with workers dying at {point}");
+    (cluster, deaths)
+}
+
+/// Every training stage is lost after its first step, and after its last.
+#[test]
+fn p5_every_kind_that_trains_is_killed_after_each_of_its_steps() {
+    let (cluster, _) = dies_at("checkpoint::after_commit", 1);
+    let trains = |kind: &str| StageSettings::all().into_iter().any(|s| s.kind() == kind && s.training().is_some());
+    let stages = reference()["stages"].as_array().expect("stages").iter();
+    let said = cluster.said("w1");
+    for stage in stages.filter(|stage| trains(stage["kind"].as_str().expect("a kind"))) {
+        let name = stage["name"].as_str().expect("a name");
+        let went_on = |step: u32| {
+            let words = format!("goes on from the checkpoint after step {step}");
+            said.lines().any(|line| line.contains(&words) && line.ends_with(&format!("/{name}")))
+        };
+        assert!(went_on(1) && went_on(2), "{name} was not killed twice");
+    }
+}
+
+/// Everything that a worker does, shards and merges too, is computed and lost before it is reported.
+#[test]
+fn p5_every_kind_is_killed_before_it_reports() {
+    // The first task of each worker is the one that its predecessor lost.
+    let (_, deaths) = dies_at("outcome::before_report", 2);
+    let stages = reference()["stages"].as_array().expect("stages");
+    let of_workers = stages.iter().filter(|stage| stage["kind"] != "register").count();
+    assert!(deaths as usize >= of_workers - 1, "{deaths} deaths in {of_workers} stages");
+}
