@@ -8,6 +8,7 @@ mod cost;
 mod fleet;
 mod missing;
 mod out_of_memory;
+mod pictures;
 mod pipeline_file;
 mod plan;
 mod print;

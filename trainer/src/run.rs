@@ -18,7 +18,7 @@ use crate::print::{self, Output};
 use crate::problem::{Problem, Result, exit};
 use crate::progress::Progress;
 use crate::summary::{self, Summary};
-use crate::{client, pipeline_file};
+use crate::{client, pictures, pipeline_file};
 
 /// How often workers and progress are looked at.
 const BEAT: Duration = Duration::from_millis(200);
@@ -109,7 +109,16 @@ pub(crate) async fn run(request: Request, options: Options) -> Result<u8> {
     handle.shutdown().await;
     let end = watched?;
     let view = view.map_err(|error| Problem::new(exit::FAULT, error))?;
-    Ok(report(&view, &pipeline, &end, &options))
+    let exit = report(&view, &pipeline, &end, &options);
+    if view.state == RunState::Finished && options.output == Output::Table {
+        match pictures::save(&store, &view).await {
+            Ok(copies) => copies.iter().for_each(|(stage, path)| {
+                print::out(&format!("{stage} drew {}", client::shown(path)));
+            }),
+            Err(why) => print::note(&format!("pictures of the run were not copied: {why}")),
+        }
+    }
+    Ok(exit)
 }
 
 async fn begin(handle: &Handle, store: &Store, request: Request) -> Result<(RunId, Pipeline)> {

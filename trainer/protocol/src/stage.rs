@@ -38,13 +38,14 @@ pub use evaluation::{Mode, Split};
 pub use frequency::{FrequencyLosses, LowFrequency, Norm, Over, Semantic};
 pub use identity::{Backend, StageIdentity};
 pub use kinds::{
-    ClipIds, ClipOutput, ControlDistance, ControlLoss, ControlMean, DataFeatures, DataOpen, DataSynthetic,
+    Activity, ClipIds, ClipOutput, ControlDistance, ControlLoss, ControlMean, DataFeatures, DataOpen, DataSynthetic,
     DistillDiscord, DistillLcm, DistillPcm, EncodeLatents, EncodeTokens, EvaluateControl, EvaluateLatentFid,
-    EvaluateReconstruction, EvaluateSpectrum, EvaluateT2m, EvaluatorNetwork, FlowBackbone, FlowNetwork, FlowProjection,
-    FlowSolver, ImportEvaluator, MdmNetwork, ModelDecoder, MovementPhase, MultiModality, Promote, Register, Resets,
-    Splits, StableMoFusionNetwork, StageSettings, TextEmbed, TextEncoder, TokenGenerator, TokenNetwork, TokenizerLoss,
-    TokenizerNetwork, TrainControl, TrainDiscord, TrainEvaluator, TrainLength, TrainMdm, TrainMld, TrainStableMoFusion,
-    TrainTokenizer, TrainTokens, TrainVae, UpAxis, VaeLoss, Windows, WindowsOf,
+    EvaluateRecognition, EvaluateReconstruction, EvaluateSpectrum, EvaluateT2m, EvaluatorNetwork, FlowBackbone,
+    FlowNetwork, FlowPrediction, FlowProjection, FlowSolver, ImportEvaluator, MdmNetwork, ModelDecoder, MovementPhase,
+    MultiModality, Promote, Register, Resets, Splits, StableMoFusionNetwork, StageSettings, TextEmbed, TextEncoder,
+    TokenGenerator, TokenNetwork, TokenizerLoss, TokenizerNetwork, TrainControl, TrainDiscord, TrainEvaluator,
+    TrainLength, TrainMdm, TrainMld, TrainStableMoFusion, TrainTokenizer, TrainTokens, TrainVae, UpAxis, VaeLoss,
+    Windows, WindowsOf,
 };
 pub use neighbours::{Neighbour, Neighbours};
 pub use network::{LatentShape, Network, Positions};

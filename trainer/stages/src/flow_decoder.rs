@@ -10,12 +10,12 @@ use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
 use checkpoint::model::Parts;
 use models::flat::{self, Values};
-use models::flow::{Solver, follow, jump};
+use models::flow::{Solver, between, follow, jump};
 use models::kernels::Dropout;
 use models::networks::{DitConfig, FlowDit, FlowUnet, Init, Projection, TimeFeatures, UnetConfig};
 use motion::Stream;
 use protocol::artifact::Role;
-use protocol::stage::{DataFormat, FlowBackbone, FlowNetwork, FlowProjection, FlowSolver, Positions};
+use protocol::stage::{DataFormat, FlowBackbone, FlowNetwork, FlowPrediction, FlowProjection, FlowSolver, Positions};
 use protocol::{Digest, Manifest, Seed};
 use serde::{Deserialize, Serialize};
 
@@ -36,6 +36,9 @@ pub const UNIT: usize = 4;
 /// Base of the time's frequencies.
 const THETA: f64 = 10_000.0;
 
+/// Below this much time to the data, a velocity is computed as if there were so much: less than half the last step of any solver that is used.
+const LEAST: f32 = 0.01;
+
 /// Meta of an artifact of kind `flow-decoder`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FlowMeta {
@@ -47,6 +50,8 @@ pub struct FlowMeta {
     pub code_dim: usize,
     /// What the velocity is predicted by.
     pub backbone: FlowBackbone,
+    /// What its network gives.
+    pub prediction: FlowPrediction,
     /// Size.
     pub network: FlowNetwork,
     /// How motion is decoded.
@@ -92,9 +97,16 @@ impl FlowPath {
 /// The network of either backbone.
 #[derive(Debug, Clone)]
 #[expect(clippy::large_enum_variant, reason = "there is one of it")]
-pub(crate) enum Field {
+pub(crate) enum Backbone {
     Unet(FlowUnet),
     Dit(FlowDit),
+}
+
+/// The velocity at every place and time.
+#[derive(Debug, Clone)]
+pub(crate) struct Field {
+    pub(crate) backbone: Backbone,
+    prediction: FlowPrediction,
 }
 
 impl FlowMeta {
@@ -135,9 +147,19 @@ impl FlowMeta {
 
     /// A fresh network.
     pub(crate) fn field(&self, init: &mut Init<'_>) -> Field {
-        match self.backbone {
-            FlowBackbone::Unet => Field::Unet(FlowUnet::new(&self.unet(), init)),
-            FlowBackbone::Dit => Field::Dit(FlowDit::new(&self.dit(), init)),
+        let backbone = match self.backbone {
+            FlowBackbone::Unet => Backbone::Unet(FlowUnet::new(&self.unet(), init)),
+            FlowBackbone::Dit => Backbone::Dit(FlowDit::new(&self.dit(), init)),
+        };
+        Field { backbone, prediction: self.prediction }
+    }
+}
+
+impl Backbone {
+    fn forward(&self, x_btf: Tensor<3>, times: &[f32], codes_bnd: Tensor<3>, dropout: &mut Dropout) -> Tensor<3> {
+        match self {
+            Self::Unet(network) => network.forward(x_btf, times, codes_bnd, dropout),
+            Self::Dit(network) => network.forward(x_btf, times, codes_bnd, None, None, dropout),
         }
     }
 }
@@ -145,17 +167,17 @@ impl FlowMeta {
 impl Field {
     /// Its parameters, in their order.
     pub(crate) fn params(&self) -> Vec<f32> {
-        match self {
-            Self::Unet(network) => flat::read(network),
-            Self::Dit(network) => flat::read(network),
+        match &self.backbone {
+            Backbone::Unet(network) => flat::read(network),
+            Backbone::Dit(network) => flat::read(network),
         }
     }
 
     /// Takes over parameters.
     pub(crate) fn take(&mut self, params: Values<'_>) {
-        match self {
-            Self::Unet(network) => params.assign(network),
-            Self::Dit(network) => params.assign(network),
+        match &mut self.backbone {
+            Backbone::Unet(network) => params.assign(network),
+            Backbone::Dit(network) => params.assign(network),
         }
     }
 
@@ -167,9 +189,31 @@ impl Field {
         codes_bnd: Tensor<3>,
         dropout: &mut Dropout,
     ) -> Tensor<3> {
-        match self {
-            Self::Unet(network) => network.forward(x_btf, times, codes_bnd, dropout),
-            Self::Dit(network) => network.forward(x_btf, times, codes_bnd, None, None, dropout),
+        let found = self.backbone.forward(x_btf.clone(), times, codes_bnd, dropout);
+        match self.prediction {
+            FlowPrediction::Velocity => found,
+            FlowPrediction::Data => {
+                let rates: Vec<f32> = times.iter().map(|t| 1.0 / (1.0 - t).max(LEAST)).collect();
+                let count = rates.len();
+                let rates = Tensor::<3>::from_data(TensorData::new(rates, [count, 1, 1]), &x_btf.device());
+                (found - x_btf) * rates
+            }
+        }
+    }
+
+    /// What training compares, [B, T, F] twice: what the network gives at `times`, where data and noise are mixed, and what it should.
+    pub(crate) fn compared(
+        &self,
+        (data_btf, noise_btf): (Tensor<3>, Tensor<3>),
+        times: &[f32],
+        codes_bnd: Tensor<3>,
+        dropout: &mut Dropout,
+    ) -> (Tensor<3>, Tensor<3>) {
+        let mixed = between(data_btf.clone(), noise_btf.clone(), times);
+        let found = self.backbone.forward(mixed, times, codes_bnd, dropout);
+        match self.prediction {
+            FlowPrediction::Velocity => (found, data_btf - noise_btf),
+            FlowPrediction::Data => (found, data_btf),
         }
     }
 }
@@ -205,11 +249,12 @@ impl FlowDecoder {
         }
         let device = device.clone().inner();
         let what = "the flow decoder's weights";
-        let field = match meta.field(&mut Init::new(Seed(0), "blank", Positions::Uniform, &device)) {
-            Field::Unet(network) => Field::Unet(weights::load(network, blobs, manifest, what)?),
-            Field::Dit(network) => Field::Dit(weights::load(network, blobs, manifest, what)?),
+        let blank = meta.field(&mut Init::new(Seed(0), "blank", Positions::Uniform, &device));
+        let backbone = match blank.backbone {
+            Backbone::Unet(network) => Backbone::Unet(weights::load(network, blobs, manifest, what)?),
+            Backbone::Dit(network) => Backbone::Dit(weights::load(network, blobs, manifest, what)?),
         };
-        Ok(Self { field, meta, device })
+        Ok(Self { field: Field { backbone, ..blank }, meta, device })
     }
 
     /// Its network, on the plain device.
@@ -257,5 +302,48 @@ impl FlowDecoder {
             }
         };
         rows.into_data().try_into_vec::<f32>().expect("networks compute in f32")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::Tolerance;
+    use protocol::stage::TrainDiscord;
+
+    use super::*;
+
+    fn meta(prediction: FlowPrediction) -> FlowMeta {
+        let settings = TrainDiscord::default();
+        FlowMeta {
+            format: DataFormat::Humanml3d,
+            features: 6,
+            code_dim: 5,
+            backbone: FlowBackbone::Unet,
+            prediction,
+            network: FlowNetwork { width: 8, condition: 4, ..settings.network },
+            solver: FlowPath::Euler,
+            steps: 1,
+            fits: Parts::new(),
+        }
+    }
+
+    /// Who predicts the data is led there by one step from wherever it is, and by a step of the published flow in the same place.
+    #[test]
+    fn a_step_to_the_end_arrives_at_the_data_that_is_predicted() {
+        let device = Device::flex();
+        let random = |shape: [usize; 3], number| {
+            let mut values = vec![0.0; shape.iter().product()];
+            Stream::new(Seed(4), "random", number, 0).fill_normal(&mut values);
+            Tensor::<3>::from_data(TensorData::new(values, shape), &device)
+        };
+        let (x, codes) = (random([1, 16, 6], 0), random([1, 4, 5], 1));
+        let field = |prediction| meta(prediction).field(&mut Init::new(Seed(1), "net", Positions::Uniform, &device));
+        let data = field(FlowPrediction::Data);
+        let given = data.backbone.forward(x.clone(), &[0.25], codes.clone(), &mut Dropout::off());
+        let velocity = data.velocity(x.clone(), &[0.25], codes.clone(), &mut Dropout::off());
+        let arrived = x.clone() + velocity * 0.75;
+        arrived.into_data().assert_approx_eq::<f32>(&given.clone().into_data(), Tolerance::absolute(1e-5));
+        let published = field(FlowPrediction::Velocity).velocity(x, &[0.25], codes, &mut Dropout::off());
+        published.into_data().assert_eq(&given.into_data(), true);
     }
 }

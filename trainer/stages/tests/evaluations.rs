@@ -10,9 +10,9 @@ use models::networks::{Denoiser, Init, Vae};
 use protocol::artifact::{FileEntry, Role};
 use protocol::stage::Diffusion;
 use protocol::stage::{
-    Batch, CheckpointPolicy, DataFormat, DataSynthetic, EncodeLatents, EvaluateLatentFid, EvaluateReconstruction,
-    EvaluateSpectrum, Family, Keep, LatentShape, Network, Positions, Sampler, Split, StageSettings, TextEmbed,
-    TrainLength, TrainVae, Training,
+    Activity, Batch, CheckpointPolicy, DataFormat, DataSynthetic, EncodeLatents, EvaluateLatentFid,
+    EvaluateRecognition, EvaluateReconstruction, EvaluateSpectrum, Family, Keep, LatentShape, Network, Positions,
+    Sampler, Split, StageSettings, TextEmbed, TrainLength, TrainVae, Training,
 };
 use protocol::{ArtifactKind, Digest, Manifest, Seed, Steps};
 use stages::artifacts::{self, DenoiserMeta, Latents, MODEL_FILE, VaeMeta, to_meta};
@@ -430,4 +430,43 @@ fn energy_by_band_is_measured_in_every_step() {
     let other = EvaluateSpectrum { motions: 2, ..settings };
     let other = bench.run("spectrum", &other.into(), &inputs).expect("the stage runs");
     assert_ne!(other.metrics(), metrics);
+}
+
+#[test]
+fn real_clips_are_recognised_and_those_of_an_untrained_model_are_not() {
+    let mut bench = bench();
+    let settings = DataSynthetic { clips: 120, val: 0.1, test: 0.3, mirror: false };
+    let dataset = bench.run("dataset", &StageSettings::DataSynthetic(settings), &[]).expect("the stage runs").output();
+    let vae = untrained_vae(&bench);
+    let model = untrained(&bench, vae, Family::Mld);
+    let activity = |name: &str, words: &[&str]| Activity {
+        name: name.into(),
+        words: words.iter().map(|w| (*w).to_owned()).collect(),
+        sheet: name == "sit",
+    };
+    let settings = EvaluateRecognition {
+        activities: vec![
+            activity("crawl", &["crawls", "crawling"]),
+            activity("sit", &["sits", "sitting"]),
+            activity("run", &["runs", "running", "jogs"]),
+        ],
+        sampler: Sampler { steps: 2, guidance: 1.0, ..Sampler::default() },
+        motions: 9,
+        ..EvaluateRecognition::default()
+    };
+    let inputs = [("dataset", dataset), ("model", model)];
+    let ran = bench.run("recognised", &settings.clone().into(), &inputs).expect("the stage runs");
+    let metrics = ran.metrics();
+    assert_eq!(metrics["real_accuracy"], 1.0, "{metrics:?}");
+    assert!(metrics["accuracy"] <= 0.5, "an untrained model draws one and the same: {metrics:?}");
+    assert!(metrics.contains_key("accuracy/run") && metrics["real_skating"] < 0.2, "{metrics:?}");
+    let manifest = bench.manifest(ran.output()).expect("stored");
+    let sheet = artifacts::file(&*bench.blobs(), &manifest, "contact-sheet.png").expect("a sheet");
+    assert!(sheet.starts_with(b"\x89PNG"));
+    let again = bench.run("recognised", &settings.clone().into(), &inputs).expect("the stage runs");
+    assert_eq!(ran.output(), again.output());
+    let mut other = settings;
+    other.activities.push(activity("fly", &["flies"]));
+    let refused = bench.run("recognised", &other.into(), &inputs).expect_err("nobody flies").to_string();
+    assert!(refused.contains("no clip of the split `train` shows `fly`"), "{refused}");
 }

@@ -7,6 +7,7 @@ pub mod jerk;
 pub mod joints;
 pub mod latent_fid;
 pub mod procrustes;
+pub mod recognition;
 pub mod reconstruction;
 pub mod retrieval;
 pub mod skating;

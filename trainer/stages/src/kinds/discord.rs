@@ -5,10 +5,10 @@
 //! published. Time runs from noise at 0 to data at 1.
 //!
 //! Departs: z is computed in each step instead of being kept in memory; the moving average, which the released script computes and never
-//! uses, is the result.
+//! uses, is the result. With `prediction: data` the network gives the data x' itself, the loss is `mean (x' - x)^2` without the weight that the velocity
+//! would give it, and the velocity is `(x' - x_t) / (1 - t)`.
 
 use checkpoint::model::Parts;
-use models::flow::between;
 use models::kernels::Dropout;
 use models::losses;
 use models::networks::Init;
@@ -47,9 +47,9 @@ impl Objective for Flow {
         let FlowSlice { data_btf: data, noise_btf: noise, codes_bnd: codes, uniforms: times } =
             self.data.slice(step, slice);
         let mut dropout = Dropout::new(self.settings.network.dropout, self.dropout_seed, step, slice as u64);
-        let found = self.field.velocity(between(data.clone(), noise.clone(), &times), &times, codes, &mut dropout);
+        let (found, target) = self.field.compared((data, noise), &times, codes, &mut dropout);
         let mut losses = Losses::new(self.settings.training.batch.global);
-        losses.add("flow", losses::mse(found, data - noise), 1.0);
+        losses.add("flow", losses::mse(found, target), 1.0);
         field_result(&self.field, &losses, &self.terms())
     }
 }
@@ -64,6 +64,7 @@ impl Gang for TrainDiscord {
             features,
             code_dim,
             backbone: self.backbone,
+            prediction: self.prediction,
             network: self.network.clone(),
             solver: self.solver.into(),
             steps: self.solver_steps,

@@ -13,7 +13,7 @@ use super::token_windows::TokenWindows;
 use super::{group, slice_result};
 use crate::artifacts;
 use crate::context::{GangContext, StageError};
-use crate::flow_decoder::{Field, UNIT};
+use crate::flow_decoder::{Backbone, Field, UNIT};
 use crate::networks::Autoencoder;
 use crate::tokenizer::TrainedTokenizer;
 use crate::train::{GroupPlan, Losses, Order, SliceResult};
@@ -150,16 +150,16 @@ impl FlowData {
 
 /// The network of a flow as one group of parameters.
 pub(super) fn field_group(field: &Field, training: &Training, ema: f64) -> GroupPlan {
-    match field {
-        Field::Unet(network) => group("model", network, training, ema),
-        Field::Dit(network) => group("model", network, training, ema),
+    match &field.backbone {
+        Backbone::Unet(network) => group("model", network, training, ema),
+        Backbone::Dit(network) => group("model", network, training, ema),
     }
 }
 
 /// What a slice gives that trains it.
 pub(super) fn field_result(field: &Field, losses: &Losses, terms: &[&'static str]) -> Result<SliceResult, StageError> {
-    match field {
-        Field::Unet(network) => slice_result(network, losses, terms),
-        Field::Dit(network) => slice_result(network, losses, terms),
+    match &field.backbone {
+        Backbone::Unet(network) => slice_result(network, losses, terms),
+        Backbone::Dit(network) => slice_result(network, losses, terms),
     }
 }

@@ -24,6 +24,7 @@ mod mld;
 mod mmm;
 mod model_decoder;
 mod pcm;
+mod recognition;
 mod reconstruction;
 mod reconstructor;
 mod recordings;
@@ -96,7 +97,7 @@ macro_rules! runners {
 
 // The list of what runs. It is held against `protocol`'s list of kinds by a test below.
 runners! {
-    Plain: DataOpen, DataSynthetic, ImportEvaluator, ModelDecoder, EvaluateSpectrum;
+    Plain: DataOpen, DataSynthetic, ImportEvaluator, ModelDecoder, EvaluateSpectrum, EvaluateRecognition;
     Map: TextEmbed, DataFeatures, EncodeLatents, EncodeTokens, EvaluateReconstruction, EvaluateLatentFid, EvaluateT2m, EvaluateControl;
     Gang: TrainVae, TrainMld, DistillLcm, DistillPcm, TrainEvaluator, TrainLength, TrainTokenizer, TrainTokens, TrainDiscord, DistillDiscord,
         TrainMdm, TrainStableMoFusion, TrainControl;
@@ -201,11 +202,24 @@ fn publish_report(
     metrics: BTreeMap<String, f64>,
     details: Value,
 ) -> Result<Outcome, StageError> {
+    publish_illustrated(cx, metrics, details, vec![])
+}
+
+/// [`publish_report`] with pictures beside it: their names and files.
+fn publish_illustrated(
+    cx: &mut dyn AttemptContext,
+    metrics: BTreeMap<String, f64>,
+    details: Value,
+    pictures: Vec<(&str, Vec<u8>)>,
+) -> Result<Outcome, StageError> {
     let report = json!({"metrics": metrics, "details": details});
     let meta = json!({"kind": cx.task().settings.kind(), "metrics": metrics, "drawn": drawn(cx)?});
-    let bytes = protocol::canonical::to_bytes(&report);
-    let output = artifacts::publish(cx, ArtifactKind::Report, meta, REPORT_FILE, bytes)?;
-    Ok(Outcome::Finished { output, metrics })
+    let mut draft = artifacts::Draft::new(cx, ArtifactKind::Report, meta);
+    draft.add(REPORT_FILE, protocol::canonical::to_bytes(&report))?;
+    for (name, bytes) in pictures {
+        draft.add(name, bytes)?;
+    }
+    Ok(Outcome::Finished { output: draft.finish(cx)?, metrics })
 }
 
 #[cfg(test)]

@@ -10,6 +10,7 @@ mod encode_latents;
 mod encode_tokens;
 mod evaluate_control;
 mod evaluate_latent_fid;
+mod evaluate_recognition;
 mod evaluate_reconstruction;
 mod evaluate_spectrum;
 mod evaluate_t2m;
@@ -38,6 +39,7 @@ pub use encode_latents::EncodeLatents;
 pub use encode_tokens::EncodeTokens;
 pub use evaluate_control::EvaluateControl;
 pub use evaluate_latent_fid::EvaluateLatentFid;
+pub use evaluate_recognition::{Activity, EvaluateRecognition};
 pub use evaluate_reconstruction::EvaluateReconstruction;
 pub use evaluate_spectrum::EvaluateSpectrum;
 pub use evaluate_t2m::{EvaluateT2m, MultiModality};
@@ -46,7 +48,7 @@ pub use model_decoder::ModelDecoder;
 pub use register::{Promote, Register};
 pub use text_embed::{ClipIds, ClipOutput, TextEmbed, TextEncoder};
 pub use train_control::{ControlDistance, ControlLoss, ControlMean, TrainControl};
-pub use train_discord::{FlowBackbone, FlowNetwork, FlowProjection, FlowSolver, TrainDiscord};
+pub use train_discord::{FlowBackbone, FlowNetwork, FlowPrediction, FlowProjection, FlowSolver, TrainDiscord};
 pub use train_evaluator::{EvaluatorNetwork, MovementPhase, TrainEvaluator};
 pub use train_length::TrainLength;
 pub use train_mdm::{MdmNetwork, TrainMdm};
@@ -83,6 +85,7 @@ super::spec::stage_kinds! {
     TrainControl,
     EvaluateControl,
     EvaluateSpectrum,
+    EvaluateRecognition,
     ImportEvaluator,
     EvaluateT2m,
     Register,

@@ -21,6 +21,17 @@ pub enum FlowBackbone {
     Dit,
 }
 
+/// What the network gives.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum FlowPrediction {
+    /// The velocity, data less noise, as published. The network must then carry noise of the features' full width, so it wants to be wider than a frame.
+    #[default]
+    Velocity,
+    /// The data, of which the velocity is computed: narrow networks can give that (Li and He, arXiv:2511.13720). The loss is on the data.
+    Data,
+}
+
 /// How tokens become a condition on each frame, of a U-Net.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
@@ -92,6 +103,8 @@ pub struct TrainDiscord {
     pub vae: String,
     /// What the velocity is predicted by.
     pub backbone: FlowBackbone,
+    /// What the network gives.
+    pub prediction: FlowPrediction,
     /// Size.
     pub network: FlowNetwork,
     /// Frames of an example; a multiple of 4. Shorter clips are left out.
@@ -116,6 +129,7 @@ impl Default for TrainDiscord {
             tokenizer: "tokenizer".into(),
             vae: String::new(),
             backbone: FlowBackbone::Unet,
+            prediction: FlowPrediction::Velocity,
             network: FlowNetwork::default(),
             window: 64,
             windows_of: WindowsOf::Frames,
