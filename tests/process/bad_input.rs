@@ -60,13 +60,21 @@ stages:
   momask: {kind: train.tokens, generator: masked, tokenizer: tokenizer}
   flow: {kind: train.discord, tokenizer: tokenizer, window: 64}
   smooth: {kind: model.decoder, model: momask, decoder: flow}
+  kit_tokenizer: {kind: train.tokenizer, dataset: kit}
+  kit_flow: {kind: train.discord, dataset: kit, tokenizer: kit_tokenizer, window: 64}
 ";
     let path = bench.path().join("p.yaml");
     for (from, to, parts) in [
         ("masked, tokenizer: tokenizer", "masked, tokenizer: other", ["p.yaml:8:", "another codebook"]),
         ("train.discord, tokenizer: tokenizer", "train.discord, tokenizer: other", ["p.yaml:10:", "another codebook"]),
-        ("kind: train.discord,", "kind: train.discord, dataset: kit,", ["p.yaml:9:", "21 joints (kit)"]),
-        ("window: 64", "window: 62", ["p.yaml:9:", "multiple of 4"]),
+        (
+            "kind: train.discord, tokenizer: tokenizer",
+            "kind: train.discord, dataset: kit, tokenizer: tokenizer",
+            ["p.yaml:9:", "21 joints (kit)"],
+        ),
+        ("model: momask, decoder: flow", "model: momask, decoder: kit_flow", ["p.yaml:10:", "21 joints (kit)"]),
+        ("tokenizer: tokenizer, window: 64", "tokenizer: tokenizer, window: 62", ["p.yaml:9:", "multiple of 4"]),
+        ("tokenizer: tokenizer}", "tokenizer: tokenizer, padded: 190}", ["p.yaml:7:", "multiple of 4"]),
     ] {
         assert!(good.contains(from), "{from}");
         fs::write(&path, good.replacen(from, to, 1)).expect("written");

@@ -54,9 +54,8 @@ fn kinds(view: &Value) -> BTreeSet<String> {
     stages.iter().map(|stage| stage["kind"].as_str().expect("a kind").to_owned()).collect()
 }
 
-fn run(workers: &str) -> Value {
-    let bench = Bench::new(TRAINER);
-    let path = pipeline(&bench).display().to_string();
+fn run(bench: &Bench, workers: &str) -> Value {
+    let path = pipeline(bench).display().to_string();
     bench.run(&["run", &path, "-o", "json", "--workers", workers]).expect_code(0).json()
 }
 
@@ -64,7 +63,7 @@ fn run(workers: &str) -> Value {
 fn reference() -> &'static Value {
     static REFERENCE: OnceLock<Value> = OnceLock::new();
     REFERENCE.get_or_init(|| {
-        let report = run("1");
+        let report = run(&Bench::new(TRAINER), "1");
         let all: BTreeSet<String> = StageSettings::all().iter().map(|stage| stage.kind().to_owned()).collect();
         let mut tried = kinds(&report);
         if shared().is_none() {
@@ -78,8 +77,23 @@ fn reference() -> &'static Value {
 #[test]
 fn p6_every_kind_has_the_same_digests_with_1_2_and_3_workers() {
     for workers in ["2", "3"] {
-        assert_eq!(digests(&run(workers)), digests(reference()), "{workers} workers against 1");
+        let bench = Bench::new(TRAINER);
+        assert_eq!(digests(&run(&bench, workers)), digests(reference()), "{workers} workers against 1");
+        if workers == "2" {
+            draws_the_spectrum(&bench);
+        }
     }
+}
+
+/// A line for every band in both panels, with a point for every step.
+fn draws_the_spectrum(bench: &Bench) {
+    bench.run(&["status", "--spectrum", "spectrum.svg"]).expect_code(0);
+    let picture = fs::read_to_string(bench.path().join("spectrum.svg")).expect("the picture");
+    assert_eq!((picture.matches("<polyline").count(), picture.matches("<circle").count()), (10, 80));
+    assert!(picture.contains("1: 0-0.5 Hz") && picture.contains("5: over 4 Hz"), "{picture}");
+    let said = bench.run(&["status", "--spectrum", "spectrum.svg", "--stage", "t2m"]).expect_code(3);
+    assert!(said.stderr.contains("no finished stage"), "{}", said.stderr);
+    bench.run(&["status", "--spectrum", "spectrum.jpeg"]).expect_code(2);
 }
 
 /// Runs the pipeline with one worker at a time, each of which dies when it gets to `point` for the `nth` time; gives how many died.

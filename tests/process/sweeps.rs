@@ -112,3 +112,41 @@ fn a_trial_that_diverges_is_stopped_and_the_sweep_goes_on() {
     assert!(why.contains("diverged"), "{why}");
     assert_eq!(states(&report)["pcm"], "ran");
 }
+
+/// Figures over how something is drawn, such as DisCoRD's of quality by evaluations of the network, are a sweep over its evaluation: one training.
+#[test]
+fn an_evaluation_is_swept_over_one_training_and_drawn_by_its_setting() {
+    let bench = Bench::new(TRAINER);
+    let config = Bench::repository().join("tests/process/kinds.yaml").display().to_string();
+    let sweep = "stages.discord.sweep={search: grid, metric: sjpe, space: {evaluate: {decoder_steps: {choice: [1, 2, 3]}, \
+        split: {choice: [test, train]}}}, evaluate: {kind: evaluate.reconstruction, tokenizer: tokenizer, shards: 1}}";
+    let report = bench.run(&["run", &config, "-o", "json", "--set", sweep, "--until", "discord"]).expect_code(0).json();
+    let trials = report["sweeps"][0]["trials"].as_array().expect("trials");
+    let values: BTreeSet<String> = trials.iter().map(|trial| trial["results"][0].to_string()).collect();
+    assert_eq!((trials.len(), values.len()), (6, 6), "{trials:#?}");
+    let logs = std::fs::read_dir(bench.store().join("workers")).expect("logs").flatten();
+    let text: String = logs.filter_map(|entry| std::fs::read_to_string(entry.path()).ok()).collect();
+    assert_eq!(text.matches("kind=\"train.discord\"").count(), 1, "trials share one training");
+
+    let plot = |more: &[&str]| bench.run(&[&["sweep", "status", "--plot", "p.svg"][..], more].concat());
+    let points = || {
+        let picture = std::fs::read_to_string(bench.path().join("p.svg")).expect("the picture");
+        (picture.matches("<polyline").count(), picture.matches("<circle").count())
+    };
+    plot(&[]).expect_code(0);
+    assert_eq!(points(), (2, 6), "a line for each split, by the one searched number");
+    plot(&["--by", "decoder_steps", "--metric", "sjpe,mpjpe_mm"]).expect_code(0);
+    assert_eq!(points(), (4, 12));
+    plot(&["--by", "seconds"]).expect_code(0);
+    assert_eq!(points(), (2, 6));
+    for (more, words) in [
+        (["--by", "lr"], "evaluate.decoder_steps, seconds, steps"),
+        (["--metric", "mpjpe"], "mpjpe_mm"),
+        (["--metric", "fid"], "`fid`"),
+    ] {
+        let said = plot(&more).expect_code(2);
+        assert!(said.stderr.contains(words), "{more:?}: {}", said.stderr);
+    }
+    let best = bench.run(&["sweep", "best"]).expect_code(0);
+    assert!(!best.stdout.contains("--set"), "nothing of the training was searched: {}", best.stdout);
+}

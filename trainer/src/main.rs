@@ -5,6 +5,7 @@
 mod cli;
 mod client;
 mod cost;
+mod figure;
 mod fleet;
 mod missing;
 mod out_of_memory;

@@ -1,9 +1,14 @@
-//! A sweep as a picture: the metric of every trial against its steps, as SVG. Grey lines were stopped, the coloured one is the best.
+//! A sweep as a picture, as SVG: the metric of every trial against its steps, where grey lines were stopped and the coloured one is the best; or
+//! metrics against a searched setting, or the time of the evaluation.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 
-use protocol::message::{SweepView, TrialState};
+use protocol::message::{RunView, StageView, SweepView, TrialState, TrialView};
+use protocol::sweep::rung_name;
+use serde_json::Value;
 
+use crate::figure::{self, Axis, Panel, escape};
 use crate::print;
 
 const WIDTH: f64 = 720.0;
@@ -13,48 +18,7 @@ const RIGHT: f64 = 24.0;
 const TOP: f64 = 44.0;
 const BOTTOM: f64 = 56.0;
 
-/// A linear axis; logarithmic where all values are positive and spread over more than a factor of 20.
-struct Axis {
-    low: f64,
-    high: f64,
-    logarithmic: bool,
-    from: f64,
-    to: f64,
-}
-
-impl Axis {
-    fn new(values: impl Iterator<Item = f64> + Clone, from: f64, to: f64) -> Self {
-        let low = values.clone().fold(f64::INFINITY, f64::min);
-        let high = values.fold(f64::NEG_INFINITY, f64::max);
-        let (low, high) = if low < high {
-            (low, high)
-        } else if low.is_finite() {
-            (low - 0.5, low + 0.5)
-        } else {
-            (0.0, 1.0)
-        };
-        Self { low, high, logarithmic: low > 0.0 && high / low > 20.0, from, to }
-    }
-
-    fn scale(&self, value: f64) -> f64 {
-        if self.logarithmic { value.ln() } else { value }
-    }
-
-    fn at(&self, value: f64) -> f64 {
-        let share = (self.scale(value) - self.scale(self.low)) / (self.scale(self.high) - self.scale(self.low));
-        self.from + share * (self.to - self.from)
-    }
-
-    fn marks(&self) -> Vec<f64> {
-        let mark = |i: i32| {
-            let scaled = self.scale(self.low) + f64::from(i) / 4.0 * (self.scale(self.high) - self.scale(self.low));
-            if self.logarithmic { scaled.exp() } else { scaled }
-        };
-        (0..=4).map(mark).collect()
-    }
-}
-
-/// The picture.
+/// The metric of every trial against its steps.
 pub(crate) fn svg(sweep: &SweepView) -> String {
     let values = sweep.trials.iter().flat_map(|trial| trial.results.iter().flatten().copied());
     let x = Axis::new(sweep.rungs.iter().map(|steps| *steps as f64).chain([0.0]), LEFT, WIDTH - RIGHT);
@@ -115,8 +79,116 @@ pub(crate) fn svg(sweep: &SweepView) -> String {
     out
 }
 
-fn escape(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('"', "&quot;")
+/// What the trials of a sweep are drawn by.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum By {
+    /// The steps that they were trained for.
+    Steps,
+    /// A searched setting that is a number.
+    Setting(String),
+    /// Seconds that their evaluation took, reading and measuring included.
+    Seconds,
+}
+
+impl By {
+    /// What says most: a searched number where every trial is trained to its end, or else the steps.
+    pub(crate) fn usual(sweep: &SweepView) -> Self {
+        let mut numbers = numbers(sweep).into_iter();
+        match (sweep.rungs.len(), numbers.next(), numbers.next()) {
+            (1, Some(only), None) => Self::Setting(only),
+            _ => Self::Steps,
+        }
+    }
+
+    /// A searched setting by its path or the end of it, `seconds` or `steps`.
+    ///
+    /// # Errors
+    /// What there is.
+    pub(crate) fn named(name: &str, sweep: &SweepView) -> Result<Self, String> {
+        let numbers = numbers(sweep);
+        let is = |path: &&String| *path == name || path.ends_with(&format!(".{name}"));
+        match (name, numbers.iter().find(is)) {
+            (_, Some(path)) => Ok(Self::Setting(path.clone())),
+            ("seconds", None) => Ok(Self::Seconds),
+            ("steps", None) => Ok(Self::Steps),
+            _ => {
+                let there =
+                    numbers.iter().map(String::as_str).chain(["seconds", "steps"]).collect::<Vec<_>>().join(", ");
+                Err(format!("`{name}` is no searched number; there is: {there}"))
+            }
+        }
+    }
+}
+
+/// Searched settings that are numbers and differ between trials.
+fn numbers(sweep: &SweepView) -> Vec<String> {
+    let Some(first) = sweep.trials.first() else { return Vec::new() };
+    let differs = |path: &&String| {
+        let mut values = sweep.trials.iter().map(|trial| trial.values.get(*path).and_then(Value::as_f64));
+        let first = values.next().flatten();
+        first.is_some() && values.clone().all(|value| value.is_some()) && values.any(|value| value != first)
+    };
+    first.values.keys().filter(differs).cloned().collect()
+}
+
+/// Curves of `metrics` over what the trials differ in: a panel for each, and a line for every choice of the other searched settings.
+///
+/// # Errors
+/// Which metric no evaluation gave, and what there is.
+pub(crate) fn curves(run: &RunView, sweep: &SweepView, by: &By, metrics: &[String]) -> Result<String, String> {
+    let last = sweep.rungs.len().saturating_sub(1);
+    let evaluations: Vec<(&TrialView, &StageView)> = sweep
+        .trials
+        .iter()
+        .filter_map(|trial| {
+            let name = format!("{}.eval", rung_name(&sweep.stage, trial.trial, last));
+            Some((trial, run.stages.iter().find(|stage| stage.name.as_str() == name)?))
+        })
+        .collect();
+    let named = |path: &str| path.rsplit('.').next().unwrap_or(path).to_owned();
+    let x = |trial: &TrialView, stage: &StageView| match by {
+        By::Setting(path) => trial.values.get(path).and_then(Value::as_f64),
+        // One that was found finished took no time now.
+        By::Seconds => Some(stage.wall_s).filter(|seconds| *seconds > 0.0),
+        By::Steps => Some(trial.steps as f64),
+    };
+    let line = |trial: &TrialView| {
+        let others = trial.values.iter().filter(|(path, _)| match by {
+            By::Setting(by) => *path != by,
+            // What is timed differs in the number that makes it longer.
+            By::Seconds | By::Steps => !trial.values[*path].is_number(),
+        });
+        let text = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+        others.map(|(path, value)| format!("{} {}", named(path), text(value))).collect::<Vec<_>>().join(", ")
+    };
+    let mut panels = Vec::new();
+    for metric in metrics {
+        let mut lines: BTreeMap<String, Vec<(f64, f64)>> = BTreeMap::new();
+        for (trial, stage) in &evaluations {
+            if let (Some(x), Some(y)) = (x(trial, stage), stage.metrics.get(metric)) {
+                lines.entry(line(trial)).or_default().push((x, *y));
+            }
+        }
+        if lines.is_empty() {
+            let given: BTreeSet<&str> =
+                evaluations.iter().flat_map(|(_, stage)| stage.metrics.keys().map(String::as_str)).collect();
+            let given = given.into_iter().filter(|name| !name.ends_with(".lower") && !name.ends_with(".upper"));
+            return Err(format!(
+                "no evaluation of `{}` has both `{metric}` and what it is drawn by; metrics: {}",
+                sweep.stage,
+                given.collect::<Vec<_>>().join(", ")
+            ));
+        }
+        lines.values_mut().for_each(|points| points.sort_by(|a, b| a.0.total_cmp(&b.0)));
+        let x = match by {
+            By::Setting(path) => named(path),
+            By::Seconds => "seconds that the evaluation took".to_owned(),
+            By::Steps => "steps".to_owned(),
+        };
+        panels.push(Panel { x, y: metric.clone(), lines });
+    }
+    let title = format!("sweep of {}: {} trials", sweep.stage, sweep.trials.len());
+    Ok(figure::svg(&title, &panels))
 }
 
 #[cfg(test)]

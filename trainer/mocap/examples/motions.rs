@@ -23,6 +23,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             joints: features::recover_joints(&dataset.clips[clip].features, dataset.skeleton()),
             features: None,
             waypoints: Vec::new(),
+            kept: Vec::new(),
         })
     };
     let mut motions: Vec<Motion> = [0, 5, 10, 15].into_iter().map(clip).collect::<Result<_, &str>>()?;

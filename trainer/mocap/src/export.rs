@@ -6,6 +6,7 @@
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
@@ -157,6 +158,8 @@ pub struct Motion {
     pub features: Option<Vec<f32>>,
     /// What it was told.
     pub waypoints: Vec<Waypoint>,
+    /// Frames that stayed, where a part of a motion was drawn anew.
+    pub kept: Vec<Range<usize>>,
 }
 
 /// A file that was written.
@@ -196,7 +199,7 @@ impl Motion {
     /// A motion of a file, by whose name it goes.
     fn of(file: &Path, skeleton: &'static Skeleton, joints: Vec<f32>, features: Option<Vec<f32>>) -> Self {
         let caption = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        Self { caption, note: String::new(), skeleton, joints, features, waypoints: Vec::new() }
+        Self { caption, note: String::new(), skeleton, joints, features, waypoints: Vec::new(), kept: Vec::new() }
     }
 
     /// Reads an array: features `[L, 263]` or `[L, 251]`, or positions `[T, 22, 3]` or `[T, 21, 3]`.
@@ -360,7 +363,8 @@ pub fn write_all(title: &str, sections: &[(String, Vec<&Motion>)], path: &Path) 
                 return refuse("motions of one skeleton");
             }
             let rows: Vec<(String, Vec<f32>)> = motions().map(|m| (m.caption.clone(), m.joints.clone())).collect();
-            draw::strip_png_along(&rows, POSES, first.skeleton, &first.waypoints, path).map_err(io)?;
+            let given = draw::Given { waypoints: &first.waypoints, kept: &first.kept };
+            draw::strip_png_along(&rows, POSES, first.skeleton, given, path).map_err(io)?;
         }
         Form::Bvh | Form::Glb | Form::Gif | Form::Npy | Form::Mp4 => {
             let Some(first) = motions().next().filter(|_| count == 1) else { return refuse("one") };
@@ -468,6 +472,7 @@ mod tests {
             joints: recover_joints(&features, dataset.skeleton()),
             features: Some(features),
             waypoints: Vec::new(),
+            kept: Vec::new(),
         }
     }
 

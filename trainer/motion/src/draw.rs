@@ -10,6 +10,7 @@ mod raster;
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
+use std::ops::Range;
 use std::path::Path;
 
 use colours::{BODY, GRID, INK, LEFT, PAPER, RIGHT, SHADOW, TOLD, TRAIL};
@@ -250,10 +251,20 @@ pub fn strip_png_to(
     skeleton: &Skeleton,
     out: impl Write,
 ) -> io::Result<()> {
-    strip_png_along_to(motions, poses, skeleton, &[], out)
+    strip_png_along_to(motions, poses, skeleton, Given::default(), out)
 }
 
-/// As [`strip_png_to`]; below, if there are waypoints, the first motion from above with the waypoints that it was told.
+/// What motions were drawn from besides words.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Given<'a> {
+    /// Places that the first motion was told.
+    pub waypoints: &'a [Waypoint],
+    /// Frames that stayed when a part of a motion was drawn anew; none of a motion that is drawn whole.
+    pub kept: &'a [Range<usize>],
+}
+
+/// As [`strip_png_to`]; poses of frames that were kept are pale, and a line below each row says from when to when. Below all, if there are waypoints,
+/// the first motion from above with the waypoints that it was told.
 ///
 /// # Errors
 /// As [`strip_png_to`].
@@ -261,10 +272,9 @@ pub fn strip_png_along_to(
     motions: &[(String, Vec<f32>)],
     poses: usize,
     skeleton: &Skeleton,
-    waypoints: &[Waypoint],
+    Given { waypoints, kept }: Given<'_>,
     out: impl Write,
 ) -> io::Result<()> {
-    const CELL: usize = 110;
     const ROW: usize = 210;
     let below = if waypoints.is_empty() { 0 } else { plan::HEIGHT };
     let (width, height) = (CELL * poses + 24, ROW * motions.len() + below);
@@ -290,8 +300,10 @@ pub fn strip_png_along_to(
             ] {
                 canvas.line(floor(a.0, a.1), floor(b.0, b.1), 1.0, GRID);
             }
-            figure(&mut canvas, &view, skeleton, &pose, 1.0);
+            let stayed = kept.iter().any(|span| span.contains(&t));
+            figure(&mut canvas, &view, skeleton, &pose, if stayed { 0.4 } else { 1.0 });
         }
+        timeline(&mut canvas, top + ROW as f64, (frames, poses), kept);
     }
     if let (Some((_, joints)), true) = (motions.first(), below > 0) {
         let at = |t: usize, joint: usize| frame(joints, skeleton, t)[joint];
@@ -305,12 +317,33 @@ pub fn strip_png_along_to(
     encoder.write_header().and_then(|mut w| w.write_image_data(canvas.bytes())).map_err(failed)
 }
 
+/// Pixels from pose to pose of a sheet.
+const CELL: usize = 110;
+
+/// Above `bottom`, which frames of a row were kept and which were drawn; nothing if none were kept.
+fn timeline(canvas: &mut Canvas, bottom: f64, (frames, poses): (usize, usize), kept: &[Range<usize>]) {
+    if kept.is_empty() {
+        return;
+    }
+    let pace = (poses.saturating_sub(1) * CELL) as f64 / frames.saturating_sub(1).max(1) as f64;
+    let x = |t: usize| 12.0 + 0.5 * CELL as f64 + pace * t as f64;
+    let stayed = |t: usize| kept.iter().any(|span| span.contains(&t));
+    let mut from = 0;
+    while from < frames {
+        let to = (from..frames).find(|t| stayed(*t) != stayed(from)).unwrap_or(frames);
+        let (colour, word) = if stayed(from) { (SHADOW, "kept") } else { (TOLD, "drawn") };
+        canvas.line([x(from), bottom - 6.0], [x(to - 1), bottom - 6.0], 4.0, colour);
+        font::draw(canvas, word, [x(from), bottom - 20.0], 1, if stayed(from) { BODY } else { TOLD });
+        from = to;
+    }
+}
+
 /// [`strip_png_to`] a file.
 ///
 /// # Errors
 /// When the file cannot be written, or a motion is not a whole number of frames.
 pub fn strip_png(motions: &[(String, Vec<f32>)], poses: usize, skeleton: &Skeleton, path: &Path) -> io::Result<()> {
-    strip_png_along(motions, poses, skeleton, &[], path)
+    strip_png_along(motions, poses, skeleton, Given::default(), path)
 }
 
 /// [`strip_png_along_to`] a file.
@@ -321,10 +354,10 @@ pub fn strip_png_along(
     motions: &[(String, Vec<f32>)],
     poses: usize,
     skeleton: &Skeleton,
-    waypoints: &[Waypoint],
+    given: Given<'_>,
     path: &Path,
 ) -> io::Result<()> {
     let mut file = BufWriter::new(File::create(path)?);
-    strip_png_along_to(motions, poses, skeleton, waypoints, &mut file)?;
+    strip_png_along_to(motions, poses, skeleton, given, &mut file)?;
     file.flush()
 }

@@ -57,10 +57,17 @@ fn what_was_told_is_drawn() {
     };
     let (mut plain, mut along) = (vec![], vec![]);
     draw::strip_png_to(&[(title.clone(), joints.clone())], 6, skeleton, &mut plain).unwrap();
-    draw::strip_png_along_to(&[(title.clone(), joints.clone())], 6, skeleton, &waypoints, &mut along).unwrap();
+    let given = draw::Given { waypoints: &waypoints, ..draw::Given::default() };
+    draw::strip_png_along_to(&[(title.clone(), joints.clone())], 6, skeleton, given, &mut along).unwrap();
     assert_eq!(purple(plain), (0, 210));
     let (found, height) = purple(along);
     assert!(found > 60 && height > 400, "{found} pixels of waypoints, {height} high");
+    // What was drawn between kept frames has that colour too, and no more height.
+    let mut edited = vec![];
+    let given = draw::Given { kept: &[0..5, 15..21], ..draw::Given::default() };
+    draw::strip_png_along_to(&[(title.clone(), joints.clone())], 6, skeleton, given, &mut edited).unwrap();
+    let (found, height) = purple(edited);
+    assert!(found > 60 && height == 210, "{found} pixels of what was drawn, {height} high");
     let (mut plain, mut along) = (vec![], vec![]);
     draw::gif_to(&joints, skeleton, &title, &mut plain).unwrap();
     draw::gif_along_to(&joints, skeleton, &title, &waypoints, &mut along).unwrap();

@@ -1,8 +1,9 @@
 //! `sweep:` on a training stage: which settings are searched, how, and what evaluates a trial.
 //!
 //! A trial is the stage with some of its settings changed, trained in rungs: a rung is an ordinary stage that stops before the end of
-//! its learning rate schedule, and the next rung goes on from the state that it left. This module is data and the arithmetic on it; who
-//! is tried next is decided by the coordinator (`coordinator::search`).
+//! its learning rate schedule, and the next rung goes on from the state that it left. Settings of the stage that evaluates can be searched
+//! too: trials that differ in those alone have one training key, and so share one training. This module is data and the arithmetic on it;
+//! who is tried next is decided by the coordinator (`coordinator::search`).
 
 use std::collections::BTreeMap;
 
@@ -10,7 +11,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::stage::{Mode, Placement, StageSettings, WorkerRange};
+use crate::stage::{Mode, Placement, Ref, StageSettings, Target, WorkerRange};
 use crate::{ArtifactKind, StageName, Steps, pipeline};
 
 /// How the space is searched.
@@ -74,7 +75,15 @@ impl Domain {
     }
 }
 
-/// Values of the searched settings by their path, such as `adversarial` or `network.width`.
+/// What the path of a searched setting of [`Sweep::evaluate`] begins with, before a `.`.
+pub const EVALUATE: &str = "evaluate";
+
+/// The path within the stage that evaluates, if `path` leads there.
+pub fn in_evaluation(path: &str) -> Option<&str> {
+    path.strip_prefix(EVALUATE)?.strip_prefix('.')
+}
+
+/// Values of the searched settings by their path, such as `adversarial`, `network.width` or `evaluate.sampler.guidance`.
 pub type Values = BTreeMap<String, Value>;
 
 /// A search over the settings of a training stage.
@@ -124,6 +133,33 @@ impl Sweep {
         })
     }
 
+    /// The setting at `path` of a stage with settings `base`, or of the stage that evaluates, if there is one.
+    pub fn setting(&self, base: &StageSettings, path: &str) -> Option<Value> {
+        match in_evaluation(path) {
+            Some(path) => setting(&self.evaluate, path),
+            None => setting(base, path),
+        }
+    }
+
+    /// `base` and the stage that evaluates, each with those of `values` in place that are its own.
+    ///
+    /// # Errors
+    /// What does not fit, each with the rule that it breaks.
+    pub fn with_values(&self, base: &StageSettings, values: &Values) -> Result<(StageSettings, StageSettings), String> {
+        let (mut own, mut of_evaluation) = (Values::new(), Values::new());
+        for (path, value) in values {
+            match in_evaluation(path) {
+                Some(path) => of_evaluation.insert(path.to_owned(), value.clone()),
+                None => own.insert(path.clone(), value.clone()),
+            };
+        }
+        let evaluate = match of_evaluation.is_empty() {
+            true => (*self.evaluate).clone(),
+            false => with_values(&self.evaluate, &of_evaluation)?,
+        };
+        Ok((with_values(base, &own)?, evaluate))
+    }
+
     /// How many trials there will be, before equal ones are left out.
     pub fn trials(&self) -> usize {
         let points = self.points().unwrap_or(usize::MAX);
@@ -156,9 +192,12 @@ pub fn with_values(base: &StageSettings, values: &Values) -> Result<StageSetting
     if broken.is_empty() { Ok(settings) } else { Err(broken.join("; ")) }
 }
 
-/// The field through which `evaluate` looks at a stage that gives a `kind`.
+/// The field through which `evaluate` looks at a stage that gives a `kind`: one that it reads, or one that it would if a stage were named there.
 pub fn evaluated_field(evaluate: &StageSettings, kind: ArtifactKind) -> Option<String> {
-    evaluate.inputs().into_iter().find(|(_, _, wanted)| *wanted == kind).map(|(field, _, _)| field)
+    let mut settings = evaluate.clone();
+    let refs: Vec<Ref<'_>> = settings.refs().into_iter().filter(|of| of.target == Target::Stage(kind)).collect();
+    let found = refs.iter().find(|of| of.read).or_else(|| refs.iter().find(|of| of.name.is_empty()));
+    found.map(|of| of.field.clone().into_owned())
 }
 
 /// What makes a stage one that a sweep derived.

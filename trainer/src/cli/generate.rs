@@ -166,7 +166,8 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
             let (timing, missed) = (motion.timing, told.as_ref().and_then(|told| told.missed(&motion)));
             let note = format!("{}, {}, seed {seed}", shared.label, shared.sampler);
             let waypoints = told.as_ref().map(|told| told.waypoints.clone()).unwrap_or_default();
-            let motion = args.out.prepared(exported(&request.caption, note, motion, waypoints));
+            let motion = Motion { kept: kept.clone(), ..exported(&request.caption, note, motion, waypoints) };
+            let motion = args.out.prepared(motion);
             let written = outs.write(number, &motion).map_err(out::refused)?;
             let frames = motion.frames();
             rows.push(Row {
@@ -228,6 +229,7 @@ pub(super) fn exported(
         joints: motion.joints,
         features: Some(motion.features),
         waypoints,
+        kept: Vec::new(),
     }
 }
 

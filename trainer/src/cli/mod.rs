@@ -14,6 +14,7 @@ mod remote;
 mod sampler;
 mod sentences;
 mod serve;
+mod spectrum;
 pub(crate) mod sweep;
 mod time;
 

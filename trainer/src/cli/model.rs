@@ -13,6 +13,7 @@ use protocol::stage::Sampler;
 use protocol::{Digest, Manifest};
 use registry::cli::{Command, Data};
 use stages::context::StageError;
+use stages::kinds::REPORT_FILE;
 
 use crate::problem::{Problem, Result, exit};
 use crate::reader::Reader;
@@ -144,6 +145,14 @@ pub(super) async fn stage(reader: &Reader, run: &RunView, name: &str) -> Result<
 pub(super) fn stages(run: &RunView) -> Vec<&str> {
     let have = run.stages.iter().filter(|stage| stage.of.is_none() && stage.outputs.contains_key(MODEL));
     have.map(|stage| stage.name.as_str()).collect()
+}
+
+/// The report of an evaluation.
+pub(super) async fn report(reader: &Reader, digest: Digest) -> Result<serde_json::Value> {
+    let manifest = manifest(reader, digest).await?;
+    let file = manifest.files.get(REPORT_FILE).ok_or_else(|| Problem::failed(format!("{digest} is no report")))?;
+    let bytes = verified(reader, file.digest).await?;
+    serde_json::from_slice(&bytes).map_err(|error| Problem::failed(format!("{digest} is no report: {error}")))
 }
 
 async fn manifest(reader: &Reader, digest: Digest) -> Result<Manifest> {

@@ -1,6 +1,6 @@
 //! Verbs about runs: submit, status, logs, pause, cancel.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
@@ -8,6 +8,7 @@ use protocol::StageName;
 use protocol::message::{RunState, RunView, Submit};
 
 use super::args::PipelineArgs;
+use super::spectrum;
 use crate::client::{Client, Target};
 use crate::pipeline_file;
 use crate::print::{self, Output};
@@ -44,6 +45,12 @@ pub(crate) struct StatusArgs {
     /// All runs, one a line
     #[arg(long)]
     all: bool,
+    /// Draws what the stage `evaluate.spectrum` found, energy by band of frequencies over the denoising steps, an SVG file
+    #[arg(long, value_name = "FILE.svg", conflicts_with = "all")]
+    spectrum: Option<PathBuf>,
+    /// The stage of --spectrum, where there are several
+    #[arg(long, value_name = "STAGE", requires = "spectrum")]
+    stage: Option<String>,
     #[command(flatten)]
     target: Target,
     /// How the answer is printed
@@ -160,7 +167,12 @@ pub(crate) async fn status(args: StatusArgs) -> Result<u8> {
             }
         }
     } else {
-        show(&reader.find(&args.run).await?, args.output);
+        let view = reader.find(&args.run).await?;
+        if let Some(path) = &args.spectrum {
+            check_parent(path)?;
+            spectrum::draw(&reader, &view, args.stage.as_deref(), path).await?;
+        }
+        show(&view, args.output);
     }
     reader.close().await;
     Ok(0)

@@ -5,13 +5,15 @@ use std::path::{Path, PathBuf};
 use clap::{Args, Subcommand};
 use protocol::message::{RunView, SweepView, TrialState, TrialView};
 use protocol::stage::Mode;
+use protocol::sweep::in_evaluation;
 use serde_json::{Value, json};
 
 use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result, exit};
 use crate::reader::Reader;
-use crate::{pipeline_file, summary, sweep_plot};
+use crate::sweep_plot::{self, By};
+use crate::{pipeline_file, summary};
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum SweepVerb {
@@ -50,9 +52,15 @@ pub(crate) struct Which {
 pub(crate) struct StatusArgs {
     #[command(flatten)]
     which: Which,
-    /// Draws the metric against the steps of every trial, an SVG file
+    /// Draws the trials, an SVG file
     #[arg(long, value_name = "FILE.svg")]
     plot: Option<PathBuf>,
+    /// What they are drawn by: a searched setting, `seconds` of their evaluation, or `steps` [default: the one searched number, or the steps]
+    #[arg(long, value_name = "SETTING", requires = "plot")]
+    by: Option<String>,
+    /// Metrics of the evaluation that are drawn, a panel for each [default: the one that decides]
+    #[arg(long, value_name = "NAME", value_delimiter = ',', requires = "plot")]
+    metric: Vec<String>,
 }
 
 #[derive(Debug, Args)]
@@ -82,7 +90,18 @@ async fn status(args: StatusArgs) -> Result<u8> {
             let problem = Problem::usage(format!("run `{}` has {} sweeps: {}", run.run, names.len(), names.join(", ")));
             return Err(problem.hint("say with --stage which one to draw"));
         };
-        std::fs::write(path, sweep_plot::svg(sweep))
+        let by = match &args.by {
+            Some(name) => By::named(name, sweep).map_err(Problem::usage)?,
+            None => By::usual(sweep),
+        };
+        let picture = match (&by, args.metric.is_empty()) {
+            (By::Steps, true) => sweep_plot::svg(sweep),
+            (_, decides) => {
+                let metrics = if decides { vec![sweep.metric.clone()] } else { args.metric.clone() };
+                sweep_plot::curves(&run, sweep, &by, &metrics).map_err(Problem::usage)?
+            }
+        };
+        std::fs::write(path, picture)
             .map_err(|error| Problem::usage(format!("cannot write `{}`: {error}", path.display())))?;
     }
     match args.which.output {
@@ -123,7 +142,8 @@ async fn best(args: BestArgs) -> Result<u8> {
         Output::Table => {
             for (sweep, best) in found {
                 print::out(&summary::sweep_line(sweep));
-                let sets = best.values.iter().map(|(path, value)| format!(" --set {}.{path}={value}", sweep.stage));
+                let own = best.values.iter().filter(|(path, _)| in_evaluation(path).is_none());
+                let sets = own.map(|(path, value)| format!(" --set {}.{path}={value}", sweep.stage));
                 print::out(&format!("alone, with the sweep left out:{}", sets.collect::<String>()));
             }
         }

@@ -257,6 +257,13 @@ impl FlowDecoder {
         Ok(Self { field: Field { backbone, ..blank }, meta, device })
     }
 
+    /// The same that makes so many steps.
+    #[must_use]
+    pub fn with_steps(mut self, steps: usize) -> Self {
+        self.meta.steps = steps;
+        self
+    }
+
     /// Its network, on the plain device.
     pub(crate) fn into_field(self) -> Field {
         self.field

@@ -7,7 +7,7 @@
 use std::collections::BTreeSet;
 
 use protocol::stage::StageSettings;
-use protocol::sweep::{Domain, MAX_TRIALS, Sweep, Values, setting};
+use protocol::sweep::{Domain, MAX_TRIALS, Sweep, Values};
 use protocol::{Digest, Seed, StageName, canonical};
 use serde_json::Value;
 
@@ -27,7 +27,7 @@ pub(super) fn points(sweep: &Sweep, settings: &StageSettings, name: &StageName, 
     for trial in 0..count as u64 {
         let point = (0..AGAIN).find_map(|again| {
             let draw = |(path, domain): (&String, &Domain)| {
-                let whole = setting(settings, path).is_some_and(|value| value.is_number() && !value.is_f64());
+                let whole = sweep.setting(settings, path).is_some_and(|value| value.is_number() && !value.is_f64());
                 (path.clone(), value(domain, uniform(bits(seed, name, trial, again, path)), whole))
             };
             let point: Values = sweep.space.iter().map(draw).collect();

@@ -15,7 +15,7 @@ use super::schema::{list_keys, overlay, unknown_key};
 use super::yaml::{Content, Entry, Node};
 use crate::ArtifactKind;
 use crate::stage::{Mode, StageSettings};
-use crate::sweep::{Domain, Rungs, SearchKind, Sweep, evaluated_field, setting};
+use crate::sweep::{Domain, EVALUATE, Rungs, SearchKind, Sweep, evaluated_field, setting};
 
 /// What a domain may be.
 const DOMAINS: [&str; 3] = ["choice", "uniform", "log_uniform"];
@@ -55,7 +55,7 @@ pub(super) fn described() -> Value {
     let mut schema = schema_of(&Head::default());
     let properties = &mut schema["properties"];
     properties["space"] = json!({
-        "description": "Settings of the stage, each with `choice: [a, b]`, `uniform: [from, to]` or `log_uniform: [from, to]`.",
+        "description": "Settings of the stage, each with `choice: [a, b]`, `uniform: [from, to]` or `log_uniform: [from, to]`; below `evaluate` those of the stage that evaluates, such as `evaluate: {sampler: {guidance: {choice: [2, 3]}}}`.",
         "type": "object",
     });
     properties["evaluate"] = json!({
@@ -103,7 +103,7 @@ impl Reader {
             Some(entry) => {
                 let before = self.mistakes.len();
                 let example = serde_json::to_value(default).ok()?;
-                let walk = Space { default, example: &example, owner: format!("stage `{name}`") };
+                let walk = Space { default, example: &example, owner: format!("stage `{name}`"), of_stage: true };
                 self.space(&walk, &entry.value, &mut Vec::new(), &format!("{path}.space"), &mut space);
                 if self.mistakes.len() > before {
                     return None;
@@ -123,6 +123,19 @@ impl Reader {
             }
             Some(entry) => self.evaluation(entry, name, default, &format!("{path}.evaluate"))?,
         };
+        let of_evaluation = node.entry("space").and_then(|space| space.value.entry(EVALUATE));
+        if let Some(entry) = of_evaluation {
+            let before = self.mistakes.len();
+            let example = serde_json::to_value(&evaluate).ok()?;
+            let owner = format!("`evaluate` of the sweep of stage `{name}`");
+            let walk = Space { default: &evaluate, example: &example, owner, of_stage: false };
+            let mut found = BTreeMap::new();
+            self.space(&walk, &entry.value, &mut Vec::new(), &format!("{path}.space.{EVALUATE}"), &mut found);
+            if self.mistakes.len() > before {
+                return None;
+            }
+            space.extend(found.into_iter().map(|(path, domain)| (format!("{EVALUATE}.{path}"), domain)));
+        }
         let Head { search, metric, mode, trials, parallel, rungs } = head?;
         Some(Sweep { search, metric, mode, trials, parallel, rungs, space, evaluate: Box::new(evaluate) })
     }
@@ -191,6 +204,10 @@ impl Reader {
         }
         let example = keys.iter().fold(walk.example, |value, key| &value[key.as_str()]);
         for entry in entries {
+            // Read when it is known what evaluates.
+            if keys.is_empty() && walk.of_stage && entry.key == EVALUATE {
+                continue;
+            }
             let path = format!("{path}.{}", entry.key);
             let references: Vec<String> =
                 walk.default.clone().refs().into_iter().map(|reference| reference.field.into_owned()).collect();
@@ -317,6 +334,8 @@ struct Space<'a> {
     default: &'a StageSettings,
     example: &'a Value,
     owner: String,
+    /// Rather than of the stage that evaluates.
+    of_stage: bool,
 }
 
 /// `{a: {b: item}}` for the keys `a`, `b`.

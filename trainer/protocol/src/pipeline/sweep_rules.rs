@@ -7,8 +7,8 @@ use super::graph::{self, ByStage};
 use super::rules::{self, Problem, Problems};
 use super::schema::list_keys;
 use crate::limits;
-use crate::stage::Placement;
-use crate::sweep::{Domain, MAX_TRIALS, Rungs, SearchKind, Sweep, Values, evaluated_field, setting, with_values};
+use crate::stage::{Placement, StageSettings};
+use crate::sweep::{self, Domain, MAX_TRIALS, Rungs, SearchKind, Sweep, Values, evaluated_field};
 use crate::{ArtifactKind, StageName};
 
 /// Everything that can be said of a stage's sweep without looking at other stages.
@@ -88,13 +88,14 @@ pub(super) fn rules(stage: &PipelineStage) -> Vec<Problem> {
     }
     for (path, domain) in &sweep.space {
         let field = format!("sweep.space.{path}");
-        let whole = setting(&stage.settings, path).is_some_and(|value| value.is_number() && !value.is_f64());
+        let whole = sweep.setting(&stage.settings, path).is_some_and(|value| value.is_number() && !value.is_f64());
         for (at, value) in tried(domain, whole) {
             let at = format!("{field}{at}");
-            let problem = match with_values(&stage.settings, &Values::from([(path.clone(), value.clone())])) {
+            let problem = match sweep.with_values(&stage.settings, &Values::from([(path.clone(), value.clone())])) {
                 Ok(_) => None,
-                // What is wrong with the stage itself is said there.
+                // What is wrong with the stage itself is said there, and what is wrong with its evaluation below.
                 Err(_) if !rules::stage(&stage.settings, &stage.placement).is_empty() => None,
+                Err(_) if !rules::stage(&sweep.evaluate, &Placement::default()).is_empty() => None,
                 Err(problem) => Some(problem),
             };
             if let Some(problem) = problem {
@@ -117,12 +118,18 @@ fn space_rules(p: &mut Problems, stage: &PipelineStage, sweep: &Sweep) {
     if sweep.metric.len() > limits::KEY_BYTES || sweep.metric.contains(char::is_control) {
         p.add("sweep.metric", "`metric` is not the name of a value", "such as `latent_fid`");
     }
-    let mut settings = stage.settings.clone();
-    let references: Vec<String> = settings.refs().into_iter().map(|reference| reference.field.into_owned()).collect();
+    let references = |settings: &StageSettings| -> Vec<String> {
+        settings.clone().refs().into_iter().map(|reference| reference.field.into_owned()).collect()
+    };
+    let (of_stage, of_evaluation) = (references(&stage.settings), references(&sweep.evaluate));
     for (path, domain) in &sweep.space {
         let field = format!("sweep.space.{path}");
-        let found = setting(&stage.settings, path).filter(|value| !value.is_object());
-        if found.is_none() || path == "kind" || path == "steps" || references.contains(path) {
+        let found = sweep.setting(&stage.settings, path).filter(|value| !value.is_object());
+        let (own, references) = match sweep::in_evaluation(path) {
+            Some(path) => (path, &of_evaluation),
+            None => (&path[..], &of_stage),
+        };
+        if found.is_none() || own == "kind" || own == "steps" || references.iter().any(|field| field == own) {
             p.add(&field, format!("`{}` is not a setting that can be searched", path.escape_debug()), "");
             continue;
         }
@@ -179,8 +186,9 @@ pub(super) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
             let Domain::Choice(values) = domain else { continue };
             for (at, value) in values.iter().enumerate() {
                 let values = Values::from([(path.clone(), value.clone())]);
-                let Ok(settings) = with_values(&stage.settings, &values) else { continue };
+                let Ok((settings, evaluation)) = sweep.with_values(&stage.settings, &values) else { continue };
                 all[i].settings = settings;
+                all[stages.len()].settings = evaluation;
                 let mut problems = ByStage::new();
                 graph::check_agreement(&all, &mut problems);
                 if let Some((other, problem)) =
@@ -192,6 +200,5 @@ pub(super) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
                 }
             }
         }
-        all[i] = stage.clone();
     }
 }

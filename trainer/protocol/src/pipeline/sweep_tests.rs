@@ -211,6 +211,50 @@ fn a_rung_is_the_stage_with_other_values_that_stops_early() {
     assert!(stage.rung(0, 0, None, &impossible).unwrap_err().contains("divisor"));
 }
 
+/// Settings of the stage that evaluates are searched beside, or instead of, those of the stage.
+#[test]
+fn what_evaluates_can_be_searched() {
+    let searched = "        evaluate: {samples: {choice: [1, 2]}, sampler: {guidance: {choice: [1, 2.5]}}}\n";
+    let space = GOOD.find("        adversarial").unwrap()..GOOD.find("      evaluate:").unwrap();
+    let mut text = GOOD.to_owned();
+    text.replace_range(space, searched);
+    let text = text.replace("search: asha", "search: grid").replace("      rungs: {first: 100, factor: 3}\n", "");
+    let text = text.replace("      trials: 24\n", "");
+    let pipeline = read("p.yaml", &text, &[]).unwrap_or_else(|e| panic!("{e}"));
+    pipeline.check().unwrap();
+    let stage = pipeline.stage(&"pcm".into()).unwrap();
+    let sweep = stage.sweep.as_ref().unwrap();
+    assert_eq!(sweep.space["evaluate.sampler.guidance"], Domain::Choice(vec![1.0.into(), 2.5.into()]));
+    assert_eq!(sweep.trials(), 4);
+    let values = |guidance: f64| Values::from([("evaluate.sampler.guidance".to_owned(), guidance.into())]);
+    let [train, eval] = stage.rung(0, 0, None, &values(1.0)).unwrap();
+    let [other, other_eval] = stage.rung(1, 0, None, &values(2.5)).unwrap();
+    assert_eq!(
+        (eval.settings.sampler().unwrap().guidance, other_eval.settings.sampler().unwrap().guidance),
+        (1.0, 2.5)
+    );
+    // They share one training, and differ in what measures it.
+    let inputs = BTreeMap::from([("teacher".to_owned(), Digest::of(b"t"))]);
+    assert_eq!(pipeline.identity(&train, &inputs), pipeline.identity(&other, &inputs));
+    assert_ne!(pipeline.identity(&eval, &inputs), pipeline.identity(&other_eval, &inputs));
+    let json = serde_json::to_string(&pipeline).unwrap();
+    assert_eq!(serde_json::from_str::<Pipeline>(&json).unwrap(), pipeline);
+
+    for (from, to, words) in [
+        ("samples:", "sampels:", "did you mean `samples`?"),
+        ("samples: {choice: [1, 2]}", "samples: {choice: [0]}", "with `evaluate.samples` at 0"),
+        ("samples: {choice: [1, 2]}", "model: {choice: [mld]}", "names a stage"),
+        ("samples: {choice: [1, 2]}", "kind: {choice: [x]}", "unknown key `kind`"),
+        ("guidance: {choice: [1, 2.5]}", "steps: {choice: [1, 2]}", "has 1 phase(s)"),
+        ("guidance: {choice: [1, 2.5]}", "guidance: {choice: [1, high]}", "expected a number"),
+        ("evaluate: {samples: {choice: [1, 2]}, sampler: {guidance: {choice: [1, 2.5]}}}", "evaluate: {}", "is empty"),
+    ] {
+        assert_eq!(text.matches(from).count(), 1, "{from}");
+        let shown = read("p.yaml", &text.replacen(from, to, 1), &[]).expect_err(to).to_string();
+        assert!(shown.contains("p.yaml:14:") && shown.contains(words), "{to}: {shown}");
+    }
+}
+
 #[test]
 fn nothing_changes_for_stages_without_a_sweep() {
     let pipeline = read("p.yaml", GOOD, &[]).unwrap();

@@ -6,7 +6,7 @@ use super::definition::{PipelineStage, StageInput};
 use super::graph;
 use super::rules::{Problem, Problems};
 use crate::stage::{Shape, StageSettings};
-use crate::sweep::{Derived, STATE_OUTPUT, Values, beside, evaluated_field, rung_name, with_values};
+use crate::sweep::{Derived, STATE_OUTPUT, Values, beside, evaluated_field, rung_name};
 use crate::{ArtifactKind, StageName, Steps};
 
 /// What is written behind the name of a swept stage to say that its best trial is meant. It always is.
@@ -63,7 +63,7 @@ impl PipelineStage {
     /// Why `values` cannot be tried, such as two that are each fine alone.
     pub fn rung(&self, trial: usize, rung: usize, stop: Option<Steps>, values: &Values) -> Result<[Self; 2], String> {
         let sweep = self.sweep.as_ref().ok_or("the stage has no sweep")?;
-        let mut settings = with_values(&self.settings, values)?;
+        let (mut settings, mut evaluation) = sweep.with_values(&self.settings, values)?;
         settings.training_mut().ok_or("the stage does not train")?.stop = stop;
         let name = rung_name(&self.name, trial, rung);
         let mut inputs = graph::references(&settings);
@@ -71,7 +71,6 @@ impl PipelineStage {
             let stage = rung_name(&self.name, trial, before);
             inputs.push(StageInput { field: STATE_OUTPUT.into(), stage, kind: ArtifactKind::Checkpoint });
         }
-        let mut evaluation = (*sweep.evaluate).clone();
         if let Some(field) = evaluated_field(&evaluation, self.settings.output().kind) {
             refer(&mut evaluation, &field, name.as_str());
         }

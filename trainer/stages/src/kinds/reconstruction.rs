@@ -120,7 +120,7 @@ impl Map for EvaluateReconstruction {
         let blobs = cx.blobs();
         let (_, dataset) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
         let dataset = artifacts::dataset(&*blobs, &dataset)?;
-        let measured = Reconstructor::read(cx)?;
+        let measured = Reconstructor::read(cx, self.decoder_steps)?;
         measured.check_format(dataset.format)?;
         let entries = dataset.entries_of(self.split);
         if entries.is_empty() {

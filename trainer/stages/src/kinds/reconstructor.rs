@@ -19,16 +19,18 @@ pub(super) enum Reconstructor {
 }
 
 impl Reconstructor {
-    /// Opens the inputs `vae` or `tokenizer`, and `decoder`, of which those are read that the stage has.
-    pub(super) fn read(cx: &dyn AttemptContext) -> Result<Self, StageError> {
+    /// Opens the inputs `vae` or `tokenizer`, and `decoder`, of which those are read that the stage has. A flow decoder makes `steps`, or as many
+    /// as it was trained with for 0.
+    pub(super) fn read(cx: &dyn AttemptContext, steps: usize) -> Result<Self, StageError> {
         let blobs = cx.blobs();
         let has = |field: &str| cx.task().inputs.contains_key(field);
-        let decoder = |role: &Role, encoder| match has("decoder") {
-            true => {
-                let (_, manifest) = artifacts::input(cx, "decoder", ArtifactKind::FlowDecoder)?;
-                FlowDecoder::read(&*blobs, &manifest, (role, encoder), &cx.device()).map(Some)
+        let decoder = |role: &Role, encoder| -> Result<Option<FlowDecoder>, StageError> {
+            if !has("decoder") {
+                return Ok(None);
             }
-            false => Ok(None),
+            let (_, manifest) = artifacts::input(cx, "decoder", ArtifactKind::FlowDecoder)?;
+            let decoder = FlowDecoder::read(&*blobs, &manifest, (role, encoder), &cx.device())?;
+            Ok(Some(if steps > 0 { decoder.with_steps(steps) } else { decoder }))
         };
         if !has("tokenizer") {
             let (digest, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;

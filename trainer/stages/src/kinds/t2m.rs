@@ -14,6 +14,7 @@
 
 mod maker;
 mod measure;
+mod perturbed;
 mod plan;
 
 use std::collections::BTreeMap;
@@ -158,6 +159,7 @@ impl Map for EvaluateT2m {
             "real": self.real,
             "reconstructed": self.reconstructs(),
             "shuffled": self.shuffled,
+            "perturbed": self.perturbed,
             "pools": self.pools,
             "drop_last": self.drop_last,
             "drawn_lengths": cx.task().inputs.contains_key("length"),

@@ -19,6 +19,9 @@ pub struct EvaluateReconstruction {
     pub tokenizer: String,
     /// Stage that gives the flow decoder that decodes the tokenizer's tokens, or the VAE's latents; the tokenizer's own, or the VAE's, if empty.
     pub decoder: String,
+    /// Steps of the flow decoder's solver, or jumps of a student, instead of those that it was trained with; 0 takes its own. A step of its
+    /// solver `midpoint` is two evaluations of the network, one of `euler` is one.
+    pub decoder_steps: usize,
     /// Stage that gives the evaluator in whose space FID is taken, of reconstructions against the clips themselves; no FID if empty.
     pub evaluator: String,
     /// Stage that gives the clips.
@@ -35,6 +38,7 @@ impl Default for EvaluateReconstruction {
             vae: "vae".into(),
             tokenizer: String::new(),
             decoder: String::new(),
+            decoder_steps: 0,
             evaluator: String::new(),
             dataset: "dataset".into(),
             split: Split::Test,
@@ -62,6 +66,11 @@ impl StageSpec for EvaluateReconstruction {
     }
 
     fn check(&self, p: &mut Problems) {
+        if self.decoder_steps > 0 && self.decoder.is_empty() {
+            let message =
+                format!("`decoder_steps` is {}, but there is no `decoder` that makes them", self.decoder_steps);
+            p.add("decoder_steps", message, "name the stage of a flow decoder");
+        }
         p.shards(self.shards);
     }
 

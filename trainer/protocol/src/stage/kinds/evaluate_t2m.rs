@@ -49,6 +49,9 @@ pub struct EvaluateT2m {
     pub real: bool,
     /// The control: captions are dealt to motions at random, so that retrieval is left to chance.
     pub shuffled: bool,
+    /// Probability that a word of what the model is told is exchanged for another of its meaning, of a table of ours; the evaluator reads the
+    /// caption itself. 0 tells it the caption.
+    pub perturbed: f64,
     /// Sampler.
     pub sampler: Sampler,
     /// Repeats with other noise, captions, crops and pools.
@@ -81,6 +84,7 @@ impl Default for EvaluateT2m {
             length: String::new(),
             real: false,
             shuffled: false,
+            perturbed: 0.0,
             sampler: Sampler::default(),
             repeats: 20,
             pools: vec![32],
@@ -130,8 +134,8 @@ impl StageSpec for EvaluateT2m {
             Ref::stage("evaluator", &mut self.evaluator, ArtifactKind::Evaluator),
             Ref::stage("model", &mut self.model, ArtifactKind::Model)
                 .only_if(generated)
-                // Shuffled captions say nothing of the model.
-                .measured_if(generated && !self.shuffled),
+                // Shuffled captions say nothing of the model, and others than its own not what it is registered with.
+                .measured_if(generated && !self.shuffled && self.perturbed == 0.0),
             Ref::stage("length", &mut self.length, ArtifactKind::Length).optional().only_if(generated),
             Ref::stage("vae", &mut self.vae, ArtifactKind::Vae).optional(),
             Ref::stage("tokenizer", &mut self.tokenizer, ArtifactKind::Tokenizer).optional(),
@@ -147,6 +151,10 @@ impl StageSpec for EvaluateT2m {
             p.add("length", message, "leave it out");
         }
         self.check_subject(p);
+        if self.perturbed > 0.0 && !self.generates() {
+            let message = "`perturbed` changes what a model is told, but no model is measured";
+            p.add("perturbed", message, "leave it out");
+        }
         p.positive("repeats", self.repeats);
         if self.pools.is_empty() {
             p.add(

@@ -38,7 +38,7 @@ impl Source {
             return Ok(Self::Real);
         }
         if plan.settings.reconstructs() {
-            let reconstructor = Reconstructor::read(cx)?;
+            let reconstructor = Reconstructor::read(cx, 0)?;
             reconstructor.check_format(plan.dataset.format)?;
             return Ok(Self::Reconstructed(reconstructor));
         }
@@ -107,7 +107,7 @@ impl<'a> Maker<'a> {
         seeds: &dyn Fn(usize, usize) -> Stream,
     ) -> Result<Vec<Vec<f32>>, StageError> {
         let captions: Vec<usize> = draws.iter().map(|d| d.caption).collect();
-        let texts = self.texts.get(&captions, |caption| plan.dataset.captions[caption].text.as_str())?;
+        let texts = self.texts.get(&captions, |caption| plan.told(caption))?;
         let lengths = draws.iter().map(|draw| self.frames(plan, *draw)).collect::<Result<Vec<usize>, StageError>>()?;
         let batch = Batch { texts: &texts, lengths: &lengths, seeds, control: None };
         generator::motions(&*self.generated.model, batch, &plan.settings.sampler, &mut |_| {})
@@ -118,7 +118,7 @@ impl<'a> Maker<'a> {
     fn frames(&self, plan: &Plan<'_>, draw: Draw) -> Result<usize, StageError> {
         let Some(lengths) = &self.generated.lengths else { return Ok(draw.len) };
         let model = &*self.generated.model;
-        let pooled = model.text().pooled(&[plan.dataset.captions[draw.caption].text.as_str()])?;
+        let pooled = model.text().pooled(&[plan.told(draw.caption)])?;
         let drawn = lengths.draw(&pooled, &mut plan.stream("length", draw.repeat, draw.number));
         Ok(drawn.min(model.longest()))
     }

@@ -1,12 +1,13 @@
 //! What all shards of an evaluation and its merge agree on: clips, captions, crops, and which of them a repeat leaves out.
 
 use motion::Stream;
-use motion::dataset::{Dataset, crop};
+use motion::dataset::{Caption, Dataset, crop};
 use motion::random::permutation;
 use protocol::stage::{EvaluateT2m, Split};
 use protocol::{ArtifactKind, Digest, Seed};
 use serde::{Deserialize, Serialize};
 
+use super::perturbed::said_otherwise;
 use crate::artifacts;
 use crate::context::{AttemptContext, StageError};
 use crate::evaluator::TrainedEvaluator;
@@ -56,6 +57,8 @@ pub(super) struct Plan<'a> {
     pub(super) evaluator: Digest,
     /// What they are of.
     pub(super) split: Split,
+    /// What a model is told instead of each of the dataset's captions; none if it is told those.
+    told: Vec<String>,
 }
 
 impl<'a> Plan<'a> {
@@ -92,7 +95,21 @@ impl<'a> Plan<'a> {
             ));
         }
         trained.check(&dataset, &entries)?;
-        Ok(Self { settings, seed: cx.task().seed, dataset, entries, split: taken, trained, evaluator })
+        let seed = cx.task().seed;
+        let tell = |(i, caption): (usize, &Caption)| {
+            let mut stream = Stream::new(seed, "evaluate.t2m/perturbed", 0, i as u64);
+            said_otherwise(&caption.text, settings.perturbed, &mut stream)
+        };
+        let told = match settings.perturbed > 0.0 {
+            true => dataset.captions.iter().enumerate().map(tell).collect(),
+            false => Vec::new(),
+        };
+        Ok(Self { settings, seed, dataset, entries, split: taken, trained, evaluator, told })
+    }
+
+    /// What a model is told for a caption.
+    pub(super) fn told(&self, caption: usize) -> &str {
+        self.told.get(caption).unwrap_or(&self.dataset.captions[caption].text)
     }
 
     pub(super) fn stream(&self, what: &str, repeat: usize, index: usize) -> Stream {

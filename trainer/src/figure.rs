@@ -1,0 +1,167 @@
+//! Curves in panels beside each other, as SVG: what one number does when another changes.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+
+use crate::print;
+
+const WIDTH: f64 = 460.0;
+const HEIGHT: f64 = 340.0;
+const LEFT: f64 = 80.0;
+const RIGHT: f64 = 20.0;
+const TOP: f64 = 64.0;
+const BOTTOM: f64 = 56.0;
+/// Panels beside each other.
+const COLUMNS: usize = 2;
+/// Colours of lines; a ninth has the first one's again.
+const COLOURS: [&str; 8] = ["#246ec8", "#d65430", "#2f8f5b", "#8a5bb5", "#c79a1b", "#4aa3b8", "#b0477a", "#6b6f76"];
+
+/// A linear axis; logarithmic where all values are positive and spread over more than a factor of 20.
+pub(crate) struct Axis {
+    low: f64,
+    high: f64,
+    logarithmic: bool,
+    from: f64,
+    to: f64,
+}
+
+impl Axis {
+    pub(crate) fn new(values: impl Iterator<Item = f64> + Clone, from: f64, to: f64) -> Self {
+        let low = values.clone().fold(f64::INFINITY, f64::min);
+        let high = values.fold(f64::NEG_INFINITY, f64::max);
+        let (low, high) = if low < high {
+            (low, high)
+        } else if low.is_finite() {
+            (low - 0.5, low + 0.5)
+        } else {
+            (0.0, 1.0)
+        };
+        Self { low, high, logarithmic: low > 0.0 && high / low > 20.0, from, to }
+    }
+
+    fn scale(&self, value: f64) -> f64 {
+        if self.logarithmic { value.ln() } else { value }
+    }
+
+    pub(crate) fn at(&self, value: f64) -> f64 {
+        let share = (self.scale(value) - self.scale(self.low)) / (self.scale(self.high) - self.scale(self.low));
+        self.from + share * (self.to - self.from)
+    }
+
+    pub(crate) fn marks(&self) -> Vec<f64> {
+        let mark = |i: i32| {
+            let scaled = self.scale(self.low) + f64::from(i) / 4.0 * (self.scale(self.high) - self.scale(self.low));
+            if self.logarithmic { scaled.exp() } else { scaled }
+        };
+        (0..=4).map(mark).collect()
+    }
+}
+
+/// One of the pictures: lines by name, each of points (x, y), and what the axes are.
+#[derive(Debug, Clone)]
+pub(crate) struct Panel {
+    pub(crate) x: String,
+    pub(crate) y: String,
+    pub(crate) lines: BTreeMap<String, Vec<(f64, f64)>>,
+}
+
+/// The picture. All panels are about the same lines, whose names stand above them where there are several. Points that are no numbers are left out.
+pub(crate) fn svg(title: &str, panels: &[Panel]) -> String {
+    let names: Vec<&String> = panels.first().map(|panel| panel.lines.keys().collect()).unwrap_or_default();
+    let columns = panels.len().clamp(1, COLUMNS);
+    let (width, height) = (WIDTH * columns as f64, 28.0 + HEIGHT * panels.len().div_ceil(COLUMNS) as f64);
+    let mut out = String::new();
+    // Writing to a text cannot fail.
+    let _ = writeln!(
+        out,
+        r##"<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" viewBox="0 0 {width} {height}" font-family="sans-serif" font-size="12" fill="#282a30">
+<rect width="{width}" height="{height}" fill="#fafaf8"/>
+<text x="{LEFT}" y="24" font-size="15">{}</text>"##,
+        escape(title)
+    );
+    for (i, panel) in panels.iter().enumerate() {
+        let (x, y) = (WIDTH * (i % COLUMNS) as f64, 28.0 + HEIGHT * (i / COLUMNS) as f64);
+        let _ = writeln!(out, r#"<g transform="translate({x},{y})">"#);
+        draw(&mut out, panel, &names);
+        let _ = writeln!(out, "</g>");
+    }
+    out + "</svg>\n"
+}
+
+fn draw(out: &mut String, panel: &Panel, names: &[&String]) {
+    let finite = |points: &Vec<(f64, f64)>| -> Vec<(f64, f64)> {
+        points.iter().copied().filter(|(x, y)| x.is_finite() && y.is_finite()).collect()
+    };
+    let lines: Vec<(&String, Vec<(f64, f64)>)> =
+        panel.lines.iter().map(|(name, points)| (name, finite(points))).collect();
+    let all: Vec<(f64, f64)> = lines.iter().flat_map(|(_, points)| points.iter().copied()).collect();
+    let x = Axis::new(all.iter().map(|point| point.0), LEFT, WIDTH - RIGHT);
+    let y = Axis::new(all.iter().map(|point| point.1), HEIGHT - BOTTOM, TOP);
+    let mut line = |text: std::fmt::Arguments<'_>| {
+        let _ = writeln!(out, "{text}");
+    };
+    for mark in y.marks() {
+        let (at, end, label) = (y.at(mark), WIDTH - RIGHT, print::number(mark));
+        line(format_args!(r##"<line x1="{LEFT}" x2="{end}" y1="{at:.1}" y2="{at:.1}" stroke="#dedfe0"/>"##));
+        line(format_args!(r#"<text x="{:.1}" y="{:.1}" text-anchor="end">{label}</text>"#, LEFT - 8.0, at + 4.0));
+    }
+    // The values themselves where they are few.
+    let mut values: Vec<f64> = all.iter().map(|point| point.0).collect();
+    values.sort_by(f64::total_cmp);
+    values.dedup();
+    let marks = if (1..=8).contains(&values.len()) { values } else { x.marks() };
+    for mark in marks {
+        let whole = mark.fract() == 0.0 && mark.abs() < 1e6;
+        let label = if whole { format!("{mark:.0}") } else { print::number(mark) };
+        let (at, bottom) = (x.at(mark), HEIGHT - BOTTOM);
+        line(format_args!(r##"<line x1="{at:.1}" x2="{at:.1}" y1="{TOP}" y2="{bottom}" stroke="#dedfe0"/>"##));
+        line(format_args!(r#"<text x="{at:.1}" y="{}" text-anchor="middle">{label}</text>"#, bottom + 18.0));
+    }
+    let middle = (LEFT + WIDTH - RIGHT) / 2.0;
+    let (below, label) = (HEIGHT - 14.0, escape(&panel.x));
+    line(format_args!(r#"<text x="{middle}" y="{below}" text-anchor="middle">{label}</text>"#));
+    line(format_args!(r#"<text x="{LEFT}" y="{}" font-weight="bold">{}</text>"#, TOP - 34.0, escape(&panel.y)));
+    for (i, (name, points)) in lines.iter().enumerate() {
+        let colour = COLOURS[i % COLOURS.len()];
+        let name = escape(name);
+        let path: Vec<String> = points.iter().map(|(a, b)| format!("{:.1},{:.1}", x.at(*a), y.at(*b))).collect();
+        line(format_args!(r#"<g stroke="{colour}" fill="{colour}"><title>{name}</title>"#));
+        line(format_args!(r#"<polyline points="{}" fill="none" stroke-width="1.8"/>"#, path.join(" ")));
+        for (a, b) in points {
+            line(format_args!(r#"<circle cx="{:.1}" cy="{:.1}" r="2.5"/>"#, x.at(*a), y.at(*b)));
+        }
+        line(format_args!("</g>"));
+        if names.len() > 1 {
+            let at = LEFT + (WIDTH - LEFT - RIGHT) / names.len() as f64 * i as f64;
+            line(format_args!(r#"<text x="{at:.1}" y="{}" fill="{colour}">{name}</text>"#, TOP - 14.0));
+        }
+    }
+}
+
+/// Text as it may stand in SVG.
+pub(crate) fn escape(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('"', "&quot;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn curves_lie_inside_their_panels_and_have_their_names() {
+        let lines = BTreeMap::from([
+            ("ddim".to_owned(), vec![(1.0, 0.5), (2.0, 0.4), (50.0, f64::NAN)]),
+            ("dpm & <co>".to_owned(), vec![(1.0, 0.6), (50.0, 0.01)]),
+        ]);
+        let panel = Panel { x: "steps".into(), y: "fid".into(), lines };
+        let picture = svg("a title", &[panel.clone(), panel.clone(), panel]);
+        assert_eq!((picture.matches("<polyline").count(), picture.matches("<circle").count()), (6, 12));
+        assert!(picture.contains("dpm &amp; &lt;co>") && !picture.contains("NaN"), "{picture}");
+        for circle in picture.split("<circle cx=\"").skip(1) {
+            let x: f64 = circle.split('"').next().unwrap().parse().unwrap();
+            let y: f64 = circle.split("cy=\"").nth(1).unwrap().split('"').next().unwrap().parse().unwrap();
+            assert!((LEFT..=WIDTH - RIGHT).contains(&x) && (TOP..=HEIGHT - BOTTOM).contains(&y), "{x} {y}");
+        }
+        assert!(svg("nothing", &[]).ends_with("</svg>\n"));
+    }
+}
