@@ -4,6 +4,7 @@ mod args;
 mod config;
 mod control;
 mod data;
+mod door;
 mod export;
 mod gallery;
 mod generate;
@@ -14,6 +15,7 @@ mod remote;
 mod sampler;
 mod sentences;
 mod serve;
+mod stream;
 pub(crate) mod sweep;
 mod time;
 

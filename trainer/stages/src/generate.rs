@@ -161,6 +161,11 @@ impl Generator {
         Ok(Edited { motion, kept: spans.filter(|(kept, _)| *kept).map(|(_, span)| span).collect() })
     }
 
+    /// Frames of a piece that [`edit`](Self::edit) keeps or draws as a whole; `None` if the model draws whole motions alone.
+    pub fn infilling_unit(&self) -> Option<usize> {
+        self.model.infilling().map(|infilling| infilling.unit())
+    }
+
     /// Whether the model makes anything of `prompt`. What it knows nothing of it reads as the empty sentence, and so draws without being told what: the built-in encoder
     /// has words of Latin letters and digits alone.
     pub fn knows(&self, prompt: &str) -> Result<bool, StageError> {
