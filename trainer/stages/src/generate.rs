@@ -95,6 +95,12 @@ impl Generator {
         Ok(Self { model, lengths, sampler: parts.sampler })
     }
 
+    /// A model that is none of a file.
+    #[cfg(test)]
+    pub(crate) fn of(model: Box<dyn MotionGenerator>) -> Self {
+        Self { model, lengths: None, sampler: None }
+    }
+
     /// How motions are drawn when nobody says: as the model was measured, or as the papers draw from its kind if nobody measured it.
     pub fn sampler(&self) -> Sampler {
         self.sampler.clone().unwrap_or_else(|| self.model.family().published())

@@ -375,3 +375,6 @@ impl MotionStream {
         (world, off)
     }
 }
+
+#[cfg(test)]
+mod tests;
