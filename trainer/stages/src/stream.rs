@@ -164,7 +164,8 @@ impl MotionStream {
                 percent = control.hints.density.1;
             }
         }
-        let longest = generator.longest() / unit * unit;
+        // What it could draw beyond the longest clips of the benchmark it has never seen.
+        let longest = generator.longest().min(skeleton.max_frames - 1) / unit * unit;
         let stream = Self {
             settings,
             joining,

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use stages::stream::{Ask, MotionStream, Segment};
 use tokio::sync::{mpsc, oneshot};
 
-use super::{Beginning, Opening};
+use super::opening::{Beginning, Opening};
 use crate::problem::{Problem, Result};
 
 /// A segment with the time that it took, or why there is none.

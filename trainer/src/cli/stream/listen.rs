@@ -29,8 +29,9 @@ use tokio::time::{sleep, timeout};
 use super::course::Pace;
 use super::engine::Engine;
 use super::line::{self, Line, MOST_BYTES};
+use super::opening::{Beginning, Opening, StreamArgs};
+use super::real;
 use super::report::Real;
-use super::{Beginning, Opening, StreamArgs, real};
 use crate::print;
 use crate::problem::{Problem, Result, exit};
 

@@ -12,9 +12,9 @@ use stages::generate::Generator;
 use stages::stream::{MotionStream, Segment};
 
 use super::super::{model, out};
-use super::Beginning;
 use super::course::{Course, Pace};
 use super::line::{self, Form, Line, QUEUE};
+use super::opening::Beginning;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result};
 

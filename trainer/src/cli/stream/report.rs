@@ -177,7 +177,7 @@ impl Meter {
         let Self { frames, segments, latency, .. } = self;
         let (sustained, rate) = (self.sustained(), self.rate());
         let mut text = format!(
-            "{frames} frames in {segments} segments; {sustained:.0} frames a second, {:.1} times real time (drawing alone {rate:.0}, {:.1} times)\n\
+            "{frames} frames in {segments} segment(s); {sustained:.0} frames a second, {:.1} times real time (drawing alone {rate:.0}, {:.1} times)\n\
              {:.0} ms from a sentence to its first frame in the mean of {}, {:.0} ms at worst",
             sustained / self.fps,
             rate / self.fps,
@@ -187,7 +187,7 @@ impl Meter {
         );
         if self.overlap.count > 0 {
             text += &format!(
-                "\njoined by {} over {:.0} frames; joints were up to {:.1} cm off at the junctions, {:.1} in the mean, which faded",
+                "\njoined by {} over {:.0} frame(s); joints were up to {:.1} cm off at the junctions, {:.1} in the mean, which faded",
                 self.joining.name(),
                 self.overlap.mean(),
                 100.0 * self.offset.largest,
