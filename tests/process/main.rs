@@ -20,6 +20,7 @@ mod reading;
 mod registry;
 mod results;
 mod storage;
+mod streaming;
 mod sweeps;
 mod tokens;
 mod verify;

@@ -53,7 +53,7 @@ pub fn words(line: &str) -> Vec<String> {
     words
 }
 
-/// All command lines of `program` in the documents of the repository at `root`, each as its words.
+/// All command lines of `program` in the documents of the repository at `root`, each as its words without what the shell reads (`< FILE`).
 pub fn commands(root: &Path, program: &str) -> Vec<Vec<String>> {
     let lines = DOCUMENTS.iter().flat_map(|document| shell_lines(&root.join(document), None));
     let through_cargo = format!("cargo run --release --bin {program} -- ");
@@ -61,7 +61,8 @@ pub fn commands(root: &Path, program: &str) -> Vec<Vec<String>> {
         Some(rest) => format!("{program} {rest}"),
         None => line,
     });
-    lines.map(|line| words(&line)).filter(|words| words.first().is_some_and(|first| first == program)).collect()
+    let own = |line: String| words(&line).into_iter().take_while(|word| word != "<").collect::<Vec<_>>();
+    lines.map(own).filter(|words| words.first().is_some_and(|first| first == program)).collect()
 }
 
 #[cfg(test)]

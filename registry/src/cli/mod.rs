@@ -177,6 +177,9 @@ pub enum Data {
         /// For each part of a model those that it was made for.
         #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
         fits: BTreeMap<Role, Parts>,
+        /// Versions of any model that a control part was made beside, as `MODEL:VERSION`; the newest [`MOST_BASES`] are looked at.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        bases: Vec<String>,
     },
     /// Of `history`.
     History { model: ModelName, history: Vec<Promotion> },
@@ -468,6 +471,9 @@ fn exists(store: &ReadStore, digest: Digest) -> Result<bool, Refused> {
     store.blobs().exists(digest).map_err(|e| Refused::from(QueryError::Blob(e.to_string())))
 }
 
+/// Versions that are looked at for bases of a control part.
+pub const MOST_BASES: usize = 1_000;
+
 async fn show(store: &ReadStore, text: &str) -> Result<Data, Refused> {
     let reference: ModelRef = text.parse().map_err(invalid)?;
     if reference.pick.is_none() {
@@ -478,7 +484,30 @@ async fn show(store: &ReadStore, text: &str) -> Result<Data, Refused> {
     let version = store.resolve(text).await?;
     let manifest = store.blobs().manifest(version.artifact).map_err(|e| QueryError::Blob(e.to_string()))?;
     let fits = fits(store, &manifest)?;
-    Ok(Data::Version { version, manifest, fits })
+    let bases = match fits.get(&Role::CONTROL) {
+        Some(wanted) => bases(store, &version, wanted).await?,
+        None => Vec::new(),
+    };
+    Ok(Data::Version { version, manifest, fits, bases })
+}
+
+/// Other versions whose parts are those that are `wanted`: the models that a control part fits.
+async fn bases(store: &ReadStore, own: &Version, wanted: &Parts) -> Result<Vec<String>, Refused> {
+    let mut all = Vec::new();
+    for model in store.models().await? {
+        all.extend(store.versions(&model.model).await?);
+    }
+    all.sort_by_key(|version| std::cmp::Reverse(version.created_ms));
+    let mut bases = Vec::new();
+    for version in all.iter().take(MOST_BASES).filter(|version| version.artifact != own.artifact) {
+        // What is no model, or is damaged, is no base; `fsck` says so.
+        let Ok(manifest) = store.blobs().manifest(version.artifact) else { continue };
+        let Ok(model) = ModelMeta::read(&manifest) else { continue };
+        if wanted.iter().all(|(role, digest)| model.parts.get(role) == Some(digest)) {
+            bases.push(format!("{}:{}", version.model, version.version));
+        }
+    }
+    Ok(bases)
 }
 
 /// For each part of a model those that it was made for; nothing for what is no model.

@@ -81,7 +81,7 @@ pub fn render(data: &Data) -> String {
             }
             format!("{}\n{}\n", model.model, table.trim_fmt())
         }
-        Data::Version { version, manifest, fits } => {
+        Data::Version { version, manifest, fits, bases } => {
             let mut text = format!("{}:{}\n", version.model, version.version);
             let lines = [
                 ("artifact", version.artifact.to_string()),
@@ -89,7 +89,7 @@ pub fn render(data: &Data) -> String {
                 ("from", source(version)),
                 ("registered", format_ms(version.created_ms)),
             ];
-            for (name, value) in lines.into_iter().chain(drawn(manifest)).chain(made_for(fits)) {
+            for (name, value) in lines.into_iter().chain(drawn(manifest)).chain(made_for(fits)).chain(beside(bases)) {
                 text += &format!("  {name:<11} {value}\n");
             }
             let mut values = table(&["EVALUATION", "METRIC", "VALUE, ± HALF THE 95 % INTERVAL"]);
@@ -253,6 +253,11 @@ fn made_for(fits: &BTreeMap<Role, Parts>) -> Option<(&'static str, String)> {
         format!("{role} for {}", each.collect::<Vec<_>>().join(" and "))
     };
     (!fits.is_empty()).then(|| ("fits", list(fits.iter().map(one))))
+}
+
+/// Versions that a control part was made beside.
+fn beside(bases: &[String]) -> Option<(&'static str, String)> {
+    (!bases.is_empty()).then(|| ("bases", list(bases.iter().cloned())))
 }
 
 fn source(version: &Version) -> String {

@@ -407,6 +407,11 @@ impl Outs {
         Ok(outs)
     }
 
+    /// Whether nothing is to be written.
+    pub fn is_empty(&self) -> bool {
+        self.alone.is_empty() && self.together.is_empty()
+    }
+
     /// Whether motions are needed again when all of them are drawn.
     pub fn wants_all(&self) -> bool {
         !self.together.is_empty()

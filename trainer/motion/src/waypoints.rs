@@ -67,6 +67,38 @@ pub fn read(file: &Path, skeleton: &Skeleton, joints: &[String]) -> Result<Vec<W
     waypoints(&lines, skeleton, &told).map_err(named)
 }
 
+/// Waypoints of a JSON value, as a `.json` file holds it; `joints` as for [`read`].
+///
+/// # Errors
+/// What is wrong with it, with its place and what was expected.
+pub fn of_json(value: &Value, skeleton: &Skeleton, joints: &[String]) -> Result<Vec<Waypoint>, String> {
+    let told: Vec<usize> = joints.iter().map(|name| number(name, skeleton)).collect::<Result<_, _>>()?;
+    waypoints(&of_value(value)?, skeleton, &told)
+}
+
+/// Refuses a first waypoint of the root that it cannot reach from where it stands as the motion begins, `start` in metres: faster than 10 m/s, and at once
+/// farther than it would come in a frame.
+///
+/// # Errors
+/// How fast it would have to be.
+pub fn check_start(waypoints: &[Waypoint], skeleton: &Skeleton, start: [f64; 3]) -> Result<(), String> {
+    let Some(first) = waypoints.iter().filter(|waypoint| waypoint.joint == 0).min_by_key(|waypoint| waypoint.frame)
+    else {
+        return Ok(());
+    };
+    let far = [0, 2].map(|axis| f64::from(first.position[axis]) - start[axis]);
+    let far = far[0].hypot(far[1]);
+    let speed = far * skeleton.fps / first.frame.max(1) as f64;
+    if speed > FASTEST {
+        let (name, seconds) = (skeleton.names[0], first.frame as f64 / skeleton.fps);
+        return Err(format!(
+            "`{name}` begins at x = {:.2}, z = {:.2} and would move at {speed:.1} m/s to be {far:.2} m from there at {seconds:.2} s; expected at most {FASTEST} m/s",
+            start[0], start[2]
+        ));
+    }
+    Ok(())
+}
+
 fn number(name: &str, skeleton: &Skeleton) -> Result<usize, String> {
     skeleton.names.iter().position(|known| *known == name).ok_or_else(|| {
         format!(
@@ -138,6 +170,10 @@ fn csv(text: &str) -> Result<Vec<Line>, String> {
 
 fn json(text: &str) -> Result<Vec<Line>, String> {
     let value: Value = serde_json::from_str(text).map_err(|error| format!("is no JSON: {error}"))?;
+    of_value(&value)
+}
+
+fn of_value(value: &Value) -> Result<Vec<Line>, String> {
     let rows = |list: &Value, joint: Option<&str>, at: &str| -> Result<Vec<Line>, String> {
         let list = list.as_array().ok_or_else(|| format!("{at}: expected a list of [t, x, y, z]"))?;
         let row = |(i, row): (usize, &Value)| {
@@ -153,7 +189,7 @@ fn json(text: &str) -> Result<Vec<Line>, String> {
         };
         list.iter().enumerate().map(row).collect()
     };
-    match &value {
+    match value {
         Value::Object(joints) => {
             let each = joints.iter().map(|(joint, list)| rows(list, Some(joint), joint));
             Ok(each.collect::<Result<Vec<_>, _>>()?.concat())
@@ -263,6 +299,21 @@ mod tests {
         let plain = from("a.csv", "x,y,z,t\n1,2,3,0.1\n", &["head"]).unwrap();
         assert_eq!((plain[0].joint, plain[0].frame, plain[0].position), (15, 2, [1.0, 2.0, 3.0]));
         assert_eq!(from("a.json", "[[0, 0, 1, 0]]", &[]).unwrap()[0].joint, 0);
+    }
+
+    #[test]
+    fn the_first_waypoint_is_reached_from_where_the_body_stands() {
+        let told = |t: &str| from("a.csv", &format!("t,x,y,z\n{t}\n"), &[]).unwrap();
+        let check = |t: &str, start| check_start(&told(t), body(), start);
+        assert_eq!(check("0,0,0.9,0.3", [0.0; 3]), Ok(()), "as far as a frame allows");
+        assert_eq!(check("1,3,0.9,4", [0.0; 3]), Ok(()));
+        let refused = check("0,3,0.9,4", [0.0; 3]).unwrap_err();
+        assert!(refused.contains("100.0 m/s") && refused.contains("5.00 m"), "{refused}");
+        assert!(check("1,3,0.9,4", [-30.0, 0.0, 0.0]).is_err(), "it stands elsewhere");
+        assert_eq!(check_start(&from("a.csv", "t,x,y,z\n0,9,1,9\n", &["head"]).unwrap(), body(), [0.0; 3]), Ok(()));
+        let value = serde_json::json!([[0, 0, 0.9, 0], [0.5, 0, 0.9, 1]]);
+        assert_eq!(of_json(&value, body(), &[]).unwrap().len(), 2);
+        assert!(of_json(&value, body(), &["tail".to_owned()]).unwrap_err().contains("`tail`"));
     }
 
     #[test]

@@ -27,13 +27,13 @@ pub(super) struct ControlArgs {
     #[arg(long, value_name = "FILE", conflicts_with = "edit")]
     control: Option<PathBuf>,
     /// Joints that are told, such as pelvis,left_wrist [default: those that the file names, else the pelvis]
-    #[arg(long, value_name = "NAMES", value_delimiter = ',', requires = "control")]
+    #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     joints: Vec<String>,
-    /// How strongly positions are heeded; 1 as trained, 0 not at all
-    #[arg(long, value_name = "S", default_value_t = 1.0, requires = "control")]
-    control_scale: f64,
+    /// How strongly positions are heeded; 0 not at all [default: 1, as trained]
+    #[arg(long, value_name = "S")]
+    control_scale: Option<f64>,
     /// Takes the control part of another model, MODEL@ALIAS or MODEL:VERSION, which must have been trained for this one
-    #[arg(long, value_name = "MODEL", requires = "control")]
+    #[arg(long, value_name = "MODEL", visible_alias = "control-part")]
     control_from: Option<String>,
 }
 
@@ -64,6 +64,35 @@ impl ControlArgs {
         self.control.is_some()
     }
 
+    /// Refuses options that say how to heed a path where nobody may give one.
+    pub(super) fn check(&self, streams: bool) -> Result<()> {
+        let scale = self.control_scale.unwrap_or(1.0);
+        if !(scale >= 0.0 && scale.is_finite()) {
+            return Err(Problem::usage(format!("`--control-scale` is {scale}; expected 0 or more")));
+        }
+        let given = [
+            (!self.joints.is_empty(), "joints"),
+            (self.control_scale.is_some(), "control-scale"),
+            (self.control_from.is_some(), "control-from"),
+        ];
+        match given.into_iter().find(|(given, _)| *given && !streams && self.control.is_none()) {
+            None => Ok(()),
+            Some((_, name)) => {
+                Err(Problem::usage(format!("`--{name}` says nothing without `--control` or `--stream`")))
+            }
+        }
+    }
+
+    /// How strongly positions are heeded.
+    pub(super) fn scale(&self) -> f64 {
+        self.control_scale.unwrap_or(1.0)
+    }
+
+    /// Joints that are told.
+    pub(super) fn joints(&self) -> &[String] {
+        &self.joints
+    }
+
     /// `found` with the control part of another model, if one is named.
     pub(super) async fn completed(&self, reader: &Reader, mut found: Found) -> Result<Found> {
         let Some(name) = &self.control_from else { return Ok(found) };
@@ -87,9 +116,6 @@ impl ControlArgs {
     /// What a motion for a model is told; `None` without a path. Without `frames` it ends with the path.
     pub(super) fn told(&self, generator: &Generator, label: &str, frames: Option<usize>) -> Result<Option<Told>> {
         let Some(file) = &self.control else { return Ok(None) };
-        if !(self.control_scale >= 0.0 && self.control_scale.is_finite()) {
-            return Err(Problem::usage(format!("`--control-scale` is {}; expected 0 or more", self.control_scale)));
-        }
         if generator.control().is_none() {
             return Err(
                 Problem::usage(format!("{label} has no control part, and so cannot be told where to go")).hint(TRAIN)
@@ -97,6 +123,8 @@ impl ControlArgs {
         }
         let skeleton = Skeleton::of(generator.format());
         let waypoints = waypoints::read(file, skeleton, &self.joints).map_err(Problem::usage)?;
+        waypoints::check_start(&waypoints, skeleton, [0.0; 3])
+            .map_err(|why| Problem::usage(format!("`{}`: {why}", file.display())))?;
         let end = waypoints.iter().map(|waypoint| waypoint.frame + 1).max().unwrap_or_default();
         let frames = frames.unwrap_or_else(|| end.next_multiple_of(skeleton.unit).max(skeleton.min_frames));
         if let Some(outside) = waypoints.iter().find(|waypoint| waypoint.frame >= frames) {
@@ -120,12 +148,12 @@ impl ControlArgs {
         }
         let mut hint = Hint::none(frames, skeleton.joints);
         waypoints.iter().for_each(|waypoint| hint.tell(waypoint.frame, waypoint.joint, waypoint.position));
-        Ok(Some(Told { hint, scale: self.control_scale, waypoints }))
+        Ok(Some(Told { hint, scale: self.scale(), waypoints }))
     }
 }
 
 /// What to do about a model without a control part.
-const TRAIN: &str = "a `train.control` stage gives a model that has one";
+pub(super) const TRAIN: &str = "a `train.control` stage gives a model that has one";
 
 impl Told {
     /// Positions and how strongly they are heeded.

@@ -20,15 +20,17 @@ use super::out::{self, OutArgs};
 use super::remote::check_parent;
 use super::sampler::SamplerArgs;
 use super::sentences::SentenceArgs;
+use super::stream::{self, Opening, StreamArgs};
 use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result};
 use crate::reader::Reader;
 
 #[derive(Debug, Args)]
+#[command(mut_arg("out", |out| out.required(false).required_unless_present("stream")))]
 pub(crate) struct GenerateArgs {
     /// What the motion should be, in words; several sentences make several motions
-    #[arg(required_unless_present = "captions")]
+    #[arg(required_unless_present_any = ["captions", "stream"])]
     prompt: Vec<String>,
     /// MODEL@ALIAS, MODEL@best or MODEL:VERSION
     #[arg(short, long, required_unless_present = "stage", conflicts_with = "stage")]
@@ -67,6 +69,8 @@ pub(crate) struct GenerateArgs {
     features: Option<PathBuf>,
     #[command(flatten)]
     target: Target,
+    #[command(flatten, next_help_heading = "Streaming")]
+    stream: StreamArgs,
 }
 
 /// A motion of the report.
@@ -127,22 +131,42 @@ impl GenerateArgs {
     }
 }
 
-pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
-    let requests = args.sentences.requests(&args.prompt, &[])?;
-    let seeds = args.sentences.seeds();
-    let count = requests.len() * seeds.len();
-    args.check(&requests)?;
-    let outs = args.out.files(count)?;
-    let start = Instant::now();
+/// The model, with the control part that is wanted.
+async fn found(args: &GenerateArgs) -> Result<Found> {
     let reader = Reader::open(&args.target).await?;
     let found = match (&args.stage, &args.model) {
         (Some(stage), _) => model::stage(&reader, &reader.find(&args.run).await?, stage).await?,
         (None, model) => model::version(&reader, model.as_deref().unwrap_or_default()).await?,
     };
     let found = args.control.completed(&reader, found).await?;
-    let Found { manifest, blobs, label, measured } = found;
-    let label = label.to_string();
     reader.close().await;
+    Ok(found)
+}
+
+async fn stream(args: GenerateArgs) -> Result<u8> {
+    // Names of files are looked at before the model.
+    args.out.files(1)?;
+    let found = found(&args).await?;
+    let (device, _) = model::device(args.backend.as_deref())?;
+    let GenerateArgs { stream, steps, sampler, sentences, control, out, .. } = args;
+    let (seed, scale, joints) = (sentences.seed(), control.scale(), control.joints().to_vec());
+    let opening = Opening { found, device, steps, sampler, seed, scale, joints };
+    stream::stream(stream, opening, out, |fps| sentences.bound(fps)).await
+}
+
+pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
+    args.control.check(args.stream.is_wanted())?;
+    if args.stream.is_wanted() {
+        return stream(args).await;
+    }
+    let requests = args.sentences.requests(&args.prompt, &[])?;
+    let seeds = args.sentences.seeds();
+    let count = requests.len() * seeds.len();
+    args.check(&requests)?;
+    let outs = args.out.files(count)?;
+    let start = Instant::now();
+    let Found { manifest, blobs, label, measured } = found(&args).await?;
+    let label = label.to_string();
     let (device, _) = model::device(args.backend.as_deref())?;
     let generator = Generator::load(&manifest, &blobs, &device).map_err(Problem::failed)?;
     let loaded = start.elapsed();

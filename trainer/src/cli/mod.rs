@@ -4,6 +4,7 @@ mod args;
 mod config;
 mod control;
 mod data;
+mod door;
 mod export;
 mod gallery;
 mod generate;
@@ -15,6 +16,7 @@ mod sampler;
 mod sentences;
 mod serve;
 mod spectrum;
+mod stream;
 pub(crate) mod sweep;
 mod time;
 

@@ -76,6 +76,28 @@ impl SentenceArgs {
         (0..u64::from(self.seeds)).map(|k| self.seed.wrapping_add(k)).collect()
     }
 
+    /// The seed.
+    pub(super) fn seed(&self) -> u64 {
+        self.seed
+    }
+
+    /// Frames after which a stream ends, if it does.
+    ///
+    /// # Errors
+    /// Several lengths.
+    pub(super) fn bound(&self, fps: f64) -> Result<Option<u64>> {
+        let frames = self.frames.iter().map(|frames| Length::Frames(*frames as usize));
+        let lengths: Vec<Length> = frames.chain(self.seconds.iter().copied()).collect();
+        match lengths.as_slice() {
+            [] => Ok(None),
+            [one] => Ok(Some(one.frames(fps) as u64)),
+            each => {
+                let why = format!("{} lengths for one stream; lengths of sentences stand in their lines", each.len());
+                Err(Problem::usage(why))
+            }
+        }
+    }
+
     /// Whether somebody says how long motions should be.
     pub(super) fn have_length(requests: &[Request]) -> bool {
         requests.iter().any(|request| request.length.is_some())

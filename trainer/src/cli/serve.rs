@@ -9,6 +9,7 @@ use coordinator::{Config, Coordinator};
 use registry::{Holder, Store};
 use tokio::signal::unix::{SignalKind, signal};
 
+use super::door::DoorArgs;
 use crate::problem::{Problem, Result};
 use crate::{client, print};
 
@@ -25,18 +26,8 @@ pub(crate) struct ServeArgs {
     bind: SocketAddr,
     #[command(flatten)]
     token: TokenOptions,
-    /// Certificate (PEM) for TLS, with those that sign it
-    #[arg(long, env = "STRIDE_TLS_CERT", value_name = "FILE", requires = "tls_key")]
-    tls_cert: Option<PathBuf>,
-    /// Its private key (PEM), closed to other users
-    #[arg(long, env = "STRIDE_TLS_KEY", value_name = "FILE", requires = "tls_cert")]
-    tls_key: Option<PathBuf>,
-    /// Listen beyond this machine without TLS: anybody who sees the traffic has the tokens
-    #[arg(long)]
-    insecure: bool,
-    /// A name by which callers know this server, besides the machine's own; may be repeated
-    #[arg(long, env = "STRIDE_HOST", value_name = "NAME", value_delimiter = ',')]
-    host: Vec<String>,
+    #[command(flatten)]
+    door: DoorArgs,
     /// The store's folder
     #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR")]
     store: PathBuf,
@@ -53,10 +44,7 @@ impl ServeArgs {
         if let Some(token) = &self.token.token {
             tokens.add("admin", Scopes::all(), token);
         }
-        let tls = self.tls_cert.as_deref().zip(self.tls_key.as_deref());
-        let tls = tls.map(|(certificate, key)| access::tls::server(certificate, key)).transpose()?;
-        let (hosts, insecure) = (self.host.clone(), self.insecure);
-        Ok(Config { hosts, tls, insecure, ..Config::server(self.bind, tokens) })
+        self.door.config(self.bind, tokens)
     }
 }
 

@@ -95,6 +95,12 @@ impl Generator {
         Ok(Self { model, lengths, sampler: parts.sampler })
     }
 
+    /// A model that is none of a file.
+    #[cfg(test)]
+    pub(crate) fn of(model: Box<dyn MotionGenerator>) -> Self {
+        Self { model, lengths: None, sampler: None }
+    }
+
     /// How motions are drawn when nobody says: as the model was measured, or as the papers draw from its kind if nobody measured it.
     pub fn sampler(&self) -> Sampler {
         self.sampler.clone().unwrap_or_else(|| self.model.family().published())
@@ -159,6 +165,11 @@ impl Generator {
             Some((run[0], span))
         });
         Ok(Edited { motion, kept: spans.filter(|(kept, _)| *kept).map(|(_, span)| span).collect() })
+    }
+
+    /// Frames of a piece that [`edit`](Self::edit) keeps or draws as a whole; `None` if the model draws whole motions alone.
+    pub fn infilling_unit(&self) -> Option<usize> {
+        self.model.infilling().map(|infilling| infilling.unit())
     }
 
     /// Whether the model makes anything of `prompt`. What it knows nothing of it reads as the empty sentence, and so draws without being told what: the built-in encoder

@@ -17,6 +17,7 @@ pub mod motion_networks;
 pub mod networks;
 pub mod parts;
 mod solo;
+pub mod stream;
 pub mod testing;
 pub mod text;
 pub mod timing;

@@ -5,6 +5,7 @@ pub mod frechet;
 pub mod interval;
 pub mod jerk;
 pub mod joints;
+pub mod junction;
 pub mod latent_fid;
 pub mod procrustes;
 pub mod recognition;

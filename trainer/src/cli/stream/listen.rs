@@ -1,0 +1,283 @@
+//! Streams over WebSockets: `GET /v1/stream` with a token of scope `read`, then a message a sentence in, a message a frame out.
+//!
+//! Nothing is computed before the token is checked and a place is free. What a client may cost is bounded: places, the size of a message, sentences
+//! that wait (more are not read, so that TCP holds the sender back), one segment of frames (the next is drawn when it has been sent), the time that a frame may take to
+//! be sent and that the first sentence may take to come. A message that is no sentence is answered by `{"error": ...}`, and the sentence before goes on.
+//! The last message is `{"end": REPORT}`.
+
+use std::borrow::Cow;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use access::{Scope, Tokens};
+use axum::Json;
+use axum::extract::ws::{CloseFrame, Message, WebSocket, WebSocketUpgrade, close_code};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use coordinator::Door;
+use futures::stream::{SplitSink, SplitStream};
+use futures::{SinkExt, StreamExt};
+use protocol::message::ApiError;
+use serde_json::json;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::mpsc::error::TryRecvError;
+use tokio::sync::{Semaphore, mpsc, watch};
+use tokio::task::JoinHandle;
+use tokio::time::{sleep, timeout};
+
+use super::course::Pace;
+use super::engine::Engine;
+use super::line::{self, Line, MOST_BYTES};
+use super::opening::{Beginning, Opening, StreamArgs};
+use super::real;
+use super::report::Real;
+use crate::print;
+use crate::problem::{Problem, Result, exit};
+
+/// Sentences of a connection that wait for their turn.
+const WAITING: usize = 16;
+/// How long a message may take to be sent: a client that reads nothing for so long is dropped.
+const SLOW: Duration = Duration::from_secs(10);
+/// How long the first sentence may take to come.
+const SILENCE: Duration = Duration::from_secs(60);
+/// Bytes of messages that wait for the network.
+const WRITE_BYTES: usize = 256 << 10;
+
+/// What all connections share.
+#[derive(Debug)]
+struct Hall {
+    engine: Engine,
+    beginning: Beginning,
+    real: Option<Real>,
+    bound: Option<u64>,
+    rate: f64,
+    places: Arc<Semaphore>,
+    streams: usize,
+}
+
+/// Why a connection ends.
+enum End {
+    /// The client has left, or reads nothing.
+    Gone,
+    /// There are as many frames as there may be.
+    Over,
+    /// Something that the client should know.
+    Told(u16, Cow<'static, str>),
+}
+
+type Sink = SplitSink<WebSocket, Message>;
+type Lines = mpsc::Receiver<std::result::Result<Line, String>>;
+
+/// A task that does not outlive its connection.
+struct Ends(JoinHandle<()>);
+
+impl Drop for Ends {
+    fn drop(&mut self) {
+        self.0.abort();
+    }
+}
+
+/// Answers until it is interrupted.
+pub(super) async fn listen(
+    args: StreamArgs,
+    opening: Opening,
+    bound: impl Fn(f64) -> Result<Option<u64>>,
+) -> Result<u8> {
+    let failed = |error| Problem::failed(format!("cannot listen for signals: {error}"));
+    let mut interrupt = signal(SignalKind::interrupt()).map_err(failed)?;
+    let mut terminate = signal(SignalKind::terminate()).map_err(failed)?;
+    let (Some(address), Some(file)) = (args.listen, &args.listen_token_file) else {
+        return Err(Problem::usage("`--listen` wants an address and `--listen-token-file`"));
+    };
+    let config = args.door.config(address, Tokens::read(file)?)?;
+    // Said before the model is loaded.
+    let door = Door::open(&config).await?;
+    let streams = usize::from(args.streams);
+    let (engine, beginning) = Engine::start(opening, (args.overlap, args.blend), streams).await?;
+    let skeleton = beginning.skeleton();
+    let real = args.real.as_deref().map(|path| real::read(path, skeleton)).transpose()?;
+    let rate = args.pace.flatten().unwrap_or(skeleton.fps);
+    let scheme = if door.is_encrypted() { "wss" } else { "ws" };
+    print::note(&format!(
+        "{} streams at {scheme}://{}/v1/stream, {rate} frames per second, {streams} streams at once",
+        beginning.label,
+        door.address()
+    ));
+    let (bound, places) = (bound(skeleton.fps)?, Arc::new(Semaphore::new(streams)));
+    let hall = Arc::new(Hall { engine: engine.clone(), beginning, real, bound, rate, places, streams });
+    let handler = get(move |upgrade: WebSocketUpgrade| std::future::ready(Arc::clone(&hall).admit(upgrade)));
+    let (_stop, stopped) = watch::channel(false);
+    tokio::select! {
+        () = door.serve("/v1/stream", &[Scope::Read], handler, stopped) => Ok(0),
+        _ = interrupt.recv() => Ok(0),
+        _ = terminate.recv() => Ok(0),
+        () = engine.gone() => Err(Problem::new(exit::FAULT, anyhow::anyhow!("the model's thread has ended; this is a bug of Stride's"))),
+    }
+}
+
+/// Sentences of a connection, each message one or more lines; ends with it.
+async fn read(
+    mut source: SplitStream<WebSocket>,
+    lines: mpsc::Sender<std::result::Result<Line, String>>,
+    form: line::Form,
+) {
+    let mut number = 0;
+    while let Some(Ok(message)) = source.next().await {
+        let text = match message {
+            Message::Text(text) => text,
+            Message::Ping(_) | Message::Pong(_) => continue,
+            Message::Close(_) => return,
+            Message::Binary(_) => {
+                number += 1;
+                if lines.send(Err(format!("line {number}: is binary; expected text"))).await.is_err() {
+                    return;
+                }
+                continue;
+            }
+        };
+        for text in text.lines().filter(|text| !text.trim().is_empty()) {
+            number += 1;
+            if lines.send(line::parse(number, text, &form)).await.is_err() {
+                return;
+            }
+        }
+    }
+}
+
+async fn send(sink: &mut Sink, text: String) -> std::result::Result<(), End> {
+    match timeout(SLOW, sink.send(Message::Text(text.into()))).await {
+        Ok(Ok(())) => Ok(()),
+        Ok(Err(_)) => Err(End::Gone),
+        Err(_) => {
+            tracing::debug!("a client that reads nothing is dropped");
+            Err(End::Gone)
+        }
+    }
+}
+
+async fn tell(sink: &mut Sink, what: String) -> std::result::Result<(), End> {
+    send(sink, json!({"error": what}).to_string()).await
+}
+
+impl Hall {
+    /// Takes a connection in, if there is a place.
+    fn admit(self: Arc<Self>, upgrade: WebSocketUpgrade) -> Response {
+        let Ok(place) = Arc::clone(&self.places).try_acquire_owned() else {
+            let message = format!("this server draws {} streams at once, and does", self.streams);
+            let hint = Some("try again when one has ended; `--streams N` takes more".to_owned());
+            let error = ApiError { code: "busy".to_owned(), message, hint };
+            return (StatusCode::SERVICE_UNAVAILABLE, Json(error)).into_response();
+        };
+        let upgrade = upgrade.max_message_size(MOST_BYTES).max_frame_size(MOST_BYTES);
+        upgrade.max_write_buffer_size(WRITE_BYTES).on_upgrade(move |socket| async move {
+            self.converse(socket).await;
+            drop(place);
+        })
+    }
+
+    async fn converse(&self, socket: WebSocket) {
+        let (mut sink, source) = socket.split();
+        let (sender, mut lines) = mpsc::channel(WAITING);
+        let _reading = Ends(tokio::spawn(read(source, sender, self.beginning.form.clone())));
+        let mut course = self.beginning.course(self.bound, self.real.clone());
+        let end = match self.give(&mut sink, &mut lines, &mut course).await {
+            Ok(()) | Err(End::Over) => {
+                let report = json!({"end": course.meter.json()}).to_string();
+                let _ = send(&mut sink, report).await;
+                (close_code::NORMAL, Cow::Borrowed("the stream has ended"))
+            }
+            Err(End::Gone) => return,
+            Err(End::Told(code, why)) => (code, why),
+        };
+        let (code, reason) = end;
+        let close = CloseFrame { code, reason: reason.as_ref().into() };
+        // Whoever is gone is not told.
+        let _ = timeout(SLOW, sink.send(Message::Close(Some(close)))).await;
+    }
+
+    /// Gives frames until the client leaves.
+    async fn give(
+        &self,
+        sink: &mut Sink,
+        lines: &mut Lines,
+        course: &mut super::course::Course,
+    ) -> std::result::Result<(), End> {
+        let mut stream = self.beginning.stream.clone();
+        let mut pace = Pace::new(self.rate);
+        let mut next = None;
+        let mut text = String::new();
+        loop {
+            while !course.is_pinned() {
+                let line: Line = match next.take() {
+                    Some(line) => line,
+                    None => match self.line(lines, course.has_begun()).await? {
+                        None => break,
+                        Some(Ok(line)) => line,
+                        Some(Err(what)) => {
+                            tell(sink, what).await?;
+                            continue;
+                        }
+                    },
+                };
+                match course.take(line, stream.root()) {
+                    Ok(()) => break,
+                    Err(what) => tell(sink, what).await?,
+                }
+            }
+            let over = End::Told(close_code::ERROR, "the server is stopping".into());
+            let (back, drawn) = self.engine.draw(stream, course.ask()).await.ok_or(over)?;
+            stream = back;
+            let (segment, took) = match drawn {
+                Ok(drawn) => drawn,
+                Err(what) => {
+                    tell(sink, what).await?;
+                    return Err(End::Told(close_code::ERROR, "the model cannot go on".into()));
+                }
+            };
+            course.drawn(&segment, took);
+            for k in 0..segment.frames {
+                if course.is_over() {
+                    return Err(End::Over);
+                }
+                sleep(pace.wait(Instant::now())).await;
+                text.clear();
+                course.write(&mut text, &segment, k);
+                send(sink, text.clone()).await?;
+                course.given(&segment, k);
+                while next.is_none() && !course.is_pinned() {
+                    match lines.try_recv() {
+                        Ok(Ok(line)) => next = Some(line),
+                        Ok(Err(what)) => tell(sink, what).await?,
+                        Err(TryRecvError::Empty) => break,
+                        Err(TryRecvError::Disconnected) => return Err(End::Gone),
+                    }
+                }
+                if next.is_some() && !course.is_pinned() {
+                    stream.cut(k + 1);
+                    break;
+                }
+            }
+        }
+    }
+
+    /// A line that is there, or the first one; `None` if the sentence goes on.
+    async fn line(
+        &self,
+        lines: &mut Lines,
+        begun: bool,
+    ) -> std::result::Result<Option<std::result::Result<Line, String>>, End> {
+        if begun {
+            return match lines.try_recv() {
+                Ok(line) => Ok(Some(line)),
+                Err(TryRecvError::Empty) => Ok(None),
+                Err(TryRecvError::Disconnected) => Err(End::Gone),
+            };
+        }
+        match timeout(SILENCE, lines.recv()).await {
+            Ok(Some(line)) => Ok(Some(line)),
+            Ok(None) => Err(End::Gone),
+            Err(_) => Err(End::Told(close_code::POLICY, "no sentence came within a minute".into())),
+        }
+    }
+}

@@ -1,0 +1,34 @@
+//! `trainer generate --stream`: sentences in, motion out, without end. Decision 0012.
+
+mod course;
+mod engine;
+mod line;
+mod listen;
+mod opening;
+mod pipe;
+mod real;
+mod report;
+
+use super::out::OutArgs;
+use crate::problem::Result;
+
+pub(super) use self::opening::{Opening, StreamArgs};
+
+/// Streams until its input or its output ends. `bound` gives the frames at a rate after which it does in any case.
+pub(super) async fn stream(
+    args: StreamArgs,
+    opening: Opening,
+    out: OutArgs,
+    bound: impl Fn(f64) -> Result<Option<u64>>,
+) -> Result<u8> {
+    if args.listen.is_some() {
+        return listen::listen(args, opening, bound).await;
+    }
+    let outs = out.files(1)?;
+    let (generator, beginning) = opening.open(args.overlap, args.blend)?;
+    let skeleton = beginning.skeleton();
+    let real = args.real.as_deref().map(|path| real::read(path, skeleton)).transpose()?;
+    let course = beginning.course(bound(skeleton.fps)?, real);
+    let pace = args.pace.map(|rate| rate.unwrap_or(skeleton.fps));
+    pipe::run(&generator, beginning, course, pace, (outs, out.report()))
+}

@@ -1,0 +1,69 @@
+//! By how much real motion changes its course, for junctions to be held against.
+
+use std::path::Path;
+
+use motion::{Skeleton, files, npy};
+use stages::evaluation::junction::{Jump, jumps, usual};
+
+use super::report::Real;
+use crate::problem::{Problem, Result};
+
+/// Clips that are read of a folder, the first ones of its list.
+const CLIPS: usize = 256;
+/// Bytes of a list of clips.
+const LIST_BYTES: u64 = 8 << 20;
+/// Boundaries without which a percentile says little.
+const LEAST: usize = 100;
+
+/// Of a motion, `.npy` as `trainer export` takes it, or of a dataset folder's training clips.
+pub(super) fn read(path: &Path, skeleton: &'static Skeleton) -> Result<Real> {
+    let mut all: Vec<Jump> = Vec::new();
+    let name = if path.is_dir() {
+        let list = path.join("train.txt");
+        let bytes = files::read(&list, LIST_BYTES)
+            .map_err(|error| Problem::usage(format!("`{}`: {error}; expected a dataset folder", list.display())))?;
+        let text = String::from_utf8_lossy(&bytes).into_owned();
+        let ids = text.lines().map(str::trim).filter(|id| motion::dataset::is_clip_id(id)).take(CLIPS);
+        let mut clips = 0;
+        for id in ids {
+            let file = path.join("new_joint_vecs").join(format!("{id}.npy"));
+            // Lists name clips that are not there, in the published sets too.
+            if file.exists() {
+                all.extend(of_file(&file, skeleton)?);
+                clips += 1;
+            }
+        }
+        format!("{clips} training clips of {}", path.display())
+    } else {
+        all = of_file(path, skeleton)?;
+        path.display().to_string()
+    };
+    match usual(&all) {
+        Some(usual) if all.len() >= LEAST => Ok(Real { name, usual }),
+        _ => Err(Problem::usage(format!(
+            "`{}`: has {} places to measure jumps at; expected at least {LEAST}, some seconds of motion",
+            path.display(),
+            all.len()
+        ))),
+    }
+}
+
+fn of_file(file: &Path, skeleton: &'static Skeleton) -> Result<Vec<Jump>> {
+    let refuse = |what: String| Problem::usage(format!("`{}`: {what}", file.display()));
+    let array = npy::read_any_float(file).map_err(|error| Problem::usage(error.to_string()))?;
+    let joints = match array.shape[..] {
+        [_, count, 3] if count == skeleton.joints => array.data.iter().map(|v| f64::from(*v)).collect(),
+        [_, width] if width == skeleton.features => motion::features::recover_joints_wide(&array.data, skeleton),
+        _ => {
+            return Err(refuse(format!(
+                "has shape {:?}; expected positions [frames, {}, 3] or features [frames, {}]",
+                array.shape, skeleton.joints, skeleton.features
+            )));
+        }
+    };
+    let metres: Vec<f64> = joints.iter().map(|v| v * skeleton.metres_per_unit).collect();
+    Ok(jumps(&metres, skeleton.joints, skeleton.fps)
+        .into_iter()
+        .filter(|jump| jump.velocity.is_finite() && jump.acceleration.is_finite())
+        .collect())
+}
