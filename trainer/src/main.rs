@@ -6,6 +6,7 @@ mod cli;
 mod client;
 mod cost;
 mod fleet;
+mod hub_names;
 mod missing;
 mod out_of_memory;
 mod pipeline_file;

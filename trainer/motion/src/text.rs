@@ -121,7 +121,7 @@ pub struct Texts {
     pub odd: Vec<(usize, Oddity)>,
 }
 
-/// Reads a text file: every line that is not blank, or every line that does not parse.
+/// Reads a text file: every line that is not blank, or the lines that do not parse, the first [`limits::MISTAKES`] of them.
 pub fn parse_file(file: &Path, content: &str) -> Result<Texts, Vec<TextError>> {
     let (mut texts, mut errors) = (Texts::default(), vec![]);
     for (i, line) in content.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
@@ -129,6 +129,10 @@ pub fn parse_file(file: &Path, content: &str) -> Result<Texts, Vec<TextError>> {
             Ok(caption) => caption,
             Err(what) => {
                 errors.push(TextError { file: file.into(), line: i + 1, what });
+                // Each names the file, so that many would take far more than the text.
+                if errors.len() >= limits::MISTAKES {
+                    break;
+                }
                 continue;
             }
         };

@@ -12,6 +12,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use protocol::limits;
 use serde_json::Value;
 
 use crate::features::recover_joints;
@@ -52,19 +53,37 @@ struct Line {
 /// # Errors
 /// What is wrong with it, with its line or place and what was expected.
 pub fn read(file: &Path, skeleton: &Skeleton, joints: &[String]) -> Result<Vec<Waypoint>, String> {
+    let limit = if ending(file) == "npy" { limits::ARRAY_BYTES } else { PATH_BYTES };
+    let bytes = if ["csv", "json", "npy"].contains(&ending(file).as_str()) {
+        files::read(file, limit).map_err(|error| format!("`{}`: {error}", file.display()))?
+    } else {
+        Vec::new()
+    };
+    parse(file, &bytes, skeleton, joints)
+}
+
+/// Waypoints of a file's bytes, as [`read`] gives them; what kind they are the file's name says.
+///
+/// # Errors
+/// As [`read`].
+pub fn parse(file: &Path, bytes: &[u8], skeleton: &Skeleton, joints: &[String]) -> Result<Vec<Waypoint>, String> {
     let told: Vec<usize> = joints.iter().map(|name| number(name, skeleton)).collect::<Result<_, _>>()?;
     let named = |error: String| format!("`{}`: {error}", file.display());
-    let ending = file.extension().and_then(|ending| ending.to_str()).unwrap_or_default().to_lowercase();
+    let ending = ending(file);
     if ending == "npy" {
-        return motion(file, skeleton, if told.is_empty() { &[0] } else { &told });
+        return motion(file, bytes, skeleton, if told.is_empty() { &[0] } else { &told });
     }
     if ending != "csv" && ending != "json" {
         return Err(named("expected a name that ends in .csv, .json or .npy".into()));
     }
-    let bytes = files::read(file, PATH_BYTES).map_err(|error| named(error.to_string()))?;
-    let text = String::from_utf8(bytes).map_err(|_| named("is no text in UTF-8".into()))?;
-    let lines = if ending == "csv" { csv(&text) } else { json(&text) }.map_err(named)?;
+    let text = std::str::from_utf8(bytes).map_err(|_| named("is no text in UTF-8".into()))?;
+    let lines = if ending == "csv" { csv(text) } else { json(text) }.map_err(named)?;
     waypoints(&lines, skeleton, &told).map_err(named)
+}
+
+/// What a file's name ends in, in lower case.
+fn ending(file: &Path) -> String {
+    file.extension().and_then(|ending| ending.to_str()).unwrap_or_default().to_lowercase()
 }
 
 fn number(name: &str, skeleton: &Skeleton) -> Result<usize, String> {
@@ -78,8 +97,8 @@ fn number(name: &str, skeleton: &Skeleton) -> Result<usize, String> {
 }
 
 /// Joints of a motion in every frame.
-fn motion(file: &Path, skeleton: &Skeleton, told: &[usize]) -> Result<Vec<Waypoint>, String> {
-    let array = npy::read_any_float(file).map_err(|error| error.to_string())?;
+fn motion(file: &Path, bytes: &[u8], skeleton: &Skeleton, told: &[usize]) -> Result<Vec<Waypoint>, String> {
+    let array = npy::parse(file, bytes, true).map_err(|error| error.to_string())?;
     let (joints, features) = (skeleton.joints, skeleton.features);
     let rows = match array.shape[..] {
         [_, count, 3] if count == joints => array.data,
