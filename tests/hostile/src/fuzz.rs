@@ -94,10 +94,9 @@ fn files(path: &Path) -> Vec<Vec<u8>> {
 /// If an input breaks a rule; it says which, and how to run it again.
 pub fn run(name: &str, targets: &[Target], memory: &Cap<System>, corpus: &Path, found: &Path) {
     let target = targets.iter().find(|target| target.name == name).expect("a target of that name");
-    let inputs = Inputs::new(target, corpus);
     match variable(STATE_VARIABLE) {
-        Some(state) => child(target, &inputs, memory, Path::new(&state)),
-        None => parent(target, &inputs, found),
+        Some(state) => child(target, &Inputs::new(target, corpus), memory, Path::new(&state)),
+        None => parent(target, corpus, found),
     }
 }
 
@@ -129,7 +128,7 @@ fn verdict(target: &Target, bytes: &[u8], memory: &Cap<System>) -> Result<bool, 
 
 fn child(target: &Target, inputs: &Inputs<'_>, memory: &Cap<System>, state: &Path) {
     // What is caught is told by whom it concerns; thousands of backtraces would be told by nobody.
-    std::panic::set_hook(Box::new(|info| SAID.set(info.to_string())));
+    std::panic::set_hook(Box::new(|info| SAID.set(info.to_string().chars().take(2_000).collect())));
     let state = File::options().write(true).open(state).expect("the file that the test made");
     let seconds =
         variable(SECONDS_VARIABLE).map_or(SECONDS, |value| value.parse().expect("STRIDE_FUZZ_SECONDS is a number"));
@@ -179,7 +178,7 @@ fn wait(child: &mut Child, state: &File) -> Option<std::process::ExitStatus> {
     }
 }
 
-fn parent(target: &Target, inputs: &Inputs<'_>, found: &Path) {
+fn parent(target: &Target, corpus: &Path, found: &Path) {
     let name = target.name;
     let state = tempfile::NamedTempFile::new().expect("a file for the state");
     state.as_file().write_all_at(&0_u64.to_le_bytes(), 0).expect("a file of ours");
@@ -193,6 +192,7 @@ fn parent(target: &Target, inputs: &Inputs<'_>, found: &Path) {
     let mut index = [0; 8];
     state.as_file().read_exact_at(&mut index, 0).expect("a file of ours");
     let index = u64::from_le_bytes(index);
+    let inputs = Inputs::new(target, corpus);
     let bytes = inputs.get(index).unwrap_or_default();
     fs::create_dir_all(found).expect("a folder for what was found");
     let file = found.join(format!("{name}-{}", Digest::of(&bytes).short()));

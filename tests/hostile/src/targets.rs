@@ -72,8 +72,23 @@ pub fn run(name: &str, bytes: &[u8]) -> bool {
     (target.run)(bytes)
 }
 
+/// Characters of an error: of many mistakes, each of a line or two.
+const ERROR: usize = 64 << 10;
+
+/// What was read, if an error is short enough to be read too.
+fn read<T, E: ToString>(result: Result<T, E>) -> Option<T> {
+    match result {
+        Ok(value) => Some(value),
+        Err(error) => {
+            let length = error.to_string().len();
+            assert!(length <= ERROR, "an error of {length} bytes");
+            None
+        }
+    }
+}
+
 fn bvh(bytes: &[u8]) -> bool {
-    let Ok(bvh) = Bvh::parse(Path::new("x.bvh"), bytes) else { return false };
+    let Some(bvh) = read(Bvh::parse(Path::new("x.bvh"), bytes)) else { return false };
     assert_eq!(bvh.values.len(), bvh.frames * bvh.channels());
     assert!(bvh.rate > 0.0 && bvh.values.iter().all(|value| value.is_finite()));
     if let Ok(take) = Take::of_bvh(&bvh, &Reading::default()) {
@@ -85,7 +100,7 @@ fn bvh(bytes: &[u8]) -> bool {
 }
 
 fn joint_map(bytes: &[u8]) -> bool {
-    let Ok(map) = JointMap::parse(Path::new("x.yaml"), &String::from_utf8_lossy(bytes)) else { return false };
+    let Some(map) = read(JointMap::parse(Path::new("x.yaml"), &String::from_utf8_lossy(bytes))) else { return false };
     assert_eq!(JointMap::parse(Path::new("x.yaml"), &map.to_yaml()).ok().as_ref(), Some(&map), "{}", map.to_yaml());
     // Our own recording has all joints by their names.
     let recording = Bvh::parse(Path::new("x.bvh"), &seeds::bvh()[2]).expect("one of ours");
@@ -107,7 +122,7 @@ fn npy(bytes: &[u8]) -> bool {
 }
 
 fn npz(bytes: &[u8]) -> bool {
-    let Ok(found) = arrays::parse(Path::new("x.npz"), bytes) else { return false };
+    let Some(found) = read(arrays::parse(Path::new("x.npz"), bytes)) else { return false };
     assert!(found.data.len().is_multiple_of(3 * found.joints) && found.data.iter().all(|v| v.is_finite()));
     assert!(found.rate.is_none_or(|rate| rate >= 1.0));
     true
@@ -122,7 +137,7 @@ fn survives(caption: &Caption) {
 
 fn captions(bytes: &[u8]) -> bool {
     let Ok(content) = std::str::from_utf8(bytes) else { return false };
-    let Ok(rows) = captions::of_table(Path::new("x.csv"), content) else { return false };
+    let Some(rows) = read(captions::of_table(Path::new("x.csv"), content)) else { return false };
     rows.iter().flat_map(|row| &row.captions).for_each(survives);
     true
 }
@@ -130,8 +145,8 @@ fn captions(bytes: &[u8]) -> bool {
 fn texts(bytes: &[u8]) -> bool {
     let Ok(content) = std::str::from_utf8(bytes) else { return false };
     let file = Path::new("x.txt");
-    let beside = captions::of_text(file, content);
-    if let Ok(captions) = &beside {
+    let beside = read(captions::of_text(file, content));
+    if let Some(captions) = &beside {
         captions.iter().for_each(survives);
     }
     if let Ok(found) = text::parse_file(file, content) {
@@ -145,30 +160,30 @@ fn texts(bytes: &[u8]) -> bool {
             assert_eq!(text::hashed_embedding(&caption.text).len(), text::EMBEDDING_WIDTH);
         }
     }
-    beside.is_ok()
+    beside.is_some()
 }
 
 fn sentences(bytes: &[u8]) -> bool {
     let Ok(content) = std::str::from_utf8(bytes) else { return false };
-    let read = [false, true].map(|json| requests::parse("x", content, json));
+    let read = [false, true].map(|json| read(requests::parse("x", content, json)));
     for request in read.iter().flatten().flatten() {
         assert!(request.length.is_none_or(|length| length.frames(20.0) > 0));
     }
-    read.iter().any(Result::is_ok)
+    read.iter().any(Option::is_some)
 }
 
 fn pipeline(bytes: &[u8]) -> bool {
     let Ok(content) = std::str::from_utf8(bytes) else { return false };
-    protocol::pipeline::read("x.yaml", content, &[]).map_err(|mistakes| mistakes.to_string()).is_ok()
+    read(protocol::pipeline::read("x.yaml", content, &[])).is_some()
 }
 
 fn waypoints(bytes: &[u8]) -> bool {
     let skeleton = Skeleton::of(DataFormat::Humanml3d);
-    let read = ["x.csv", "x.json", "x.npy"].map(|name| waypoints::parse(Path::new(name), bytes, skeleton, &[]));
+    let read = ["x.csv", "x.json", "x.npy"].map(|name| read(waypoints::parse(Path::new(name), bytes, skeleton, &[])));
     for waypoint in read.iter().flatten().flatten() {
         assert!(waypoint.joint < 22 && waypoint.position.iter().all(|v| v.is_finite()));
     }
-    read.iter().any(Result::is_ok)
+    read.iter().any(Option::is_some)
 }
 
 /// Bytes that are read where they lie.
@@ -185,7 +200,7 @@ impl ReadAt for Slice<'_> {
 }
 
 fn safetensors(bytes: &[u8]) -> bool {
-    let Ok(file) = WeightsFile::open(Slice(bytes)) else { return false };
+    let Some(file) = read(WeightsFile::open(Slice(bytes))) else { return false };
     for (name, tensor) in &file.tensors {
         let count: usize = tensor.shape.iter().product();
         // What is asked for is known by who reads, never by the file; here it is what the file holds at most.
@@ -201,7 +216,7 @@ fn tokenizer(bytes: &[u8]) -> bool {
     let t5 = Rules { repair: false, strip: true, lower: false, first: None, end: 1, pad: 0, most: 6 };
     let mut accepted = false;
     for rules in [clip, t5] {
-        let Ok(tokenizer) = Tokenizer::new("x", bytes, &rules, 7) else { continue };
+        let Some(tokenizer) = read(Tokenizer::new("x", bytes, &rules, 7)) else { continue };
         accepted = true;
         for caption in ["ab a b \u{1f600}", "", "a person walks forward, turns around & sits\u{2028}down"] {
             if let Ok(ids) = tokenizer.ids(caption) {
@@ -215,7 +230,7 @@ fn tokenizer(bytes: &[u8]) -> bool {
 /// Opens an encoder's folder and reads all of it.
 fn opened(root: &str, kind: Kind) -> bool {
     let request = Request { kind, ids: TokenIds::HuggingFace, most: 0 };
-    let Ok(folder) = EncoderFolder::open(&scratch::folder().join(root), &request) else { return false };
+    let Some(folder) = read(EncoderFolder::open(&scratch::folder().join(root), &request)) else { return false };
     folder.description.check().expect("it was checked");
     // Any answer will do.
     let _ = folder.tokenizer().expect("it was made").ids("ab a b");

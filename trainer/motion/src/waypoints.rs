@@ -12,7 +12,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use protocol::limits;
+use protocol::{excerpt, limits};
 use serde_json::Value;
 
 use crate::features::recover_joints;
@@ -89,7 +89,8 @@ fn ending(file: &Path) -> String {
 fn number(name: &str, skeleton: &Skeleton) -> Result<usize, String> {
     skeleton.names.iter().position(|known| *known == name).ok_or_else(|| {
         format!(
-            "`{name}` is no joint of a skeleton of {} joints; its joints are {}",
+            "`{}` is no joint of a skeleton of {} joints; its joints are {}",
+            excerpt(name),
             skeleton.joints,
             skeleton.names.join(", ")
         )
@@ -132,11 +133,11 @@ fn csv(text: &str) -> Result<Vec<Line>, String> {
     let columns: Vec<String> = header.split(',').map(|column| column.trim().to_lowercase()).collect();
     let column = |name: &str| columns.iter().position(|column| column == name);
     let (Some(t), Some(x), Some(y), Some(z)) = (column("t"), column("x"), column("y"), column("z")) else {
-        return Err(format!("line 1 is `{}`; {expected}", header.trim()));
+        return Err(format!("line 1 is `{}`; {expected}", excerpt(header.trim())));
     };
     let joint = column("joint");
     if columns.len() != 4 + usize::from(joint.is_some()) {
-        return Err(format!("line 1 is `{}`; {expected}", header.trim()));
+        return Err(format!("line 1 is `{}`; {expected}", excerpt(header.trim())));
     }
     lines
         .map(|(i, line)| {
@@ -147,7 +148,8 @@ fn csv(text: &str) -> Result<Vec<Line>, String> {
             }
             let value = |k: usize| {
                 let cell = cells[k];
-                cell.parse::<f64>().map_err(|_| format!("{place}: `{cell}` in column `{}` is no number", columns[k]))
+                cell.parse::<f64>()
+                    .map_err(|_| format!("{place}: `{}` in column `{}` is no number", excerpt(cell), columns[k]))
             };
             let (seconds, position) = (value(t)?, [value(x)?, value(y)?, value(z)?]);
             Ok(Line { place, seconds, joint: joint.map(|k| cells[k].to_owned()), position })
@@ -167,14 +169,17 @@ fn json(text: &str) -> Result<Vec<Line>, String> {
                     let joint = joint.map(str::to_owned);
                     Ok(Line { place, seconds: *t, joint, position: [*x, *y, *z] })
                 }
-                _ => Err(format!("{place} is {row}; expected [t, x, y, z] in seconds and metres")),
+                _ => Err(format!(
+                    "{place} is {}; expected [t, x, y, z] in seconds and metres",
+                    excerpt(&row.to_string())
+                )),
             }
         };
         list.iter().enumerate().map(row).collect()
     };
     match &value {
         Value::Object(joints) => {
-            let each = joints.iter().map(|(joint, list)| rows(list, Some(joint), joint));
+            let each = joints.iter().map(|(joint, list)| rows(list, Some(joint), &excerpt(joint)));
             Ok(each.collect::<Result<Vec<_>, _>>()?.concat())
         }
         list => rows(list, None, "path"),
