@@ -76,7 +76,7 @@ fn dependencies_point_one_way() {
     never("text-models", &["burn", "tokio", "sqlx", "axum", "reqwest", "hf-hub", "onig", "registry", "checkpoint"]);
     never(
         "hub",
-        &["burn", "sqlx", "axum", "hf-hub", "aws-lc", "openssl", "native-tls", "ureq", "registry", "checkpoint"],
+        &["burn", "sqlx", "axum", "hf-hub", "aws-lc", "openssl-sys", "native-tls", "ureq", "registry", "checkpoint"],
     );
     never("hostile", &["burn", "tokio", "sqlx", "axum", "reqwest"]);
     never("models", &["tokio", "sqlx", "axum", "reqwest", "registry", "checkpoint", "stages"]);
