@@ -64,9 +64,10 @@ pub(crate) fn fetch(
     said: &mut dyn FnMut(&str),
 ) -> Result<Found, Failure> {
     access::tls::install_provider();
-    let client = || Client::builder().connect_timeout(CONNECT).timeout(None).user_agent("stride");
+    // Of a blocking client the limit is for each wait, not for the whole.
+    let client = || Client::builder().connect_timeout(CONNECT).timeout(SILENCE).user_agent("stride");
     let built = |client: reqwest::blocking::ClientBuilder| client.build().map_err(|e| Failure::Away(chain(&e)));
-    let asks = built(client().redirect(reqwest::redirect::Policy::none()).timeout(SILENCE))?;
+    let asks = built(client().redirect(reqwest::redirect::Policy::none()))?;
     let fetches = built(client().redirect(reqwest::redirect::Policy::limited(5)))?;
     let mut remote = Remote { settings, name, asks, fetches, commit: String::new(), names: BTreeSet::new(), said };
     remote.list()?;
