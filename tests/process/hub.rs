@@ -45,7 +45,7 @@ fn an_encoder_of_the_hub_without_a_network() {
 
     fill_cache(home.path());
     let run = || bench.run(&["run", "p.yaml", "-o", "json"]).expect_code(0).json();
-    assert_eq!(states(&run())["words"], "finished");
+    assert_eq!(states(&run())["words"], "ran");
     assert_eq!(states(&run())["words"], "cached");
     // The same content by its commit is the same encoder.
     pipeline(&bench, &format!(", revision: {COMMIT}"));
@@ -58,7 +58,7 @@ fn an_encoder_of_the_hub_without_a_network() {
     pipeline(&bench, "");
     let merges = home.path().join("hub/models--tiny--clip/snapshots").join(COMMIT).join("merges.txt");
     fs::write(merges, "#version: 0.2\na b</w>\n\n").expect("a file of ours");
-    assert_eq!(states(&run())["words"], "finished");
+    assert_eq!(states(&run())["words"], "ran");
 
     // A folder of that name comes first, and has no revision.
     fs::create_dir_all(bench.path().join("tiny/clip")).expect("a folder of ours");
