@@ -88,8 +88,8 @@ pub(crate) fn resolve_cached(pipeline: &mut Pipeline) -> Result<Vec<(String, Str
         let todo = if read.offline { "HF_HUB_OFFLINE is set" } else { "`trainer run` fetches it" };
         match Hub::new(read).cached(&name, encoder) {
             Ok(found) => place(settings, &found.folder),
-            Err(HubError::NotHere { cache, .. }) => {
-                absent.push((settings.path.clone(), format!("not in the hub's cache {}; {todo}", cache.display())));
+            Err(HubError::NotHere { .. }) => {
+                absent.push((settings.path.clone(), format!("not in the hub's cache; {todo}")))
             }
             Err(error) => return Err(refused(&stage, &error)),
         }
