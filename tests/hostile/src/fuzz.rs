@@ -30,7 +30,7 @@ pub const INPUT_VARIABLE: &str = "STRIDE_FUZZ_INPUT";
 /// Where the process that tries inputs says which one it is at; set for it alone.
 const STATE_VARIABLE: &str = "STRIDE_FUZZ_STATE";
 /// An input that takes so long by the clock never ends.
-const HANGS: Duration = Duration::from_secs(60);
+const HANGS: Duration = Duration::from_secs(120);
 
 fn variable(name: &str) -> Option<String> {
     std::env::var(name).ok().filter(|value| !value.is_empty())
