@@ -74,6 +74,11 @@ fn dependencies_point_one_way() {
     never("motion", &["burn", "tokio", "sqlx", "axum", "registry", "checkpoint"]);
     never("mocap", &["burn", "tokio", "sqlx", "axum", "registry", "checkpoint"]);
     never("text-models", &["burn", "tokio", "sqlx", "axum", "reqwest", "hf-hub", "onig", "registry", "checkpoint"]);
+    never(
+        "hub",
+        &["burn", "sqlx", "axum", "hf-hub", "aws-lc", "openssl-sys", "native-tls", "ureq", "registry", "checkpoint"],
+    );
+    never("hostile", &["burn", "tokio", "sqlx", "axum", "reqwest"]);
     never("models", &["tokio", "sqlx", "axum", "reqwest", "registry", "checkpoint", "stages"]);
     never("stages", &["sqlx", "axum", "reqwest", "registry", "coordinator", "worker"]);
     never("worker", &["sqlx", "coordinator", "registry"]);

@@ -7,6 +7,7 @@ mod client;
 mod cost;
 mod figure;
 mod fleet;
+mod hub_names;
 mod missing;
 mod out_of_memory;
 mod pictures;

@@ -9,6 +9,7 @@ use protocol::pipeline::{self, Pipeline, PipelineStage};
 use protocol::stage::{DataFormat, ExternalFolder};
 use protocol::{Digest, StageName, limits};
 
+use crate::hub_names;
 use crate::missing::{Missing, check_backend, check_format, missing};
 use crate::problem::{Problem, Result};
 
@@ -49,9 +50,10 @@ fn read_text(path: &Path) -> std::io::Result<String> {
     String::from_utf8(bytes).map_err(|error| refuse(format!("it is no UTF-8 text: {}", error.utf8_error())))
 }
 
-/// Reads the file and digests the folders it names, which must all be there.
+/// Reads the file and digests the folders it names, which must all be there; those that it names as the hub does are fetched.
 pub(crate) fn read_with_data(path: &Path, sets: &[String]) -> Result<PipelineFile> {
     let mut file = read(path, sets)?;
+    hub_names::resolve(&mut file.pipeline)?;
     let missing = missing(&file.pipeline);
     if !missing.is_empty() {
         let lines: Vec<String> = missing.iter().map(|one| format!("\n  {}", one.line())).collect();
@@ -67,7 +69,9 @@ pub(crate) fn read_with_data(path: &Path, sets: &[String]) -> Result<PipelineFil
 pub(crate) fn read_to_plan(path: &Path, sets: &[String]) -> Result<(PipelineFile, Vec<Missing>)> {
     let mut file = read(path, sets)?;
     check_backend(file.pipeline.backend)?;
-    let missing = missing(&file.pipeline);
+    let absent = hub_names::resolve_cached(&mut file.pipeline)?;
+    let mut missing = missing(&file.pipeline);
+    hub_names::explain(&mut missing, &absent);
     digest_folders(&mut file.pipeline)?;
     Ok((file, missing))
 }

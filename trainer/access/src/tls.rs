@@ -54,7 +54,7 @@ fn client() -> ConfigBuilder<ClientConfig, WantsVerifier> {
 }
 
 /// Lets a client that believes the system's certificates find the cryptography; once is enough.
-pub(crate) fn install_provider() {
+pub fn install_provider() {
     // Refused if there is one already, which does as well.
     let _ = ring::default_provider().install_default();
 }

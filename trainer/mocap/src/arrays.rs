@@ -35,10 +35,18 @@ pub struct Joints {
 /// # Errors
 /// In words, with the file.
 pub fn read(file: &Path) -> Result<Joints, String> {
+    let bytes = files::read(file, limits::CLIP_BYTES).map_err(|e| format!("{}: {e}", file.display()))?;
+    parse(file, &bytes)
+}
+
+/// Reads a file's bytes; `file` only names it in errors.
+///
+/// # Errors
+/// As [`read`].
+pub fn parse(file: &Path, bytes: &[u8]) -> Result<Joints, String> {
     let shown = file.display();
-    let bytes = files::read(file, limits::CLIP_BYTES).map_err(|e| format!("{shown}: {e}"))?;
     if !bytes.starts_with(b"PK") {
-        return joints(file, npy::parse(file, &bytes, true).map_err(|e| e.to_string())?, None);
+        return joints(file, npy::parse(file, bytes, true).map_err(|e| e.to_string())?, None);
     }
     let mut archive = zip::ZipArchive::new(Cursor::new(bytes)).map_err(|e| format!("{shown}: no .npz archive: {e}"))?;
     if archive.len() > MEMBERS {
@@ -67,7 +75,7 @@ pub fn read(file: &Path) -> Result<Joints, String> {
 }
 
 /// A member's bytes, unpacked.
-fn member(file: &Path, archive: &mut zip::ZipArchive<Cursor<Vec<u8>>>, key: &str) -> Result<Vec<u8>, String> {
+fn member(file: &Path, archive: &mut zip::ZipArchive<Cursor<&[u8]>>, key: &str) -> Result<Vec<u8>, String> {
     let fail = |what: String| format!("{}: array `{key}`: {what}", file.display());
     let member = archive.by_name(&format!("{key}.npy")).map_err(|e| fail(e.to_string()))?;
     let mut bytes = vec![];

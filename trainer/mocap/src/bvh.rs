@@ -40,7 +40,7 @@ pub const MAX_DEPTH: usize = 512;
 /// Frames times channels, and frames times nodes.
 pub const MAX_VALUES: usize = 16 << 20;
 /// Seconds that a recording lasts: what it takes at another rate follows from them.
-pub const MAX_SECONDS: f64 = 6.0 * 3600.0;
+pub const MAX_SECONDS: f64 = 3600.0;
 
 /// Why a file is not read.
 #[derive(Debug, thiserror::Error)]

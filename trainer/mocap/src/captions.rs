@@ -10,6 +10,7 @@ use std::path::Path;
 
 use motion::synthetic::tokens;
 use motion::text::{self, Caption};
+use protocol::excerpt;
 use serde_json::Value;
 
 /// Names of the column that says which clip.
@@ -22,6 +23,9 @@ pub const FROM: [&str; 3] = ["from", "from_s", "f_tag"];
 pub const TO: [&str; 3] = ["to", "to_s", "to_tag"];
 /// Names of the column that says which recording a clip is cut from.
 pub const SOURCE: [&str; 3] = ["source", "source_path", "take"];
+
+/// Bytes of a sentence with its tokens: half of what a line of captions may have, since its mirror image may be nearly twice as long.
+const SENTENCE_BYTES: usize = protocol::limits::CAPTION_BYTES / 2;
 
 /// A row of a table.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -42,13 +46,17 @@ pub fn sentence(text: &str) -> Result<Caption, String> {
         return Err("an empty caption".into());
     }
     if text.contains('#') || text.contains(char::is_control) {
-        return Err(format!("caption `{}` has a `#` or a control character", text.escape_debug()));
+        return Err(format!("caption `{}` has a `#` or a control character", excerpt(&text)));
     }
-    if text.len() > protocol::limits::CAPTION_BYTES {
-        return Err(format!("a caption of {} bytes, at most {} are read", text.len(), protocol::limits::CAPTION_BYTES));
+    if text.len() > SENTENCE_BYTES {
+        return Err(format!("a caption of {} bytes, at most {SENTENCE_BYTES} are read", text.len()));
     }
     let tokens = tokens(&text.to_lowercase());
-    Ok(Caption::whole(text, tokens))
+    let caption = Caption::whole(text, tokens);
+    match caption.to_line().len() {
+        0..=SENTENCE_BYTES => Ok(caption),
+        bytes => Err(format!("a caption of {bytes} bytes with its tokens, at most {SENTENCE_BYTES} are read")),
+    }
 }
 
 /// The captions of a text file.
@@ -83,7 +91,7 @@ fn of_csv(content: &str) -> Result<Vec<Row>, String> {
     let (Some(clip), true) = (clip, caption.is_some() || source.is_some()) else {
         return Err(format!(
             "1: columns {}; expected one of {} and one of {}",
-            names.join(", "),
+            excerpt(&names.join(", ")),
             CLIP.join(", "),
             CAPTION.join(", ")
         ));
@@ -101,7 +109,7 @@ fn of_csv(content: &str) -> Result<Vec<Row>, String> {
                     .parse::<f64>()
                     .ok()
                     .filter(|t| t.is_finite() && *t >= 0.0)
-                    .ok_or_else(|| fail(format!("`{text}` is no time in seconds"))),
+                    .ok_or_else(|| fail(format!("`{}` is no time in seconds", excerpt(text)))),
             };
             let mut captions = vec![];
             if let Some(at) = caption {
@@ -165,13 +173,15 @@ fn csv_records(content: &str) -> Result<Vec<(usize, Vec<String>)>, String> {
 fn of_json(content: &str) -> Result<Vec<Row>, String> {
     let value: Value = serde_json::from_str(content).map_err(|e| format!(" {e}"))?;
     let sentences = |value: &Value| -> Result<Vec<Caption>, String> {
-        let one = |value: &Value| value.as_str().ok_or_else(|| format!("`{value}` is no sentence")).and_then(sentence);
+        let one = |value: &Value| {
+            value.as_str().ok_or_else(|| format!("`{}` is no sentence", excerpt(&value.to_string()))).and_then(sentence)
+        };
         value.as_array().map_or_else(|| one(value).map(|caption| vec![caption]), |list| list.iter().map(one).collect())
     };
     match value {
         Value::Object(clips) => {
             let row = |(clip, value): (&String, &Value)| {
-                let captions = sentences(value).map_err(|e| format!(" `{clip}`: {e}"))?;
+                let captions = sentences(value).map_err(|e| format!(" `{}`: {e}", excerpt(clip)))?;
                 Ok(Row { clip: clip.clone(), captions, source: None })
             };
             clips.iter().map(row).collect()
@@ -181,7 +191,8 @@ fn of_json(content: &str) -> Result<Vec<Row>, String> {
                 let get = |names: &[&str]| names.iter().find_map(|name| row.get(name));
                 let number = |names: &[&str]| {
                     get(names).map_or(Ok(0.0), |v| {
-                        v.as_f64().ok_or_else(|| format!(" entry {i}: `{v}` is no time in seconds"))
+                        v.as_f64()
+                            .ok_or_else(|| format!(" entry {i}: `{}` is no time in seconds", excerpt(&v.to_string())))
                     })
                 };
                 let clip = get(&CLIP).and_then(Value::as_str).ok_or_else(|| format!(" entry {i}: no `clip`"))?;

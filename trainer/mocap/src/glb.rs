@@ -27,6 +27,9 @@ const MOST_NODES: usize = 4_096;
 /// Frames times nodes: half a GiB of rotations.
 const MOST_ROTATIONS: usize = 32 << 20;
 
+/// Metres: where the singles of the file still tell a bone's ends apart by centimetres, and sums of bones stay finite.
+const FARTHEST: f64 = 1e5;
+
 /// Colours of the three sides, sRGB, as in the drawings.
 const COLOURS: [(Side, &str, [u8; 3]); 3] = [
     (Side::Middle, "middle", [70, 74, 84]),
@@ -61,8 +64,8 @@ pub enum GlbError {
         /// Frames per second.
         fps: f64,
     },
-    /// A position or rotation is not finite.
-    #[error("the motion holds a number that is not finite")]
+    /// A position or rotation is not finite, or so far away that no figure could be drawn there.
+    #[error("the motion holds a number that is not finite, or a position farther than {FARTHEST} m")]
     NotFinite,
 }
 
@@ -87,7 +90,7 @@ pub fn to_bytes(rig: &Rig, fps: f64, metres_per_unit: f64, name: &str) -> Result
     }
     let offsets = rig.nodes.iter().flat_map(|node| node.offset);
     let numbers = offsets.chain(rig.roots.iter().flatten().copied()).chain(rig.local.iter().flatten().copied());
-    if !metres_per_unit.is_finite() || !numbers.into_iter().all(|v| (v * metres_per_unit).abs() < f64::from(f32::MAX)) {
+    if !metres_per_unit.is_finite() || !numbers.into_iter().all(|v| (v * metres_per_unit).abs() <= FARTHEST) {
         return Err(GlbError::NotFinite);
     }
     let times: Vec<f32> = (0..frames).map(|t| (t as f64 / fps) as f32).collect();

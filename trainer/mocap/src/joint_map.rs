@@ -22,6 +22,7 @@ use std::path::{Path, PathBuf};
 use motion::Skeleton;
 use motion::files;
 use motion::quaternion::{self as quat, Vec3};
+use protocol::excerpt;
 use protocol::pipeline::yaml_as_json;
 use protocol::stage::DataFormat;
 use serde::{Deserialize, Serialize};
@@ -185,7 +186,11 @@ impl JointMap {
             return Err(fail(format!(" joints are missing: {}", missing.join(", "))));
         }
         if !strange.is_empty() {
-            return Err(fail(format!(" `{}` are no joints; expected {}", strange.join("`, `"), names.join(", "))));
+            return Err(fail(format!(
+                " `{}` are no joints; expected {}",
+                excerpt(&strange.join("`, `")),
+                names.join(", ")
+            )));
         }
         Ok(map)
     }

@@ -110,7 +110,7 @@ pub fn list(folder: &Path, table: Option<&Path>) -> Result<Listing, ListError> {
         }
     }
     for (file, required) in tables(folder, table) {
-        match read_text(&file) {
+        match read_text(&file, limits::CLIP_LIST_BYTES) {
             Ok(Some(text)) => match captions::of_table(&file, &text) {
                 Ok(rows) => apply(&file, rows, &mut clips, &mut notes, &mut problems),
                 Err(problem) => problems.push(problem),
@@ -134,8 +134,8 @@ fn id_of(path: &Path) -> String {
     parts.iter().map(|part| part.to_string_lossy()).collect::<Vec<_>>().join("_")
 }
 
-fn read_text(file: &Path) -> Result<Option<String>, String> {
-    match files::read(file, limits::CLIP_LIST_BYTES) {
+fn read_text(file: &Path, most: u64) -> Result<Option<String>, String> {
+    match files::read(file, most) {
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
         Err(e) => Err(format!("{}: {e}", file.display())),
         Ok(bytes) => String::from_utf8(bytes).map(Some).map_err(|_| format!("{}: not UTF-8 text", file.display())),
@@ -145,7 +145,7 @@ fn read_text(file: &Path) -> Result<Option<String>, String> {
 /// The captions in a file of the clip's own.
 fn texts(folder: &Path, clip: &mut ClipFile) -> Result<(), String> {
     for file in [folder.join("texts").join(format!("{}.txt", clip.id)), clip.path.with_extension("txt")] {
-        if let Some(text) = read_text(&file)? {
+        if let Some(text) = read_text(&file, limits::CAPTIONS_BYTES)? {
             clip.captions = captions::of_text(&file, &text)?;
             break;
         }
@@ -222,7 +222,7 @@ fn apply(
 fn lists(folder: &Path, clips: &mut BTreeMap<String, ClipFile>, problems: &mut Vec<String>) -> bool {
     let mut texts = vec![];
     for split in Split::ALL {
-        match read_text(&folder.join(format!("{split}.txt"))) {
+        match read_text(&folder.join(format!("{split}.txt")), limits::CLIP_LIST_BYTES) {
             Ok(Some(text)) => texts.push((split, text)),
             Ok(None) => return false,
             Err(problem) => problems.push(problem),

@@ -69,7 +69,8 @@ impl FromStr for Length {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let expected = || format!("`{text}` is no length; expected frames such as `120`, or seconds such as `4.5s`");
+        let shown = protocol::excerpt(text);
+        let expected = || format!("`{shown}` is no length; expected frames such as `120`, or seconds such as `4.5s`");
         match text.strip_suffix('s') {
             Some(number) => Self::seconds(number.parse().map_err(|_| expected())?),
             None => Self::of_frames(text.parse().map_err(|_| expected())?),
@@ -185,6 +186,7 @@ fn of_json(line: &str) -> Result<Request, String> {
         return Ok(Request { caption, length: None });
     }
     let fields: Fields = serde_json::from_str(line).map_err(|error| {
+        let error = protocol::excerpt(&error.to_string());
         format!("{error}; expected a line such as {{\"caption\": \"a person walks\", \"seconds\": 4.5}}")
     })?;
     let length = match (fields.frames, fields.seconds) {

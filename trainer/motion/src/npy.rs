@@ -118,7 +118,10 @@ pub fn parse(file: &Path, bytes: &[u8], allow_f64: bool) -> Result<Array, NpyErr
     Ok(Array { shape, data: data.map_err(header_error)? })
 }
 
-/// What the header's reader takes on trust: how long it is, for which it makes room, and a shape, whose axes it multiplies.
+/// Brackets in one another; those of a plain array are a mapping and the tuple in it.
+const DEPTH: usize = 4;
+
+/// What the header's reader takes on trust: how long it is, for which it makes room, how deep it is, and a shape, whose axes it multiplies.
 fn check_header(bytes: &[u8]) -> Result<(), String> {
     let [b'\x93', b'N', b'U', b'M', b'P', b'Y', major, _, rest @ ..] = bytes else {
         return Err("it does not begin as one".into());
@@ -133,6 +136,18 @@ fn check_header(bytes: &[u8]) -> Result<(), String> {
         return Err(format!("a header of {length} bytes, expected at most {}", limits::ARRAY_HEADER_BYTES));
     }
     let header = rest.get(..length as usize).ok_or("its header is cut off")?;
+    // Its reader takes twice as long for each level.
+    let mut depth = 0_usize;
+    for byte in header {
+        match byte {
+            b'(' | b'[' | b'{' => depth += 1,
+            b')' | b']' | b'}' => depth = depth.saturating_sub(1),
+            _ => {}
+        }
+        if depth > DEPTH {
+            return Err(format!("a header with more than {DEPTH} brackets in one another"));
+        }
+    }
     let header = String::from_utf8_lossy(header);
     for after in header.split("shape").skip(1) {
         let axes = after.split_once('(').and_then(|(_, axes)| axes.split_once(')')).map_or("", |(axes, _)| axes);

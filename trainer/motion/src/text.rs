@@ -7,7 +7,7 @@
 
 use std::path::{Path, PathBuf};
 
-use protocol::limits;
+use protocol::{excerpt, limits};
 use serde::{Deserialize, Serialize};
 
 /// Width of [`hashed_embedding`].
@@ -76,7 +76,7 @@ impl Caption {
         }
         let tokens: Vec<String> = tokens.split_whitespace().map(str::to_owned).collect();
         if let Some(token) = tokens.iter().find(|t| split_token(t).is_none()) {
-            return Err(format!("token `{}` is not `word/POS`", token.escape_debug()));
+            return Err(format!("token `{}` is not `word/POS`", excerpt(token)));
         }
         Ok(Self { text: text.to_owned(), tokens, from_s: seconds(from)?, to_s: seconds(to)? })
     }
@@ -93,8 +93,7 @@ impl Caption {
 }
 
 fn seconds(text: &str) -> Result<f64, String> {
-    let value: f64 =
-        text.trim().parse().map_err(|_| format!("time `{}` is not a number of seconds", text.escape_debug()))?;
+    let value: f64 = text.trim().parse().map_err(|_| format!("time `{}` is not a number of seconds", excerpt(text)))?;
     Ok(if value.is_nan() { 0.0 } else { value })
 }
 
@@ -121,7 +120,7 @@ pub struct Texts {
     pub odd: Vec<(usize, Oddity)>,
 }
 
-/// Reads a text file: every line that is not blank, or every line that does not parse.
+/// Reads a text file: every line that is not blank, or the lines that do not parse, the first [`limits::MISTAKES`] of them.
 pub fn parse_file(file: &Path, content: &str) -> Result<Texts, Vec<TextError>> {
     let (mut texts, mut errors) = (Texts::default(), vec![]);
     for (i, line) in content.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
@@ -129,6 +128,10 @@ pub fn parse_file(file: &Path, content: &str) -> Result<Texts, Vec<TextError>> {
             Ok(caption) => caption,
             Err(what) => {
                 errors.push(TextError { file: file.into(), line: i + 1, what });
+                // Each names the file, so that many would take far more than the text.
+                if errors.len() >= limits::MISTAKES {
+                    break;
+                }
                 continue;
             }
         };

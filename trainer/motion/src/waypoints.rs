@@ -12,6 +12,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use protocol::{excerpt, limits};
 use serde_json::Value;
 
 use crate::features::recover_joints;
@@ -52,18 +53,31 @@ struct Line {
 /// # Errors
 /// What is wrong with it, with its line or place and what was expected.
 pub fn read(file: &Path, skeleton: &Skeleton, joints: &[String]) -> Result<Vec<Waypoint>, String> {
+    let limit = if ending(file) == "npy" { limits::ARRAY_BYTES } else { PATH_BYTES };
+    let bytes = if ["csv", "json", "npy"].contains(&ending(file).as_str()) {
+        files::read(file, limit).map_err(|error| format!("`{}`: {error}", file.display()))?
+    } else {
+        Vec::new()
+    };
+    parse(file, &bytes, skeleton, joints)
+}
+
+/// Waypoints of a file's bytes, as [`read`] gives them; what kind they are the file's name says.
+///
+/// # Errors
+/// As [`read`].
+pub fn parse(file: &Path, bytes: &[u8], skeleton: &Skeleton, joints: &[String]) -> Result<Vec<Waypoint>, String> {
     let told: Vec<usize> = joints.iter().map(|name| number(name, skeleton)).collect::<Result<_, _>>()?;
     let named = |error: String| format!("`{}`: {error}", file.display());
-    let ending = file.extension().and_then(|ending| ending.to_str()).unwrap_or_default().to_lowercase();
+    let ending = ending(file);
     if ending == "npy" {
-        return motion(file, skeleton, if told.is_empty() { &[0] } else { &told });
+        return motion(file, bytes, skeleton, if told.is_empty() { &[0] } else { &told });
     }
     if ending != "csv" && ending != "json" {
         return Err(named("expected a name that ends in .csv, .json or .npy".into()));
     }
-    let bytes = files::read(file, PATH_BYTES).map_err(|error| named(error.to_string()))?;
-    let text = String::from_utf8(bytes).map_err(|_| named("is no text in UTF-8".into()))?;
-    let lines = if ending == "csv" { csv(&text) } else { json(&text) }.map_err(named)?;
+    let text = std::str::from_utf8(bytes).map_err(|_| named("is no text in UTF-8".into()))?;
+    let lines = if ending == "csv" { csv(text) } else { json(text) }.map_err(named)?;
     waypoints(&lines, skeleton, &told).map_err(named)
 }
 
@@ -99,10 +113,16 @@ pub fn check_start(waypoints: &[Waypoint], skeleton: &Skeleton, start: [f64; 3])
     Ok(())
 }
 
+/// What a file's name ends in, in lower case.
+fn ending(file: &Path) -> String {
+    file.extension().and_then(|ending| ending.to_str()).unwrap_or_default().to_lowercase()
+}
+
 fn number(name: &str, skeleton: &Skeleton) -> Result<usize, String> {
     skeleton.names.iter().position(|known| *known == name).ok_or_else(|| {
         format!(
-            "`{name}` is no joint of a skeleton of {} joints; its joints are {}",
+            "`{}` is no joint of a skeleton of {} joints; its joints are {}",
+            excerpt(name),
             skeleton.joints,
             skeleton.names.join(", ")
         )
@@ -110,8 +130,8 @@ fn number(name: &str, skeleton: &Skeleton) -> Result<usize, String> {
 }
 
 /// Joints of a motion in every frame.
-fn motion(file: &Path, skeleton: &Skeleton, told: &[usize]) -> Result<Vec<Waypoint>, String> {
-    let array = npy::read_any_float(file).map_err(|error| error.to_string())?;
+fn motion(file: &Path, bytes: &[u8], skeleton: &Skeleton, told: &[usize]) -> Result<Vec<Waypoint>, String> {
+    let array = npy::parse(file, bytes, true).map_err(|error| error.to_string())?;
     let (joints, features) = (skeleton.joints, skeleton.features);
     let rows = match array.shape[..] {
         [_, count, 3] if count == joints => array.data,
@@ -145,11 +165,11 @@ fn csv(text: &str) -> Result<Vec<Line>, String> {
     let columns: Vec<String> = header.split(',').map(|column| column.trim().to_lowercase()).collect();
     let column = |name: &str| columns.iter().position(|column| column == name);
     let (Some(t), Some(x), Some(y), Some(z)) = (column("t"), column("x"), column("y"), column("z")) else {
-        return Err(format!("line 1 is `{}`; {expected}", header.trim()));
+        return Err(format!("line 1 is `{}`; {expected}", excerpt(header.trim())));
     };
     let joint = column("joint");
     if columns.len() != 4 + usize::from(joint.is_some()) {
-        return Err(format!("line 1 is `{}`; {expected}", header.trim()));
+        return Err(format!("line 1 is `{}`; {expected}", excerpt(header.trim())));
     }
     lines
         .map(|(i, line)| {
@@ -160,7 +180,8 @@ fn csv(text: &str) -> Result<Vec<Line>, String> {
             }
             let value = |k: usize| {
                 let cell = cells[k];
-                cell.parse::<f64>().map_err(|_| format!("{place}: `{cell}` in column `{}` is no number", columns[k]))
+                cell.parse::<f64>()
+                    .map_err(|_| format!("{place}: `{}` in column `{}` is no number", excerpt(cell), columns[k]))
             };
             let (seconds, position) = (value(t)?, [value(x)?, value(y)?, value(z)?]);
             Ok(Line { place, seconds, joint: joint.map(|k| cells[k].to_owned()), position })
@@ -184,14 +205,17 @@ fn of_value(value: &Value) -> Result<Vec<Line>, String> {
                     let joint = joint.map(str::to_owned);
                     Ok(Line { place, seconds: *t, joint, position: [*x, *y, *z] })
                 }
-                _ => Err(format!("{place} is {row}; expected [t, x, y, z] in seconds and metres")),
+                _ => Err(format!(
+                    "{place} is {}; expected [t, x, y, z] in seconds and metres",
+                    excerpt(&row.to_string())
+                )),
             }
         };
         list.iter().enumerate().map(row).collect()
     };
     match value {
         Value::Object(joints) => {
-            let each = joints.iter().map(|(joint, list)| rows(list, Some(joint), joint));
+            let each = joints.iter().map(|(joint, list)| rows(list, Some(joint), &excerpt(joint)));
             Ok(each.collect::<Result<Vec<_>, _>>()?.concat())
         }
         list => rows(list, None, "path"),

@@ -19,5 +19,5 @@ pub use artifact::{ArtifactKind, FileEntry, Manifest};
 pub use digest::Digest;
 pub use id::{Alias, Attempt, Fence, Generation, Incarnation, ModelName, RunId, Seed, StageName, TaskId, WorkerId};
 pub use pipeline::Pipeline;
-pub use printable::printable;
+pub use printable::{excerpt, printable};
 pub use units::Steps;

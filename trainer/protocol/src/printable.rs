@@ -26,9 +26,25 @@ pub fn printable(text: &str) -> Cow<'_, str> {
     Cow::Owned(shown)
 }
 
+/// Characters of a text that an error shows.
+const SHOWN: usize = 120;
+
+/// The beginning of a text of somebody else's, for an error.
+pub fn excerpt(text: &str) -> String {
+    let begins: String = text.chars().take(SHOWN).collect();
+    let more = if begins.len() < text.len() { "..." } else { "" };
+    format!("{}{more}", begins.escape_debug())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_error_shows_the_beginning_of_a_text() {
+        assert_eq!(excerpt("a\u{1b}b"), "a\\u{1b}b");
+        assert_eq!(excerpt(&"\u{e9}".repeat(121)), format!("{}...", "\u{e9}".repeat(120)));
+    }
 
     #[test]
     fn no_escape_sequence_is_left() {

@@ -5,6 +5,7 @@
 
 mod attempt;
 mod gang;
+pub mod hostile;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;

@@ -2,6 +2,9 @@
 
 use std::path::Path;
 
+/// Characters that are said of a file.
+const SHOWN: usize = 2_000;
+
 /// What is wrong with a file of an encoder, what was expected, and what to do.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{place}: {what}")]
@@ -14,7 +17,13 @@ pub struct EncoderError {
 
 impl EncoderError {
     pub(crate) fn new(place: impl ToString, what: impl Into<String>) -> Self {
-        Self { place: place.to_string(), what: what.into() }
+        let mut what = what.into();
+        // It may quote the file.
+        if let Some((end, _)) = what.char_indices().nth(SHOWN) {
+            what.truncate(end);
+            what.push_str("...");
+        }
+        Self { place: place.to_string(), what }
     }
 
     pub(crate) fn at(place: &Path, what: impl Into<String>) -> Self {

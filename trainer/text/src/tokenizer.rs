@@ -1,13 +1,14 @@
 //! Captions as ids: the `tokenizers` crate under the [`Rules`] of a published model.
 //!
 //! The crate takes what a file says on trust, so a file is looked at first. Refused are: a network's table that is shorter than the vocabulary,
-//! dropout (ids would be drawn), and steps before the cutting that make much text of little. What the file says of truncation and padding is
+//! dropout (ids would be drawn), more entries than any vocabulary has, and steps before the cutting that make much text of little. What the file says of truncation and padding is
 //! replaced by the rules. A panic of the crate is an error here.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use protocol::limits;
-use serde::Deserialize;
+use serde::de::{IgnoredAny, MapAccess, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer};
 use serde_json::{Value, json};
 use tokenizers::{PostProcessor as _, TruncationParams};
 
@@ -23,11 +24,16 @@ const REPLACEMENTS: (usize, usize) = (4, 8);
 /// Bytes that a character may become in a table of SentencePiece's.
 const MAPPED_BYTES: usize = 64;
 
-/// The parts of `tokenizer.json` that are looked at; vocabulary and merges are passed over.
+/// Entries of a vocabulary, of its merges, and of the tokens added to it; that of the papers' encoders has at most 49,408.
+const ENTRIES: usize = 500_000;
+
+/// The parts of `tokenizer.json` that are looked at; vocabulary and merges are counted.
 #[derive(Deserialize)]
 struct Looked {
     #[serde(default)]
     normalizer: Value,
+    #[serde(default)]
+    added_tokens: Count,
     model: LookedModel,
 }
 
@@ -35,6 +41,50 @@ struct Looked {
 struct LookedModel {
     #[serde(default)]
     dropout: Option<f64>,
+    #[serde(default)]
+    vocab: Count,
+    #[serde(default)]
+    merges: Count,
+}
+
+/// How many entries a list or a mapping has, of which none is kept.
+#[derive(Default)]
+struct Count(usize);
+
+impl<'de> Deserialize<'de> for Count {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct Counts;
+
+        impl<'de> Visitor<'de> for Counts {
+            type Value = Count;
+
+            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str("a list or a mapping")
+            }
+
+            fn visit_unit<E>(self) -> Result<Count, E> {
+                Ok(Count(0))
+            }
+
+            fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Count, A::Error> {
+                let mut count = 0;
+                while list.next_element::<IgnoredAny>()?.is_some() {
+                    count += 1;
+                }
+                Ok(Count(count))
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Count, A::Error> {
+                let mut count = 0;
+                while map.next_entry::<IgnoredAny, IgnoredAny>()?.is_some() {
+                    count += 1;
+                }
+                Ok(Count(count))
+            }
+        }
+
+        deserializer.deserialize_any(Counts)
+    }
 }
 
 /// A tokenizer under a model's rules.
@@ -139,6 +189,12 @@ fn parsed(place: &str, json: &[u8]) -> Result<tokenizers::Tokenizer, EncoderErro
     let refuse = |what: String| EncoderError::new(place, what);
     let expected = "expected a `tokenizer.json` as Hugging Face's tokenizers write it";
     let looked: Looked = serde_json::from_slice(json).map_err(|e| refuse(format!("{e}; {expected}")))?;
+    let counted = [("model.vocab", &looked.model.vocab), ("model.merges", &looked.model.merges)];
+    for (what, Count(count)) in counted.into_iter().chain([("added_tokens", &looked.added_tokens)]) {
+        if *count > ENTRIES {
+            return Err(refuse(format!("`{what}` has {count} entries; expected at most {ENTRIES}")));
+        }
+    }
     if looked.model.dropout.is_some_and(|share| share != 0.0) {
         return Err(refuse("`model.dropout` is set, so that ids would be drawn by chance; set it to null".into()));
     }

@@ -380,7 +380,7 @@ mod tests {
             ("Frames: 2", "Frames: 99999999999999999999999", "whole number that can be counted to"),
             ("Frames: 2", "Frames: 99999999999", "at most"),
             (".0333", "0", "expected seconds above 0"),
-            (".0333", "1e30", "at most 21600 s are read"),
+            (".0333", "1e30", "at most 3600 s are read"),
             ("-90", "1e39", "value 1 of frame 1 is `1e39`"),
             ("-90", "-90 3", "frame 1 has more than 2 numbers"),
             ("2 -90", "2", "x.bvh:7: frame 1 has 1 numbers, expected 2"),

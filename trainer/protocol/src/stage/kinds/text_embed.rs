@@ -26,9 +26,11 @@ const SENTENCE_T5_FILES: [&str; 1] = ["modules.json"];
 pub struct TextEmbed {
     /// Which encoder.
     pub encoder: TextEncoder,
-    /// Folder with the published encoder, in the layout of Hugging Face or of sentence-transformers; `hashed` has none. Not part of the key: the
-    /// content's digest is.
+    /// Folder with the published encoder, in the layout of Hugging Face or of sentence-transformers, or its name on huggingface.co, such as
+    /// `sentence-transformers/sentence-t5-large`, where no such folder is; `hashed` has none. Not part of the key: the content's digest is.
     pub path: String,
+    /// Branch, tag or commit of a name on huggingface.co; empty is `main`. Not part of the key either.
+    pub revision: String,
     /// Which vector of CLIP's a caption is; its words are the states of all tokens either way.
     pub output: ClipOutput,
     /// How captions become CLIP's token ids.
@@ -46,6 +48,7 @@ impl Default for TextEmbed {
         Self {
             encoder: TextEncoder::Hashed,
             path: String::new(),
+            revision: String::new(),
             output: ClipOutput::Projected,
             ids: ClipIds::HuggingFace,
             max_tokens: 0,

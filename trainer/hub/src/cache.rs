@@ -1,0 +1,77 @@
+//! What is in the cache.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use motion::files;
+
+use crate::settings::Settings;
+use crate::wanted::{Encoder, Failure, Repository, get_all};
+use crate::{Found, HubError, Name, is_commit};
+
+/// Bytes of a file with a commit.
+const COMMIT_BYTES: u64 = 1 << 10;
+
+/// The folder of a repository.
+pub(crate) fn root(settings: &Settings, name: &Name) -> PathBuf {
+    settings.cache.join(format!("models--{}", name.repository.replace('/', "--")))
+}
+
+/// The folder of a commit.
+pub(crate) fn snapshot(settings: &Settings, name: &Name, commit: &str) -> PathBuf {
+    root(settings, name).join("snapshots").join(commit)
+}
+
+/// Whether the name is that of a file below a folder, and of none above it.
+pub(crate) fn is_sound(name: &str) -> bool {
+    let plain = |part: &str| !part.is_empty() && part != "." && part != ".." && !part.contains(['\\', '\0']);
+    name.len() <= 1_000 && name.split('/').all(plain)
+}
+
+/// A commit's files as they lie here.
+struct Snapshot {
+    folder: PathBuf,
+    names: BTreeSet<String>,
+}
+
+impl Repository for Snapshot {
+    fn names(&self) -> &BTreeSet<String> {
+        &self.names
+    }
+
+    fn get(&mut self, name: &str) -> Result<PathBuf, Failure> {
+        Ok(self.folder.join(name))
+    }
+}
+
+fn commit(settings: &Settings, name: &Name) -> Option<String> {
+    if name.is_commit() {
+        return Some(name.revision.clone());
+    }
+    // A branch that was never asked for has no file.
+    let bytes = files::read(&root(settings, name).join("refs").join(&name.revision), COMMIT_BYTES).ok()?;
+    String::from_utf8(bytes).ok().map(|text| text.trim().to_owned()).filter(|text| is_commit(text))
+}
+
+fn names(folder: &Path) -> BTreeSet<String> {
+    // What is not there is named by who misses it.
+    let Ok(all) = files::tree(folder) else { return BTreeSet::new() };
+    let name = |path: PathBuf| Some(path.strip_prefix(folder).ok()?.to_string_lossy().into_owned());
+    all.into_iter().filter_map(name).collect()
+}
+
+/// The snapshot of a name with all that is wanted; `why` says why nothing is fetched.
+pub(crate) fn find(settings: &Settings, name: &Name, encoder: Encoder, why: &str) -> Result<Found, HubError> {
+    let away = |why: String| HubError::NotHere { name: name.to_string(), cache: settings.cache.clone(), why };
+    let commit = commit(settings, name).ok_or_else(|| away(why.to_owned()))?;
+    let folder = snapshot(settings, name, &commit);
+    let mut snapshot = Snapshot { names: names(&folder), folder: folder.clone() };
+    if snapshot.names.is_empty() {
+        return Err(away(why.to_owned()));
+    }
+    match get_all(&mut snapshot, encoder) {
+        Ok(()) => Ok(Found { folder, commit, note: None }),
+        Err(Failure::Said(error)) => Err(error),
+        Err(Failure::Content(what) | Failure::Away(what)) => Err(away(format!("which {what}, {why}"))),
+    }
+}

@@ -1,0 +1,263 @@
+//! What the hub has, and how it gets into the cache.
+
+use std::collections::BTreeSet;
+use std::fs::{self, File};
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use protocol::limits;
+use reqwest::blocking::{Client, Response};
+use reqwest::header::{ETAG, HeaderMap};
+use reqwest::{StatusCode, Url};
+use serde::Deserialize;
+use sha2::{Digest as _, Sha256};
+
+pub(crate) use crate::wanted::Failure;
+
+use crate::cache::{is_sound, root, snapshot};
+use crate::settings::Settings;
+use crate::wanted::{Encoder, Repository, get_all};
+use crate::{Found, HubError, Name, is_commit};
+
+/// Bytes of the hub's answer about a repository.
+const LISTING_BYTES: u64 = 16 << 20;
+/// Files of a repository.
+const FILES: usize = 20_000;
+/// Until there is a connection.
+const CONNECT: Duration = Duration::from_secs(10);
+/// Until something more arrives.
+const SILENCE: Duration = Duration::from_secs(60);
+/// Large enough to be told.
+const TOLD_BYTES: u64 = 1 << 20;
+
+/// What the hub says of a revision.
+#[derive(Deserialize)]
+struct Listing {
+    sha: String,
+    #[serde(default)]
+    siblings: Vec<Sibling>,
+}
+
+#[derive(Deserialize)]
+struct Sibling {
+    rfilename: String,
+}
+
+struct Remote<'a> {
+    settings: &'a Settings,
+    name: &'a Name,
+    /// Follows nobody: the first answer says what the file is, and where.
+    asks: Client,
+    /// Follows to where the file is. What was shown to the hub is not shown there.
+    fetches: Client,
+    commit: String,
+    names: BTreeSet<String>,
+    said: &'a mut dyn FnMut(&str),
+}
+
+/// Fetches what is not in the cache.
+pub(crate) fn fetch(
+    settings: &Settings,
+    name: &Name,
+    encoder: Encoder,
+    said: &mut dyn FnMut(&str),
+) -> Result<Found, Failure> {
+    access::tls::install_provider();
+    // Of a blocking client the limit is for each wait, not for the whole.
+    let client = || Client::builder().connect_timeout(CONNECT).timeout(SILENCE).user_agent("stride");
+    let built = |client: reqwest::blocking::ClientBuilder| client.build().map_err(|e| Failure::Away(chain(&e)));
+    let asks = built(client().redirect(reqwest::redirect::Policy::none()))?;
+    let fetches = built(client().redirect(reqwest::redirect::Policy::limited(5)))?;
+    let mut remote = Remote { settings, name, asks, fetches, commit: String::new(), names: BTreeSet::new(), said };
+    remote.list()?;
+    get_all(&mut remote, encoder)?;
+    let commit = remote.commit;
+    if !name.is_commit() {
+        write_whole(&root(settings, name).join("refs").join(&name.revision), commit.as_bytes())?;
+    }
+    Ok(Found { folder: snapshot(settings, name, &commit), commit, note: None })
+}
+
+/// An error with its causes.
+fn chain(error: &dyn std::error::Error) -> String {
+    let causes = std::iter::successors(error.source(), |cause| cause.source());
+    causes.fold(error.to_string(), |said, cause| format!("{said}: {cause}"))
+}
+
+fn io(file: &Path) -> impl FnOnce(std::io::Error) -> Failure + '_ {
+    |source| Failure::Said(HubError::Io { file: file.into(), source })
+}
+
+/// Writes a file beside its place first.
+fn write_whole(file: &Path, bytes: &[u8]) -> Result<(), Failure> {
+    let folder = file.parent().unwrap_or(Path::new("."));
+    fs::create_dir_all(folder).map_err(io(folder))?;
+    let mut kept = tempfile::NamedTempFile::new_in(folder).map_err(io(folder))?;
+    kept.write_all(bytes).map_err(io(file))?;
+    kept.persist(file).map_err(|e| io(file)(e.error))?;
+    Ok(())
+}
+
+/// What a file is called in the cache, and its SHA-256 where the name is that.
+struct Identity {
+    etag: String,
+    sha256: Option<String>,
+}
+
+fn identity(headers: &HeaderMap) -> Option<Identity> {
+    let text = |name: &str| headers.get(name).and_then(|value| value.to_str().ok());
+    let etag = text("x-linked-etag").or_else(|| text(ETAG.as_str()))?;
+    let etag = etag.trim_start_matches("W/").trim_matches('"').to_owned();
+    let plain = etag.bytes().all(|c| c.is_ascii_alphanumeric() || c == b'-');
+    let is_digest = etag.len() == 64 && etag.bytes().all(|c| c.is_ascii_hexdigit());
+    (plain && (8..=128).contains(&etag.len()))
+        .then(|| Identity { sha256: is_digest.then(|| etag.to_lowercase()), etag })
+}
+
+impl Remote<'_> {
+    fn refused(&self, what: String) -> Failure {
+        let endpoint = self.settings.endpoint.clone();
+        Failure::Said(HubError::Refused { name: self.name.to_string(), endpoint, what })
+    }
+
+    fn url(&self, parts: &[&str]) -> Result<Url, Failure> {
+        let endpoint = &self.settings.endpoint;
+        let wrong = |why: String| Failure::Away(format!("`{endpoint}` is no address ({why})"));
+        let mut url = Url::parse(endpoint).map_err(|e| wrong(e.to_string()))?;
+        if !matches!(url.scheme(), "http" | "https") {
+            return Err(wrong("expected https".into()));
+        }
+        url.path_segments_mut().map_err(|()| wrong("it has no paths".into()))?.pop_if_empty().extend(parts);
+        Ok(url)
+    }
+
+    /// Asks with the token, and tells what is no success.
+    fn send(&self, client: &Client, method: reqwest::Method, url: Url) -> Result<Response, Failure> {
+        let request = client.request(method, url);
+        let request = match &self.settings.token {
+            Some(token) => request.bearer_auth(token),
+            None => request,
+        };
+        let answer = request.send().map_err(|e| Failure::Away(chain(&e)))?;
+        match answer.status() {
+            status if status.is_success() || status.is_redirection() => Ok(answer),
+            StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN => {
+                Err(self
+                    .refused("no such repository, or one that is private or gated; set HF_TOKEN if it is yours".into()))
+            }
+            StatusCode::NOT_FOUND => Err(self.refused("no such repository or revision".into())),
+            status if status.is_server_error() || status == StatusCode::TOO_MANY_REQUESTS => {
+                Err(Failure::Away(format!("it answers {status}")))
+            }
+            status => Err(self.refused(format!("{status}"))),
+        }
+    }
+
+    /// Asks which commit the revision is, and which files it has.
+    fn list(&mut self) -> Result<(), Failure> {
+        let repository = self.name.repository.clone();
+        let (organisation, name) = repository.split_once('/').unwrap_or(("", &repository));
+        let url = self.url(&["api", "models", organisation, name, "revision", &self.name.revision])?;
+        // A repository that was renamed is somewhere else on the hub.
+        let answer = self.send(&self.fetches, reqwest::Method::GET, url)?;
+        let mut bytes = Vec::new();
+        answer.take(LISTING_BYTES + 1).read_to_end(&mut bytes).map_err(|e| Failure::Away(e.to_string()))?;
+        let listing: Option<Listing> = serde_json::from_slice(&bytes).ok();
+        let listing = listing.filter(|listing| is_commit(&listing.sha) && listing.siblings.len() <= FILES);
+        let listing = listing.ok_or_else(|| self.refused("what is no list of files; is it a hub?".into()))?;
+        self.commit = listing.sha;
+        self.names = listing.siblings.into_iter().map(|one| one.rfilename).filter(|name| is_sound(name)).collect();
+        Ok(())
+    }
+
+    /// Fetches a file to its blob, or to its place if nothing says what it is.
+    fn download(&mut self, name: &str, place: &Path) -> Result<(), Failure> {
+        let repository = self.name.repository.clone();
+        let parts: Vec<&str> =
+            repository.split('/').chain(["resolve", self.commit.as_str()]).chain(name.split('/')).collect();
+        let url = self.url(&parts)?;
+        let identity = identity(self.send(&self.asks, reqwest::Method::HEAD, url.clone())?.headers());
+        let root = root(self.settings, self.name);
+        let blob = identity.as_ref().map_or_else(|| place.to_owned(), |known| root.join("blobs").join(&known.etag));
+        if !blob.is_file() {
+            let answer = self.send(&self.fetches, reqwest::Method::GET, url)?;
+            let sha256 = identity.as_ref().and_then(|known| known.sha256.as_deref());
+            self.keep(name, answer, &blob, sha256)?;
+        }
+        if blob == place {
+            return Ok(());
+        }
+        let folder = place.parent().unwrap_or(Path::new("."));
+        fs::create_dir_all(folder).map_err(io(folder))?;
+        // From `snapshots/COMMIT/a/b` to `blobs/ETAG`.
+        let up = "../".repeat(2 + name.matches('/').count());
+        let target = PathBuf::from(up).join("blobs").join(blob.file_name().unwrap_or_default());
+        match std::os::unix::fs::symlink(target, place) {
+            // Another process was faster.
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => Ok(()),
+            made => made.map_err(io(place)),
+        }
+    }
+
+    /// Writes an answer to `blob`, once all of it is there and is what it should be.
+    fn keep(&mut self, name: &str, mut answer: Response, blob: &Path, sha256: Option<&str>) -> Result<(), Failure> {
+        let length = answer.content_length();
+        if length.is_some_and(|bytes| bytes > limits::WEIGHTS_BYTES) {
+            let (bytes, most) = (length.unwrap_or_default(), limits::WEIGHTS_BYTES);
+            return Err(self.refused(format!("`{name}` has {bytes} bytes; at most {most} are fetched")));
+        }
+        if length.is_some_and(|bytes| bytes >= TOLD_BYTES) {
+            (self.said)(&format!("fetching {name} of {} ({} MB)", self.name, length.unwrap_or_default() >> 20));
+        }
+        let folder = blob.parent().unwrap_or(Path::new("."));
+        fs::create_dir_all(folder).map_err(io(folder))?;
+        let mut kept = tempfile::NamedTempFile::new_in(folder).map_err(io(folder))?;
+        let (mut hasher, mut part, mut written) = (Sha256::new(), vec![0; 256 << 10], 0_u64);
+        loop {
+            let count = answer.read(&mut part).map_err(|e| Failure::Away(format!("`{name}` was cut: {e}")))?;
+            if count == 0 {
+                break;
+            }
+            written += count as u64;
+            if written > limits::WEIGHTS_BYTES {
+                return Err(self
+                    .refused(format!("`{name}` has more than {} bytes; no more are fetched", limits::WEIGHTS_BYTES)));
+            }
+            hasher.update(&part[..count]);
+            kept.write_all(&part[..count]).map_err(io(blob))?;
+        }
+        if length.is_some_and(|length| length != written) {
+            return Err(Failure::Away(format!(
+                "`{name}` was cut after {written} of {} bytes",
+                length.unwrap_or_default()
+            )));
+        }
+        let found = protocol::Digest::from_bytes(hasher.finalize().into()).hex();
+        if sha256.is_some_and(|expected| expected != found) {
+            return Err(self.refused(format!("`{name}` arrived with another digest than it should have")));
+        }
+        kept.as_file().sync_all().map_err(io(blob))?;
+        let kept = kept.persist(blob).map_err(|e| io(blob)(e.error))?;
+        readable(&kept).map_err(io(blob))
+    }
+}
+
+/// Temporary files are their owner's alone; what is in the cache is everybody's who may read the cache.
+fn readable(file: &File) -> std::io::Result<()> {
+    file.set_permissions(std::os::unix::fs::PermissionsExt::from_mode(0o644))
+}
+
+impl Repository for Remote<'_> {
+    fn names(&self) -> &BTreeSet<String> {
+        &self.names
+    }
+
+    fn get(&mut self, name: &str) -> Result<PathBuf, Failure> {
+        let place = snapshot(self.settings, self.name, &self.commit).join(name);
+        if !place.is_file() {
+            self.download(name, &place)?;
+        }
+        Ok(place)
+    }
+}

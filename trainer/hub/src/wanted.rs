@@ -1,0 +1,144 @@
+//! Which files of a repository an encoder reads: those that `text_models::EncoderFolder` opens, and no others.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Component, Path, PathBuf};
+
+use motion::files;
+use serde::Deserialize;
+
+/// Bytes of a file that says which others there are.
+const LISTING_BYTES: u64 = 16 << 20;
+/// Files of sharded weights.
+const SHARDS: usize = 256;
+/// Modules of a sentence encoder.
+const MODULES: usize = 16;
+
+/// What is read of a repository.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Encoder {
+    /// CLIP's text tower, whose tokenizer may be in parts.
+    Clip,
+    /// T5's encoder.
+    T5,
+    /// T5 with what `modules.json` lists behind it.
+    SentenceT5,
+}
+
+/// A repository's files, of which some are wanted.
+pub(crate) trait Repository {
+    /// All names, folders separated by `/`.
+    fn names(&self) -> &BTreeSet<String>;
+
+    /// One of the names as a file of this machine.
+    fn get(&mut self, name: &str) -> Result<PathBuf, Failure>;
+}
+
+/// Why a file is not to be had.
+#[derive(Debug)]
+pub(crate) enum Failure {
+    /// The hub cannot be reached.
+    Away(String),
+    /// All else, for people.
+    Said(crate::HubError),
+    /// The repository is not such an encoder.
+    Content(String),
+}
+
+/// Gets all that an encoder reads.
+pub(crate) fn get_all(repository: &mut dyn Repository, encoder: Encoder) -> Result<(), Failure> {
+    let modules = modules(repository, encoder)?;
+    let (root, behind) = modules.split_first().map_or(("", &[][..]), |(first, behind)| (first.as_str(), behind));
+    repository_file(repository, &below(root, "config.json"))?;
+    let at_root = |name: &str| below(root, name);
+    let tokenizer = at_root("tokenizer.json");
+    if repository.names().contains(&tokenizer) {
+        repository.get(&tokenizer)?;
+    } else if encoder == Encoder::Clip {
+        repository_file(repository, &at_root("vocab.json"))?;
+        repository_file(repository, &at_root("merges.txt"))?;
+    } else {
+        return Err(Failure::Content(format!("has no `{tokenizer}`")));
+    }
+    for name in ["tokenizer_config.json", "special_tokens_map.json", "sentence_bert_config.json"] {
+        if repository.names().contains(&at_root(name)) {
+            repository.get(&at_root(name))?;
+        }
+    }
+    weights(repository, root)?;
+    for folder in behind {
+        // What only divides has neither.
+        if repository.names().contains(&below(folder, "config.json")) {
+            repository.get(&below(folder, "config.json"))?;
+            let is_there = |name: &str| repository.names().contains(&below(folder, name));
+            if is_there("model.safetensors") || is_there("pytorch_model.bin") {
+                weights(repository, folder)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+fn below(folder: &str, name: &str) -> String {
+    if folder.is_empty() { name.to_owned() } else { format!("{folder}/{name}") }
+}
+
+fn repository_file(repository: &mut dyn Repository, name: &str) -> Result<PathBuf, Failure> {
+    if repository.names().contains(name) {
+        return repository.get(name);
+    }
+    Err(Failure::Content(format!("has no `{name}`")))
+}
+
+fn json<T: serde::de::DeserializeOwned>(repository: &mut dyn Repository, name: &str) -> Result<T, Failure> {
+    let file = repository_file(repository, name)?;
+    let bytes = files::read(&file, LISTING_BYTES).map_err(|e| Failure::Content(format!("`{name}` {e}")))?;
+    serde_json::from_slice(&bytes).map_err(|e| Failure::Content(format!("`{name}`: {e}")))
+}
+
+/// The folders that `modules.json` lists, the network's first; none if there is no such file.
+fn modules(repository: &mut dyn Repository, encoder: Encoder) -> Result<Vec<String>, Failure> {
+    #[derive(Deserialize)]
+    struct Module {
+        path: String,
+    }
+    if !repository.names().contains("modules.json") {
+        return match encoder {
+            Encoder::SentenceT5 => {
+                Err(Failure::Content("has no `modules.json`, which sentence-transformers write".into()))
+            }
+            Encoder::Clip | Encoder::T5 => Ok(Vec::new()),
+        };
+    }
+    let listed: Vec<Module> = json(repository, "modules.json")?;
+    let is_below =
+        |module: &Module| Path::new(&module.path).components().all(|part| matches!(part, Component::Normal(_)));
+    if listed.len() > MODULES || !listed.iter().all(is_below) {
+        return Err(Failure::Content("`modules.json` lists more than folders of its own".into()));
+    }
+    Ok(listed.into_iter().map(|module| module.path).collect())
+}
+
+/// The weights of a folder: safetensors, whole or in parts, before pickles.
+fn weights(repository: &mut dyn Repository, folder: &str) -> Result<(), Failure> {
+    #[derive(Deserialize)]
+    struct Index {
+        weight_map: BTreeMap<String, String>,
+    }
+    let at = |name: &str| below(folder, name);
+    let (whole, index, pickle) = (at("model.safetensors"), at("model.safetensors.index.json"), at("pytorch_model.bin"));
+    if repository.names().contains(&whole) {
+        return repository.get(&whole).map(drop);
+    }
+    if repository.names().contains(&index) {
+        let listed: Index = json(repository, &index)?;
+        let shards: BTreeSet<String> = listed.weight_map.into_values().collect();
+        if shards.len() > SHARDS {
+            return Err(Failure::Content(format!("`{index}` names {} files; expected at most {SHARDS}", shards.len())));
+        }
+        return shards.iter().try_for_each(|shard| repository_file(repository, &at(shard)).map(drop));
+    }
+    if repository.names().contains(&pickle) {
+        return repository.get(&pickle).map(drop);
+    }
+    Err(Failure::Content(format!("has none of `{whole}`, `{index}` and `{pickle}`")))
+}

@@ -1,0 +1,83 @@
+//! The importer of evaluators on the bytes of a file: what `tests/hostile.rs` and `fuzz/` run.
+
+use std::fs;
+use std::path::PathBuf;
+
+use burn::tensor::Device;
+use motion::npy;
+use protocol::stage::{DataFormat, ImportEvaluator, StageSettings};
+
+use super::Bench;
+use crate::context::StageError;
+use crate::words::{WORD_WIDTH, Words};
+
+/// Runs what is called `name`: whether the bytes were accepted.
+///
+/// # Panics
+/// If there is no such function, or it breaks on the bytes.
+pub fn run(name: &str, bytes: &[u8]) -> bool {
+    match name {
+        "evaluator" => evaluator(bytes),
+        "vocabulary" => vocabulary(bytes),
+        other => panic!("`{other}` is none of `evaluator` and `vocabulary`"),
+    }
+}
+
+/// A folder of this process.
+fn folder(name: &str) -> PathBuf {
+    let folder = std::env::temp_dir().join(format!("stride-hostile-{}", std::process::id())).join(name);
+    fs::create_dir_all(&folder).expect("a folder of ours");
+    folder
+}
+
+/// A weak point of ours, rather than of the file.
+fn accepted<T>(result: Result<T, StageError>) -> bool {
+    if let Err(error @ StageError::Fault(_)) = &result {
+        panic!("{error}");
+    }
+    result.is_ok()
+}
+
+/// `import.evaluator` of weights: a torch file if the first byte is even, safetensors if it is odd.
+///
+/// # Panics
+/// If it breaks on them.
+pub fn evaluator(bytes: &[u8]) -> bool {
+    let Some((which, bytes)) = bytes.split_first() else { return false };
+    let root = folder("evaluator");
+    let features = motion::Skeleton::of(DataFormat::Humanml3d).features;
+    let meta = root.join("Comp_v6_KLD01/meta");
+    if !meta.exists() {
+        fs::create_dir_all(&meta).expect("a folder of ours");
+        for name in ["mean.npy", "std.npy"] {
+            npy::write(&meta.join(name), &[features], &vec![1.0; features]).expect("a file of ours");
+        }
+    }
+    let names = ["finest.tar", "finest.safetensors"];
+    let (here, other) = if which % 2 == 0 { (names[0], names[1]) } else { (names[1], names[0]) };
+    // There is none the first time.
+    let _ = fs::remove_file(root.join(other));
+    fs::write(root.join(here), bytes).expect("a file of ours");
+    let path = root.display().to_string();
+    let settings = ImportEvaluator { path, format: DataFormat::Humanml3d, words: String::new() };
+    let mut bench = Bench::new(Device::flex(), 1, 1);
+    accepted(bench.run("evaluator", &StageSettings::ImportEvaluator(settings), &[]))
+}
+
+/// The pickled index of a vocabulary of four words.
+///
+/// # Panics
+/// If the reader breaks on it.
+pub fn vocabulary(bytes: &[u8]) -> bool {
+    let root = folder("words");
+    let vectors = root.join("our_vab_data.npy");
+    if !vectors.exists() {
+        npy::write(&vectors, &[4, WORD_WIDTH], &vec![0.5; 4 * WORD_WIDTH]).expect("a file of ours");
+    }
+    fs::write(root.join("our_vab_idx.pkl"), bytes).expect("a file of ours");
+    let words = Words::open(&root.display().to_string());
+    if let Ok(Words::Vocabulary { index, .. }) = &words {
+        assert!(index.values().all(|row| *row < 4));
+    }
+    accepted(words)
+}
