@@ -18,6 +18,7 @@ mod memory;
 mod motions;
 mod reading;
 mod registry;
+mod released;
 mod results;
 mod storage;
 mod sweeps;
