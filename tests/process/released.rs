@@ -36,6 +36,16 @@ fn checkpoint() -> Option<PathBuf> {
     Some(file)
 }
 
+/// A folder with a mean and a deviation of HumanML3D's features.
+fn statistics(dir: &Path) -> String {
+    let folder = dir.join("meta");
+    fs::create_dir_all(&folder).expect("a test's own files");
+    for (name, value) in [("mean.npy", 0.0), ("std.npy", 1.0)] {
+        motion::npy::write(&folder.join(name), &[263], &[value; 263]).expect("a test's own files");
+    }
+    folder.display().to_string()
+}
+
 #[test]
 fn weights_go_in_and_out_as_the_readme_says() {
     let Some(checkpoint) = checkpoint() else { return };
@@ -48,6 +58,9 @@ fn weights_go_in_and_out_as_the_readme_says() {
     for line in shell_lines(&Bench::repository().join("README.md"), Some(marker)) {
         println!("$ {line}");
         let line = line.replace("configs/motionlcm-released.yaml", &file.display().to_string());
+        let line = line
+            .replace("deps/motionlcm/meta", &statistics(dir))
+            .replace("sentence-t5=data/sentence-t5-large", "hashed");
         let words = words(&line);
         let mut words: Vec<&str> = words.iter().map(String::as_str).collect();
         // `trainer registry` is the same as `registry`.
@@ -56,7 +69,9 @@ fn weights_go_in_and_out_as_the_readme_says() {
         }
         reports.push(bench.run(&[&words[..], &["-o", "json"]].concat()).expect_code(0).json());
     }
-    assert_eq!(reports.len(), 3);
+    assert_eq!(reports.len(), 4);
+    let version = bench.run(&["registry", "show", "motionlcm:1", "-o", "json"]).expect_code(0).json();
+    assert!(version["manifest"]["files"]["vae/model.safetensors"].is_object(), "{version}");
     // What was exported is imported, and gives the same to the bit.
     for (i, exported) in ["motionlcm.ckpt", "motionlcm.safetensors"].into_iter().enumerate() {
         let again = dir.join(format!("{i}.yaml"));
