@@ -74,10 +74,6 @@ impl Checkpoint {
         if count > TENSORS {
             return Err(found.refuse(format!("{count} tensors; expected at most {TENSORS}")));
         }
-        if let Some((name, tensor)) = found.weights.tensors().iter().find(|(_, tensor)| tensor.shape.contains(&0)) {
-            let (name, shape) = (name.escape_debug(), &tensor.shape);
-            return Err(found.refuse(format!("`{name}` has shape {shape:?}, which holds nothing")));
-        }
         Ok(found)
     }
 
@@ -146,10 +142,15 @@ impl Found<'_> {
     /// The length of an axis of a tensor.
     ///
     /// # Errors
-    /// If it has no such tensor, or that has fewer axes.
+    /// If it has no such tensor, or that has fewer axes or holds nothing.
     pub fn dim(&self, name: &str, axis: usize) -> Result<usize, StageError> {
-        let found = self.tensor(name).and_then(|tensor| tensor.shape.get(axis));
-        found.copied().ok_or_else(|| self.refuse(format!("no tensor `{}{name}` with {} axes", self.prefix, axis + 1)))
+        let shape = self.tensor(name).map(|tensor| &tensor.shape[..]).unwrap_or_default();
+        // With an axis of 0 the others cost nothing, and may be any number.
+        if shape.contains(&0) {
+            return Err(self.refuse(format!("`{}{name}` has shape {shape:?}, which holds nothing", self.prefix)));
+        }
+        let missing = || self.refuse(format!("no tensor `{}{name}` with {} axes", self.prefix, axis + 1));
+        shape.get(axis).copied().ok_or_else(missing)
     }
 
     /// How many entries the list `stem` has: `stem.0.`, `stem.1.` and so on.
