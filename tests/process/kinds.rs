@@ -14,7 +14,7 @@ use serde_json::Value;
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
 /// Kinds that read published files, for which a fixture stands.
-const OF_FIXTURES: [&str; 2] = ["data.open", "import.evaluator"];
+const OF_FIXTURES: [&str; 3] = ["data.open", "import.evaluator", "import.model"];
 
 /// Real motion and the fixtures of parity, if they are on this machine.
 fn shared() -> Option<PathBuf> {
@@ -43,6 +43,8 @@ fn pipeline(bench: &Bench) -> PathBuf {
         }
         text += "  folder: {kind: data.open, format: humanml3d, path: folder}\n";
         text += "  imported: {kind: import.evaluator, path: evaluator}\n";
+        let weights = shared.join("parity/01_vae_v2/weights.ckpt");
+        text += &format!("  released: {{kind: import.model, path: {}, dataset: dataset}}\n", weights.display());
     }
     let path = bench.path().join("kinds.yaml");
     fs::write(&path, text).expect("written");

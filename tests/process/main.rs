@@ -20,6 +20,7 @@ mod mocap;
 mod motions;
 mod reading;
 mod registry;
+mod released;
 mod results;
 mod storage;
 mod streaming;

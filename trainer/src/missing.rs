@@ -57,7 +57,8 @@ pub(crate) fn missing(pipeline: &Pipeline) -> Vec<Missing> {
 fn lacks(folder: &ExternalFolder) -> Option<String> {
     let path = Path::new(&folder.path);
     if !path.exists() {
-        return Some("no such folder".into());
+        let file = path.extension().is_some() && folder.format.is_none() && folder.files.is_empty();
+        return Some(if file { "no such file" } else { "no such folder" }.into());
     }
     // What is wrong with a dataset's folder is told by who opens it, all of it at once.
     if folder.format.is_some() || !path.is_dir() {

@@ -31,7 +31,12 @@ pub(crate) fn read(path: &Path, sets: &[String]) -> Result<PipelineFile> {
             problem
         }
     })?;
-    let pipeline = pipeline::read(&name, &source, sets).map_err(|mistakes| {
+    of_text(&name, source, sets)
+}
+
+/// Validates the text of a file called `name`.
+pub(crate) fn of_text(name: &str, source: String, sets: &[String]) -> Result<PipelineFile> {
+    let pipeline = pipeline::read(name, &source, sets).map_err(|mistakes| {
         let count = mistakes.0.len();
         let problem = Problem::usage(format!("{count} mistake(s) in the pipeline\n\n{mistakes}"));
         problem.hint("nothing was run and nothing was stored")
@@ -52,7 +57,11 @@ fn read_text(path: &Path) -> std::io::Result<String> {
 
 /// Reads the file and digests the folders it names, which must all be there; those that it names as the hub does are fetched.
 pub(crate) fn read_with_data(path: &Path, sets: &[String]) -> Result<PipelineFile> {
-    let mut file = read(path, sets)?;
+    with_data(read(path, sets)?)
+}
+
+/// Digests the folders that a pipeline names, which must all be there.
+pub(crate) fn with_data(mut file: PipelineFile) -> Result<PipelineFile> {
     hub_names::resolve(&mut file.pipeline)?;
     let missing = missing(&file.pipeline);
     if !missing.is_empty() {

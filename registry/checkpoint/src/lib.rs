@@ -4,6 +4,8 @@
 //! Nothing in it is executable on load. Not its job: where blobs live, and whether they may be written.
 
 pub mod model;
+pub mod published;
+pub mod torch;
 
 use std::fmt;
 use std::path::{Path, PathBuf};

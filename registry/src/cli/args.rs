@@ -4,6 +4,8 @@ use std::path::PathBuf;
 
 use clap::{Subcommand, ValueEnum};
 
+use checkpoint::published::Layout;
+
 use super::Command;
 use crate::Place;
 use crate::leaderboard::Style;
@@ -17,6 +19,33 @@ pub enum Output {
     Table,
     /// For programs: one object on stdout; errors as one object on stderr.
     Json,
+}
+
+/// In whose files weights are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum LayoutName {
+    /// A file of MLD's and MotionLCM's: VAE, denoiser, control parts under `state_dict`
+    Motionlcm,
+    /// Three files: tokenizer, masked and residual transformer
+    Momask,
+    /// Two files: tokenizer and transformer
+    T2mgpt,
+    /// A file: the network
+    Mdm,
+    /// One safetensors file of any model, each part's names behind its role
+    Safetensors,
+}
+
+impl From<LayoutName> for Layout {
+    fn from(name: LayoutName) -> Self {
+        match name {
+            LayoutName::Motionlcm => Self::MotionLcm,
+            LayoutName::Momask => Self::Momask,
+            LayoutName::T2mgpt => Self::T2mGpt,
+            LayoutName::Mdm => Self::Mdm,
+            LayoutName::Safetensors => Self::Safetensors,
+        }
+    }
 }
 
 /// A verb with its arguments.
@@ -144,12 +173,15 @@ pub enum Verb {
         #[arg(long, value_name = "PLACE")]
         blobs: Option<Place>,
     },
-    /// Copies a version's files to a folder
+    /// Copies a version's files to a folder, or its weights to files that other code reads
     Export {
         /// MODEL@ALIAS, MODEL@best or MODEL:VERSION
         model: String,
-        /// The folder; it must be empty or missing
+        /// The folder; it must be empty or missing. With a layout of one file, the file, which must be missing
         dir: PathBuf,
+        /// The weights alone, in the files and under the names of the code that published such models
+        #[arg(long, value_enum)]
+        layout: Option<LayoutName>,
     },
 }
 
@@ -159,7 +191,7 @@ pub(super) enum Asked {
     /// A command for the holder of the store.
     Command(Command),
     /// Something that ends in this machine's files.
-    Export { model: String, dir: PathBuf },
+    Export { model: String, dir: PathBuf, layout: Option<Layout> },
     /// Likewise, and only of a store whose folder this machine has.
     Backup { dir: PathBuf },
     /// Likewise, of no store yet.
@@ -199,7 +231,9 @@ impl Verb {
             Self::Backup { dir } => return Asked::Backup { dir },
             Self::Restore { backup, to, blobs } => return Asked::Restore { backup, to, blobs },
             Self::Adopt { blobs } => return Asked::Adopt { blobs },
-            Self::Export { model, dir } => return Asked::Export { model, dir },
+            Self::Export { model, dir, layout } => {
+                return Asked::Export { model, dir, layout: layout.map(Layout::from) };
+            }
         })
     }
 }

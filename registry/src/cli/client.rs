@@ -5,6 +5,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use access::{ConnectError, Server, ServerOptions, explain};
+use checkpoint::published::Layout;
 use protocol::Digest;
 use protocol::message::ApiError;
 use reqwest::{Method, Response};
@@ -22,8 +23,8 @@ const BETWEEN: Duration = Duration::from_millis(50);
 pub async fn execute(verb: Verb, dir: &Path, options: &ServerOptions, output: Output) -> u8 {
     let answer = match verb.asks() {
         Asked::Command(command) => ask(command, dir, options).await,
-        Asked::Export { model, dir: into } => {
-            with(dir, options, Need::Read, async |place| export(place, &model, &into).await).await
+        Asked::Export { model, dir: into, layout } => {
+            with(dir, options, Need::Read, async |place| export(place, &model, &into, layout).await).await
         }
         Asked::Backup { dir: into } => match local(options, "a backup is made on the machine of the store") {
             Ok(()) => backup(dir, &into).await,
@@ -221,13 +222,21 @@ fn unreachable_(message: &str) -> Answer {
     ))
 }
 
-async fn export(place: &Place, model: &str, dir: &Path) -> Result<Answer, Missed> {
+async fn export(place: &Place, model: &str, dir: &Path, layout: Option<Layout>) -> Result<Answer, Missed> {
     let shown = place.ask(&Command::Show { reference: model.to_owned() }).await?;
     Ok(match shown.data {
-        Some(super::Data::Version { version, .. }) => match export::export(place, &version, dir).await {
-            Ok(files) => Answer::done(super::Data::Exported { version, dir: dir.to_owned(), files }),
-            Err(error) => Answer::refused(error),
-        },
+        Some(super::Data::Version { version, .. }) => {
+            let written = match layout {
+                Some(layout) => export::weights(place, &version, dir, layout).await,
+                None => export::export(place, &version, dir).await.map(|files| (files, Vec::new())),
+            };
+            match written {
+                Ok((files, left_out)) => {
+                    Answer::done(super::Data::Exported { version, dir: dir.to_owned(), files, left_out })
+                }
+                Err(error) => Answer::refused(error),
+            }
+        }
         Some(_) => Answer::refused(error(
             "invalid",
             format!("`{model}` is no one version"),

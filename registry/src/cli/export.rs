@@ -1,9 +1,11 @@
 //! A model's files in a folder of this machine, under the names that its manifest gives them, from wherever the blobs are.
 
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Component, Path};
 
+use checkpoint::published::{ExportError, Layout, Planned};
 use protocol::message::ApiError;
 use protocol::{Digest, Manifest};
 use sha2::{Digest as _, Sha256};
@@ -20,19 +22,7 @@ pub(super) trait Source {
 /// Writes `manifest.json` and every file; returns their names. The folder must be empty or missing. What is there afterwards
 /// has the digests that the manifest says, wherever it came from.
 pub(super) async fn export(source: &impl Source, version: &Version, dir: &Path) -> Result<Vec<String>, ApiError> {
-    let failed =
-        |path: &Path, e: &io::Error| error("storage", format!("failed to write `{}`: {e}", path.display()), None);
-    match fs::read_dir(dir) {
-        Ok(mut entries) => {
-            if entries.next().is_some() {
-                let hint = "choose a folder that is empty or does not exist";
-                return Err(error("invalid", format!("folder `{}` is not empty", dir.display()), Some(hint)));
-            }
-        }
-        Err(e) if e.kind() == io::ErrorKind::NotFound => fs::create_dir_all(dir).map_err(|e| failed(dir, &e))?,
-        Err(e) => return Err(failed(dir, &e)),
-    }
-    let damaged = |e: &dyn std::fmt::Display| error("damaged", e, Some("`registry fsck` checks the store"));
+    empty_folder(dir)?;
     let mut bytes = Vec::new();
     whole(source, version.artifact, &mut |part| bytes.write_all(part)).await?;
     let manifest = serde_json::from_slice::<Manifest>(&bytes).map_err(|e| damaged(&e))?;
@@ -53,6 +43,82 @@ pub(super) async fn export(source: &impl Source, version: &Version, dir: &Path) 
     fs::write(&path, bytes).map_err(|e| failed(&path, &e))?;
     names.push("manifest.json".into());
     Ok(names)
+}
+
+/// Writes the weights alone, in the files of a layout, and returns their names, and the parts that it has no place for. Of a layout of one file `path` is that file, which must be missing;
+/// otherwise a folder, which must be empty or missing.
+pub(super) async fn weights(
+    source: &impl Source,
+    version: &Version,
+    path: &Path,
+    layout: Layout,
+) -> Result<(Vec<String>, Vec<String>), ApiError> {
+    let mut bytes = Vec::new();
+    whole(source, version.artifact, &mut |part| bytes.write_all(part)).await?;
+    let manifest = serde_json::from_slice::<Manifest>(&bytes).map_err(|e| damaged(&e))?;
+    let plan = layout.plan(&manifest).map_err(|e| refused(&e))?;
+    let single = plan.files.len() == 1;
+    if !single {
+        empty_folder(path)?;
+    }
+    let mut names = Vec::new();
+    for planned in &plan.files {
+        let to = if single { path.to_owned() } else { path.join(planned.name) };
+        if written(source, &manifest, planned, &to).await? {
+            names.push(if single { layout.name().to_owned() } else { planned.name.to_owned() });
+        }
+    }
+    if names.is_empty() {
+        let hint = Some("`--layout safetensors` takes every model");
+        return Err(error("invalid", format!("`{}` has no weights for `{}`", version.model, layout.name()), hint));
+    }
+    Ok((names, plan.left_out))
+}
+
+/// Writes one file of a layout, if the model has what is in it.
+async fn written(source: &impl Source, manifest: &Manifest, planned: &Planned, to: &Path) -> Result<bool, ApiError> {
+    let mut files = BTreeMap::new();
+    for name in planned.reads() {
+        let Some(entry) = manifest.files.get(name) else { continue };
+        let mut bytes = Vec::new();
+        whole(source, entry.digest, &mut |part| bytes.write_all(part)).await?;
+        files.insert(name.to_owned(), bytes);
+    }
+    let count = planned.write(|| File::create_new(to).map(io::BufWriter::new), &files).map_err(|e| match e {
+        ExportError::Write(e) => failed(to, &e),
+        e => refused(&e),
+    })?;
+    Ok(count > 0)
+}
+
+fn refused(e: &ExportError) -> ApiError {
+    match e {
+        ExportError::Damaged { .. } => damaged(e),
+        _ => error("invalid", e, Some("`registry show` lists a version's parts")),
+    }
+}
+
+fn failed(path: &Path, e: &io::Error) -> ApiError {
+    error("storage", format!("failed to write `{}`: {e}", path.display()), None)
+}
+
+fn damaged(e: &dyn std::fmt::Display) -> ApiError {
+    error("damaged", e, Some("`registry fsck` checks the store"))
+}
+
+/// Makes a folder, unless it is there and empty.
+fn empty_folder(dir: &Path) -> Result<(), ApiError> {
+    match fs::read_dir(dir) {
+        Ok(mut entries) => match entries.next() {
+            None => Ok(()),
+            Some(_) => {
+                let hint = "choose a folder that is empty or does not exist";
+                Err(error("invalid", format!("folder `{}` is not empty", dir.display()), Some(hint)))
+            }
+        },
+        Err(e) if e.kind() == io::ErrorKind::NotFound => fs::create_dir_all(dir).map_err(|e| failed(dir, &e)),
+        Err(e) => Err(failed(dir, &e)),
+    }
 }
 
 /// A blob's bytes, and that they are those.

@@ -204,7 +204,14 @@ pub enum Data {
     /// Of `restore`.
     Restored { summary: Summary, dir: std::path::PathBuf },
     /// Of `export`.
-    Exported { version: Version, dir: std::path::PathBuf, files: Vec<String> },
+    Exported {
+        version: Version,
+        dir: std::path::PathBuf,
+        files: Vec<String>,
+        /// Parts that the layout has no place for.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        left_out: Vec<String>,
+    },
 }
 
 /// What came of a command.

@@ -206,8 +206,12 @@ pub fn render(data: &Data) -> String {
             let (at, bytes, dir) = (format_ms(*at_ms), size(*bytes), dir.display());
             format!("`{dir}` is store {store} as of {at}: {blobs} blobs ({bytes}), all verified\n")
         }
-        Data::Exported { version, dir, files } => {
-            format!("{}:{} is in `{}`: {}\n", version.model, version.version, dir.display(), files.join(", "))
+        Data::Exported { version, dir, files, left_out } => {
+            let without = match left_out.is_empty() {
+                true => String::new(),
+                false => format!("; the layout has no place for {}", left_out.join(", ")),
+            };
+            format!("{}:{} is in `{}`: {}{without}\n", version.model, version.version, dir.display(), files.join(", "))
         }
     }
 }

@@ -61,7 +61,7 @@ pub fn layout<M: Module>(module: &M) -> Vec<Entry> {
                 Some(rest) => format!("emb_proj.1.{rest}"),
                 None => name,
             };
-            self.1.push(Entry { name, shape: param.dims().to_vec() });
+            self.1.push(Entry { name, shape: param.lazy_shape().to_vec() });
         }
     }
     let mut visitor = Layout(Vec::new(), Vec::new());

@@ -41,11 +41,11 @@ pub use kinds::{
     Activity, ClipIds, ClipOutput, ControlDistance, ControlLoss, ControlMean, DataFeatures, DataOpen, DataSynthetic,
     DistillDiscord, DistillLcm, DistillPcm, EncodeLatents, EncodeTokens, EvaluateControl, EvaluateLatentFid,
     EvaluateRecognition, EvaluateReconstruction, EvaluateSpectrum, EvaluateT2m, EvaluatorNetwork, FlowBackbone,
-    FlowNetwork, FlowPrediction, FlowProjection, FlowSolver, ImportEvaluator, MdmNetwork, ModelDecoder, MovementPhase,
-    MultiModality, Promote, Register, Resets, Splits, StableMoFusionNetwork, StageSettings, TextEmbed, TextEncoder,
-    TokenGenerator, TokenNetwork, TokenizerLoss, TokenizerNetwork, TrainControl, TrainDiscord, TrainEvaluator,
-    TrainLength, TrainMdm, TrainMld, TrainStableMoFusion, TrainTokenizer, TrainTokens, TrainVae, UpAxis, VaeLoss,
-    Windows, WindowsOf,
+    FlowNetwork, FlowPrediction, FlowProjection, FlowSolver, ImportEvaluator, ImportModel, ImportedPart, MdmNetwork,
+    ModelDecoder, MovementPhase, MultiModality, Promote, Register, Resets, Splits, StableMoFusionNetwork,
+    StageSettings, TextActivation, TextEmbed, TextEncoder, TokenGenerator, TokenNetwork, TokenizerLoss,
+    TokenizerNetwork, TrainControl, TrainDiscord, TrainEvaluator, TrainLength, TrainMdm, TrainMld, TrainStableMoFusion,
+    TrainTokenizer, TrainTokens, TrainVae, UpAxis, VaeLoss, Windows, WindowsOf,
 };
 pub use neighbours::{Neighbour, Neighbours};
 pub use network::{LatentShape, Network, Positions};
@@ -55,7 +55,7 @@ pub use sampler::{Family, Sampler, Solver, measured_with};
 pub use spec::{Output, Ref, Shape, StageSpec, Target};
 pub use training::{Batch, Decay, Optimizer, Training};
 
-/// A folder outside the store that a stage reads.
+/// A folder, or a file, outside the store that a stage reads.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ExternalFolder {
     /// The field that names it.
@@ -143,7 +143,7 @@ impl StageSettings {
         let read = settings.refs().into_iter().filter(|reference| reference.read);
         read.filter_map(|Ref { field, name, target, .. }| match target {
             Target::Stage(kind) => Some((field.into_owned(), name.clone(), kind)),
-            Target::Dataset(_) | Target::Folder => None,
+            Target::Dataset(_) | Target::Folder | Target::File => None,
         })
         .collect()
     }
@@ -156,7 +156,7 @@ impl StageSettings {
             let format = match target {
                 Target::Stage(_) => return None,
                 Target::Dataset(format) => Some(format),
-                Target::Folder => None,
+                Target::Folder | Target::File => None,
             };
             Some(ExternalFolder { field: field.into_owned(), path: name.clone(), format, files, origin })
         })

@@ -8,6 +8,7 @@ mod door;
 mod export;
 mod gallery;
 mod generate;
+mod import;
 mod keep;
 mod model;
 mod out;
@@ -75,6 +76,8 @@ enum Verb {
     Gallery(Box<gallery::GalleryArgs>),
     /// Turns a motion or a recording into another form: BVH, GLB, a page, a picture, an array
     Export(export::ExportArgs),
+    /// Makes a version of a model of weights that others have published
+    Import(Box<import::ImportArgs>),
     /// Measures how long models take for a sentence (AITS), side by side
     Time(time::TimeArgs),
     /// Lists what this build and machine can compute on
@@ -213,7 +216,9 @@ impl Verb {
     /// What a store gets is its user's alone; what else a command writes, the user's umask decides.
     fn keep_to_oneself(&self) {
         let store_only = match self {
-            Self::Run(_) | Self::Serve(_) | Self::Resume(_) | Self::Cancel(_) | Self::Pause(_) => true,
+            Self::Run(_) | Self::Serve(_) | Self::Resume(_) | Self::Cancel(_) | Self::Pause(_) | Self::Import(_) => {
+                true
+            }
             Self::Registry(args) => !matches!(args.verb, registry::cli::Verb::Export { .. }),
             _ => false,
         };
@@ -236,6 +241,7 @@ impl Verb {
             Self::Generate(args) => args.report(),
             Self::Gallery(args) => args.report,
             Self::Export(args) => args.report(),
+            Self::Import(args) => args.output,
             Self::Time(args) => args.output,
             Self::Devices(args) => args.output,
             Self::Worker(WorkerVerb::List(args)) => args.output,
@@ -264,6 +270,7 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Data(verb) => data::data(&verb),
         Verb::Gallery(args) => gallery::gallery(*args).await,
         Verb::Export(args) => export::export(&args),
+        Verb::Import(args) => import::import(*args, command_line()).await,
         Verb::Time(args) => time::time(args).await,
         Verb::Devices(args) => Ok(config::devices(&args)),
         Verb::Config(verb) => config::config(&verb),

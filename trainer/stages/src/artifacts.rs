@@ -74,6 +74,9 @@ pub struct VaeMeta {
     pub mean: Vec<f32>,
     /// Their standard deviation, `[features]`.
     pub std: Vec<f32>,
+    /// Linears around the bottleneck. Where nothing is said there are some if it has another width than the transformer.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub projection: Option<bool>,
 }
 
 /// Meta of an artifact of kind `latents`.
@@ -118,6 +121,12 @@ pub struct DenoiserMeta {
     pub text_dim: usize,
     /// The parts that it was trained with: the VAE whose latents it makes, the text encoder.
     pub fits: Parts,
+    /// Linears around the transformer. Where nothing is said there are some if it has another width than a latent token.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub projection: Option<bool>,
+    /// Width of the time sinusoid, where it is not that of all published denoisers.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub time_dim: Option<usize>,
 }
 
 /// Reads a manifest's meta as `T`; `what` names the artifact in the error.
@@ -502,6 +511,8 @@ mod tests {
             guidance_dim: 256,
             text_dim: 768,
             fits: Parts::from([(Role::VAE, Digest::of(b"vae"))]),
+            projection: None,
+            time_dim: None,
         };
         let json = to_meta(&meta);
         assert_eq!(json["family"], "pcm");

@@ -217,6 +217,9 @@ pub struct ControlMeta {
     pub std: Vec<f32>,
     /// The denoiser whose copy the ControlNet is; for another one it says nothing.
     pub fits: Parts,
+    /// A Linear behind the trajectory encoder. Where nothing is said there is one if a latent token has another width than it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub projection: Option<bool>,
 }
 
 impl ControlMeta {
@@ -237,7 +240,7 @@ impl ControlMeta {
             layers: self.network.layers,
             heads: self.network.heads,
             feed_forward: self.network.feed_forward,
-            projection: denoiser.latent.dim != self.network.width,
+            projection: self.projection.unwrap_or(denoiser.latent.dim != self.network.width),
             norm_eps: NORM_EPS,
         };
         TrajectoryEncoder::new(&config, init)

@@ -28,7 +28,7 @@ use crate::weights;
 /// Widths of the U-Net's two levels, over the first.
 const MULTIPLES: [usize; 2] = [1, 2];
 /// Width of a head of the U-Net's attention in the middle.
-const HEAD: usize = 32;
+pub(crate) const HEAD: usize = 32;
 /// Feed-forward width of the transformer, over its width.
 const RATE: usize = 4;
 /// Frames of a code.

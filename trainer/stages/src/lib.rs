@@ -16,6 +16,7 @@ pub mod length;
 pub mod motion_networks;
 pub mod networks;
 pub mod parts;
+pub mod published;
 mod solo;
 pub mod stream;
 pub mod testing;

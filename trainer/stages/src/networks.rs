@@ -22,7 +22,7 @@ use crate::kinds::word;
 use crate::weights;
 
 /// Width of the time sinusoid in every published denoiser.
-const TIME_DIM: usize = 768;
+pub(crate) const TIME_DIM: usize = 768;
 /// Added to variances in layer norms.
 const NORM_EPS: f64 = 1e-5;
 
@@ -37,7 +37,7 @@ impl VaeMeta {
             layers: self.network.layers,
             heads: self.network.heads,
             feed_forward: self.network.feed_forward,
-            projection: self.latent.dim != self.network.width,
+            projection: self.projection.unwrap_or(self.latent.dim != self.network.width),
             norm_eps: NORM_EPS,
         }
     }
@@ -54,9 +54,9 @@ impl DenoiserMeta {
             heads: self.network.heads,
             feed_forward: self.network.feed_forward,
             text_dim: self.text_dim,
-            time_dim: TIME_DIM,
+            time_dim: self.time_dim.unwrap_or(TIME_DIM),
             text_relu: self.text_relu,
-            projection: self.latent.dim != self.network.width,
+            projection: self.projection.unwrap_or(self.latent.dim != self.network.width),
             guidance_dim: (self.guidance_dim > 0).then_some(self.guidance_dim),
             norm_eps: NORM_EPS,
         }

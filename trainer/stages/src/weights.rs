@@ -9,6 +9,9 @@ use protocol::{ArtifactKind, Digest, Manifest};
 use crate::artifacts::{self, Draft, MODEL_FILE};
 use crate::context::{AttemptContext, ContextError, StageError};
 
+/// Where tensors are that published files have beside the weights and that follow from a network's size: no reader of ours needs them.
+pub const CONSTANTS_FILE: &str = "constants.safetensors";
+
 /// Uploads weights as the file of an artifact.
 pub fn add(draft: &mut Draft, entries: &[Entry], values: &[f32]) -> Result<(), StageError> {
     draft.add_pieces(MODEL_FILE, &Weights::new(entries, values).pieces())

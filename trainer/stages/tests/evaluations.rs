@@ -57,6 +57,7 @@ fn vae_of(bench: &Bench, std: f32) -> Digest {
         network: network(),
         mean: vec![0.0; 263],
         std: vec![std; 263],
+        projection: None,
     };
     let device = bench.device();
     let vae = Vae::new(&meta.config(), &mut Init::new(Seed(1), "vae", Positions::Sinusoid, &device));
@@ -76,6 +77,8 @@ fn untrained_model(bench: &Bench, vae: Digest, family: Family, latent: LatentSha
         text_relu: false,
         text_dim: 768,
         fits: Parts::from([(Role::VAE, vae), (Role::TEXT, text.digest())]),
+        projection: None,
+        time_dim: None,
     };
     let device = bench.device();
     let denoiser = Denoiser::new(&meta.config(), &mut Init::new(Seed(2), "denoiser", Positions::Uniform, &device));

@@ -101,6 +101,7 @@ fn untrained_vae(bench: &Bench) -> Digest {
         network: network(),
         mean: vec![0.0; 263],
         std: vec![1.0; 263],
+        projection: None,
     };
     let net = Vae::new(&meta.config(), &mut Init::new(Seed(1), "vae", Positions::Sinusoid, &device));
     put(bench, ArtifactKind::Vae, to_meta(&meta), save(&net))
@@ -121,6 +122,8 @@ fn untrained(bench: &Bench, family: Family) -> Digest {
         text_relu: false,
         text_dim: 768,
         fits: Parts::from([(Role::VAE, vae), (Role::TEXT, text.digest())]),
+        projection: None,
+        time_dim: None,
     };
     let net = Denoiser::new(&meta.config(), &mut Init::new(Seed(2), "denoiser", Positions::Uniform, &device));
     let denoiser = put(bench, ArtifactKind::Denoiser, to_meta(&meta), save(&net));

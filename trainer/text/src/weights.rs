@@ -17,7 +17,7 @@ use serde::Deserialize;
 
 use crate::error::EncoderError;
 use crate::network::TensorSpec;
-use crate::tensor_file::{Element, ReadAt, TensorFile, WeightsFile};
+use crate::tensor_file::{Element, ReadAt, TensorFile, WeightsFile, widen};
 
 /// Files of sharded weights.
 const SHARDS: usize = 256;
@@ -68,6 +68,20 @@ impl std::fmt::Debug for StoredTensor {
 }
 
 impl StoredTensor {
+    /// Its numbers, row by row.
+    ///
+    /// # Errors
+    /// Why they cannot be had.
+    pub fn values(&self) -> Result<Vec<f32>, String> {
+        let bytes = self.read()?;
+        let mut values = vec![0.0; bytes.len() / self.element.bytes()];
+        if values.len() != self.shape.iter().product::<usize>() {
+            return Err(format!("{} numbers for the shape {:?}", values.len(), self.shape));
+        }
+        widen(self.element, &bytes, &mut values);
+        Ok(values)
+    }
+
     /// Its bytes, little-endian.
     fn read(&self) -> Result<Vec<u8>, String> {
         let length = self.shape.iter().product::<usize>() * self.element.bytes();
@@ -117,6 +131,39 @@ impl Weights {
             return Err(EncoderError::at(folder, what));
         }
         Ok(weights)
+    }
+
+    /// The tensors of one file, safetensors or torch's, whatever it is called. Names of tensors in dicts of a torch file have the dicts' keys before
+    /// them, with dots between.
+    ///
+    /// # Errors
+    /// Why the file is none of the two, or promises more than it holds.
+    pub fn open_file(path: &Path) -> Result<Self, EncoderError> {
+        let refuse = |what: String| EncoderError::at(path, what);
+        let (file, bytes) = files::open(path).map_err(|e| refuse(e.to_string()))?;
+        if bytes > limits::WEIGHTS_BYTES {
+            return Err(refuse(format!("has {bytes} bytes; at most {} are read", limits::WEIGHTS_BYTES)));
+        }
+        let mut first = Vec::new();
+        file.take(9).read_to_end(&mut first).map_err(|e| refuse(e.to_string()))?;
+        let mut weights = Self::default();
+        // The length of a header stands before it, and a header is an object.
+        match first.get(8) {
+            Some(b'{') => weights.add_safetensors(path)?,
+            Some(_) => weights.add_torch(path)?,
+            None => return Err(refuse(format!("has {bytes} bytes; expected a checkpoint of torch, or safetensors"))),
+        }
+        Ok(weights)
+    }
+
+    /// All tensors by name.
+    pub fn tensors(&self) -> &BTreeMap<String, StoredTensor> {
+        &self.tensors
+    }
+
+    /// What is there and holds no floats of at most 32 bits: its name, and what it is instead.
+    pub fn others(&self) -> &BTreeMap<String, String> {
+        &self.others
     }
 
     fn add_safetensors(&mut self, path: &Path) -> Result<(), EncoderError> {
@@ -245,7 +292,10 @@ fn shards(path: &Path) -> Result<Vec<String>, EncoderError> {
 
 /// The length of a file that a pickle reader may open: a regular file, not too large, and no archive that unpacks to more than it is.
 /// `torch.save` writes archives that are not compressed.
-fn archive_length(path: &Path) -> Result<u64, String> {
+///
+/// # Errors
+/// What it is instead, without its path.
+pub fn archive_length(path: &Path) -> Result<u64, String> {
     let (mut file, length) = files::open(path).map_err(|e| e.to_string())?;
     if length > limits::WEIGHTS_BYTES {
         return Err(format!("has {length} bytes; at most {} are read", limits::WEIGHTS_BYTES));

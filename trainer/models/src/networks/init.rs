@@ -1,7 +1,7 @@
 //! First values of parameters, drawn on the host from a keyed stream in declaration order: never from a backend's global
 //! generator, whose state cannot be saved and differs between backends.
 
-use burn::module::Param;
+use burn::module::{Param, ParamId};
 use burn::tensor::{Device, Tensor, TensorData};
 use motion::random::Stream;
 use protocol::Seed;
@@ -13,18 +13,34 @@ pub struct Init<'a> {
     stream: Stream,
     device: &'a Device,
     positions: Positions,
-    draws: bool,
+    draws: Draws,
+}
+
+/// What parameters begin with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Draws {
+    /// Their draws.
+    Made,
+    /// Zeros.
+    Left,
+    /// Nothing, until they are asked for.
+    Never,
 }
 
 impl<'a> Init<'a> {
     /// All parameters of one network of one stage. `purpose` keeps two networks of one stage apart.
     pub fn new(seed: Seed, purpose: &str, positions: Positions, device: &'a Device) -> Self {
-        Self { stream: Stream::new(seed, purpose, 0, 0), device, positions, draws: true }
+        Self { stream: Stream::new(seed, purpose, 0, 0), device, positions, draws: Draws::Made }
     }
 
     /// Zeros in place of all draws: of a network whose weights are read right after, for draws of a large one take longer than that.
     pub fn blank(device: &'a Device) -> Self {
-        Self { draws: false, ..Self::new(Seed(0), "blank", Positions::Uniform, device) }
+        Self { draws: Draws::Left, ..Self::new(Seed(0), "blank", Positions::Uniform, device) }
+    }
+
+    /// No values at all: of a network whose [layout](crate::flat::layout) alone is wanted. However large it is, it takes no memory.
+    pub fn shapes(device: &'a Device) -> Self {
+        Self { draws: Draws::Never, ..Self::blank(device) }
     }
 
     /// Where parameters are made.
@@ -32,23 +48,27 @@ impl<'a> Init<'a> {
         self.device
     }
 
-    fn param<const D: usize>(&self, values: Vec<f32>, shape: [usize; D]) -> Param<Tensor<D>> {
-        Param::from_tensor(Tensor::from_data(TensorData::new(values, shape), self.device))
+    fn param<const D: usize>(&self, values: impl FnOnce() -> Vec<f32>, shape: [usize; D]) -> Param<Tensor<D>> {
+        if self.draws == Draws::Never {
+            let zeros = move |device: &Device, _| Tensor::zeros(shape, device);
+            return Param::uninitialized(ParamId::new(), zeros, self.device.clone(), true, shape.into());
+        }
+        Param::from_tensor(Tensor::from_data(TensorData::new(values(), shape), self.device))
     }
 
     fn draw<const D: usize>(&mut self, low: f64, high: f64, shape: [usize; D]) -> Param<Tensor<D>> {
-        let count = shape.iter().product();
         #[expect(clippy::cast_possible_truncation, reason = "parameters are f32")]
         let values = match self.draws {
-            true => (0..count).map(|_| self.stream.range(low, high) as f32).collect(),
-            false => vec![0.0; count],
+            Draws::Made => (0..shape.iter().product()).map(|_| self.stream.range(low, high) as f32).collect(),
+            Draws::Left => vec![0.0; shape.iter().product()],
+            Draws::Never => Vec::new(),
         };
-        self.param(values, shape)
+        self.param(|| values, shape)
     }
 
     /// Every element `value`.
     pub fn constant<const D: usize>(&self, value: f32, shape: [usize; D]) -> Param<Tensor<D>> {
-        self.param(vec![value; shape.iter().product()], shape)
+        self.param(|| vec![value; shape.iter().product()], shape)
     }
 
     /// Uniform within `±sqrt(6 / (fan_in + fan_out))` of an [out, in] matrix (Glorot and Bengio, 2010).
@@ -87,12 +107,15 @@ impl<'a> Init<'a> {
     }
 
     fn normal_times<const D: usize>(&mut self, deviation: f32, shape: [usize; D]) -> Param<Tensor<D>> {
-        let mut values = vec![0.0; shape.iter().product()];
-        if self.draws {
+        let mut values = match self.draws {
+            Draws::Never => Vec::new(),
+            Draws::Made | Draws::Left => vec![0.0; shape.iter().product()],
+        };
+        if self.draws == Draws::Made {
             self.stream.fill_normal(&mut values);
             values.iter_mut().for_each(|v| *v *= deviation);
         }
-        self.param(values, shape)
+        self.param(|| values, shape)
     }
 
     /// A position table [rows, 1, width]: uniform on [0, 1) as published, or sinusoids.
@@ -107,7 +130,7 @@ impl<'a> Init<'a> {
                     let angle = row as f64 * frequency;
                     (if column < half { angle.sin() } else { angle.cos() }) as f32
                 };
-                let values = (0..rows).flat_map(|r| (0..width).map(move |c| value(r, c))).collect();
+                let values = || (0..rows).flat_map(|r| (0..width).map(move |c| value(r, c))).collect();
                 self.param(values, [rows, 1, width])
             }
         }

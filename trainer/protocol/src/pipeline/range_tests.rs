@@ -60,6 +60,14 @@ fn stages() -> Vec<(String, StageSettings)> {
         ),
         ("evaluator", StageSettings::TrainEvaluator(TrainEvaluator::default())),
         ("imported", StageSettings::ImportEvaluator(ImportEvaluator { path: "t2m".into(), ..Default::default() })),
+        (
+            "released",
+            StageSettings::ImportModel(ImportModel {
+                path: "vae.ckpt".into(),
+                statistics: "meta".into(),
+                ..ImportModel::default()
+            }),
+        ),
         ("t2m", StageSettings::EvaluateT2m(EvaluateT2m { model: "lcm".into(), sampler, ..EvaluateT2m::default() })),
     ];
     let register = Register { model: "m".into(), from: vec!["lcm".into()], ..Register::default() };

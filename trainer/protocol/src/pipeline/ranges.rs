@@ -52,6 +52,8 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("network.depth", Whole(1, 16), "blocks"),
     ("network.word_blocks", Whole(0, 255), "blocks"),
     ("network.growth", Whole(1, 16), ""),
+    ("heads", Whole(0, 1_024), "heads"),
+    ("growth", Whole(1, 16), ""),
     ("network.condition", Whole(1, 16_384), "channels"),
     ("solver_steps", Whole(1, 1_000), "steps"),
     ("decoder_steps", Whole(0, 1_000), "steps"),

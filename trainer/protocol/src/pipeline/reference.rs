@@ -10,7 +10,7 @@ use serde_json::{Map, Value, json};
 
 use super::described::{described, described_as, generator};
 use super::{read, sweep};
-use crate::stage::{DataOpen, DataSynthetic, Placement, Shape, StageSettings, Target, TextEmbed};
+use crate::stage::{DataOpen, DataSynthetic, ImportModel, Placement, Shape, StageSettings, Target, TextEmbed};
 
 /// The JSON Schema (draft 2020-12) of a pipeline file.
 pub fn json_schema() -> Value {
@@ -83,6 +83,7 @@ fn described_kind(settings: &StageSettings) -> Value {
                 format!("{} stage that gives {}", if key == field { "A" } else { "Each a" }, kind.noun())
             }
             Target::Dataset(_) | Target::Folder => "A folder".to_owned(),
+            Target::File => "A file".to_owned(),
         };
         let inner = key.split('.').fold(&mut schema, |schema, part| &mut schema["properties"][part]);
         inner["x-refers-to"] = lead.into();
@@ -131,8 +132,13 @@ pub fn markdown() -> String {
             Shape::Registry => "done by the coordinator",
         };
         let _ = writeln!(text, "\n## {kind}\n\n{}\n", sentence(&schema));
-        let (noun, version) = (output.kind.noun(), settings.code_version());
-        let _ = writeln!(text, "Gives {noun} (`{}`); {runs}; code version {version}.\n", output.name);
+        let version = settings.code_version();
+        // What `import.model` gives stands with its parts.
+        let gives = match settings.get::<ImportModel>() {
+            Some(_) => "what `part` says".to_owned(),
+            None => format!("{} (`{}`)", output.kind.noun(), output.name),
+        };
+        let _ = writeln!(text, "Gives {gives}; {runs}; code version {version}.\n");
         table(&mut text, &schema);
     }
     text

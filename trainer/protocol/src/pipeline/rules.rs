@@ -37,6 +37,7 @@ mod tests {
                 stage(&settings, &Placement::default()).into_iter().map(|problem| problem.field).collect();
             let expected: &[&str] = match settings.kind() {
                 "data.open" | "data.features" | "import.evaluator" => &["path"],
+                "import.model" => &["path", "statistics"],
                 "register" => &["model", "from"],
                 _ => &[],
             };

@@ -78,7 +78,9 @@ impl<'a> Neighbours<'a> {
 
     /// Which VAE made the latents that a model was trained on.
     pub fn vae_of_model(&self, model: &str) -> Option<&str> {
-        self.of_model(model, &|name| self.vae_of_latents(self.read_by(name, ArtifactKind::Latents)?))
+        let of_latents = |name: &str| self.vae_of_latents(self.read_by(name, ArtifactKind::Latents)?);
+        // What is imported reads no latents.
+        self.of_model(model, &|name| of_latents(name).or_else(|| self.read_by(name, ArtifactKind::Vae)))
     }
 
     /// What a model can do.
@@ -108,7 +110,8 @@ impl<'a> Neighbours<'a> {
         self.stage(name)?.format().or_else(|| {
             let of = |kind| self.read_by(name, kind);
             let tokens = || of(ArtifactKind::Tokens).or_else(|| of(ArtifactKind::Model));
-            let from = self.dataset_of(name).or_else(|| self.vae_of_model(name)).or_else(tokens)?;
+            let tokenizer = || of(ArtifactKind::Tokenizer);
+            let from = self.dataset_of(name).or_else(|| self.vae_of_model(name)).or_else(tokens).or_else(tokenizer)?;
             if from == name { None } else { self.format(from) }
         })
     }

@@ -49,6 +49,11 @@ pub trait StageSpec:
     /// What it gives.
     const OUTPUT: Output;
 
+    /// What it gives with these settings, where that depends on them.
+    fn output(&self) -> Output {
+        Self::OUTPUT
+    }
+
     /// The stages and files that it refers to.
     fn refs(&mut self) -> Vec<Ref<'_>>;
 
@@ -108,6 +113,8 @@ pub enum Target {
     Dataset(DataFormat),
     /// A folder whose files are all digested.
     Folder,
+    /// A file.
+    File,
 }
 
 /// A reference of a stage's settings, with the place that holds the name.
@@ -157,6 +164,11 @@ impl<'a> Ref<'a> {
     pub fn folder(field: &'static str, path: &'a mut String) -> Self {
         let read = !path.is_empty();
         Self { field: field.into(), name: path, target: Target::Folder, read, measured: false, files: &[], origin: "" }
+    }
+
+    /// A file; none if the path is empty.
+    pub fn file(field: &'static str, path: &'a mut String) -> Self {
+        Self { target: Target::File, ..Self::folder(field, path) }
     }
 
     /// The folder must have these files; `origin` says what it is and where to get it.
@@ -219,7 +231,7 @@ impl<S: StageSpec> AnySpec for S {
     }
 
     fn output(&self) -> Output {
-        S::OUTPUT
+        StageSpec::output(self)
     }
 
     fn schema(&self, generator: &mut SchemaGenerator) -> Schema {

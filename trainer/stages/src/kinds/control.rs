@@ -316,6 +316,7 @@ impl Gang for TrainControl {
             mean,
             std,
             fits: Parts::from([(Role::DENOISER, denoiser.digest())]),
+            projection: None,
         };
         let device = cx.device();
         let tracked = device.clone().autodiff();

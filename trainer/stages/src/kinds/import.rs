@@ -9,7 +9,6 @@
 //! file.
 
 use std::collections::{BTreeMap, HashMap};
-use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use models::flat::layout;
@@ -109,7 +108,7 @@ fn weights(folder: &Path) -> Result<(PathBuf, Vec<u8>), StageError> {
 
 /// The three state dicts of a torch file.
 fn unpickle(file: &Path) -> Result<Vec<u8>, String> {
-    let length = check_container(file)?;
+    let length = text_models::archive_length(file)?;
     let mut tensors = Vec::new();
     for part in PARTS {
         let reader = PytorchReader::with_top_level_key(file, part)
@@ -135,30 +134,6 @@ fn unpickle(file: &Path) -> Result<Vec<u8>, String> {
         all = all.with(&name, tensor.shape().to_vec(), values);
     }
     all.to_bytes().map_err(|e| e.to_string())
-}
-
-/// The length of a file that a pickle reader may open: a regular file, not too large, and no archive that unpacks to more than it is.
-/// `torch.save` writes archives that are not compressed.
-fn check_container(path: &Path) -> Result<u64, String> {
-    let (mut file, length) = files::open(path).map_err(|e| e.to_string())?;
-    if length > limits::WEIGHTS_BYTES {
-        return Err(format!("has {length} bytes; at most {} are read", limits::WEIGHTS_BYTES));
-    }
-    let mut magic = [0; 2];
-    if file.read_exact(&mut magic).is_err() || &magic != b"PK" {
-        return Ok(length);
-    }
-    let mut archive = zip::ZipArchive::new(file).map_err(|e| e.to_string())?;
-    let mut unpacked = 0_u64;
-    for i in 0..archive.len() {
-        unpacked = unpacked.saturating_add(archive.by_index_raw(i).map_err(|e| e.to_string())?.size());
-    }
-    if unpacked > length {
-        return Err(format!(
-            "unpacks to {unpacked} bytes, but has {length}; expected an archive as `torch.save` writes it"
-        ));
-    }
-    Ok(length)
 }
 
 /// Sizes out of shapes.

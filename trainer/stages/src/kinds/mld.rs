@@ -158,6 +158,8 @@ impl Gang for TrainMld {
             guidance_dim: 0,
             text_dim: data.text_meta().dim,
             fits: Parts::from([(Role::VAE, vae_digest), (Role::TEXT, text_part.digest())]),
+            projection: None,
+            time_dim: None,
         };
         let device = cx.device().autodiff();
         let purpose = format!("{}/init", cx.task().name);

@@ -16,6 +16,7 @@ mod flow_data;
 mod flow_student;
 mod frequency;
 mod import;
+mod import_model;
 mod latent_data;
 mod latent_fid;
 mod lcm;
@@ -97,7 +98,7 @@ macro_rules! runners {
 
 // The list of what runs. It is held against `protocol`'s list of kinds by a test below.
 runners! {
-    Plain: DataOpen, DataSynthetic, ImportEvaluator, ModelDecoder, EvaluateSpectrum, EvaluateRecognition;
+    Plain: DataOpen, DataSynthetic, ImportEvaluator, ImportModel, ModelDecoder, EvaluateSpectrum, EvaluateRecognition;
     Map: TextEmbed, DataFeatures, EncodeLatents, EncodeTokens, EvaluateReconstruction, EvaluateLatentFid, EvaluateT2m, EvaluateControl;
     Gang: TrainVae, TrainMld, DistillLcm, DistillPcm, TrainEvaluator, TrainLength, TrainTokenizer, TrainTokens, TrainDiscord, DistillDiscord,
         TrainMdm, TrainStableMoFusion, TrainControl;

@@ -148,6 +148,7 @@ impl Gang for TrainVae {
             network: self.network.clone(),
             mean: dataset.mean.clone(),
             std: dataset.std.clone(),
+            projection: None,
         };
         let (seed, device) = (cx.task().seed, cx.device().autodiff());
         let purpose = stage.to_string();

@@ -15,6 +15,7 @@ mod evaluate_reconstruction;
 mod evaluate_spectrum;
 mod evaluate_t2m;
 mod import_evaluator;
+mod import_model;
 mod model_decoder;
 mod register;
 mod text_embed;
@@ -44,6 +45,7 @@ pub use evaluate_reconstruction::EvaluateReconstruction;
 pub use evaluate_spectrum::EvaluateSpectrum;
 pub use evaluate_t2m::{EvaluateT2m, MultiModality};
 pub use import_evaluator::ImportEvaluator;
+pub use import_model::{ImportModel, ImportedPart, TextActivation};
 pub use model_decoder::ModelDecoder;
 pub use register::{Promote, Register};
 pub use text_embed::{ClipIds, ClipOutput, TextEmbed, TextEncoder};
@@ -87,6 +89,7 @@ super::spec::stage_kinds! {
     EvaluateSpectrum,
     EvaluateRecognition,
     ImportEvaluator,
+    ImportModel,
     EvaluateT2m,
     Register,
 }

@@ -1,0 +1,311 @@
+//! `import.model`: published weights, read from their files. Sources: MLD, MotionLCM, T2M-GPT, MoMask, MMM, MDM, DisCoRD.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::ArtifactKind;
+use crate::stage::features::check_frames;
+use crate::stage::{
+    ControlHints, DataFormat, Family, FlowSolver, Neighbours, Output, Problems, Ref, Shape, Solver, StageSpec,
+};
+
+/// What a file's statistics are called in published folders.
+const STATISTICS: [&str; 2] = ["mean.npy|Mean.npy", "std.npy|Std.npy"];
+const STATISTICS_ORIGIN: &str = "mean and deviation of the features that the model was trained on: those of the data set (MotionLCM, MDM), \
+                                 or the folder `meta` beside the weights (MoMask, T2M-GPT)";
+const HINT_STATISTICS: [&str; 2] = ["Mean_raw.npy", "Std_raw.npy"];
+const HINT_ORIGIN: &str = "mean and deviation of the joints that OmniControl and MotionLCM normalise hints with, `humanml_spatial_norm` there";
+
+/// What is taken of a file, and so what the stage gives.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum ImportedPart {
+    /// The VAE of MLD or MotionLCM, also out of a file that has a denoiser beside it: a VAE.
+    #[default]
+    Vae,
+    /// The denoiser of MLD, or MotionLCM's teacher: a model. Reads `vae` and `text`.
+    Mld,
+    /// MotionLCM's student: a model. Reads `vae` and `text`.
+    Lcm,
+    /// MotionLCM's ControlNet and trajectory encoder: the model `model` with a control part.
+    Control,
+    /// The tokenizer of T2M-GPT, MMM or MoMask: a tokenizer.
+    Tokenizer,
+    /// T2M-GPT's transformer: a model. Reads `tokenizer` and `text`.
+    T2mgpt,
+    /// MoMask's masked transformer, and with `residual` the one of the layers above the first: a model. Reads `tokenizer` and `text`.
+    Momask,
+    /// MMM's transformer: a model. Reads `tokenizer` and `text`.
+    Mmm,
+    /// MDM, the moving average of its weights if there is one: a model. Reads `text`.
+    Mdm,
+    /// DisCoRD's decoder: a flow decoder, which `model.decoder` puts into a model. Reads `tokenizer`.
+    Discord,
+}
+
+/// Whether a denoiser has a ReLU on the caption's embedding, which its weights do not say.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum TextActivation {
+    /// As in the published denoiser of its shape: with latents as wide as the transformer (v1, MLD) it has one, otherwise (v2) none.
+    #[default]
+    Published,
+    /// It has one.
+    Relu,
+    /// It has none.
+    None,
+}
+
+/// `import.model`: published weights. Sizes are read off the shapes of the weights; what these do not say is set here, with the published
+/// value as default. Tensors that nothing reads, such as an evaluator's or an optimizer's, are named in the log and left out.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct ImportModel {
+    /// File with the weights, of torch (`.ckpt`, `.tar`, `.pth`, `.pt`) or `.safetensors` under the same names. Nothing in it is run. Not part of the
+    /// key: the content's digest is.
+    pub path: String,
+    /// What is taken of it.
+    pub part: ImportedPart,
+    /// `momask`: file with the residual transformer; a tokenizer of one codebook needs none.
+    pub residual: String,
+    /// `vae`, `tokenizer`, `mdm`: what it was trained on.
+    pub format: DataFormat,
+    /// `vae`, `tokenizer`, `mdm`: folder with the mean and the deviation that it was trained with, `mean.npy` and `std.npy`, or `Mean.npy` and
+    /// `Std.npy`.
+    pub statistics: String,
+    /// The same out of a data set: stage that gives it, in place of `format` and `statistics`.
+    pub dataset: String,
+    /// `mld`, `lcm`: stage that gives the VAE whose latents it makes. A file that holds a VAE besides must hold this one.
+    pub vae: String,
+    /// `t2mgpt`, `momask`, `mmm`, `discord`: stage that gives the tokenizer.
+    pub tokenizer: String,
+    /// All that give a model but `control`: stage that gives caption embeddings of the encoder that it was trained with, of whatever captions.
+    pub text: String,
+    /// `control`: stage that gives the model that it controls. A file that holds a denoiser besides must hold this one's.
+    pub model: String,
+    /// Attention heads; 0 takes the published number: 4 (MLD, MotionLCM, MDM, DisCoRD), 6 (MoMask), 16 (T2M-GPT, MMM).
+    pub heads: usize,
+    /// `mld`, `lcm`: whether captions go through a ReLU.
+    pub text_activation: TextActivation,
+    /// `lcm`: guidance scales w that it was trained with.
+    pub guidance: (f64, f64),
+    /// `lcm`: the solver's step k in training, which samplers without `timesteps` follow: 100 (v2), 20 (v1).
+    pub skip: usize,
+    /// `control`: what it was told in training.
+    pub hints: ControlHints,
+    /// `control`: folder with `Mean_raw.npy` and `Std_raw.npy`, the statistics of joints in metres that hints were normalised with.
+    pub hint_statistics: String,
+    /// `momask`: tokens of the longest motion. The others' files say it.
+    pub longest: usize,
+    /// `tokenizer`: what dilations grow by from block to block.
+    pub growth: usize,
+    /// `mdm`: timesteps of its cosine schedule: 1000, or 50 in the authors' later model.
+    pub timesteps: usize,
+    /// `mdm`: whether attention was kept off padding, as in the later model.
+    pub mask_frames: bool,
+    /// `mdm`: frames of the longest motion.
+    pub max_frames: usize,
+    /// `discord`: how the flow is followed.
+    pub solver: FlowSolver,
+    /// `discord`: steps of that.
+    pub solver_steps: usize,
+}
+
+impl Default for ImportModel {
+    fn default() -> Self {
+        Self {
+            path: String::new(),
+            part: ImportedPart::Vae,
+            residual: String::new(),
+            format: DataFormat::Humanml3d,
+            statistics: String::new(),
+            dataset: String::new(),
+            vae: "vae".into(),
+            tokenizer: "tokenizer".into(),
+            text: "text".into(),
+            model: "lcm".into(),
+            heads: 0,
+            text_activation: TextActivation::Published,
+            guidance: (5.0, 15.0),
+            skip: 100,
+            hints: ControlHints::default(),
+            hint_statistics: String::new(),
+            longest: 49,
+            growth: 3,
+            timesteps: 1000,
+            mask_frames: false,
+            max_frames: 196,
+            solver: FlowSolver::Midpoint,
+            solver_steps: 15,
+        }
+    }
+}
+
+impl ImportedPart {
+    /// The word in YAML.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Vae => "vae",
+            Self::Mld => "mld",
+            Self::Lcm => "lcm",
+            Self::Control => "control",
+            Self::Tokenizer => "tokenizer",
+            Self::T2mgpt => "t2mgpt",
+            Self::Momask => "momask",
+            Self::Mmm => "mmm",
+            Self::Mdm => "mdm",
+            Self::Discord => "discord",
+        }
+    }
+
+    /// Attention heads of the published one.
+    pub fn heads(self) -> usize {
+        match self {
+            Self::Momask => 6,
+            Self::T2mgpt | Self::Mmm => 16,
+            _ => 4,
+        }
+    }
+
+    /// What of a stage it decides: whether it holds features' statistics, and which stages it reads.
+    fn reads(self) -> Reads {
+        let none = Reads::default();
+        match self {
+            Self::Vae | Self::Tokenizer => Reads { statistics: true, ..none },
+            Self::Mld | Self::Lcm => Reads { vae: true, text: true, ..none },
+            Self::Control => Reads { model: true, ..none },
+            Self::T2mgpt | Self::Momask | Self::Mmm => Reads { tokenizer: true, text: true, ..none },
+            Self::Mdm => Reads { statistics: true, text: true, ..none },
+            Self::Discord => Reads { tokenizer: true, ..none },
+        }
+    }
+
+    /// Where its file comes from.
+    fn origin(self) -> &'static str {
+        match self {
+            Self::Vae | Self::Lcm | Self::Control => {
+                "a checkpoint of MotionLCM, linked in github.com/Dai-Wenxun/MotionLCM"
+            }
+            Self::Mld => {
+                "a checkpoint of MLD or MotionLCM, linked in github.com/ChenFengYe/motion-latent-diffusion and github.com/Dai-Wenxun/MotionLCM"
+            }
+            Self::Tokenizer => {
+                "a tokenizer, linked in github.com/EricGuo5513/momask-codes, github.com/Mael-zys/T2M-GPT and github.com/exitudio/MMM"
+            }
+            Self::T2mgpt => "a checkpoint of T2M-GPT, linked in github.com/Mael-zys/T2M-GPT",
+            Self::Momask => "a checkpoint of MoMask, linked in github.com/EricGuo5513/momask-codes",
+            Self::Mmm => "a checkpoint of MMM, linked in github.com/exitudio/MMM",
+            Self::Mdm => "a checkpoint of MDM, linked in github.com/GuyTevet/motion-diffusion-model",
+            Self::Discord => "a checkpoint of DisCoRD, linked in github.com/whwjdqls/DisCoRD",
+        }
+    }
+}
+
+/// What a part's import reads besides its file.
+#[derive(Debug, Clone, Copy, Default)]
+#[expect(clippy::struct_excessive_bools, reason = "a table of five columns")]
+struct Reads {
+    statistics: bool,
+    vae: bool,
+    tokenizer: bool,
+    text: bool,
+    model: bool,
+}
+
+impl StageSpec for ImportModel {
+    const KIND: &'static str = "import.model";
+    const SHAPE: Shape = Shape::Plain;
+    const OUTPUT: Output = Output { name: "vae", kind: ArtifactKind::Vae };
+
+    fn output(&self) -> Output {
+        match self.part {
+            ImportedPart::Vae => Self::OUTPUT,
+            ImportedPart::Tokenizer => Output { name: "tokenizer", kind: ArtifactKind::Tokenizer },
+            ImportedPart::Discord => Output { name: "decoder", kind: ArtifactKind::FlowDecoder },
+            _ => Output { name: "model", kind: ArtifactKind::Model },
+        }
+    }
+
+    fn refs(&mut self) -> Vec<Ref<'_>> {
+        let reads = self.part.reads();
+        let control = self.part == ImportedPart::Control;
+        vec![
+            Ref::file("path", &mut self.path).holding(&[], self.part.origin()),
+            Ref::file("residual", &mut self.residual)
+                .holding(&[], self.part.origin())
+                .only_if(self.part == ImportedPart::Momask),
+            Ref::folder("statistics", &mut self.statistics)
+                .holding(&STATISTICS, STATISTICS_ORIGIN)
+                .only_if(reads.statistics),
+            Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset).optional().only_if(reads.statistics),
+            Ref::folder("hint_statistics", &mut self.hint_statistics)
+                .holding(&HINT_STATISTICS, HINT_ORIGIN)
+                .only_if(control),
+            Ref::stage("vae", &mut self.vae, ArtifactKind::Vae).only_if(reads.vae),
+            Ref::stage("tokenizer", &mut self.tokenizer, ArtifactKind::Tokenizer).only_if(reads.tokenizer),
+            Ref::stage("text", &mut self.text, ArtifactKind::Embeddings).only_if(reads.text),
+            Ref::stage("model", &mut self.model, ArtifactKind::Model).only_if(reads.model),
+        ]
+    }
+
+    fn check(&self, p: &mut Problems) {
+        let part = self.part;
+        let missing = |path: &str| path.trim().is_empty();
+        if missing(&self.path) {
+            p.add("path", "`path` is missing: the file with the weights", &format!("download {}", part.origin()));
+        }
+        if part.reads().statistics && !missing(&self.statistics) && !missing(&self.dataset) {
+            let message = "`statistics` and `dataset` are both given, and both say what was subtracted from features";
+            p.add("statistics", message, "leave one of them out");
+        }
+        if part.reads().statistics && missing(&self.statistics) && missing(&self.dataset) {
+            let help = format!("give {STATISTICS_ORIGIN}; or write `dataset: dataset`");
+            p.add("statistics", "`statistics` is missing: the folder with `mean.npy` and `std.npy`", &help);
+        }
+        if part == ImportedPart::Control {
+            if missing(&self.hint_statistics) {
+                let message = "`hint_statistics` is missing: the folder with `Mean_raw.npy` and `Std_raw.npy`";
+                p.add("hint_statistics", message, &format!("give {HINT_ORIGIN}"));
+            }
+            self.hints.check(p);
+        }
+        if part != ImportedPart::Momask && !missing(&self.residual) {
+            let message = format!("`residual` is given, but `{}` has one file", part.name());
+            p.add("residual", message, "leave it out");
+        }
+        let (low, high) = self.guidance;
+        if !(low >= 0.0 && low <= high && high.is_finite()) {
+            let message = format!("`guidance` is [{low}, {high}]; expected numbers of 0 or more, the smaller first");
+            p.add("guidance", message, "published: [5, 15]");
+        }
+        if self.skip == 0 || !1000usize.is_multiple_of(self.skip) {
+            let message = format!("`skip` is {}; expected a divisor of the 1000 timesteps", self.skip);
+            p.add("skip", message, "published: 100 (v2) and 20 (v1)");
+        }
+        check_frames(p, self.max_frames);
+    }
+
+    fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
+        let model = &self.model;
+        if self.part == ImportedPart::Control && stages.family(model).is_some_and(|family| !family.draws_latents()) {
+            let message = format!("`{model}` is no latent diffusion, and only such a model has a ControlNet");
+            p.add("model", message, "name the stage that imports or trains the model that it controls");
+        }
+    }
+
+    fn format(&self) -> Option<DataFormat> {
+        (self.part.reads().statistics && self.dataset.is_empty()).then_some(self.format)
+    }
+
+    fn family(&self) -> Option<Family> {
+        match self.part {
+            ImportedPart::Mld => Some(Family::Mld),
+            ImportedPart::Lcm => Some(Family::Lcm { skip: self.skip, guidance: self.guidance }),
+            ImportedPart::T2mgpt => Some(Family::Autoregressive),
+            ImportedPart::Momask => Some(Family::Masked),
+            ImportedPart::Mmm => Some(Family::Mmm),
+            ImportedPart::Mdm => Some(Family::Features { timesteps: self.timesteps, solver: Solver::Ddpm }),
+            ImportedPart::Vae | ImportedPart::Control | ImportedPart::Tokenizer | ImportedPart::Discord => None,
+        }
+    }
+}

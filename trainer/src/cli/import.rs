@@ -1,0 +1,145 @@
+//! `trainer import`: published weights as a version of a model. A pipeline of `import.model` and `register` does it, which this writes and runs;
+//! `--print` shows it, to be kept and changed.
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+
+use crate::pipeline_file;
+use crate::print::{self, Output};
+use crate::problem::{Problem, Result};
+use crate::run;
+
+/// What becomes a version.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Part {
+    /// The denoiser of MLD, or MotionLCM's teacher, with its VAE
+    Mld,
+    /// MotionLCM's student with its VAE
+    Lcm,
+    /// MotionLCM's student with its VAE and its control part
+    Control,
+    /// T2M-GPT's transformer with its tokenizer
+    T2mgpt,
+    /// MoMask's two transformers with their tokenizer
+    Momask,
+    /// MMM's transformer with its tokenizer
+    Mmm,
+    /// MDM
+    Mdm,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ImportArgs {
+    /// File with the weights: of torch (`.ckpt`, `.tar`, `.pth`, `.pt`), or `.safetensors` under the published names
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+    /// The model of which it becomes a version
+    #[arg(long = "as", value_name = "MODEL")]
+    model: String,
+    /// What it is
+    #[arg(long, value_enum)]
+    part: Part,
+    /// Folder with the mean and the deviation of the features that it was trained on: `mean.npy` and `std.npy`
+    #[arg(long, value_name = "DIR")]
+    statistics: PathBuf,
+    /// What it was trained on: `humanml3d` or `kit`
+    #[arg(long, default_value = "humanml3d", value_name = "FORMAT")]
+    format: String,
+    /// The text encoder that it was trained with: `clip=FOLDER`, `t5=FOLDER`, `sentence-t5=FOLDER` or `hashed`
+    #[arg(long, default_value = "hashed", value_name = "ENCODER=FOLDER")]
+    text: String,
+    /// File with the VAE, where FILE does not hold it
+    #[arg(long, value_name = "FILE")]
+    vae: Option<PathBuf>,
+    /// File with the tokenizer of a token model
+    #[arg(long, value_name = "FILE", required_if_eq_any = [("part", "t2mgpt"), ("part", "momask"), ("part", "mmm")])]
+    tokenizer: Option<PathBuf>,
+    /// File with MoMask's residual transformer
+    #[arg(long, value_name = "FILE")]
+    residual: Option<PathBuf>,
+    /// Folder with `Mean_raw.npy` and `Std_raw.npy`, which a control part's hints are normalised with
+    #[arg(long, value_name = "DIR", required_if_eq("part", "control"))]
+    hint_statistics: Option<PathBuf>,
+    /// Overrides a key of the pipeline, such as `stages.weights.heads=8`; may be repeated
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Prints the pipeline and runs nothing
+    #[arg(long)]
+    print: bool,
+    /// The store's folder
+    #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR")]
+    store: PathBuf,
+    /// How the result is printed
+    #[arg(short, long, value_enum, default_value_t)]
+    pub(super) output: Output,
+}
+
+pub(crate) async fn import(args: ImportArgs, command: String) -> Result<u8> {
+    let source = args.pipeline()?;
+    let file = pipeline_file::of_text("the pipeline of `trainer import`", source, &args.set)?;
+    if args.print {
+        print::out(&file.source);
+        return Ok(0);
+    }
+    let file = Box::new(pipeline_file::with_data(file)?);
+    let options = run::Options { store: args.store, blobs: None, workers: Some(1), output: args.output, command };
+    run::run(run::Request::Submit { file, until: None }, options).await
+}
+
+/// A path as YAML has a text.
+fn quoted(path: &Path) -> String {
+    serde_json::Value::from(path.display().to_string()).to_string()
+}
+
+impl ImportArgs {
+    /// The pipeline. Which captions are embedded does not matter, so a few are made up.
+    fn pipeline(&self) -> Result<String> {
+        let text = match self.text.split_once('=') {
+            Some((encoder, folder)) => format!("{{encoder: {encoder}, path: {}}}", quoted(Path::new(folder))),
+            None if self.text == "hashed" => "{encoder: hashed}".to_owned(),
+            None => {
+                let problem = Problem::usage(format!("`--text {}` names no folder", self.text));
+                return Err(problem.hint("write `--text sentence-t5=FOLDER`, or `clip=`, `t5=`; `hashed` needs none"));
+            }
+        };
+        let (format, statistics) = (&self.format, quoted(&self.statistics));
+        let trained = format!("format: {format}, statistics: {statistics}");
+        let mut stages = String::new();
+        let mut stage = |name: &str, part: &str, path: &Path, more: &str| {
+            let path = quoted(path);
+            let _ = writeln!(stages, "  {name}: {{kind: import.model, part: {part}, path: {path}{more}}}");
+        };
+        let weights = "weights";
+        match self.part {
+            Part::Mld | Part::Lcm | Part::Control => {
+                stage("vae", "vae", self.vae.as_ref().unwrap_or(&self.file), &format!(", {trained}"));
+                if let (Part::Control, Some(hints)) = (self.part, &self.hint_statistics) {
+                    stage("lcm", "lcm", &self.file, "");
+                    stage(weights, "control", &self.file, &format!(", hint_statistics: {}", quoted(hints)));
+                } else {
+                    stage(weights, if self.part == Part::Mld { "mld" } else { "lcm" }, &self.file, "");
+                }
+            }
+            Part::T2mgpt | Part::Momask | Part::Mmm => {
+                if let Some(tokenizer) = &self.tokenizer {
+                    stage("tokenizer", "tokenizer", tokenizer, &format!(", {trained}"));
+                }
+                let name = match self.part {
+                    Part::T2mgpt => "t2mgpt",
+                    Part::Momask => "momask",
+                    _ => "mmm",
+                };
+                let residual = self.residual.as_deref().map(|path| format!(", residual: {}", quoted(path)));
+                stage(weights, name, &self.file, &residual.unwrap_or_default());
+            }
+            Part::Mdm => stage(weights, "mdm", &self.file, &format!(", {trained}")),
+        }
+        let model = serde_json::Value::from(self.model.as_str());
+        Ok(format!(
+            "name: import\ndataset: {{format: synthetic, clips: 8}}\ntext: {text}\nstages:\n{stages}  \
+             release: {{kind: register, model: {model}, from: {weights}}}\n"
+        ))
+    }
+}

@@ -1,0 +1,411 @@
+//! Sizes of published networks, read off the shapes of their weights. Where they stand in files is said beside them.
+//!
+//! A size is read off a tensor that holds as many numbers, and every other tensor of the network is held against the sizes before anything is
+//! made of them.
+
+use models::networks::{
+    DenoiserConfig, GptConfig, MdmConfig, MmmConfig, MomaskConfig, POSITIONS, Projection, TimeFeatures,
+    TrajectoryConfig, UnetConfig, VaeConfig,
+};
+use protocol::stage::{Network, Positions};
+
+use super::{Checkpoint, Found};
+use crate::context::StageError;
+
+/// Added to variances in layer norms.
+const NORM_EPS: f64 = 1e-5;
+/// Levels of every published tokenizer, and what each shortens by.
+const LEVELS: usize = 2;
+const STRIDE: usize = 2;
+/// Most blocks of a network one after the other, and most codebooks.
+const BLOCKS: usize = 255;
+/// Most blocks of a tokenizer's level.
+const DEPTH: usize = 16;
+
+type Result<T> = std::result::Result<T, StageError>;
+
+/// MLD's and MotionLCM's VAE.
+pub fn vae(file: &Checkpoint) -> Result<Found<'_>> {
+    file.network("VAE", &VAE, VAE_MARKER)
+}
+
+/// The same, if there is one.
+pub fn find_vae(file: &Checkpoint) -> Option<Found<'_>> {
+    // Without anything before them these are names of others too.
+    file.find(&VAE[..2], VAE_MARKER)
+}
+
+const VAE: [&str; 4] = ["state_dict.vae.", "vae.", "state_dict.", ""];
+const VAE_MARKER: &str = "query_pos_decoder.pe";
+
+/// MLD's and MotionLCM's denoiser.
+pub fn denoiser(file: &Checkpoint) -> Result<Found<'_>> {
+    file.network("denoiser", &DENOISER, DENOISER_MARKER)
+}
+
+/// The same, if there is one.
+pub fn find_denoiser(file: &Checkpoint) -> Option<Found<'_>> {
+    file.find(&DENOISER[..2], DENOISER_MARKER)
+}
+
+const DENOISER: [&str; 4] = ["state_dict.denoiser.", "denoiser.", "state_dict.", ""];
+const DENOISER_MARKER: &str = "time_embedding.linear_1.weight";
+
+/// MotionLCM's ControlNet.
+pub fn controlnet(file: &Checkpoint) -> Result<Found<'_>> {
+    file.network("ControlNet", &["state_dict.controlnet.", "controlnet."], "controlnet_cond_embedding.0.weight")
+}
+
+/// MotionLCM's trajectory encoder.
+pub fn trajectory_encoder(file: &Checkpoint) -> Result<Found<'_>> {
+    file.network("trajectory encoder", &["state_dict.traj_encoder.", "traj_encoder."], "skel_embedding.weight")
+}
+
+/// The tokenizer of T2M-GPT, MMM and MoMask.
+pub fn tokenizer(file: &Checkpoint) -> Result<Found<'_>> {
+    let places = ["vq_model.", "net.vqvae.", "net.", "vqvae.", "tokenizer.", ""];
+    file.network("tokenizer", &places, "encoder.model.0.weight")
+}
+
+/// MoMask's masked transformer.
+pub fn masked(file: &Checkpoint) -> Result<Found<'_>> {
+    file.network(
+        "masked transformer",
+        &["t2m_transformer.", "trans.", "mask.", "generator.mask.", ""],
+        "token_emb.weight",
+    )
+}
+
+/// MoMask's residual transformer.
+pub fn residual(file: &Checkpoint) -> Result<Found<'_>> {
+    file.network("residual transformer", &["res_transformer.", "res.", "generator.res.", ""], "quant_emb.weight")
+}
+
+/// T2M-GPT's transformer.
+pub fn gpt(file: &Checkpoint) -> Result<Found<'_>> {
+    file.network("transformer of T2M-GPT", &["trans.", "generator.", ""], "trans_base.tok_emb.weight")
+}
+
+/// MMM's transformer.
+pub fn mmm(file: &Checkpoint) -> Result<Found<'_>> {
+    file.network("transformer of MMM", &["trans.", "generator.", ""], "trans_base.learn_tok_emb.weight")
+}
+
+/// MDM, the average of its weights first.
+pub fn mdm(file: &Checkpoint) -> Result<Found<'_>> {
+    file.network("MDM", &["model_avg.", "model.", "state_dict.", "denoiser.", ""], "embed_timestep.time_embed.0.weight")
+}
+
+/// DisCoRD's U-Net.
+pub fn unet(file: &Checkpoint) -> Result<Found<'_>> {
+    file.network("U-Net of DisCoRD", &["", "state_dict.", "model.", "decoder."], "net.init_proj.weight")
+}
+
+/// Entries of a list of blocks, which may be no more than any network has.
+fn listed(found: &Found<'_>, stem: &str) -> Result<usize> {
+    let count = found.count(stem);
+    if count > BLOCKS {
+        return Err(found.refuse(format!("`{stem}` has {count} entries; expected at most {BLOCKS}")));
+    }
+    Ok(count)
+}
+
+/// Width, layers and feed-forward width of a skip stack.
+fn stack(found: &Found<'_>, stem: &str) -> Result<(usize, usize, usize)> {
+    Ok((
+        found.dim(&format!("{stem}.middle_block.self_attn.in_proj_weight"), 1)?,
+        2 * listed(found, &format!("{stem}.input_blocks"))? + 1,
+        found.dim(&format!("{stem}.middle_block.linear1.weight"), 0)?,
+    ))
+}
+
+/// The same of blocks one after the other.
+fn blocks(found: &Found<'_>, stem: &str) -> Result<(usize, usize, usize)> {
+    Ok((
+        found.dim(&format!("{stem}.0.self_attn.in_proj_weight"), 1)?,
+        listed(found, stem)?,
+        found.dim(&format!("{stem}.0.linear1.weight"), 0)?,
+    ))
+}
+
+/// Refuses heads that do not divide the width.
+fn divided(found: &Found<'_>, width: usize, heads: usize) -> Result<usize> {
+    if heads > 0 && width.is_multiple_of(heads) {
+        return Ok(heads);
+    }
+    Err(found.refuse(format!("it is {width} wide, which {heads} attention heads do not divide; set `heads`")))
+}
+
+/// A number that is left when `less` is taken away.
+fn without(found: &Found<'_>, name: &str, axis: usize, less: usize) -> Result<usize> {
+    let all = found.dim(name, axis)?;
+    let few = || found.refuse(format!("`{name}` has {all} rows; expected more than {less}"));
+    all.checked_sub(less).filter(|rest| *rest > 0).ok_or_else(few)
+}
+
+/// Of a VAE.
+pub fn of_vae(found: &Found<'_>, heads: usize) -> Result<VaeConfig> {
+    let (width, layers, feed_forward) = stack(found, "encoder")?;
+    let projection = found.has("latent_pre.weight");
+    let tokens = found.dim("global_motion_token", 0)?;
+    // Each latent token has a mean and a deviation, and they stand before the frames.
+    if !tokens.is_multiple_of(2) || tokens >= POSITIONS {
+        return Err(
+            found.refuse(format!("`global_motion_token` has {tokens} rows; expected an even number below {POSITIONS}"))
+        );
+    }
+    Ok(VaeConfig {
+        features: found.dim("skel_embedding.weight", 1)?,
+        tokens: tokens / 2,
+        dim: if projection { found.dim("latent_pre.weight", 0)? } else { width },
+        width,
+        layers,
+        heads: divided(found, width, heads)?,
+        feed_forward,
+        projection,
+        norm_eps: NORM_EPS,
+    })
+}
+
+/// Of a denoiser of latents of `tokens` tokens, which its weights do not say; the ReLU is left open.
+pub fn of_denoiser(found: &Found<'_>, tokens: usize, heads: usize) -> Result<DenoiserConfig> {
+    let (width, layers, feed_forward) = stack(found, "encoder")?;
+    let projection = found.has("latent_pre.weight");
+    let guided = "time_embedding.cond_proj.weight";
+    let guidance_dim = if found.has(guided) { Some(found.dim(guided, 1)?) } else { None };
+    let time_dim = found.dim(DENOISER_MARKER, 1)?;
+    // Pairs of a sine and a cosine; between the frequencies of two pairs there is a step.
+    for (what, dim, least) in [("time", time_dim, 2), ("guidance", guidance_dim.unwrap_or(4), 4)] {
+        if dim < least || !dim.is_multiple_of(2) {
+            return Err(found.refuse(format!("its {what} is {dim} numbers; expected an even number, at least {least}")));
+        }
+    }
+    Ok(DenoiserConfig {
+        tokens,
+        dim: if projection { found.dim("latent_pre.weight", 1)? } else { width },
+        width,
+        layers,
+        heads: divided(found, width, heads)?,
+        feed_forward,
+        text_dim: found.dim("emb_proj.1.weight", 1)?,
+        time_dim,
+        text_relu: !projection,
+        projection,
+        guidance_dim,
+        norm_eps: NORM_EPS,
+    })
+}
+
+/// Of a trajectory encoder.
+pub fn of_trajectory(found: &Found<'_>, heads: usize) -> Result<TrajectoryConfig> {
+    let (width, layers, feed_forward) = stack(found, "encoder")?;
+    let projection = found.has("latent_proj.weight");
+    let coordinates = found.dim("skel_embedding.weight", 1)?;
+    if !coordinates.is_multiple_of(3) {
+        return Err(
+            found.refuse(format!("`skel_embedding.weight` reads {coordinates} coordinates; expected three a joint"))
+        );
+    }
+    Ok(TrajectoryConfig {
+        joints: coordinates / 3,
+        tokens: found.dim("global_motion_token", 0)?,
+        dim: if projection { found.dim("latent_proj.weight", 0)? } else { width },
+        width,
+        layers,
+        heads: divided(found, width, heads)?,
+        feed_forward,
+        projection,
+        norm_eps: NORM_EPS,
+    })
+}
+
+/// Sizes as settings have them.
+pub fn network(width: usize, layers: usize, heads: usize, feed_forward: usize) -> Network {
+    Network { width, layers, heads, feed_forward, positions: Positions::Uniform, ..Network::default() }
+}
+
+/// A tokenizer's networks and codebooks.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TokenizerSizes {
+    /// Features per frame.
+    pub features: usize,
+    /// Codes of a codebook.
+    pub codes: usize,
+    /// Width of a code.
+    pub code_dim: usize,
+    /// Codebooks.
+    pub quantizers: usize,
+    /// Width of the convolutions.
+    pub width: usize,
+    /// Residual blocks of a level.
+    pub depth: usize,
+    /// Whether the only codebook has no number in its name (T2M-GPT, MMM).
+    pub single: bool,
+}
+
+/// Of a tokenizer.
+pub fn of_tokenizer(found: &Found<'_>) -> Result<TokenizerSizes> {
+    let single = found.has("quantizer.codebook");
+    let first = if single { "quantizer.codebook" } else { "quantizer.layers.0.codebook" };
+    let depth = found.count("encoder.model.2.1.model");
+    if !(1..=DEPTH).contains(&depth) {
+        return Err(found.refuse(format!("a level of {depth} residual blocks; expected 1 to {DEPTH}")));
+    }
+    let books = (0..BLOCKS).take_while(|q| found.has(&format!("quantizer.layers.{q}.codebook"))).count();
+    let taps = found.dim("encoder.model.2.0.weight", 2)?;
+    if taps != 2 * STRIDE || !found.has(&format!("encoder.model.{}.weight", LEVELS + 2)) {
+        return Err(found
+            .refuse(format!("its encoder has not {LEVELS} levels that halve the frames, as all published ones have")));
+    }
+    Ok(TokenizerSizes {
+        features: found.dim("encoder.model.0.weight", 1)?,
+        codes: found.dim(first, 0)?,
+        code_dim: found.dim(first, 1)?,
+        quantizers: if single { 1 } else { books },
+        width: found.dim("encoder.model.0.weight", 0)?,
+        depth,
+        single,
+    })
+}
+
+/// Of MoMask's masked transformer; how many codebooks there are it does not say.
+pub fn of_masked(found: &Found<'_>, quantizers: usize, heads: usize) -> Result<MomaskConfig> {
+    let (width, layers, feed_forward) = blocks(found, "seqTransEncoder.layers")?;
+    Ok(MomaskConfig {
+        codes: without(found, "token_emb.weight", 0, 2)?,
+        quantizers,
+        dim: found.dim("token_emb.weight", 1)?,
+        width,
+        layers,
+        heads: divided(found, width, heads)?,
+        feed_forward,
+        text_dim: found.dim("cond_emb.weight", 1)?,
+    })
+}
+
+/// Of MoMask's residual transformer, with shared weights as published.
+pub fn of_residual(found: &Found<'_>, heads: usize) -> Result<MomaskConfig> {
+    if found.has("output_proj_bias") {
+        return Err(found
+            .refuse("its output tables are not shared with its inputs; published residual transformers share them"));
+    }
+    let (width, layers, feed_forward) = blocks(found, "seqTransEncoder.layers")?;
+    let quantizers = found.dim("quant_emb.weight", 1)?;
+    if quantizers < 3 {
+        return Err(found.refuse(format!("it is of {quantizers} codebooks; expected at least 3")));
+    }
+    Ok(MomaskConfig {
+        codes: without(found, "token_embed_weight_", 1, 1)?,
+        quantizers,
+        dim: found.dim("token_embed_weight_", 2)?,
+        width,
+        layers,
+        heads: divided(found, width, heads)?,
+        feed_forward,
+        text_dim: found.dim("cond_emb.weight", 1)?,
+    })
+}
+
+/// Positions of T2M-GPT or MMM, the caption's and the end's counted: its tables' rows.
+fn positions(found: &Found<'_>, longest: usize) -> Result<usize> {
+    let table =
+        ["trans_base.pos_embed.embed", "trans_base.pos_embedding.weight"].into_iter().find(|name| found.has(name));
+    let block = table.map_or(Ok(longest + 2), |name| found.dim(name, 0))?;
+    if block < 3 {
+        return Err(found.refuse(format!("it has {block} positions; expected at least 3")));
+    }
+    Ok(block)
+}
+
+/// Feed-forward width over the width.
+fn rate(found: &Found<'_>, name: &str, width: usize) -> Result<usize> {
+    let wide = found.dim(name, 0)?;
+    if !wide.is_multiple_of(width) {
+        return Err(found.refuse(format!("`{name}` has {wide} rows; expected a multiple of the width, {width}")));
+    }
+    Ok(wide / width)
+}
+
+/// Of T2M-GPT's transformer; `longest` tokens where the file has no table of positions.
+pub fn of_gpt(found: &Found<'_>, longest: usize, heads: usize) -> Result<GptConfig> {
+    let width = found.dim("trans_base.blocks.0.attn.key.weight", 0)?;
+    Ok(GptConfig {
+        codes: without(found, "trans_base.tok_emb.weight", 0, 2)?,
+        width,
+        heads: divided(found, width, heads)?,
+        layers: listed(found, "trans_base.blocks")?,
+        block: positions(found, longest)?,
+        text_dim: found.dim("trans_base.cond_emb.weight", 1)?,
+        rate: rate(found, "trans_base.blocks.0.mlp.0.weight", width)?,
+    })
+}
+
+/// Of MMM's transformer.
+pub fn of_mmm(found: &Found<'_>, longest: usize, heads: usize) -> Result<MmmConfig> {
+    let width = found.dim("trans_head.blocks.0.attn.key.weight", 0)?;
+    let layers = listed(found, "trans_head.blocks")?;
+    Ok(MmmConfig {
+        codes: found.dim("trans_head.head.weight", 0)?,
+        dim: found.dim("trans_base.learn_tok_emb.weight", 1)?,
+        width,
+        heads: divided(found, width, heads)?,
+        layers,
+        local: listed(found, "trans_base.cross_att")?.min(layers),
+        block: positions(found, longest)?,
+        text_dim: found.dim("trans_base.cond_emb.weight", 1)?,
+        rate: rate(found, "trans_head.blocks.0.mlp.0.weight", width)?,
+    })
+}
+
+/// Of MDM.
+pub fn of_mdm(found: &Found<'_>, heads: usize) -> Result<MdmConfig> {
+    let (width, layers, feed_forward) = blocks(found, "seqTransEncoder.layers")?;
+    if !width.is_multiple_of(2) {
+        return Err(found.refuse(format!("it is {width} wide; expected an even number")));
+    }
+    Ok(MdmConfig {
+        features: found.dim("input_process.poseEmbedding.weight", 1)?,
+        width,
+        layers,
+        heads: divided(found, width, heads)?,
+        feed_forward,
+        text_dim: found.dim("embed_text.weight", 1)?,
+        norm_eps: NORM_EPS,
+    })
+}
+
+/// Of DisCoRD's U-Net, of two levels as published; `attention` is the heads and their width, if it has any.
+pub fn of_unet(found: &Found<'_>, attention: (usize, usize)) -> Result<UnetConfig> {
+    let projection = "net.condition_projection";
+    let features = found.dim("net.final_conv.weight", 0)?;
+    let has = |name: &str| found.has(&format!("{projection}.{name}"));
+    let dim = |name: &str, axis| found.dim(&format!("{projection}.{name}"), axis);
+    let (kind, token_dim) = if has("3.weight") {
+        (Projection::Stack, dim("3.weight", 1)?)
+    } else if has("1.weight") {
+        (Projection::Repeat, dim("1.weight", 1)?)
+    } else if has("0.weight") {
+        (Projection::Transposed, dim("0.weight", 0)?)
+    } else {
+        return Err(found.refuse(format!(
+            "`{projection}` is none of those that decoders are trained with here: stack, repeat, transposed"
+        )));
+    };
+    if found.has("net.time_mlp.0.weights") {
+        return Err(found.refuse("its time has frequencies of its own; published ones have fixed frequencies"));
+    }
+    let blocks = (0..BLOCKS).take_while(|i| found.has(&format!("net.downs.0.{i}.mlp.1.weight"))).count();
+    Ok(UnetConfig {
+        features,
+        width: found.dim("net.init_proj.weight", 0)?,
+        multiples: vec![1, 2],
+        token_dim,
+        condition_dim: without(found, "net.init_proj.weight", 1, features)?,
+        blocks,
+        projection: kind,
+        attention: found.has("net.mid_attn.fn.fn.to_qkv.weight").then_some(attention),
+        time: TimeFeatures::Sinusoid,
+        theta: 10_000.0,
+        learned_variance: false,
+    })
+}
