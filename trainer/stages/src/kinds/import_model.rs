@@ -19,8 +19,9 @@ use models::networks::{
 use motion::{Skeleton, npy};
 use protocol::artifact::Role;
 use protocol::stage::{
-    DataFormat, Diffusion, Family, FlowBackbone, FlowNetwork, FlowProjection, ImportModel, ImportedPart, LatentShape,
-    MdmNetwork, NoiseSchedule, Prediction, StageSpec, TextActivation, TokenNetwork, TokenizerNetwork,
+    DataFormat, Diffusion, Family, FlowBackbone, FlowNetwork, FlowPrediction, FlowProjection, ImportModel,
+    ImportedPart, LatentShape, MdmNetwork, NoiseSchedule, Prediction, StageSpec, TextActivation, TokenNetwork,
+    TokenizerNetwork,
 };
 use protocol::{ArtifactKind, Digest, Manifest};
 
@@ -28,7 +29,7 @@ use super::{Plain, latent_data, word};
 use crate::artifacts::{self, DenoiserMeta, Draft, EmbeddingsMeta, MODEL_FILE, VaeMeta, to_meta};
 use crate::context::{AttemptContext, ContextError, Outcome, StageError};
 use crate::control::{CONTROLNET_PREFIX, ControlMeta, TRAJECTORY_PREFIX};
-use crate::flow_decoder::{Field, FlowMeta, HEAD};
+use crate::flow_decoder::{Backbone, FlowMeta, HEAD};
 use crate::generator::{FEATURE_DIFFUSION, GeneratorMeta, LATENT_DIFFUSION, MASKED_PREFIX, RESIDUAL_PREFIX, TOKENS};
 use crate::motion_networks::{Architecture, MotionDenoiserMeta};
 use crate::networks::TIME_DIM;
@@ -567,6 +568,7 @@ impl Import<'_> {
             features: config.features,
             code_dim: config.token_dim,
             backbone: FlowBackbone::Unet,
+            prediction: FlowPrediction::Velocity,
             network: FlowNetwork {
                 width: config.width,
                 condition: config.condition_dim,
@@ -580,7 +582,7 @@ impl Import<'_> {
             steps: self.settings.solver_steps,
             fits: Parts::from([(Role::TOKENIZER, digest)]),
         };
-        let Field::Unet(network) = meta.field(&mut Init::shapes(&self.device)) else {
+        let Backbone::Unet(network) = meta.field(&mut Init::shapes(&self.device)).backbone else {
             return Err(StageError::Fault("a U-Net was asked for".into()));
         };
         let entries = layout(&network);

@@ -2,7 +2,7 @@
 //!
 //! What a clip shows is read off its captions: the first activity one of whose words they have. A classifier ([`crate::evaluation::recognition`]) learns that from
 //! clips of the train split, at most [`TAUGHT`] of an activity. Then motions are drawn for captions and lengths of `split`, activity by activity in turn, keyed by
-//! (seed, number of the motion), and each is right if it is taken for what its caption names.
+//! (seed, number of the motion), and each is right if it is taken for what its caption names. An activity that `split` has no clip of is said and not asked for.
 //!
 //! Departs: the paper's classifier is a recurrent network and its classes are labels; ours is a closed form, and classes are words.
 //!
@@ -149,15 +149,19 @@ impl Plain for EvaluateRecognition {
         let vocabulary = Vocabulary::of(&self.activities);
         let classifier = Recognition(self).taught(cx, &dataset, &vocabulary)?;
         let looked_at = by_activity(&dataset, &vocabulary, self.split);
-        if let Some(activity) = looked_at.iter().position(Vec::is_empty) {
-            return Err(Recognition(self).unknown(activity, self.split));
+        let present: Vec<usize> = (0..looked_at.len()).filter(|activity| !looked_at[*activity].is_empty()).collect();
+        for (activity, _) in looked_at.iter().enumerate().filter(|(_, entries)| entries.is_empty()) {
+            cx.log(&format!("{}; it is not asked for", Recognition(self).unknown(activity, self.split)));
+        }
+        if present.is_empty() {
+            return Err(no_entries(self.split));
         }
         let real = Real::of(&dataset, &classifier, &looked_at);
 
         let seed = cx.task().seed;
         let stream = |what: &str, i: usize| Stream::new(seed, &format!("evaluate.recognition/{what}"), 0, i as u64);
         let asked = (0..self.motions).map(|i| {
-            let activity = i % looked_at.len();
+            let activity = present[i % present.len()];
             let mut draw = stream("entry", i);
             let entry = &dataset.entries[looked_at[activity][draw.below(looked_at[activity].len())]];
             let caption = entry.captions[draw.below(entry.captions.len())];
