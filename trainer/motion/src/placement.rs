@@ -28,6 +28,14 @@ impl Placement {
         Self { angle: self.angle + heading[2].atan2(heading[0]), x, z }
     }
 
+    /// Of a clip whose frame `(heading, root)` lies as a clip does that begins here: it faces the same way, and its root is above the same point.
+    #[must_use]
+    pub fn with_frame(self, heading: Quat, root: Vec3) -> Self {
+        let turned = Self { angle: self.angle - heading[2].atan2(heading[0]), x: 0.0, z: 0.0 };
+        let [x, _, z] = turned.to_world(root);
+        Self { x: self.x - x, z: self.z - z, ..turned }
+    }
+
     /// With its origin below `point` of the world.
     #[must_use]
     pub fn below(self, point: Vec3) -> Self {
@@ -127,6 +135,8 @@ mod tests {
         let (heading, root) = root_path(&rows, skeleton)[at + 3];
         let once = Placement::default().of_frame(heading, root);
         assert!((twice.x - once.x).abs() < 1e-9 && (twice.angle - once.angle).abs() < 1e-9);
+        let back = once.with_frame(heading, root);
+        assert!(back.x.abs() < 1e-9 && back.z.abs() < 1e-9 && back.angle.abs() < 1e-9, "and back: {back:?}");
         assert_eq!(once.below([7.0, 1.0, 8.0]).to_world([0.0; 3]), [7.0, 0.0, 8.0]);
     }
 

@@ -8,6 +8,8 @@
 //! Departs, where the paper says nothing:
 //! - a masked token model keeps the tokens of the last frames and fills in the rest (`Infilling`);
 //! - any other model draws a motion of its own, whose first frame is laid on the last one of the stream;
+//! - a segment without waypoints is then turned and shifted so that its root is where the stream's is at the junction, and faces the same way: where the model does not quite
+//!   begin where it was told, the body does not glide there. With waypoints it stays where they are;
 //! - what the two still differ by at the junction fades within `blend` frames ([`Fade`]), joint by joint, so bones change their length a little
 //!   there.
 //!
@@ -228,14 +230,20 @@ impl MotionStream {
                 drawn.len() / width
             )));
         }
+        let path = root_path(&drawn, self.skeleton);
+        let metres = self.skeleton.metres_per_unit;
+        let place = match overlap.checked_sub(1).and_then(|last| path.get(last)) {
+            Some((heading, root)) if ask.waypoints.is_empty() => {
+                self.place(self.tail.frames() - 1).with_frame(*heading, quat::scale(*root, metres))
+            }
+            _ => place,
+        };
         let (joints, offset) = self.placed(&drawn, (overlap, frames), place);
         let missed = ask.waypoints.iter().filter(|waypoint| waypoint.frame < frames).map(|waypoint| {
             let at = 3 * (waypoint.frame * self.skeleton.joints + waypoint.joint);
             quat::norm(quat::sub([joints[at], joints[at + 1], joints[at + 2]], waypoint.position.map(f64::from)))
         });
         let segment = Segment { missed: missed.collect(), joints, frames, overlap, offset };
-        let path = root_path(&drawn, self.skeleton);
-        let metres = self.skeleton.metres_per_unit;
         let places = path[overlap..overlap + frames].iter();
         self.tail.places.extend(places.map(|(heading, root)| place.of_frame(*heading, quat::scale(*root, metres))));
         self.tail.features.extend(&drawn[overlap * width..(overlap + frames) * width]);

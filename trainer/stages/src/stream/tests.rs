@@ -230,23 +230,32 @@ fn waypoints_are_of_the_world() {
 
 #[test]
 fn a_difference_fades() {
-    let (rows, generator, mut stream, said) = scripted(Joining::Placement);
-    let first = stream.draw(&generator, &ask(Some(40))).unwrap();
-    // As if it had forgotten where it was.
-    said.borrow_mut().given = 200;
-    let second = stream.draw(&generator, &ask(Some(40))).unwrap();
-    assert!(second.offset > 0.1, "{}", second.offset);
-    let far = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-    let (last, new) = (&first.joints[39 * 66..], &second.joints[..66]);
-    assert!(far(last, new) < 0.5 * second.offset, "{} of {}", far(last, new), second.offset);
-    // Behind the fade it is the other motion, as it lies in the world.
-    let own = recover_joints(&rows[199 * body().features..][..41 * body().features], body());
-    let distance = |joints: &[f64], t: usize| {
-        let at = |j: usize, axis: usize| joints[(t * 22 + j) * 3 + axis];
-        (0..3).map(|axis| (at(21, axis) - at(0, axis)).powi(2)).sum::<f64>().sqrt()
-    };
-    let own: Vec<f64> = own.into_iter().map(f64::from).collect();
-    assert!((distance(&second.joints, 30) - distance(&own, 31)).abs() < 1e-3);
+    for joining in [Joining::Control, Joining::Placement] {
+        let (rows, generator, mut stream, said) = scripted(joining);
+        let first = stream.draw(&generator, &ask(Some(40))).unwrap();
+        // As if it had forgotten where it was.
+        said.borrow_mut().given = 200;
+        let second = stream.draw(&generator, &ask(Some(40))).unwrap();
+        assert!(second.offset > 0.1, "{}", second.offset);
+        let far = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        let (last, new) = (&first.joints[39 * 66..], &second.joints[..66]);
+        assert!(far(last, new) < 0.5 * second.offset, "{} of {}", far(last, new), second.offset);
+        // Behind the fade it is the other motion, as it lies in the world.
+        let own = recover_joints(&rows[199 * body().features..][..41 * body().features], body());
+        let own: Vec<f64> = own.into_iter().map(f64::from).collect();
+        let distance = |joints: &[f64], t: usize| {
+            let at = |j: usize, axis: usize| joints[(t * 22 + j) * 3 + axis];
+            (0..3).map(|axis| (at(21, axis) - at(0, axis)).powi(2)).sum::<f64>().sqrt()
+        };
+        assert!((distance(&second.joints, 30) - distance(&own, 31)).abs() < 1e-3);
+        // The root goes as it does there, from where the stream stood: nothing of the way is made up for.
+        let way = |joints: &[f64], t: usize, to: usize| {
+            let root = |t: usize, axis: usize| joints[t * 66 + axis];
+            (root(to, 0) - root(t, 0)).hypot(root(to, 2) - root(t, 2))
+        };
+        let from_end = [last, &second.joints[..]].concat();
+        assert!((way(&from_end, 0, 31) - way(&own, 0, 31)).abs() < 1e-3, "{joining:?}");
+    }
 }
 
 #[test]
