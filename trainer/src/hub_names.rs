@@ -60,7 +60,7 @@ pub(crate) fn resolve(pipeline: &mut Pipeline) -> Result<()> {
         let hub = Hub::new(Settings::of_environment());
         // The client drives a runtime of its own, which this thread may do already.
         let found = std::thread::scope(|scope| {
-            let fetching = scope.spawn(|| hub.folder(&name, encoder, &mut |line| print::note(line)));
+            let fetching = scope.spawn(|| hub.folder(&name, encoder, &mut print::note));
             fetching.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
         });
         let found = found.map_err(|error| refused(&stage, &error))?;

@@ -150,7 +150,7 @@ fn child(target: &Target, inputs: &Inputs<'_>, memory: &Cap<System>, state: &Pat
         bytes_in_all += bytes.len() as u64;
         index += 1;
     }
-    println!("{}: {index} inputs of {bytes_in_all} bytes, {accepted} accepted", target.name);
+    eprintln!("{}: {index} inputs of {bytes_in_all} bytes, {accepted} accepted", target.name);
     std::process::exit(0);
 }
 

@@ -5,9 +5,11 @@ use std::path::{Path, PathBuf};
 
 use motion::files;
 
+use crate::error::HubError;
+use crate::found::Found;
+use crate::name::{Name, is_commit};
 use crate::settings::Settings;
 use crate::wanted::{Encoder, Failure, Repository, get_all};
-use crate::{Found, HubError, Name, is_commit};
 
 /// Bytes of a file with a commit.
 const COMMIT_BYTES: u64 = 1 << 10;

@@ -16,9 +16,11 @@ use sha2::{Digest as _, Sha256};
 pub(crate) use crate::wanted::Failure;
 
 use crate::cache::{is_sound, root, snapshot};
+use crate::error::HubError;
+use crate::found::Found;
+use crate::name::{Name, is_commit};
 use crate::settings::Settings;
 use crate::wanted::{Encoder, Repository, get_all};
-use crate::{Found, HubError, Name, is_commit};
 
 /// Bytes of the hub's answer about a repository.
 const LISTING_BYTES: u64 = 16 << 20;

@@ -6,6 +6,8 @@ use std::path::{Component, Path, PathBuf};
 use motion::files;
 use serde::Deserialize;
 
+use crate::error::HubError;
+
 /// Bytes of a file that says which others there are.
 const LISTING_BYTES: u64 = 16 << 20;
 /// Files of sharded weights.
@@ -39,7 +41,7 @@ pub(crate) enum Failure {
     /// The hub cannot be reached.
     Away(String),
     /// All else, for people.
-    Said(crate::HubError),
+    Said(HubError),
     /// The repository is not such an encoder.
     Content(String),
 }

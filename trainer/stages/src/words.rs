@@ -5,6 +5,7 @@
 //! vectors are of different evaluators. Source of the published form: text-to-motion (Guo et al.), whose vocabulary is cut from GloVe.
 
 use std::collections::{BTreeMap, HashMap};
+use std::io::Read as _;
 use std::path::Path;
 
 use checkpoint::Blobs;
@@ -91,9 +92,14 @@ impl Words {
         };
         let file = folder.join("our_vab_idx.pkl");
         let wanted = "expected a pickled dict from word to row";
-        let (_, length) = files::open(&file).map_err(|e| bad(&file, e.to_string()))?;
+        let (mut opened, length) = files::open(&file).map_err(|e| bad(&file, e.to_string()))?;
         if length > limits::VOCABULARY_BYTES {
             return Err(bad(&file, format!("has {length} bytes; at most {} are read", limits::VOCABULARY_BYTES)));
+        }
+        // An archive, which the reader would unpack, could be of any size there.
+        let mut magic = [0; 2];
+        if opened.read_exact(&mut magic).is_ok() && &magic == b"PK" {
+            return Err(bad(&file, format!("is an archive; {wanted}")));
         }
         let value = PytorchReader::read_pickle_data(&file, None).map_err(|e| bad(&file, format!("{e}; {wanted}")))?;
         let PickleValue::Dict(dict) = value else { return Err(bad(&file, wanted.into())) };
