@@ -303,6 +303,8 @@ async fn show_plan(args: PlanArgs) -> Result<u8> {
         Err(OpenError::NotAStore(_)) => None,
         Err(error) => return Err(error.into()),
     };
+    let mut file = file;
+    pipeline_file::resolve_versions(&mut file.pipeline, store.as_ref()).await?;
     let mut plan = plan::plan(&file.pipeline, store.as_ref()).await?;
     plan.missing = missing;
     if !args.no_time && plan.stages.iter().any(|step| step.action != "cached") {

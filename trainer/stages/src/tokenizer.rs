@@ -59,7 +59,7 @@ impl TokenizerMeta {
     }
 
     /// Names and shapes of the codebooks in the file.
-    fn books(&self) -> Vec<Entry> {
+    pub(crate) fn books(&self) -> Vec<Entry> {
         let shape = vec![self.codes, self.code_dim];
         let name = |q: usize| format!("quantizer.layers.{q}.codebook");
         (0..self.quantizers).map(|q| Entry { name: name(q), shape: shape.clone() }).collect()
