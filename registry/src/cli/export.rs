@@ -56,7 +56,7 @@ pub(super) async fn export(source: &impl Source, version: &Version, dir: &Path) 
 }
 
 /// A blob's bytes, and that they are those.
-async fn whole(
+pub(super) async fn whole(
     source: &impl Source,
     digest: Digest,
     write: &mut impl FnMut(&[u8]) -> io::Result<()>,

@@ -156,9 +156,9 @@ struct RegistryArgs {
     store: PathBuf,
     #[command(flatten)]
     server: ServerOptions,
-    /// How the answer is printed
-    #[arg(short, long, value_enum, default_value_t, global = true)]
-    output: registry::cli::Output,
+    /// How the answer is printed; for `export`, the file of a bundle, FILE.tar.zst
+    #[arg(short, long, default_value = "table", value_name = "table|json", global = true)]
+    output: registry::cli::OutputArg,
     #[command(subcommand)]
     verb: registry::cli::Verb,
 }

@@ -9,6 +9,7 @@ mod api;
 mod auth;
 mod blocking;
 mod body;
+mod bundles;
 mod clock;
 mod effects;
 mod failure;
