@@ -23,3 +23,4 @@ mod storage;
 mod sweeps;
 mod tokens;
 mod verify;
+mod versions;
