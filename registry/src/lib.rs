@@ -8,6 +8,7 @@
 
 pub mod backup;
 pub mod blob;
+pub mod bundle;
 pub mod catalog;
 pub mod cli;
 mod clock;

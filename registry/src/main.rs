@@ -6,7 +6,7 @@ use std::process::ExitCode;
 
 use access::ServerOptions;
 use clap::Parser;
-use registry::cli::{Output, Verb, execute};
+use registry::cli::{OutputArg, Verb, execute};
 
 /// Models, their versions, and the aliases that point at them
 #[derive(Debug, Parser)]
@@ -17,9 +17,9 @@ struct Cli {
     store: PathBuf,
     #[command(flatten)]
     server: ServerOptions,
-    /// How the answer is printed
-    #[arg(short, long, value_enum, default_value_t, global = true)]
-    output: Output,
+    /// How the answer is printed; for `export`, the file of a bundle, FILE.tar.zst
+    #[arg(short, long, default_value = "table", value_name = "table|json", global = true)]
+    output: OutputArg,
     #[command(subcommand)]
     verb: Verb,
 }

@@ -27,3 +27,4 @@ mod streaming;
 mod sweeps;
 mod tokens;
 mod verify;
+mod versions;

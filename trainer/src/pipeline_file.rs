@@ -8,6 +8,7 @@ use motion::folder_digest::{files_digest, folder_digest};
 use protocol::pipeline::{self, Pipeline, PipelineStage};
 use protocol::stage::{DataFormat, ExternalFolder};
 use protocol::{Digest, StageName, limits};
+use registry::ReadStore;
 
 use crate::hub_names;
 use crate::missing::{Missing, check_backend, check_format, missing};
@@ -105,6 +106,21 @@ fn digest_folders(pipeline: &mut Pipeline) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// Fills in what the versions of the registry stand for that the pipeline names; `None` is a store that does not exist yet.
+pub(crate) async fn resolve_versions(pipeline: &mut Pipeline, store: Option<&ReadStore>) -> Result<()> {
+    let named = || pipeline.stages.iter().find_map(|stage| Some((stage, stage.versions().into_iter().next()?)));
+    match (store, named()) {
+        (_, None) => Ok(()),
+        (Some(store), Some(_)) => coordinator::resolve_versions(pipeline, store).await.map_err(Problem::from),
+        (None, Some((stage, input))) => {
+            let (name, field, version) = (&stage.name, input.field, input.version);
+            let text =
+                format!("stage `{name}`: `{field}` is `{version}`, a version of a registry, but there is no store");
+            Err(Problem::usage(text).hint("name the store with `--store DIR`; `registry list` shows what is in one"))
+        }
+    }
 }
 
 /// Whether the stage of `--until` exists.

@@ -339,7 +339,9 @@ fn difference(pipeline: &Pipeline, stage: &PipelineStage, earlier: &[(RunRow, Pi
     }
     for (field, content) in &stage.external {
         if before.external.get(field) != Some(content) {
-            changes.push(format!("the content of the folder `{field}`"));
+            let is_version = stage.versions().iter().any(|input| input.field == *field);
+            let what = if is_version { "the version" } else { "the content of the folder" };
+            changes.push(format!("{what} `{field}`"));
         }
     }
     let json = |stage: &PipelineStage| serde_json::to_value(stage.settings.without_references()).unwrap_or_default();

@@ -50,6 +50,9 @@ struct Recorded {
 /// Verifies `steps` steps of every training stage of `pipeline` that the store in `dir` knows.
 pub(crate) async fn verify(pipeline: &Pipeline, dir: &Path, steps: u64, output: Output) -> Result<u8> {
     let store = ReadStore::open(dir).await?;
+    let mut pipeline = pipeline.clone();
+    crate::pipeline_file::resolve_versions(&mut pipeline, Some(&store)).await?;
+    let pipeline = &pipeline;
     let device = models::device::open(pipeline.backend, 0).map_err(|error| Problem::new(exit::USAGE, error))?;
     let mut outputs: BTreeMap<StageName, Digest> = BTreeMap::new();
     let mut all = Vec::new();
@@ -57,7 +60,10 @@ pub(crate) async fn verify(pipeline: &Pipeline, dir: &Path, steps: u64, output: 
         let inputs: Option<BTreeMap<String, Digest>> =
             stage.inputs.iter().map(|input| Some((input.field.clone(), *outputs.get(&input.stage)?))).collect();
         let Some(inputs) = inputs else { continue };
-        let known = store.stage_result(pipeline.identity(stage, &inputs).key()).await?;
+        let identity = pipeline.identity(stage, &inputs);
+        let known = store.stage_result(identity.key()).await?;
+        // Versions of the registry too.
+        let inputs = identity.inputs;
         if let Some(value) = known.as_ref().and_then(|row| row.outputs.values().next()) {
             outputs.insert(stage.name.clone(), *value);
         }

@@ -44,6 +44,16 @@ pub enum ModelError {
         /// What there is.
         have: Vec<String>,
     },
+    /// It has no part of a kind, or several.
+    #[error("the model has {} of kind `{}`; its parts: {}", if *several { "several parts" } else { "no part" }, word(*kind), have.join(", "))]
+    OfKind {
+        /// What was looked for.
+        kind: ArtifactKind,
+        /// Whether there are several.
+        several: bool,
+        /// What there is.
+        have: Vec<String>,
+    },
     /// A part was made for another one than the model has.
     #[error("the part `{role}` was made for the `{needs}` {wanted}, but the model has {found}")]
     Unfit {
@@ -86,6 +96,32 @@ impl Model {
         let have = || self.parts.keys().map(|role| format!("`{role}`")).collect();
         self.parts.get(role).copied().ok_or_else(|| ModelError::Missing { missing: role.clone(), have: have() })
     }
+}
+
+/// The one part of a kind that a model has, with its role and its digest. `read` gives a part's manifest by digest.
+///
+/// # Errors
+/// What `read` says; inside, that there is none, or which of several is meant is not known.
+pub fn part_of_kind<E>(
+    model: &Model,
+    kind: ArtifactKind,
+    mut read: impl FnMut(Digest) -> Result<Manifest, E>,
+) -> Result<Result<(Role, Digest, Manifest), ModelError>, E> {
+    let (mut found, mut have, mut several) = (None, Vec::new(), false);
+    for (role, digest) in &model.parts {
+        let manifest = read(*digest)?;
+        have.push(format!("`{role}` ({})", word(manifest.kind)));
+        if manifest.kind == kind {
+            several = found.replace((role.clone(), *digest, manifest)).is_some() || several;
+        }
+    }
+    Ok(found.filter(|_| !several).ok_or(ModelError::OfKind { kind, several, have }))
+}
+
+/// A kind as it stands in a manifest.
+fn word(kind: ArtifactKind) -> String {
+    let word = serde_json::to_value(kind).expect("a kind is a word");
+    word.as_str().unwrap_or_default().to_owned()
 }
 
 /// What an evaluation says in its report's meta, as `drawn`: which model it measured, and how it drew from it.
@@ -234,6 +270,26 @@ mod tests {
         let refused = extend(&manifest, None, &BTreeMap::from([(Role::LENGTH, length)])).unwrap_err().to_string();
         assert!(refused.contains("`length` was made for the `text`"), "{refused}");
         assert_eq!(Model::read(&vae), Err(ModelError::NotAModel(ArtifactKind::Vae)));
+    }
+
+    #[test]
+    fn a_part_is_found_by_its_kind() {
+        let parts = parts();
+        let manifest = assemble("latent-diffusion", DataFormat::Kit, &parts).unwrap();
+        let find = |manifest: &Manifest, kind, parts: &BTreeMap<Role, Manifest>| {
+            let read = |digest| parts.values().find(|part| part.digest() == digest).cloned().ok_or("gone");
+            part_of_kind(&Model::read(manifest).unwrap(), kind, read).unwrap()
+        };
+        let (role, digest, vae) = find(&manifest, ArtifactKind::Vae, &parts).unwrap();
+        assert_eq!((role, digest, &vae), (Role::VAE, parts[&Role::VAE].digest(), &parts[&Role::VAE]));
+        let missing = find(&manifest, ArtifactKind::Tokenizer, &parts).unwrap_err().to_string();
+        assert!(missing.contains("no part of kind `tokenizer`") && missing.contains("`vae` (vae)"), "{missing}");
+        let second = Role::try_from("denoiser-2".to_owned()).unwrap();
+        let mut more = parts.clone();
+        more.insert(second, Manifest::new(ArtifactKind::Denoiser, json!({})));
+        let manifest = assemble("latent-diffusion", DataFormat::Kit, &more).unwrap();
+        let several = find(&manifest, ArtifactKind::Denoiser, &more).unwrap_err().to_string();
+        assert!(several.contains("several parts of kind `denoiser`"), "{several}");
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! The command line: what users type, turned into a [`Command`].
 
 use std::path::PathBuf;
+use std::str::FromStr;
 
 use clap::{Subcommand, ValueEnum};
 
@@ -8,6 +9,7 @@ use checkpoint::published::Layout;
 
 use super::Command;
 use crate::Place;
+use crate::bundle::SUFFIX;
 use crate::leaderboard::Style;
 use crate::versions::Expect;
 
@@ -44,6 +46,42 @@ impl From<LayoutName> for Layout {
             LayoutName::T2mgpt => Self::T2mGpt,
             LayoutName::Mdm => Self::Mdm,
             LayoutName::Safetensors => Self::Safetensors,
+        }
+    }
+}
+
+/// What stands behind `-o`: how the answer is printed, or where `export` writes a bundle.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub enum OutputArg {
+    /// As [`Output::Table`].
+    #[default]
+    Table,
+    /// As [`Output::Json`].
+    Json,
+    /// A bundle's file.
+    Bundle(PathBuf),
+}
+
+impl FromStr for OutputArg {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        match text {
+            "table" => Ok(Self::Table),
+            "json" => Ok(Self::Json),
+            file if file.ends_with(SUFFIX) => Ok(Self::Bundle(file.into())),
+            _ => Err(format!("expected `table`, `json`, or for `export` a file whose name ends in `{SUFFIX}`")),
+        }
+    }
+}
+
+impl OutputArg {
+    /// How the answer is printed, and the bundle's file.
+    pub(super) fn split(self) -> (Output, Option<PathBuf>) {
+        match self {
+            Self::Table => (Output::Table, None),
+            Self::Json => (Output::Json, None),
+            Self::Bundle(file) => (Output::Table, Some(file)),
         }
     }
 }
@@ -173,15 +211,23 @@ pub enum Verb {
         #[arg(long, value_name = "PLACE")]
         blobs: Option<Place>,
     },
-    /// Copies a version's files to a folder, or its weights to files that other code reads
+    /// Copies a version's files to a folder, or to one file that `import` reads on another machine
     Export {
         /// MODEL@ALIAS, MODEL@best or MODEL:VERSION
         model: String,
-        /// The folder; it must be empty or missing. With a layout of one file, the file, which must be missing
-        dir: PathBuf,
-        /// The weights alone, in the files and under the names of the code that published such models
+        /// The folder, which must be empty or missing; or with `-o`, a bundle's file, FILE.tar.zst
+        dir: Option<PathBuf>,
+        /// The weights alone, in the files and under the names of the code that published such models; of a layout of one file, `DIR` is the file, which must be missing
         #[arg(long, value_enum)]
         layout: Option<LayoutName>,
+    },
+    /// Registers the version in a bundle's file that `export -o FILE.tar.zst` wrote
+    Import {
+        /// The bundle
+        file: PathBuf,
+        /// Register it as a version of this model instead of what it was called there
+        #[arg(long, value_name = "NAME")]
+        model: Option<String>,
     },
 }
 
@@ -192,6 +238,10 @@ pub(super) enum Asked {
     Command(Command),
     /// Something that ends in this machine's files.
     Export { model: String, dir: PathBuf, layout: Option<Layout> },
+    /// Likewise, in one file.
+    Bundle { model: String, file: PathBuf },
+    /// A file of this machine, into a store that need not be there yet.
+    Import { file: PathBuf, model: Option<String> },
     /// Likewise, and only of a store whose folder this machine has.
     Backup { dir: PathBuf },
     /// Likewise, of no store yet.
@@ -202,7 +252,37 @@ pub(super) enum Asked {
 
 impl Verb {
     /// What is asked, and whether it is of the store's holder alone.
-    pub(super) fn asks(self) -> Asked {
+    ///
+    /// # Errors
+    /// What `file` behind `-o` has to do with it, if that is nothing.
+    pub(super) fn asks(self, file: Option<PathBuf>) -> Result<Asked, String> {
+        let is_bundle = |path: &PathBuf| path.to_string_lossy().ends_with(SUFFIX);
+        match (&self, file) {
+            (Self::Export { layout: Some(_), .. }, Some(_)) => {
+                return Err("a bundle holds the whole version; name a layout, or a bundle's file".into());
+            }
+            (Self::Export { model, dir: None, .. }, Some(file)) => {
+                return Ok(Asked::Bundle { model: model.clone(), file });
+            }
+            (Self::Export { dir: Some(_), .. }, Some(_)) => {
+                return Err("a folder and a bundle's file are named; name one of them".into());
+            }
+            (Self::Export { dir: None, .. }, None) => {
+                return Err(format!("`export` writes to a folder, or with `-o FILE{SUFFIX}` to one file; name one"));
+            }
+            (Self::Export { model, dir: Some(file), layout: None }, None) if is_bundle(file) => {
+                return Ok(Asked::Bundle { model: model.clone(), file: file.clone() });
+            }
+            (_, Some(file)) => {
+                return Err(format!("`-o {}` is for `export`; expected `table` or `json`", file.display()));
+            }
+            (_, None) => {}
+        }
+        Ok(self.other())
+    }
+
+    /// What is asked by a verb that writes no bundle.
+    fn other(self) -> Asked {
         Asked::Command(match self {
             Self::List => Command::List,
             Self::Show { model } => Command::Show { reference: model },
@@ -232,8 +312,10 @@ impl Verb {
             Self::Restore { backup, to, blobs } => return Asked::Restore { backup, to, blobs },
             Self::Adopt { blobs } => return Asked::Adopt { blobs },
             Self::Export { model, dir, layout } => {
-                return Asked::Export { model, dir, layout: layout.map(Layout::from) };
+                let (dir, layout) = (dir.unwrap_or_default(), layout.map(Layout::from));
+                return Asked::Export { model, dir, layout };
             }
+            Self::Import { file, model } => return Asked::Import { file, model },
         })
     }
 }

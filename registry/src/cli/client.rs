@@ -6,13 +6,15 @@ use std::time::{Duration, Instant};
 
 use access::{ConnectError, Server, ServerOptions, explain};
 use checkpoint::published::Layout;
-use protocol::Digest;
 use protocol::message::ApiError;
-use reqwest::{Method, Response};
+use protocol::{Digest, ModelName};
+use reqwest::header::CONTENT_LENGTH;
+use reqwest::{Body, Method, Response};
+use tokio::io::AsyncReadExt as _;
 
 use super::args::Asked;
 use super::export::{self, Source};
-use super::{Answer, Command, Data, Output, Verb, error, print, read, run};
+use super::{Answer, Command, Data, OutputArg, Verb, bundles, error, print, read, run};
 use crate::{Holder, OpenError, ReadStore, Store};
 
 /// How long to wait for a holder without an address, such as another `registry` command, to end or to get one.
@@ -20,11 +22,30 @@ const PATIENCE: Duration = Duration::from_secs(5);
 const BETWEEN: Duration = Duration::from_millis(50);
 
 /// Runs a verb on the store in `dir`, or at the server of `options`, and prints the answer; returns the exit code.
-pub async fn execute(verb: Verb, dir: &Path, options: &ServerOptions, output: Output) -> u8 {
-    let answer = match verb.asks() {
+pub async fn execute(verb: Verb, dir: &Path, options: &ServerOptions, output: OutputArg) -> u8 {
+    let (output, file) = output.split();
+    let answer = match verb.asks(file) {
+        Err(why) => Answer::refused(error("invalid", why, Some("`registry help` shows how commands are written"))),
+        Ok(asked) => answer(asked, dir, options).await,
+    };
+    // A closed pipe (`| head`) is no failure of the command.
+    let _ = print::show(&answer, output);
+    answer.exit
+}
+
+async fn answer(asked: Asked, dir: &Path, options: &ServerOptions) -> Answer {
+    match asked {
         Asked::Command(command) => ask(command, dir, options).await,
         Asked::Export { model, dir: into, layout } => {
-            with(dir, options, Need::Read, async |place| export(place, &model, &into, layout).await).await
+            let to = layout.map_or(Destination::Folder(&into), |layout| Destination::Weights(&into, layout));
+            with(dir, options, Need::Read, async |place| export_to(place, &model, to).await).await
+        }
+        Asked::Bundle { model, file } => {
+            with(dir, options, Need::Read, async |place| export_to(place, &model, Destination::Bundle(&file)).await)
+                .await
+        }
+        Asked::Import { file, model } => {
+            with(dir, options, Need::Make, async |place| import(place, &file, model.as_deref()).await).await
         }
         Asked::Backup { dir: into } => match local(options, "a backup is made on the machine of the store") {
             Ok(()) => backup(dir, &into).await,
@@ -35,10 +56,7 @@ pub async fn execute(verb: Verb, dir: &Path, options: &ServerOptions, output: Ou
             Ok(summary) => Answer::done(Data::Restored { summary, dir: to }),
             Err(e) => Answer::from(e),
         },
-    };
-    // A closed pipe (`| head`) is no failure of the command.
-    let _ = print::show(&answer, output);
-    answer.exit
+    }
 }
 
 /// Runs a command on the store in `dir`, or at the server of `options`.
@@ -52,6 +70,8 @@ enum Need {
     Read,
     Collect,
     Write,
+    /// A store that is made if there is none.
+    Make,
 }
 
 impl Command {
@@ -173,6 +193,7 @@ async fn with(
         let holder = Holder::this_process("registry");
         let opened = match need {
             Need::Collect => Store::open_to_collect(dir, holder).await,
+            Need::Make => Store::open(dir, holder).await,
             Need::Read | Need::Write => Store::open_existing(dir, holder).await,
         };
         let busy = match opened {
@@ -222,27 +243,80 @@ fn unreachable_(message: &str) -> Answer {
     ))
 }
 
-async fn export(place: &Place, model: &str, dir: &Path, layout: Option<Layout>) -> Result<Answer, Missed> {
+/// Where a version's files go.
+#[derive(Clone, Copy)]
+enum Destination<'a> {
+    Folder(&'a Path),
+    /// The weights alone, as others write them.
+    Weights(&'a Path, Layout),
+    Bundle(&'a Path),
+}
+
+async fn export_to(place: &Place, model: &str, to: Destination<'_>) -> Result<Answer, Missed> {
     let shown = place.ask(&Command::Show { reference: model.to_owned() }).await?;
-    Ok(match shown.data {
-        Some(super::Data::Version { version, .. }) => {
-            let written = match layout {
-                Some(layout) => export::weights(place, &version, dir, layout).await,
-                None => export::export(place, &version, dir).await.map(|files| (files, Vec::new())),
+    let Some(data) = shown.data else { return Ok(shown) };
+    let Data::Version { version, .. } = data else {
+        let hint = "say MODEL@best or MODEL:VERSION";
+        return Ok(Answer::refused(error("invalid", format!("`{model}` is no one version"), Some(hint))));
+    };
+    let (written, to) = match to {
+        Destination::Folder(dir) => (export::export(place, &version, dir).await.map(|files| (files, Vec::new())), dir),
+        Destination::Weights(dir, layout) => (export::weights(place, &version, dir, layout).await, dir),
+        Destination::Bundle(file) => {
+            (bundles::export(place, &version, file).await.map(|files| (files, Vec::new())), file)
+        }
+    };
+    Ok(match written {
+        Ok((files, left_out)) => Answer::done(Data::Exported { version, dir: to.to_owned(), files, left_out }),
+        Err(error) => Answer::refused(error),
+    })
+}
+
+/// Has a bundle of this machine registered where the store is.
+async fn import(place: &Place, file: &Path, model: Option<&str>) -> Result<Answer, Missed> {
+    let shown = file.display().to_string();
+    match place {
+        Place::Here(store) => Ok(bundles::import(store, file, &shown, model).await),
+        Place::Reading(_) => Ok(Answer::refused(error("internal", "the store was opened for reading", None))),
+        Place::At(server) => {
+            let opened = async {
+                let file = tokio::fs::File::open(file).await?;
+                let bytes = file.metadata().await?.len();
+                Ok::<_, std::io::Error>((file, bytes))
             };
-            match written {
-                Ok((files, left_out)) => {
-                    Answer::done(super::Data::Exported { version, dir: dir.to_owned(), files, left_out })
+            let (file, bytes) = match opened.await {
+                Ok(opened) => opened,
+                Err(e) => return Ok(Answer::refused(error("invalid", format!("`{shown}`: {e}"), None))),
+            };
+            let path = match model.map(str::parse::<ModelName>).transpose() {
+                Ok(None) => "/v1/bundles".to_owned(),
+                Ok(Some(model)) => format!("/v1/bundles?model={model}"),
+                Err(e) => {
+                    return Ok(Answer::refused(error("invalid", e, Some("`--model NAME` gives it another name"))));
                 }
-                Err(error) => Answer::refused(error),
+            };
+            let request = server.request(Method::POST, &path).header(CONTENT_LENGTH, bytes);
+            match check(request.body(Body::wrap_stream(pieces(file))).send().await).await? {
+                Ok(response) => {
+                    let mut answer: Answer = response.json().await.map_err(|e| Missed::Broken(explain(&e)))?;
+                    if let Some(Data::Imported { file, .. }) = &mut answer.data {
+                        *file = shown;
+                    }
+                    Ok(answer)
+                }
+                Err(refused) => Ok(Answer::refused(refused)),
             }
         }
-        Some(_) => Answer::refused(error(
-            "invalid",
-            format!("`{model}` is no one version"),
-            Some("say MODEL@best or MODEL:VERSION"),
-        )),
-        None => shown,
+    }
+}
+
+/// A file's bytes, piece by piece.
+fn pieces(file: tokio::fs::File) -> impl futures::Stream<Item = std::io::Result<Vec<u8>>> {
+    futures::stream::try_unfold(file, async |mut file| {
+        let mut piece = vec![0; 1 << 18];
+        let count = file.read(&mut piece).await?;
+        piece.truncate(count);
+        Ok((count > 0).then_some((piece, file)))
     })
 }
 

@@ -122,7 +122,7 @@ fn empty_folder(dir: &Path) -> Result<(), ApiError> {
 }
 
 /// A blob's bytes, and that they are those.
-async fn whole(
+pub(super) async fn whole(
     source: &impl Source,
     digest: Digest,
     write: &mut impl FnMut(&[u8]) -> io::Result<()>,

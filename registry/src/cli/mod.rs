@@ -7,6 +7,7 @@
 //! is refused, 6 the holder of the store does not answer, 9 damage found, 10 a gate does not hold.
 
 mod args;
+mod bundles;
 mod client;
 mod export;
 mod print;
@@ -20,7 +21,8 @@ use protocol::message::ApiError;
 use protocol::{Alias, Digest, Manifest, ModelName, RunId};
 use serde::{Deserialize, Serialize};
 
-pub use args::{Output, Verb};
+pub use args::{Output, OutputArg, Verb};
+pub use bundles::import;
 pub use client::{ask, execute};
 pub use print::{render, show_error};
 
@@ -212,6 +214,8 @@ pub enum Data {
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         left_out: Vec<String>,
     },
+    /// Of `import`.
+    Imported { version: Version, file: String },
 }
 
 /// What came of a command.

@@ -213,6 +213,12 @@ pub fn render(data: &Data) -> String {
             };
             format!("{}:{} is in `{}`: {}{without}\n", version.model, version.version, dir.display(), files.join(", "))
         }
+        Data::Imported { version, file } => {
+            let (model, number) = (&version.model, version.version);
+            format!(
+                "`{file}` is {model}:{number}; `trainer generate \"a person walks\" --model {model}@{number}` draws from it\n"
+            )
+        }
     }
 }
 
@@ -266,7 +272,7 @@ fn beside(bases: &[String]) -> Option<(&'static str, String)> {
 
 fn source(version: &Version) -> String {
     let part = |name: &str| version.source[name].as_str().map(str::to_owned);
-    list(part("run").into_iter().chain(part("stage")))
+    list(part("run").into_iter().chain(part("stage")).chain(crate::bundle::origin(&version.source)))
 }
 
 #[expect(clippy::cast_precision_loss, reason = "for people")]

@@ -17,12 +17,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 pub use gate::{Gate, GateResult, ParseGateError};
+pub use protocol::model_ref::{BEST, LATEST, ModelRef, Pick};
 pub(crate) use rules::{compare, gates, judge, pick, previous, refuse_reserved, summary, unknown};
-
-/// Aliases that are queries; nothing is promoted to them.
-pub const BEST: &str = "best";
-/// The newest version, by number.
-pub const LATEST: &str = "latest";
 
 /// A model as a list shows it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -132,81 +128,6 @@ impl fmt::Display for Expect {
         match self {
             Self::None => f.write_str("none"),
             Self::Version(version) => write!(f, "{version}"),
-        }
-    }
-}
-
-/// How users point at a model version: `quickstart@staging`, `quickstart@best`, `quickstart:3`.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct ModelRef {
-    pub model: ModelName,
-    /// Which of its versions; `None` means the model as a whole.
-    pub pick: Option<Pick>,
-}
-
-/// Which version of a model.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Pick {
-    /// The best by the model's metric.
-    Best,
-    /// The newest.
-    Latest,
-    /// Where an alias points.
-    Alias(Alias),
-    /// By number.
-    Number(u64),
-}
-
-impl FromStr for ModelRef {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let bad = |why: String| {
-            format!("`{text}` names no model version: {why}; expected `MODEL@ALIAS`, `MODEL@best` or `MODEL:VERSION`")
-        };
-        let name = |model: &str| model.parse::<ModelName>().map_err(|e| bad(e.to_string()));
-        if let Some((model, alias)) = text.split_once('@') {
-            let pick = match alias {
-                BEST => Pick::Best,
-                LATEST => Pick::Latest,
-                alias => Pick::Alias(alias.parse().map_err(|e: protocol::id::ParseNameError| bad(e.to_string()))?),
-            };
-            Ok(Self { model: name(model)?, pick: Some(pick) })
-        } else if let Some((model, number)) = text.split_once(':') {
-            let number = number.trim_start_matches('v').parse().map_err(|_| bad(format!("`{number}` is no number")))?;
-            Ok(Self { model: name(model)?, pick: Some(Pick::Number(number)) })
-        } else {
-            Ok(Self { model: name(text)?, pick: None })
-        }
-    }
-}
-
-impl fmt::Display for ModelRef {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let model = &self.model;
-        match &self.pick {
-            None => write!(f, "{model}"),
-            Some(Pick::Best) => write!(f, "{model}@{BEST}"),
-            Some(Pick::Latest) => write!(f, "{model}@{LATEST}"),
-            Some(Pick::Alias(alias)) => write!(f, "{model}@{alias}"),
-            Some(Pick::Number(number)) => write!(f, "{model}:{number}"),
-        }
-    }
-}
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used, reason = "a test may panic")]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn references_read_as_they_are_written() {
-        for text in ["m@staging", "m@best", "m@latest", "m:3", "m"] {
-            assert_eq!(text.parse::<ModelRef>().unwrap().to_string(), text);
-        }
-        for text in ["", "@x", "m@", "m:", "m:x", "a/b@x"] {
-            let error = text.parse::<ModelRef>().unwrap_err();
-            assert!(error.contains("expected"), "{error}");
         }
     }
 }

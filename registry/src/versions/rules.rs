@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use protocol::model_ref::is_number;
 use protocol::stage::Mode;
 use protocol::{Alias, ModelName};
 
@@ -84,6 +85,11 @@ pub(crate) fn refuse_reserved(alias: &Alias) -> Result<(), WriteError> {
     if matches!(alias.as_str(), BEST | LATEST) {
         return Err(WriteError::Conflict(format!(
             "`{alias}` is computed from the versions and cannot be moved; choose another alias"
+        )));
+    }
+    if is_number(alias.as_str()) {
+        return Err(WriteError::Conflict(format!(
+            "`@{alias}` names version {alias}, so no alias may be called that; choose another alias"
         )));
     }
     Ok(())

@@ -69,6 +69,7 @@ fn expected(method: &str, path: &str) -> &'static [Scope] {
         ("GET", "/v1/blobs/{digest}") => &[Read, Worker],
         ("PUT", "/v1/blobs/{digest}") | ("GET", "/v1/blobs/{digest}/staged") => &[Worker],
         ("POST", "/v1/registry") => &[Read, Promote, Admin],
+        ("POST", "/v1/bundles") => &[Promote],
         other => panic!("{other:?} is not in this table: say who may call it"),
     }
 }

@@ -146,6 +146,64 @@ impl Header {
     }
 }
 
+/// What of a file fitted a network.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Fitted {
+    /// Values by tensor of the network, in its order; none of a tensor that the file has not, or has in another shape or type.
+    pub values: Vec<Option<Vec<f32>>>,
+    /// Those without values: name and shape, and what the file has under the name.
+    pub fresh: Vec<String>,
+}
+
+/// The tensors of a file that fit `entries` by name, behind `prefix`, and by shape. `read` is as in [`load_from`].
+///
+/// # Errors
+/// What `read` says; inside, that the file is not safetensors. That nothing fits is none.
+pub fn fitting<E>(
+    entries: &[Entry],
+    bytes: u64,
+    read: &mut ReadAt<'_, E>,
+    prefix: &str,
+) -> Result<Result<Fitted, LoadError>, E> {
+    let header = match Header::read(bytes, read)? {
+        Ok(header) => header,
+        Err(error) => return Ok(Err(error)),
+    };
+    let tensors = header.metadata.tensors();
+    let mut fitted = Fitted::default();
+    for entry in entries {
+        let name = format!("{prefix}{}", entry.name);
+        let found = tensors.get(&name);
+        match found.filter(|info| info.shape == entry.shape && info.dtype == Dtype::F32) {
+            Some(info) => {
+                let mut values = vec![0.0; entry.len()];
+                read_values(header.data + info.data_offsets.0 as u64, &mut values, read)?;
+                fitted.values.push(Some(values));
+            }
+            None => {
+                let there = match found {
+                    Some(info) if info.dtype != Dtype::F32 => format!("{:?} there", info.dtype),
+                    Some(info) => format!("{:?} there", info.shape),
+                    None => "not there".to_owned(),
+                };
+                fitted.fresh.push(format!("{name} {:?} ({there})", entry.shape));
+                fitted.values.push(None);
+            }
+        }
+    }
+    Ok(Ok(fitted))
+}
+
+/// The names and shapes of a file's tensors. `read` is as in [`load_from`].
+///
+/// # Errors
+/// As [`fitting`].
+pub fn tensors<E>(bytes: u64, read: &mut ReadAt<'_, E>) -> Result<Result<Vec<Entry>, LoadError>, E> {
+    let entry = |(name, info): (String, &TensorInfo)| Entry { name, shape: info.shape.clone() };
+    let entries = |header: Header| header.metadata.tensors().into_iter().map(entry).collect();
+    Ok(Header::read(bytes, read)?.map(entries))
+}
+
 /// The largest header that is read; that of a thousand tensors has a hundred kilobytes.
 const HEADER_BYTES: u64 = 16 << 20;
 

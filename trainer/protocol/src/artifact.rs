@@ -52,6 +52,29 @@ pub enum ArtifactKind {
 }
 
 impl ArtifactKind {
+    /// Whether a registered model is one or has one as a part, so that a version may stand where a stage gives it.
+    pub fn is_of_models(self) -> bool {
+        match self {
+            Self::Vae
+            | Self::Tokenizer
+            | Self::FlowDecoder
+            | Self::TokenGenerator
+            | Self::TextEncoder
+            | Self::Denoiser
+            | Self::Evaluator
+            | Self::Length
+            | Self::Control
+            | Self::Model => true,
+            Self::Dataset
+            | Self::Embeddings
+            | Self::Latents
+            | Self::Tokens
+            | Self::Report
+            | Self::Checkpoint
+            | Self::Shard => false,
+        }
+    }
+
     /// What it is called in a message.
     pub fn noun(self) -> &'static str {
         match self {

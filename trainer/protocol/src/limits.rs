@@ -14,6 +14,8 @@ pub const BATCH_BYTES: usize = 16 << 20;
 pub const SUBMISSION_BYTES: usize = 8 << 20;
 /// Bytes of a blob.
 pub const BLOB_BYTES: usize = 8 << 30;
+/// Bytes of a version's bundle, and of all its files together.
+pub const BUNDLE_BYTES: usize = 256 << 30;
 /// Bytes of all calls together, blobs excepted, that are in memory at a time; more wait.
 pub const CALLS_BYTES: usize = 32 << 20;
 /// Calls of clients that change something (submissions, commands about runs) that wait to be decided; one more is told to come again.

@@ -28,6 +28,7 @@ mod training;
 
 use std::collections::BTreeSet;
 
+use crate::model_ref::names_version;
 use crate::{ArtifactKind, Digest, Steps};
 
 pub use control::{ControlHints, ControlSetting};
@@ -68,6 +69,19 @@ pub struct ExternalFolder {
     pub files: &'static [&'static str],
     /// What it is and where to get it.
     pub origin: &'static str,
+}
+
+/// A version of the registry that a stage reads where it could read another stage.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct VersionInput {
+    /// The field that names it, such as `init` or `teacher`.
+    pub field: String,
+    /// The version as written, such as `motionlcm@prod`.
+    pub version: String,
+    /// What is read of it: the whole model, or its part of this kind.
+    pub kind: ArtifactKind,
+    /// The part that the model must have, where the whole model is read for it.
+    pub part: Option<ArtifactKind>,
 }
 
 /// What is asked of every kind, answered by the kind's [`StageSpec`].
@@ -136,8 +150,8 @@ impl StageSettings {
         crate::canonical::digest(&self.without_references())
     }
 
-    /// The stages it reads: field name, stage name, what that stage must give. `register` reads more (the evaluations
-    /// of its candidates), which the pipeline adds.
+    /// The stages it reads, and versions of the registry in the place of stages: field name, stage name, what that stage must give.
+    /// `register` reads more (the evaluations of its candidates), which the pipeline adds.
     pub fn inputs(&self) -> Vec<(String, String, ArtifactKind)> {
         let mut settings = self.clone();
         let read = settings.refs().into_iter().filter(|reference| reference.read);
@@ -146,6 +160,32 @@ impl StageSettings {
             Target::Dataset(_) | Target::Folder | Target::File => None,
         })
         .collect()
+    }
+
+    /// The versions of the registry that it reads, among its [`inputs`](Self::inputs).
+    pub fn versions(&self) -> Vec<VersionInput> {
+        let mut settings = self.clone();
+        let read = settings.refs().into_iter().filter(|reference| reference.read && names_version(reference.name));
+        read.filter_map(|Ref { field, name, target, part, .. }| match target {
+            Target::Stage(kind) => Some(VersionInput { field: field.into_owned(), version: name.clone(), kind, part }),
+            Target::Dataset(_) | Target::Folder => None,
+        })
+        .collect()
+    }
+
+    /// The settings as the reader of pipelines and the reference of keys take them: references that are left out while they are empty,
+    /// so that keys of stages are what they were before there were such references, are there.
+    pub(crate) fn example(&self) -> serde_json::Value {
+        let mut json = serde_json::to_value(self).expect("settings are JSON");
+        for reference in self.clone().refs() {
+            if let Some(json) = json.as_object_mut()
+                && !reference.field.contains(['.', '['])
+                && !json.contains_key(&*reference.field)
+            {
+                json.insert(reference.field.into_owned(), "".into());
+            }
+        }
+        json
     }
 
     /// Folders outside the store that it reads. Their contents count for its key, not their paths.

@@ -162,9 +162,9 @@ struct RegistryArgs {
     store: PathBuf,
     #[command(flatten)]
     server: ServerOptions,
-    /// How the answer is printed
-    #[arg(short, long, value_enum, default_value_t, global = true)]
-    output: registry::cli::Output,
+    /// How the answer is printed; for `export`, the file of a bundle, FILE.tar.zst
+    #[arg(short, long, default_value = "table", value_name = "table|json", global = true)]
+    output: registry::cli::OutputArg,
     #[command(subcommand)]
     verb: registry::cli::Verb,
 }
@@ -313,6 +313,8 @@ async fn show_plan(args: PlanArgs) -> Result<u8> {
         Err(OpenError::NotAStore(_)) => None,
         Err(error) => return Err(error.into()),
     };
+    let mut file = file;
+    pipeline_file::resolve_versions(&mut file.pipeline, store.as_ref()).await?;
     let mut plan = plan::plan(&file.pipeline, store.as_ref()).await?;
     plan.missing = missing;
     if !args.no_time && plan.stages.iter().any(|step| step.action != "cached") {

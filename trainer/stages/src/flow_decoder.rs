@@ -23,6 +23,7 @@ use crate::artifacts;
 use crate::context::StageError;
 use crate::networks::Autoencoder;
 use crate::tokenizer::TrainedTokenizer;
+use crate::warm_start::WarmStart;
 use crate::weights;
 
 /// Widths of the U-Net's two levels, over the first.
@@ -171,6 +172,14 @@ impl Field {
             Backbone::Unet(network) => flat::read(network),
             Backbone::Dit(network) => flat::read(network),
         }
+    }
+
+    /// With the weights that training is to begin with.
+    pub(crate) fn begun_with(self, start: &mut WarmStart) -> Result<Self, StageError> {
+        Ok(match self {
+            Self::Unet(network) => Self::Unet(start.take(network, "")?),
+            Self::Dit(network) => Self::Dit(start.take(network, "")?),
+        })
     }
 
     /// Takes over parameters.

@@ -25,5 +25,6 @@ pub mod timing;
 pub mod tokenizer;
 pub mod train;
 pub mod verify;
+mod warm_start;
 pub mod weights;
 pub mod words;

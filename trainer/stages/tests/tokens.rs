@@ -399,3 +399,10 @@ fn what_does_not_fit_is_refused_with_a_reason() {
     let error = refused(&mut world, settings.into(), &[("dataset", "dataset")]);
     assert!(error.contains("the longest clip"), "{error}");
 }
+
+#[test]
+fn every_kind_of_tokens_begins_with_what_it_gave() {
+    let mut world = run(1, 1);
+    // 2 tokenizers, 3 generators, 2 flow decoders and their students, the evaluator, the VAE and the teacher of its latents.
+    assert_eq!(common::begin_again(&mut world.bench, chain(1), &world.outputs), 12);
+}

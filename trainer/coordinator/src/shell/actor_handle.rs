@@ -8,13 +8,14 @@ use futures::FutureExt as _;
 use protocol::message::{Poll, RunView, Submit};
 use protocol::pipeline::Pipeline;
 use protocol::{RunId, WorkerId, limits};
-use registry::{ReadStore, Store, WriteError};
+use registry::{QueryError, ReadStore, Store, WriteError};
 use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 
 use super::blocking::blocking;
 use super::clock::Clock;
 use super::records::{Records, read};
+use super::versions::resolve_versions;
 use crate::batch::{Ask, Front, Refused};
 use crate::event::{Effect, Event, Observation};
 use crate::rejected::Rejected;
@@ -107,7 +108,17 @@ impl ActorHandle {
             pipeline.check()?;
             Ok(pipeline)
         });
-        let pipeline = read.await.map_err(Rejected::Invalid)?;
+        let mut pipeline = read.await.map_err(Rejected::Invalid)?;
+        // One that was submitted before has its versions already.
+        if let Some(key) = &submit.idempotency_key
+            && let Some(row) = self.store.run_by_key(key).await.map_err(WriteError::from)?
+        {
+            return Ok(row.run);
+        }
+        resolve_versions(&mut pipeline, &self.store).await.map_err(|error| match error {
+            QueryError::NotFound(why) | QueryError::Invalid(why) => Refused::from(Rejected::Invalid(why)),
+            error => Refused::from(WriteError::from(error)),
+        })?;
         let event = Event::Submit {
             pipeline: Box::new(pipeline),
             source: submit.source,

@@ -17,7 +17,7 @@ use super::actor_handle::ActorHandle;
 use super::auth::{self, Gate};
 use super::failure::Failure;
 use super::route::Route;
-use super::{polls, queries, uploads};
+use super::{bundles, polls, queries, uploads};
 
 /// How long a call may take that waits for nothing but the disk.
 const SHORT: Duration = Duration::from_secs(60);
@@ -61,6 +61,7 @@ fn table() -> Vec<Entry> {
         entry("GET",  "/v1/runs/{run}/logs",       &[Read],         CALL,                     SHORT, queries::logs),
         entry("GET",  "/v1/runs/{run}/metrics",    &[Read],         CALL,                     SHORT, queries::metrics),
         entry("POST", "/v1/runs/{run}/{action}",   &[Submit],       CALL,                     SHORT, queries::control),
+        entry("POST", "/v1/bundles",               &[Promote],      limits::BUNDLE_BYTES,     LONG,  bundles::import),
         entry("POST", "/v1/registry", &[Read, Promote, Admin],      CALL,                     LONG,  queries::registry),
     ]
 }

@@ -9,6 +9,7 @@ mod api;
 mod auth;
 mod blocking;
 mod body;
+mod bundles;
 mod clock;
 mod door;
 mod effects;
@@ -21,6 +22,7 @@ mod records;
 mod route;
 mod start_error;
 mod uploads;
+mod versions;
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
@@ -50,6 +52,7 @@ pub use self::queries::{BlobStored, Submitted};
 pub use self::records::{Records, RecordsError, StageMetrics};
 pub use self::route::Route;
 pub use self::start_error::StartError;
+pub use self::versions::resolve_versions;
 
 /// How a coordinator is run.
 #[derive(Debug, Clone)]

@@ -105,8 +105,9 @@ impl PipelineStage {
             let (field, stage) = (shown(&input.field), shown(input.stage.as_str()));
             wrong.push(format!("stage `{name}` reads `{stage}` as `{field}`, of which its settings know nothing"));
         }
-        let folders = self.settings.folders();
-        for field in self.external.keys().filter(|field| folders.iter().all(|folder| folder.field != **field)) {
+        let folders = self.settings.folders().into_iter().map(|folder| folder.field);
+        let known: BTreeSet<String> = folders.chain(self.versions().into_iter().map(|input| input.field)).collect();
+        for field in self.external.keys().filter(|field| !known.contains(*field)) {
             let field = shown(field);
             wrong.push(format!("stage `{name}` has a digest of `{field}`, which it does not read"));
         }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::stage::{Backend, ExternalFolder, Placement, StageIdentity, StageSettings, Target};
+use crate::stage::{Backend, ExternalFolder, Placement, StageIdentity, StageSettings, Target, VersionInput};
 use crate::sweep::{Derived, Sweep};
 use crate::{ArtifactKind, Digest, Seed, StageName};
 
@@ -36,7 +36,8 @@ pub struct PipelineStage {
     pub placement: Placement,
     /// The stages it reads.
     pub inputs: Vec<StageInput>,
-    /// Digests of the folders outside the store that it reads, by the field that names each.
+    /// Digests of what it reads that no stage of the pipeline gives, by the field that names each: the contents of folders outside the
+    /// store, and versions of the registry, which are resolved when the pipeline is submitted and stay what they were then.
     pub external: BTreeMap<String, Digest>,
     /// A search over its settings.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -112,6 +113,29 @@ impl Pipeline {
         let kinds = self.stages.iter().map(|stage| &stage.settings).chain(evaluations);
         let beyond = kinds.filter(|settings| settings.code_version() > FIRST_VERSION);
         self.code_versions = beyond.map(|settings| (settings.kind().to_owned(), settings.code_version())).collect();
+    }
+}
+
+/// What stands before the fields of a sweep's evaluation among those of its stage.
+pub(super) const IN_EVALUATION: &str = "sweep.evaluate.";
+
+impl PipelineStage {
+    /// The versions of the registry that it reads, those of a sweep's evaluation included.
+    pub fn versions(&self) -> Vec<VersionInput> {
+        let mut all = self.settings.versions();
+        let evaluation = self.sweep.iter().flat_map(|sweep| sweep.evaluate.versions());
+        all.extend(evaluation.map(|input| VersionInput { field: format!("{IN_EVALUATION}{}", input.field), ..input }));
+        all
+    }
+
+    /// The digests among [`external`](Self::external) that its settings name, or its sweep's evaluation, by the fields there.
+    pub(super) fn external_of(&self, evaluation: bool) -> BTreeMap<String, Digest> {
+        let own = |(field, digest): (&String, &Digest)| match (field.strip_prefix(IN_EVALUATION), evaluation) {
+            (Some(field), true) => Some((field.to_owned(), *digest)),
+            (None, false) => Some((field.clone(), *digest)),
+            _ => None,
+        };
+        self.external.iter().filter_map(own).collect()
     }
 }
 

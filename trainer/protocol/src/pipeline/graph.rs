@@ -4,7 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::definition::{PipelineStage, StageInput};
 use super::rules::Problems;
-use crate::stage::{Neighbour, Neighbours, Register, StageSettings};
+use crate::model_ref::{ModelRef, names_version};
+use crate::stage::{Neighbour, Neighbours, Register, Shape, StageSettings, VersionInput};
 use crate::sweep::Domain;
 use crate::{ArtifactKind, StageName, limits};
 
@@ -14,11 +15,11 @@ const LISTED: usize = 20;
 /// Problems by stage.
 pub(super) type ByStage = BTreeMap<StageName, Problems>;
 
-/// The edges of `settings`, references only.
+/// The edges of `settings`, references to stages only; versions of the registry are no stages.
 pub(super) fn references(settings: &StageSettings) -> Vec<StageInput> {
     let input =
         |(field, stage, kind): (String, String, ArtifactKind)| StageInput { field, stage: StageName::new(stage), kind };
-    settings.inputs().into_iter().map(input).collect()
+    settings.inputs().into_iter().filter(|(_, name, _)| !names_version(name)).map(input).collect()
 }
 
 /// Gives every `register` stage the evaluations of its candidates as inputs.
@@ -113,6 +114,9 @@ pub(super) fn check_totals(stages: &[PipelineStage], found: &mut ByStage) {
 pub(super) fn check_references(stages: &[PipelineStage], found: &mut ByStage) {
     let by_name: BTreeMap<&StageName, &PipelineStage> = stages.iter().map(|stage| (&stage.name, stage)).collect();
     for stage in stages {
+        for version in stage.versions() {
+            check_version(stage, &version, found.entry(stage.name.clone()).or_default());
+        }
         for input in &stage.inputs {
             let problems = found.entry(stage.name.clone()).or_default();
             let what = input.kind.noun();
@@ -158,6 +162,22 @@ pub(super) fn check_references(stages: &[PipelineStage], found: &mut ByStage) {
                 Some(_) => {}
             }
         }
+    }
+}
+
+/// What can be said of a version before a registry is asked.
+fn check_version(stage: &PipelineStage, input: &VersionInput, problems: &mut Problems) {
+    let VersionInput { field, version, kind, .. } = input;
+    let what = kind.noun();
+    if stage.settings.shape() == Shape::Registry {
+        let message =
+            format!("`{field}` is `{version}`, a version of the registry; expected a stage that gives {what}");
+        problems.add(field, message, "what is registered already need not be registered again; name a stage");
+    } else if !kind.is_of_models() {
+        let message = format!("`{field}` is `{version}`, but no version of the registry holds {what}");
+        problems.add(field, message, "name a stage");
+    } else if let Err(why) = version.parse::<ModelRef>() {
+        problems.add(field, format!("`{field}`: {why}"), "such as `motionlcm@prod`, `motionlcm@best` or `motionlcm@3`");
     }
 }
 

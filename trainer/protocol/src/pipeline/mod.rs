@@ -36,3 +36,5 @@ mod sweep_tests;
 mod tests;
 #[cfg(test)]
 mod token_tests;
+#[cfg(test)]
+mod version_tests;

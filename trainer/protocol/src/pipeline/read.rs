@@ -301,7 +301,7 @@ impl Reader {
             Some(entry) => self.sweep(entry, name, &default).map(Some),
             None => Some(None),
         };
-        let settings = self.overlaid(serde_json::to_value(&default).ok()?, node, &owner, &path, &skip);
+        let settings = self.overlaid(default.example(), node, &owner, &path, &skip);
         Some((settings?, placement?, sweep?))
     }
 

@@ -75,12 +75,13 @@ fn stage(settings: &StageSettings) -> Value {
 
 /// The schema of a kind's settings, with what its references lead to.
 fn described_kind(settings: &StageSettings) -> Value {
-    let mut schema = described_as(settings.schema(&mut generator()).to_value(), settings);
+    let mut schema = described_as(settings.schema(&mut generator()).to_value(), &settings.example());
     for (field, target) in references(settings) {
         let key = field.split_once('[').map_or(&*field, |(list, _)| list);
         let lead = match target {
             Target::Stage(kind) => {
-                format!("{} stage that gives {}", if key == field { "A" } else { "Each a" }, kind.noun())
+                let or = if kind.is_of_models() && settings.shape() != Shape::Registry { " or a version" } else { "" };
+                format!("{} stage{or} that gives {}", if key == field { "A" } else { "Each a" }, kind.noun())
             }
             Target::Dataset(_) | Target::Folder => "A folder".to_owned(),
             Target::File => "A file".to_owned(),
@@ -93,7 +94,7 @@ fn described_kind(settings: &StageSettings) -> Value {
 
 /// References of a kind. A list that is empty by default is asked as if it had an entry.
 fn references(settings: &StageSettings) -> BTreeMap<String, Target> {
-    let mut json = serde_json::to_value(settings).expect("settings are JSON");
+    let mut json = settings.example();
     for value in json.as_object_mut().into_iter().flat_map(Map::values_mut) {
         if value.as_array().is_some_and(Vec::is_empty) {
             *value = json!(["x"]);

@@ -1,12 +1,10 @@
 //! What a sweep means for the pipeline around it: what it reads, who may read it, and the stages that a trial is made of.
 
-use std::collections::BTreeMap;
-
-use super::definition::{PipelineStage, StageInput};
+use super::definition::{IN_EVALUATION, PipelineStage, StageInput};
 use super::graph;
 use super::rules::{Problem, Problems};
-use crate::stage::{Shape, StageSettings};
-use crate::sweep::{Derived, STATE_OUTPUT, Values, beside, evaluated_field, rung_name};
+use crate::stage::{Shape, StageSettings, Target};
+use crate::sweep::{Derived, STATE_OUTPUT, Values, beside, evaluated_field, rung_name, with_values};
 use crate::{ArtifactKind, StageName, Steps};
 
 /// What is written behind the name of a swept stage to say that its best trial is meant. It always is.
@@ -18,33 +16,34 @@ pub(super) fn references(stage: &PipelineStage) -> Vec<StageInput> {
     let evaluated = evaluated_field(&sweep.evaluate, stage.settings.output().kind);
     let inputs =
         graph::references(&sweep.evaluate).into_iter().filter(|input| Some(&input.field) != evaluated.as_ref());
-    inputs.map(|input| StageInput { field: format!("sweep.evaluate.{}", input.field), ..input }).collect()
+    inputs.map(|input| StageInput { field: format!("{IN_EVALUATION}{}", input.field), ..input }).collect()
 }
 
-/// Takes `@best` off references to swept stages: what such a stage gives is its best trial.
+/// Takes `@best` off references to swept stages: what such a stage gives is its best trial. A name that no stage has is a model's.
 pub(super) fn resolve_best<'a>(
     stage: &mut PipelineStage,
     stages: impl Iterator<Item = (&'a StageName, bool)> + Clone,
 ) -> Vec<Problem> {
     let mut problems = Problems::default();
-    let marked: Vec<StageInput> = stage.inputs.iter().filter(|i| i.stage.as_str().ends_with(BEST)).cloned().collect();
-    for input in marked {
-        let name = input.stage.as_str().trim_end_matches(BEST).to_owned();
-        if stages.clone().any(|(other, swept)| other.as_str() == name && !swept) {
-            let message =
-                format!("`{}` is `{}`, but `{name}` has no `sweep`, so it has one result", input.field, input.stage);
-            problems.add(&input.field, message, &format!("write `{name}`"));
+    let mut resolve = |settings: &mut StageSettings, prefix: &str| {
+        for reference in settings.refs() {
+            let Target::Stage(_) = reference.target else { continue };
+            let Some(name) = reference.name.strip_suffix(BEST).map(str::to_owned) else { continue };
+            let Some((_, swept)) = stages.clone().find(|(other, _)| other.as_str() == name) else { continue };
+            if !swept {
+                let field = format!("{prefix}{}", reference.field);
+                let message = format!("`{field}` is `{name}{BEST}`, but `{name}` has no `sweep`, so it has one result");
+                problems.add(&field, message, &format!("write `{name}`"));
+            }
+            *reference.name = name;
         }
-        let in_sweep = input.field.strip_prefix("sweep.evaluate.");
-        let settings = match (in_sweep, &mut stage.sweep) {
-            (Some(_), Some(sweep)) => &mut *sweep.evaluate,
-            _ => &mut stage.settings,
-        };
-        refer(settings, in_sweep.unwrap_or(&input.field), &name);
-        for other in stage.inputs.iter_mut().filter(|other| other.field == input.field) {
-            other.stage = StageName::new(&*name);
-        }
+    };
+    resolve(&mut stage.settings, "");
+    if let Some(sweep) = &mut stage.sweep {
+        resolve(&mut sweep.evaluate, IN_EVALUATION);
     }
+    stage.inputs = graph::references(&stage.settings);
+    stage.inputs.extend(references(stage));
     problems.0
 }
 
@@ -82,11 +81,11 @@ impl PipelineStage {
             inputs: graph::references(&evaluation),
             settings: evaluation,
             placement: placement.clone(),
-            external: BTreeMap::new(),
+            external: self.external_of(true),
             sweep: None,
             derived: derived(StageName::new(format!("{}.eval", self.name))),
         };
-        let external = self.external.clone();
+        let external = self.external_of(false);
         let train =
             Self { name, settings, placement, inputs, external, sweep: None, derived: derived(self.name.clone()) };
         Ok([train, eval])

@@ -23,7 +23,7 @@ impl DataFormat {
     }
 
     /// Its skeleton in words.
-    pub(crate) fn skeleton(self) -> &'static str {
+    pub fn skeleton(self) -> &'static str {
         match self {
             Self::Humanml3d => "22 joints (humanml3d)",
             Self::Kit => "21 joints (kit)",

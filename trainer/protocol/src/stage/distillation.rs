@@ -40,6 +40,10 @@ pub struct Distillation {
     pub ema: f64,
     /// Dropout in the frozen networks, as the original script has it by accident.
     pub upstream_dropout: bool,
+    /// Stage that gives a model whose denoiser the student begins with where shapes fit, or a version such as `motionlcm@prod`; empty begins with
+    /// the teacher's weights.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub init: String,
     /// The rest.
     #[serde(flatten)]
     pub training: Training,
@@ -62,6 +66,7 @@ impl Distillation {
             huber_c: 0.5,
             ema: 0.95,
             upstream_dropout: false,
+            init: String::new(),
             training: Training::published(steps, global, 2e-4),
         }
     }
@@ -71,6 +76,7 @@ impl Distillation {
             Ref::stage("teacher", &mut self.teacher, ArtifactKind::Model),
             Ref::stage("latents", &mut self.latents, ArtifactKind::Latents),
             Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
+            Ref::init(&mut self.init, ArtifactKind::Model, ArtifactKind::Denoiser),
         ]
     }
 

@@ -1,6 +1,6 @@
 //! What models that diffuse motion itself share.
 
-use super::{Diffusion, Neighbours, NoiseSchedule, Problems};
+use super::{Diffusion, NoiseSchedule, Problems};
 use crate::limits;
 
 /// Checks a schedule of `timesteps` for samplers that draw among features.
@@ -27,17 +27,5 @@ pub(super) fn check_parameters(p: &mut Problems, parameters: usize) {
     if parameters > limits::PARAMETERS {
         let message = format!("it has {parameters} parameters or more; expected at most {}", limits::PARAMETERS);
         p.add("network", message, "take fewer layers, or narrower ones");
-    }
-}
-
-/// What must hold between such a kind and the stages that it reads.
-pub(super) fn check_neighbours(p: &mut Problems, stages: &Neighbours<'_>, dataset: &str, text: &str, init: &str) {
-    stages.same_captions(p, text, dataset);
-    if let (false, Some(ours), Some(theirs)) = (init.is_empty(), stages.format(dataset), stages.format(init))
-        && ours != theirs
-    {
-        let message =
-            format!("`{init}` makes motions of {}, but `{dataset}` has {}", theirs.skeleton(), ours.skeleton());
-        p.add("init", message, "go on from a model that was trained on the same format");
     }
 }

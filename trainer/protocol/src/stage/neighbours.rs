@@ -49,7 +49,9 @@ impl<'a> Neighbours<'a> {
     pub(crate) fn new(stages: impl Iterator<Item = (&'a StageName, &'a dyn Neighbour)>) -> Self {
         let stages: BTreeMap<&str, &dyn Neighbour> = stages.map(|(name, settings)| (name.as_str(), settings)).collect();
         let read = |settings: &dyn Neighbour| -> Vec<(ArtifactKind, String)> {
-            settings.inputs().into_iter().map(|(_, stage, kind)| (kind, stage)).collect()
+            // What a training begins with says nothing of what it gives.
+            let read = settings.inputs().into_iter().filter(|(field, ..)| field != "init");
+            read.map(|(_, stage, kind)| (kind, stage)).collect()
         };
         let reads = stages.iter().map(|(name, settings)| (*name, read(*settings))).collect();
         let mut measured: BTreeMap<String, Vec<_>> = BTreeMap::new();

@@ -134,6 +134,8 @@ pub struct Ref<'a> {
     pub files: &'static [&'static str],
     /// What the folder is and where to get it.
     pub origin: &'static str,
+    /// The part of a model that is read of it, if one is.
+    pub part: Option<ArtifactKind>,
 }
 
 impl<'a> Ref<'a> {
@@ -147,7 +149,14 @@ impl<'a> Ref<'a> {
             measured: false,
             files: &[],
             origin: "",
+            part: None,
         }
+    }
+
+    /// A stage that must give `kind`, with whose weights a training begins: those of its `part`, if it gives a model. An empty name
+    /// begins with random ones.
+    pub fn init(name: &'a mut String, kind: ArtifactKind, part: ArtifactKind) -> Self {
+        Self { part: Some(part), ..Self::stage("init", name, kind).optional() }
     }
 
     /// A dataset's folder.
@@ -157,13 +166,14 @@ impl<'a> Ref<'a> {
             DataFormat::Humanml3d => "HumanML3D, made from AMASS as github.com/EricGuo5513/HumanML3D says",
             DataFormat::Kit => "KIT-ML, linked in github.com/EricGuo5513/HumanML3D",
         };
-        Self { field: field.into(), name: path, target, read, measured: false, files: &[], origin }
+        Self { field: field.into(), name: path, target, read, measured: false, files: &[], origin, part: None }
     }
 
     /// A folder; none if the path is empty.
     pub fn folder(field: &'static str, path: &'a mut String) -> Self {
         let read = !path.is_empty();
-        Self { field: field.into(), name: path, target: Target::Folder, read, measured: false, files: &[], origin: "" }
+        let target = Target::Folder;
+        Self { field: field.into(), name: path, target, read, measured: false, files: &[], origin: "", part: None }
     }
 
     /// A file; none if the path is empty.

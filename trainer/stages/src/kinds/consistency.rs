@@ -16,6 +16,7 @@ use models::networks::{Denoiser, Init, guidance_embedding};
 use protocol::artifact::Role;
 use protocol::stage::{Distance, Distillation, Family, Positions};
 use protocol::{ArtifactKind, Digest, Manifest, Seed};
+use serde_json::json;
 
 use super::group;
 use super::latent_data::{self, LatentData, LatentSlice};
@@ -23,6 +24,7 @@ use crate::artifacts::{self, DenoiserMeta};
 use crate::context::{AttemptContext, GangContext, StageError};
 use crate::parts::{self, model_error};
 use crate::train::{Average, GroupPlan, TrainState};
+use crate::warm_start::WarmStart;
 use crate::weights;
 
 /// Networks and data of a distillation.
@@ -60,7 +62,7 @@ pub(super) struct SolverStep {
 
 impl Distiller {
     /// Reads the inputs and builds the networks.
-    pub(super) fn read(cx: &dyn GangContext, settings: &Distillation) -> Result<Self, StageError> {
+    pub(super) fn read(cx: &mut dyn GangContext, settings: &Distillation) -> Result<Self, StageError> {
         let data = LatentData::read(cx, &settings.training)?;
         let blobs = cx.blobs();
         let (_, manifest) = artifacts::input(cx, "teacher", ArtifactKind::Model)?;
@@ -90,6 +92,11 @@ impl Distiller {
         let tracked = device.clone().autodiff();
         let student = start_from(blank(Some(settings.guidance_dim), &tracked), &teacher);
         let target = start_from(blank(Some(settings.guidance_dim), &device), &teacher);
+        let mut start = WarmStart::find(cx, ArtifactKind::Denoiser)?;
+        let student = start.take(student, "")?;
+        let DenoiserMeta { network, diffusion, text_relu, text_dim, fits, .. } = &teacher_meta;
+        let ours = json!({"network": network, "diffusion": diffusion, "text_relu": text_relu, "text_dim": text_dim, "fits": fits});
+        start.finish(cx, &ours)?;
         Ok(Self {
             settings: settings.clone(),
             data,

@@ -39,6 +39,7 @@ use crate::control::{
 use crate::networks::Autoencoder;
 use crate::parts::{self, model_error};
 use crate::train::{Clip, GroupPlan, Losses, Objective, Pick, SliceResult, TrainState, Trained, train};
+use crate::warm_start::WarmStart;
 use crate::weights;
 
 /// The term on latents.
@@ -326,6 +327,10 @@ impl Gang for TrainControl {
         let mut init = Init::new(cx.task().seed, &purpose, self.network.positions, &tracked);
         let control = copied_from(&base, meta.controlnet(&base_meta, &mut init));
         let trajectory = meta.trajectory(&base_meta, &mut init);
+        let mut start = WarmStart::find(cx, ArtifactKind::Control)?;
+        let control = start.take(control, CONTROLNET_PREFIX)?;
+        let trajectory = start.take(trajectory, TRAJECTORY_PREFIX)?;
+        start.finish(cx, &to_meta(&meta))?;
         let decoder = if self.loss.control > 0.0 {
             let part = parts::part(&*blobs, &model, &Role::VAE, ArtifactKind::Vae)?;
             let vae: VaeMeta = artifacts::meta(&part, "the VAE")?;

@@ -21,6 +21,7 @@ use crate::artifacts::to_meta;
 use crate::context::{GangContext, Outcome, StageError};
 use crate::flow_decoder::{Field, FlowMeta};
 use crate::train::{GroupPlan, Losses, Objective, SliceResult, TrainState, Trained, train};
+use crate::warm_start::WarmStart;
 use crate::weights;
 
 struct Flow {
@@ -73,6 +74,9 @@ impl Gang for TrainDiscord {
         let tracked = cx.device().autodiff();
         let (seed, purpose) = data.purpose();
         let field = meta.field(&mut Init::new(seed, &format!("{purpose}/init"), Positions::Uniform, &tracked));
+        let mut start = WarmStart::find(cx, ArtifactKind::FlowDecoder)?;
+        let field = field.begun_with(&mut start)?;
+        start.finish(cx, &to_meta(&meta))?;
         let mut objective = Flow { settings: self.clone(), data, field, dropout_seed: dropout_seed(cx) };
         match train(&mut objective, &self.training, cx)? {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),

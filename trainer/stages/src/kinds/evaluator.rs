@@ -20,10 +20,11 @@ use protocol::stage::{Positions, Split, TrainEvaluator};
 use protocol::{ArtifactKind, Seed};
 
 use super::{Gang, dropout_seed, group, no_clips};
-use crate::artifacts;
+use crate::artifacts::{self, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::evaluator::{self, EvaluatorMeta, UNIT, normalise};
 use crate::train::{GroupPlan, Objective, Order, Pick, SliceResult, TrainState, Trained, Turns, train};
+use crate::warm_start::WarmStart;
 use crate::words::{CLASSES, CaptionBatch, WORD_WIDTH, WORDS, Words};
 
 /// Keeps the slope of a distance finite at 0, as in the original.
@@ -289,8 +290,15 @@ impl Gang for TrainEvaluator {
         let purpose = stage.to_string();
         let draws = |what: &str| format!("{purpose}/init {what}");
         let fresh = |purpose: &str| Init::new(seed, purpose, Positions::Uniform, &device);
+        let mut start = WarmStart::find(cx, ArtifactKind::Evaluator)?;
+        let encoder = MovementEncoder::new(&meta.config, &mut fresh(&draws("encoder")));
+        let text = TextEncoder::new(&meta.config, &mut fresh(&draws("text")));
+        let motion = MotionEncoder::new(&meta.config, &mut fresh(&draws("motion")));
+        let encoder = start.take(encoder, "movement_encoder.")?;
+        let (text, motion) = (start.take(text, "text_encoder.")?, start.take(motion, "motion_encoder.")?);
+        start.finish(cx, &to_meta(&meta))?;
         let movements = Movements {
-            encoder: MovementEncoder::new(&meta.config, &mut fresh(&draws("encoder"))),
+            encoder,
             decoder: MovementDecoder::new(&meta.config, meta.mean.len(), &mut fresh(&draws("decoder"))),
         };
         let batch = self.training.batch.global;
@@ -298,8 +306,8 @@ impl Gang for TrainEvaluator {
         let mut objective = EvaluatorObjective {
             settings: self.clone(),
             frozen: MovementEncoder::new(&meta.config, &mut Init::new(seed, "frozen", Positions::Uniform, &plain)),
-            text: TextEncoder::new(&meta.config, &mut fresh(&draws("text"))),
-            motion: MotionEncoder::new(&meta.config, &mut fresh(&draws("motion"))),
+            text,
+            motion,
             movements,
             windows: Order::new(seed, &format!("{purpose}/windows"), train_entries.len(), window_batch, 1),
             clips: Order::new(seed, &format!("{purpose}/clips"), train_entries.len(), batch, 1),

@@ -7,32 +7,30 @@
 
 use std::collections::BTreeMap;
 
-use burn::module::Module;
 use burn::tensor::Device;
-use checkpoint::model::{Model, Parts};
+use checkpoint::model::Parts;
 use models::diffusion::{Schedule, affine, unzip};
 use models::kernels::Dropout;
 use models::losses::{FrameWeights, Pointwise};
-use models::names::{self, to_bytes};
+use models::names::to_bytes;
 use models::networks::Init;
+use protocol::ArtifactKind;
 use protocol::artifact::Role;
 use protocol::stage::{FrequencyLosses, Positions, StageSpec, TrainMdm, TrainStableMoFusion, Training};
-use protocol::{ArtifactKind, Manifest};
 
 use super::feature_data::{Cut, FeatureData, Rules};
 use super::frequency::{FrequencyTerms, LOW_FREQUENCY, Predicted, SEMANTIC, clean};
 use super::{Gang, group, slice_result};
-use crate::artifacts::{self, Draft, MODEL_FILE, to_meta};
-use crate::context::{AttemptContext, ContextError, GangContext, Outcome, StageError};
+use crate::artifacts::{Draft, MODEL_FILE, to_meta};
+use crate::context::{GangContext, Outcome, StageError};
 use crate::generator::FEATURE_DIFFUSION;
 use crate::motion_networks::{Architecture, MotionDenoiserMeta, MotionNetwork};
-use crate::parts::{self, model_error};
+use crate::parts;
 use crate::train::{Average, GroupPlan, Losses, Objective, SliceResult, TrainState, Trained, train};
+use crate::warm_start::WarmStart;
 
 /// The term of the loss that every diffusion has.
 const DENOISING: &str = "denoising";
-/// The input that gives weights to begin with.
-const INIT: &str = "init";
 
 struct Features<N> {
     data: FeatureData,
@@ -133,7 +131,9 @@ fn run<N: MotionNetwork>(
     let tracked = cx.device().autodiff();
     let purpose = format!("{}/init", cx.task().name);
     let mut init = Init::new(cx.task().seed, &purpose, Positions::Uniform, &tracked);
-    let network = begin(cx, make(&meta, &mut init), &meta)?;
+    let mut start = WarmStart::find(cx, ArtifactKind::Denoiser)?;
+    let network = start.take(make(&meta, &mut init), "")?;
+    start.finish(cx, &to_meta(&meta))?;
     let mut objective = Features {
         data,
         network,
@@ -158,50 +158,6 @@ fn run<N: MotionNetwork>(
             Ok(Outcome::Finished { output, metrics })
         }
     }
-}
-
-/// The denoiser of the model that training begins with, if one is named.
-pub(super) fn init_part(cx: &dyn AttemptContext) -> Result<Option<Manifest>, StageError> {
-    if !cx.task().inputs.contains_key(INIT) {
-        return Ok(None);
-    }
-    let (_, manifest) = artifacts::input(cx, INIT, ArtifactKind::Model)?;
-    let model = Model::read(&manifest).map_err(model_error)?;
-    parts::part(&*cx.blobs(), &model, &Role::DENOISER, ArtifactKind::Denoiser).map(Some)
-}
-
-/// `network` with the weights of that denoiser.
-pub(super) fn with_weights<N: Module>(
-    cx: &dyn AttemptContext,
-    network: N,
-    denoiser: &Manifest,
-) -> Result<N, StageError> {
-    let weights = artifacts::file(&*cx.blobs(), denoiser, MODEL_FILE)?;
-    let corrupt = |e| StageError::Context(ContextError::Corrupt(format!("the denoiser of `{INIT}`: {e}")));
-    names::load(network, &weights, "").map_err(corrupt)
-}
-
-/// A model whose weights cannot be gone on from.
-pub(super) fn unfit(what: &str) -> StageError {
-    StageError::Input(format!("`{INIT}` has {what}; name a model that this stage could have trained"))
-}
-
-fn begin<N: Module>(cx: &dyn AttemptContext, network: N, meta: &MotionDenoiserMeta) -> Result<N, StageError> {
-    let Some(denoiser) = init_part(cx)? else { return Ok(network) };
-    let theirs: MotionDenoiserMeta = artifacts::meta(&denoiser, "the denoiser of `init`")?;
-    let differs = [
-        ("another network or size", theirs.architecture != meta.architecture),
-        (
-            "another noise schedule or prediction",
-            (&theirs.diffusion, &theirs.family) != (&meta.diffusion, &meta.family),
-        ),
-        ("been trained on features of another scale", (&theirs.mean, &theirs.std) != (&meta.mean, &meta.std)),
-        ("been trained with another text encoder", theirs.fits != meta.fits),
-    ];
-    if let Some((what, _)) = differs.iter().find(|(_, differs)| *differs) {
-        return Err(unfit(what));
-    }
-    with_weights(cx, network, &denoiser)
 }
 
 impl Gang for TrainMdm {

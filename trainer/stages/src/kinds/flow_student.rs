@@ -19,6 +19,7 @@ use crate::artifacts::{self, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::flow_decoder::{Field, FlowDecoder, FlowMeta, FlowPath};
 use crate::train::{Average, GroupPlan, Losses, Objective, SliceResult, TrainState, Trained, train};
+use crate::warm_start::WarmStart;
 use crate::weights;
 
 struct Student {
@@ -90,6 +91,9 @@ impl Gang for DistillDiscord {
         let mut student = meta.field(&mut Init::new(Seed(0), "blank", Positions::Uniform, &tracked));
         let field = teacher.into_field();
         student.take(Values::Host(&field.params()));
+        let mut start = WarmStart::find(cx, ArtifactKind::FlowDecoder)?;
+        let student = student.begun_with(&mut start)?;
+        start.finish(cx, &to_meta(&meta))?;
         let mut objective = Student {
             settings: self.clone(),
             data,

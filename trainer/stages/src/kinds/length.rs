@@ -21,6 +21,7 @@ use crate::artifacts::{self, Embeddings, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::length::LengthMeta;
 use crate::train::{GroupPlan, Losses, Objective, Order, SliceResult, TrainState, Trained, train};
+use crate::warm_start::WarmStart;
 use crate::weights;
 
 /// Frames between the mean of the predicted lengths and the true one.
@@ -112,9 +113,12 @@ impl Gang for TrainLength {
         let (seed, purpose) = (cx.task().seed, cx.task().name.to_string());
         let tracked = cx.device().autodiff();
         let mut init = Init::new(seed, &format!("{purpose}/init"), Positions::Uniform, &tracked);
+        let mut start = WarmStart::find(cx, ArtifactKind::Length)?;
+        let network = start.take(LengthEstimator::new(meta.text_dim, meta.classes, &mut init), "")?;
+        start.finish(cx, &to_meta(&meta))?;
         let mut objective = Lengths {
             settings: self.clone(),
-            network: LengthEstimator::new(meta.text_dim, meta.classes, &mut init),
+            network,
             order: Order::new(seed, &purpose, train_entries.len(), self.training.batch.global, 1),
             train: train_entries,
             dataset,

@@ -18,14 +18,14 @@ use protocol::ArtifactKind;
 use protocol::artifact::Role;
 use protocol::stage::{Family, TrainMld};
 
-use super::features::{init_part, unfit, with_weights};
 use super::frequency::{FrequencyTerms, LOW_FREQUENCY, Predicted, SEMANTIC, clean};
 use super::latent_data::{self, LatentData};
 use super::{Gang, group, slice_result};
-use crate::artifacts::{self, DenoiserMeta, VaeMeta};
+use crate::artifacts::{self, DenoiserMeta, VaeMeta, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::networks::Autoencoder;
 use crate::train::{GroupPlan, Losses, Objective, Pick, SliceResult, TrainState, Trained, train};
+use crate::warm_start::WarmStart;
 
 /// The term of the loss that every latent diffusion has.
 const DENOISING: &str = "denoising";
@@ -165,16 +165,9 @@ impl Gang for TrainMld {
         let purpose = format!("{}/init", cx.task().name);
         let mut init = Init::new(cx.task().seed, &purpose, self.network.positions, &device);
         let network = Denoiser::new(&meta.config(), &mut init);
-        let network = match init_part(cx)? {
-            Some(denoiser) => {
-                let theirs: DenoiserMeta = artifacts::meta(&denoiser, "the denoiser of `init`")?;
-                if theirs != meta {
-                    return Err(unfit("another size, noise schedule, VAE or text encoder"));
-                }
-                with_weights(cx, network, &denoiser)?
-            }
-            None => network,
-        };
+        let mut start = WarmStart::find(cx, ArtifactKind::Denoiser)?;
+        let network = start.take(network, "")?;
+        start.finish(cx, &to_meta(&meta))?;
         let seed = super::dropout_seed(cx);
         let noise = Schedule::new(&self.diffusion, TIMESTEPS);
         let statistics = (&vae.mean[..], &vae.std[..]);

@@ -23,6 +23,7 @@ use crate::parts;
 use crate::text::{self, TextEncoder};
 use crate::tokenizer::TrainedTokenizer;
 use crate::train::{GroupPlan, Losses, Objective, Pick, SliceResult, TrainState};
+use crate::warm_start::WarmStart;
 
 /// Trains MMM's network.
 pub(super) struct WithWords {
@@ -45,6 +46,7 @@ impl WithWords {
         meta: &GeneratorMeta,
         cx: &dyn GangContext,
         init: &mut Init<'_>,
+        start: &mut WarmStart,
     ) -> Result<Self, StageError> {
         let blobs = cx.blobs();
         let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
@@ -64,7 +66,7 @@ impl WithWords {
         let config = meta.mmm(tokenizer.meta().code_dim);
         Ok(Self {
             settings: settings.clone(),
-            network: Mmm::new(&config, init),
+            network: start.take(Mmm::new(&config, init), "")?,
             config,
             data,
             captions,

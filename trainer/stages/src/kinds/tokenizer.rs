@@ -21,15 +21,18 @@ use models::networks::{Init, Tokenizer};
 use models::quantizer::{Book, Pass, candidates, perplexity};
 use motion::Stream;
 use motion::random::permutation;
+use protocol::ArtifactKind;
 use protocol::stage::{Positions, Resets, TrainTokenizer};
 
 use super::token_windows::TokenWindows;
 use super::{Gang, dropout_seed, group, slice_result};
+use crate::artifacts::to_meta;
 use crate::context::{GangContext, Outcome, StageError};
 use crate::tokenizer::TokenizerMeta;
 use crate::train::{
     AfterStep, BufferPlan, GroupPlan, Losses, Objective, Order, Pick, SliceResult, SumPlan, TrainState, Trained, train,
 };
+use crate::warm_start::WarmStart;
 
 /// Frames that one token stands for.
 const UNIT: usize = 4;
@@ -40,6 +43,8 @@ struct VqObjective {
     order: Order,
     network: Tokenizer,
     books: Vec<Vec<f32>>,
+    /// Codebooks that training was told to begin with, by layer.
+    given: Vec<Option<Vec<f32>>>,
     /// What the first step begins with.
     first: Option<Rc<Vec<Vec<f32>>>>,
     dropout_seed: u64,
@@ -109,7 +114,8 @@ impl VqObjective {
         Pass::through(rows, dim, active, &plain, books, if self.settings.drawn { Some(&mut uniforms) } else { None })
     }
 
-    /// The codebooks that the first step begins with: rows of its batch, each layer's out of what those before it leave over.
+    /// The codebooks that the first step begins with: those that were given, else rows of its batch, each layer's out of what those before
+    /// it leave over.
     fn first_books(&mut self) -> Rc<Vec<Vec<f32>>> {
         if let Some(first) = &self.first {
             return Rc::clone(first);
@@ -122,7 +128,10 @@ impl VqObjective {
         let mut books = vec![Vec::new(); quantizers];
         let begin = |q: usize, rows: &[f32]| {
             let mut draw = self.stream("first codes", 0, q as u64);
-            books[q] = candidates(rows, codes, dim, |len| noise(len, &mut draw));
+            books[q] = match &self.given[q] {
+                Some(book) => book.clone(),
+                None => candidates(rows, codes, dim, |len| noise(len, &mut draw)),
+            };
             Cow::<[f32]>::Owned(books[q].clone())
         };
         self.pass(rows, &picks, quantizers, begin);
@@ -303,12 +312,17 @@ impl Gang for TrainTokenizer {
         let tracked = cx.device().autodiff();
         let (seed, purpose) = (windows.seed, windows.purpose.clone());
         let mut init = Init::new(seed, &format!("{purpose}/init"), Positions::Uniform, &tracked);
+        let mut start = WarmStart::find(cx, ArtifactKind::Tokenizer)?;
+        let network = start.take(Tokenizer::new(&meta.config(), &mut init), "")?;
+        let given = start.values(&meta.books(), "")?.unwrap_or_else(|| vec![None; self.quantizers]);
+        start.finish(cx, &to_meta(&meta))?;
         let mut objective = VqObjective {
             settings: self.clone(),
-            network: Tokenizer::new(&meta.config(), &mut init),
+            network,
             order: Order::new(seed, &purpose, windows.examples(), self.training.batch.global, 1),
             windows,
             books: Vec::new(),
+            given,
             first: None,
             dropout_seed: dropout_seed(cx),
             device: cx.device(),

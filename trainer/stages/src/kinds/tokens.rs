@@ -28,6 +28,7 @@ use crate::context::{GangContext, Outcome, StageError};
 use crate::generator::{GeneratorMeta, MASKED_PREFIX, RESIDUAL_PREFIX, TOKENS};
 use crate::tokenizer::Tokens;
 use crate::train::{GroupPlan, Losses, Objective, Order, Pick, SliceResult, TrainState, Trained, train};
+use crate::warm_start::WarmStart;
 use crate::{parts, weights};
 
 struct Autoregressive {
@@ -278,20 +279,23 @@ impl Gang for TrainTokens {
         let format = data.tokens.meta.format;
         let (tracked, device, dropout_seed) = (cx.device().autodiff(), cx.device(), dropout_seed(cx));
         let mut init = Init::new(data.seed, &format!("{}/init", data.purpose), Positions::Uniform, &tracked);
+        let mut start = WarmStart::find(cx, ArtifactKind::TokenGenerator)?;
         let mut objective: Box<dyn Objective> = match self.generator {
             TokenGenerator::Autoregressive => {
                 let config = meta.gpt();
-                let network = Gpt::new(&config, &mut init);
+                let network = start.take(Gpt::new(&config, &mut init), "")?;
                 Box::new(Autoregressive { settings: self.clone(), config, data, network, dropout_seed, device })
             }
             TokenGenerator::Masked => {
                 let config = meta.momask();
-                let first = MaskedTransformer::new(&config, &mut init);
+                let first = start.take(MaskedTransformer::new(&config, &mut init), MASKED_PREFIX)?;
                 let above = meta.layered().then(|| ResidualTransformer::new(&config, true, &mut init));
+                let above = above.map(|above| start.take(above, RESIDUAL_PREFIX)).transpose()?;
                 Box::new(Masked { settings: self.clone(), config, data, first, above, dropout_seed, device })
             }
-            TokenGenerator::Mmm => Box::new(WithWords::new(self, data, &meta, cx, &mut init)?),
+            TokenGenerator::Mmm => Box::new(WithWords::new(self, data, &meta, cx, &mut init, &mut start)?),
         };
+        start.finish(cx, &to_meta(&meta))?;
         match train(&mut *objective, &self.training, cx)? {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {

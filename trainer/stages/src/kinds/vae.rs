@@ -17,6 +17,7 @@ use super::{Gang, group, no_clips, slice_result};
 use crate::artifacts::{self, VaeMeta, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::train::{GroupPlan, Losses, Objective, Order, Pick, SliceResult, TrainState, Trained, train};
+use crate::warm_start::WarmStart;
 use crate::weights;
 
 /// Batches that are sorted by length together.
@@ -153,6 +154,9 @@ impl Gang for TrainVae {
         let (seed, device) = (cx.task().seed, cx.device().autodiff());
         let purpose = stage.to_string();
         let mut init = Init::new(seed, &format!("{purpose}/init"), self.network.positions, &device);
+        let mut start = WarmStart::find(cx, ArtifactKind::Vae)?;
+        let network = start.take(Vae::new(&meta.config(), &mut init), "")?;
+        start.finish(cx, &to_meta(&meta))?;
         let batch = self.training.batch.global;
         let window_batch = if self.windows.batch > 0 { self.windows.batch } else { batch };
         let mut objective = VaeObjective {
@@ -162,7 +166,7 @@ impl Gang for TrainVae {
             body: Body::new(dataset.skeleton(), &dataset.mean, &dataset.std, &cx.device()),
             train: train_entries,
             dataset,
-            network: Vae::new(&meta.config(), &mut init),
+            network,
             purpose,
             seed,
             dropout_seed: super::dropout_seed(cx),

@@ -1,11 +1,14 @@
 //! Every kind of stage at sizes at which a step takes a few milliseconds.
 
-use protocol::Steps;
+use std::collections::BTreeMap;
+
 use protocol::stage::{
     Batch, DataSynthetic, Decay, DistillLcm, DistillPcm, Distillation, EncodeLatents, EvaluateLatentFid,
     EvaluateReconstruction, LatentShape, Network, Optimizer, Sampler, StageSettings, TextEmbed, TrainControl,
     TrainLength, TrainMld, TrainVae, Training,
 };
+use protocol::{Digest, Steps};
+use stages::testing::Bench;
 
 fn network() -> Network {
     Network { width: 16, layers: 3, heads: 2, feed_forward: 32, ..Network::default() }
@@ -101,4 +104,29 @@ pub(crate) fn chain(shards: usize, steps: Steps4) -> Vec<Link> {
         ("eval-lcm", evaluate("lcm", "mld", 2, 2.0), latent("lcm")),
         ("eval-pcm", evaluate("pcm", "mld", 2, 2.0), latent("pcm")),
     ]
+}
+
+/// Every training of `links` once more, beginning with what it gave, of which every tensor fits; how many there are.
+#[allow(dead_code, reason = "not every test file uses it")]
+pub(crate) fn begin_again(bench: &mut Bench, links: Vec<Link>, outputs: &BTreeMap<&'static str, Digest>) -> usize {
+    let mut count = 0;
+    for (name, mut settings, inputs) in links {
+        let mut named = false;
+        for reference in settings.refs().into_iter().filter(|reference| reference.field == "init") {
+            name.clone_into(reference.name);
+            named = true;
+        }
+        if !named {
+            continue;
+        }
+        let mut inputs: Vec<(&str, Digest)> = inputs.iter().map(|(field, from)| (*field, outputs[from])).collect();
+        inputs.push(("init", outputs[name]));
+        bench.forget(name);
+        let ran = bench.run(name, &settings, &inputs).unwrap_or_else(|e| panic!("{name}: {e}"));
+        let said = ran.told.log.join("\n");
+        assert!(said.contains("begins with") && !said.contains("fresh: "), "{name}: {said}");
+        assert_ne!(ran.output(), outputs[name], "{name}");
+        count += 1;
+    }
+    count
 }

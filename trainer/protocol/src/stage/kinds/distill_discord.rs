@@ -36,6 +36,10 @@ pub struct DistillDiscord {
     pub huber_c: f64,
     /// Decay of the target network.
     pub ema: f64,
+    /// Stage that gives the flow decoder whose weights the student begins with where their shapes fit, or a version such as `discord@prod`; empty
+    /// begins with the teacher's.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub init: String,
     /// The rest.
     #[serde(flatten)]
     pub training: Training,
@@ -56,6 +60,7 @@ impl Default for DistillDiscord {
             distance: Distance::Huber,
             huber_c: 0.5,
             ema: 0.95,
+            init: String::new(),
             training: Training { steps: Steps(48_000), lr: 2e-4, warmup: Steps(1_000), ..training },
         }
     }
@@ -73,6 +78,7 @@ impl StageSpec for DistillDiscord {
             Ref::stage("tokenizer", &mut self.tokenizer, ArtifactKind::Tokenizer).only_if(of_tokens),
             Ref::stage("vae", &mut self.vae, ArtifactKind::Vae).optional(),
             Ref::stage("teacher", &mut self.teacher, ArtifactKind::FlowDecoder),
+            Ref::init(&mut self.init, ArtifactKind::FlowDecoder, ArtifactKind::FlowDecoder),
         ]
     }
 

@@ -83,6 +83,10 @@ pub struct TrainControl {
     pub embedding: usize,
     /// The trajectory encoder's learning rate; 0 takes `lr`.
     pub trajectory_lr: f64,
+    /// Stage that gives a model whose control part training begins with where shapes fit, or a version such as `motionlcm@prod`; empty begins with the
+    /// denoiser's weights.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub init: String,
     /// The rest. Gradients of both networks are clipped together.
     #[serde(flatten)]
     pub training: Training,
@@ -102,6 +106,7 @@ impl Default for TrainControl {
             network: Network::default(),
             embedding: 256,
             trajectory_lr: 0.0,
+            init: String::new(),
             training: Training::published(192_000, 128, 1e-4),
         }
     }
@@ -118,6 +123,7 @@ impl StageSpec for TrainControl {
             Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
             Ref::stage("latents", &mut self.latents, ArtifactKind::Latents),
             Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
+            Ref::init(&mut self.init, ArtifactKind::Model, ArtifactKind::Control),
         ]
     }
 

@@ -117,6 +117,10 @@ pub struct TrainDiscord {
     pub solver_steps: usize,
     /// Exponential moving average of the weights that is kept as the result; 0 keeps the weights themselves.
     pub ema: f64,
+    /// Stage that gives a flow decoder whose weights training begins with where their shapes fit, or a version such as `discord@prod`; empty
+    /// begins with random ones.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub init: String,
     /// The rest. Published: 200 epochs of all windows with batches of 768, a cosine down to a fiftieth of the rate; here it ends at zero.
     #[serde(flatten)]
     pub training: Training,
@@ -136,6 +140,7 @@ impl Default for TrainDiscord {
             solver: FlowSolver::Midpoint,
             solver_steps: 15,
             ema: 0.999,
+            init: String::new(),
             training: Training {
                 steps: Steps(481_896),
                 batch: Batch { global: 768, slices: 16 },
@@ -161,6 +166,7 @@ impl StageSpec for TrainDiscord {
             Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
             Ref::stage("tokenizer", &mut self.tokenizer, ArtifactKind::Tokenizer).only_if(of_tokens),
             Ref::stage("vae", &mut self.vae, ArtifactKind::Vae).optional(),
+            Ref::init(&mut self.init, ArtifactKind::FlowDecoder, ArtifactKind::FlowDecoder),
         ]
     }
 

@@ -71,6 +71,10 @@ pub struct TrainEvaluator {
     pub margin: f64,
     /// Moving average of the weights that is kept as the result; 0 keeps the weights themselves.
     pub ema: f64,
+    /// Stage that gives an evaluator whose weights training begins with where their shapes fit, or a version such as `motionlcm@prod`; empty
+    /// begins with random ones.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub init: String,
     /// The rest. Gradients are clipped for each of the networks by itself.
     #[serde(flatten)]
     pub training: Training,
@@ -86,6 +90,7 @@ impl Default for TrainEvaluator {
             emphasis: 25.0,
             margin: 10.0,
             ema: 0.0,
+            init: String::new(),
             training: Training {
                 steps: Steps(300_000),
                 batch: Batch { global: 32, slices: 1 },
@@ -109,6 +114,7 @@ impl StageSpec for TrainEvaluator {
         vec![
             Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
             Ref::folder("words", &mut self.words).holding(&VOCABULARY, WORDS_ORIGIN),
+            Ref::init(&mut self.init, ArtifactKind::Evaluator, ArtifactKind::Evaluator),
         ]
     }
 

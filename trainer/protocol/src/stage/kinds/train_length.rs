@@ -16,6 +16,10 @@ pub struct TrainLength {
     pub text: String,
     /// Dropout probability before the second and the third layer.
     pub dropout: f64,
+    /// Stage that gives a length estimator whose weights training begins with where their shapes fit, or a version such as `motionlcm@prod`; empty
+    /// begins with random ones.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub init: String,
     /// The rest. Published: 300 epochs of HumanML3D with batches of 64.
     #[serde(flatten)]
     pub training: Training,
@@ -27,6 +31,7 @@ impl Default for TrainLength {
             dataset: "dataset".into(),
             text: "text".into(),
             dropout: 0.2,
+            init: String::new(),
             training: Training {
                 steps: Steps(110_000),
                 batch: Batch { global: 64, slices: 1 },
@@ -52,6 +57,7 @@ impl StageSpec for TrainLength {
         vec![
             Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
             Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
+            Ref::init(&mut self.init, ArtifactKind::Length, ArtifactKind::Length),
         ]
     }
 

@@ -3,7 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::stage::features::{check_diffusion, check_frames, check_neighbours, check_parameters};
+use crate::stage::features::{check_diffusion, check_frames, check_parameters};
 use crate::stage::{
     Batch, Decay, Diffusion, Family, FrequencyLosses, Neighbours, NoiseSchedule, Optimizer, Output, Prediction,
     Problems, Ref, Shape, Solver, StageSpec, Training,
@@ -65,7 +65,8 @@ pub struct TrainMdm {
     pub dataset: String,
     /// Stage that gives the caption embeddings.
     pub text: String,
-    /// Stage that gives a model of this kind whose weights training begins with; empty begins with random ones.
+    /// Stage that gives a model whose denoiser training begins with where shapes fit, or a version such as `motionlcm@prod`; empty begins with
+    /// random weights.
     pub init: String,
     /// Size.
     pub network: MdmNetwork,
@@ -129,7 +130,7 @@ impl StageSpec for TrainMdm {
         vec![
             Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
             Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
-            Ref::stage("init", &mut self.init, ArtifactKind::Model).optional(),
+            Ref::init(&mut self.init, ArtifactKind::Model, ArtifactKind::Denoiser),
             self.losses.reference(),
         ]
     }
@@ -145,7 +146,7 @@ impl StageSpec for TrainMdm {
     }
 
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
-        check_neighbours(p, stages, &self.dataset, &self.text, &self.init);
+        stages.same_captions(p, &self.text, &self.dataset);
     }
 
     fn training(&mut self) -> Option<&mut Training> {

@@ -19,7 +19,8 @@ pub struct TrainMld {
     pub latents: String,
     /// Stage that gives the caption embeddings.
     pub text: String,
-    /// Stage that gives a model of this kind whose weights training begins with; empty begins with random ones.
+    /// Stage that gives a model whose denoiser training begins with where shapes fit, or a version such as `motionlcm@prod`; empty begins with
+    /// random weights.
     pub init: String,
     /// Size.
     pub network: Network,
@@ -71,7 +72,7 @@ impl StageSpec for TrainMld {
             Ref::stage("vae", &mut self.vae, ArtifactKind::Vae),
             Ref::stage("latents", &mut self.latents, ArtifactKind::Latents),
             Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
-            Ref::stage("init", &mut self.init, ArtifactKind::Model).optional(),
+            Ref::init(&mut self.init, ArtifactKind::Model, ArtifactKind::Denoiser),
             self.losses.reference(),
         ]
     }

@@ -97,6 +97,10 @@ pub struct TrainTokenizer {
     pub window: usize,
     /// Which windows make an epoch.
     pub windows_of: WindowsOf,
+    /// Stage that gives a tokenizer whose weights training begins with where their shapes fit, or a version such as `momask@prod`; empty
+    /// begins with random ones.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub init: String,
     /// The rest. Published: MoMask 50 epochs with batches of 256 (about 360,000 steps), T2M-GPT and MMM 300,000 steps; both lower the rate in
     /// two steps near the end, here it follows a cosine.
     #[serde(flatten)]
@@ -117,6 +121,7 @@ impl Default for TrainTokenizer {
             loss: TokenizerLoss::default(),
             window: 64,
             windows_of: WindowsOf::Frames,
+            init: String::new(),
             training: Training {
                 steps: Steps(360_000),
                 batch: Batch { global: 256, slices: 8 },
@@ -137,7 +142,10 @@ impl StageSpec for TrainTokenizer {
     const OUTPUT: Output = Output { name: "tokenizer", kind: ArtifactKind::Tokenizer };
 
     fn refs(&mut self) -> Vec<Ref<'_>> {
-        vec![Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset)]
+        vec![
+            Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
+            Ref::init(&mut self.init, ArtifactKind::Tokenizer, ArtifactKind::Tokenizer),
+        ]
     }
 
     fn check(&self, p: &mut Problems) {

@@ -95,6 +95,10 @@ pub struct TrainTokens {
     pub corruption: f64,
     /// Masked: probability that the first layer's network sees no caption; half of what the other one has, 0.1 and 0.2 as published.
     pub guidance_dropout: f64,
+    /// Stage that gives a model whose generator training begins with where shapes fit, or a version such as `momask@prod`; empty begins with random
+    /// weights.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub init: String,
     /// The rest. Published: T2M-GPT and MMM 300,000 steps whose rate, 1e-4 and 2e-4, falls once, at half of them; here it follows a cosine.
     #[serde(flatten)]
     pub training: Training,
@@ -112,6 +116,7 @@ impl Default for TrainTokens {
             longest: 49,
             corruption: 0.5,
             guidance_dropout: 0.1,
+            init: String::new(),
             training: Training {
                 steps: Steps(300_000),
                 batch: Batch { global: 128, slices: 8 },
@@ -138,6 +143,7 @@ impl StageSpec for TrainTokens {
             Ref::stage("tokenizer", &mut self.tokenizer, ArtifactKind::Tokenizer),
             Ref::stage("text", &mut self.text, ArtifactKind::Embeddings),
             Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset).only_if(words),
+            Ref::init(&mut self.init, ArtifactKind::Model, ArtifactKind::TokenGenerator),
         ]
     }
 

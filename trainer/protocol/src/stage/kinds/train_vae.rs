@@ -66,6 +66,10 @@ pub struct TrainVae {
     pub windows: Windows,
     /// Exponential moving average of the weights that is kept as the result; 0 keeps the weights themselves.
     pub ema: f64,
+    /// Stage that gives a VAE whose weights training begins with where their shapes fit, or a version such as `motionlcm@prod`; empty
+    /// begins with random ones.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub init: String,
     /// The rest.
     #[serde(flatten)]
     pub training: Training,
@@ -80,6 +84,7 @@ impl Default for TrainVae {
             loss: VaeLoss::default(),
             windows: Windows::default(),
             ema: 0.0,
+            init: String::new(),
             training: Training::published(1_150_000, 128, 2e-4),
         }
     }
@@ -91,7 +96,10 @@ impl StageSpec for TrainVae {
     const OUTPUT: Output = Output { name: "vae", kind: ArtifactKind::Vae };
 
     fn refs(&mut self) -> Vec<Ref<'_>> {
-        vec![Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset)]
+        vec![
+            Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
+            Ref::init(&mut self.init, ArtifactKind::Vae, ArtifactKind::Vae),
+        ]
     }
 
     fn check(&self, p: &mut Problems) {

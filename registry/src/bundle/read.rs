@@ -1,0 +1,360 @@
+//! Reads a bundle as it comes, and believes nothing of it.
+//!
+//! Memory is bounded by the decompressor's window and by the manifests, which are bounded themselves; files go on to a [`Sink`] piece by
+//! piece. What is unpacked is bounded by what the manifest announces, of which each file is read once: a small archive that unpacks without
+//! end is left at the first byte too many.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::Read;
+use std::path::{Component, Path};
+
+use checkpoint::BlobError;
+use checkpoint::model::{self, Model};
+use protocol::artifact::{FileEntry, Role};
+use protocol::digest::Hasher;
+use protocol::id::is_name;
+use protocol::{ArtifactKind, Digest, Manifest, limits, printable};
+use serde::Deserialize;
+use tar::{Archive, EntryType};
+use zstd::stream::read::Decoder;
+
+use super::{Bundle, BundleError, CARD, FILES, FORMAT, HEAD, Head, MANIFEST, MANIFESTS_BYTES, TEXT_BYTES, WINDOW_LOG};
+
+/// Bytes that are read at a time.
+const PIECE: usize = 1 << 16;
+/// Zeros that may stand behind the archive: tar pads to records of 10 KiB.
+const PADDING: u64 = 1 << 16;
+/// How every zstd frame begins.
+const MAGIC: [u8; 4] = [0x28, 0xb5, 0x2f, 0xfd];
+
+type Result<T> = std::result::Result<T, BundleError>;
+
+/// Takes the files of a bundle, one after the other. `()` only has them verified.
+pub trait Sink {
+    /// A file of `bytes` bytes begins that is said to be `digest`.
+    fn begin(&mut self, digest: Digest, bytes: u64) -> std::result::Result<(), BlobError>;
+    /// Its next bytes.
+    fn write(&mut self, piece: &[u8]) -> std::result::Result<(), BlobError>;
+    /// It is whole, and is `digest`.
+    fn end(&mut self, digest: Digest) -> std::result::Result<(), BlobError>;
+}
+
+impl Sink for () {
+    fn begin(&mut self, _: Digest, _: u64) -> std::result::Result<(), BlobError> {
+        Ok(())
+    }
+
+    fn write(&mut self, _: &[u8]) -> std::result::Result<(), BlobError> {
+        Ok(())
+    }
+
+    fn end(&mut self, _: Digest) -> std::result::Result<(), BlobError> {
+        Ok(())
+    }
+}
+
+/// Reads a whole bundle and gives its files, the manifest first, to `sink`. When it returns, every file of the manifest has been given, with
+/// the length and the digest that it has there, and the parts make the model.
+///
+/// # Errors
+/// The first thing that is wrong. What the sink was given before is of no use then.
+pub fn read(reader: impl Read, sink: &mut impl Sink) -> Result<Bundle> {
+    let mut reader = reader;
+    let mut magic = [0; 4];
+    reader.read_exact(&mut magic).map_err(|_| BundleError::NotABundle("it has fewer than 4 bytes".into()))?;
+    if magic != MAGIC {
+        return Err(BundleError::NotABundle(
+            "it is not compressed with zstd; expected a file of `registry export`".into(),
+        ));
+    }
+    let mut decoder = Decoder::new(magic.as_slice().chain(reader)).map_err(|e| unreadable(&e))?;
+    decoder.window_log_max(WINDOW_LOG).map_err(|e| unreadable(&e))?;
+    let mut archive = Archive::new(decoder);
+    let mut reading = Reading::default();
+    // Raw: extensions, which hold names of any length, come as entries of their own and are refused as such.
+    for (number, entry) in archive.entries().map_err(|e| unreadable(&e))?.raw(true).enumerate() {
+        let mut entry = entry.map_err(|e| reading.cut(&e))?;
+        let name = name(number, &entry)?;
+        let bytes = entry.size();
+        reading.entry(number, &name, bytes, &mut entry, sink)?;
+    }
+    let padding = archive.into_inner();
+    check_padding(padding)?;
+    reading.finish()
+}
+
+/// The name of an entry, which must be a regular file.
+fn name<R: Read>(number: usize, entry: &tar::Entry<'_, R>) -> Result<String> {
+    let bytes = entry.path_bytes();
+    let shown = printable(&String::from_utf8_lossy(&bytes)).into_owned();
+    let refuse = |why: &str| Err(BundleError::Entry { entry: shown.clone(), why: why.to_owned() });
+    match entry.header().entry_type() {
+        EntryType::Regular => {}
+        EntryType::Symlink | EntryType::Link => return refuse("it is a link; expected files only"),
+        EntryType::Directory => return refuse("it is a folder; expected files only"),
+        EntryType::GNULongName | EntryType::GNULongLink | EntryType::XHeader | EntryType::XGlobalHeader => {
+            return refuse(
+                "it is an extension of the tar format; expected plain entries with names of at most 255 bytes",
+            );
+        }
+        _ => return refuse("it is neither file nor folder; expected files only"),
+    }
+    let Ok(name) = std::str::from_utf8(&bytes) else { return refuse("its name is no UTF-8 text") };
+    if let Err(why) = check_name(name) {
+        return refuse(why);
+    }
+    if number == 0 && name != HEAD {
+        return Err(BundleError::NotABundle(format!("it begins with `{shown}`; expected `{HEAD}`")));
+    }
+    Ok(name.to_owned())
+}
+
+/// Whether a name stays in its folder wherever it is unpacked.
+fn check_name(name: &str) -> std::result::Result<(), &'static str> {
+    if name.is_empty() {
+        return Err("it has no name");
+    }
+    if name.starts_with('/') || name.starts_with('\\') || name.contains(':') {
+        return Err("its name is absolute; expected one within the bundle");
+    }
+    if name.split('/').any(|part| part == "..") {
+        return Err("its name has `..`, which leads out of the bundle");
+    }
+    let normal = Path::new(name).components().all(|part| matches!(part, Component::Normal(_)));
+    if !normal || name.contains('\\') || name.contains("//") || name.chars().any(char::is_control) {
+        return Err("its name is not one of a file within the bundle");
+    }
+    Ok(())
+}
+
+/// What has been read.
+#[derive(Default)]
+struct Reading {
+    head: Option<Head>,
+    manifest: Option<(Manifest, Model)>,
+    card: Option<String>,
+    /// Manifests of parts.
+    parts: BTreeMap<Role, Manifest>,
+    /// Bytes of manifests that were read.
+    manifests: u64,
+    seen: BTreeSet<String>,
+}
+
+impl Reading {
+    fn entry(
+        &mut self,
+        number: usize,
+        name: &str,
+        bytes: u64,
+        from: &mut impl Read,
+        sink: &mut impl Sink,
+    ) -> Result<()> {
+        let refuse = |why: String| BundleError::Entry { entry: name.to_owned(), why };
+        if !self.seen.insert(name.to_owned()) {
+            return Err(refuse("it stands twice in the bundle".into()));
+        }
+        match (number, name) {
+            (0, HEAD) => {
+                self.head = Some(head(&small(name, bytes, TEXT_BYTES, from)?)?);
+                Ok(())
+            }
+            (1, MANIFEST) => {
+                let content = small(name, bytes, MANIFESTS_BYTES, from)?;
+                self.manifests += bytes;
+                let expected = self.head.as_ref().map(|head| head.artifact);
+                let found = Digest::of(&content);
+                if expected != Some(found) {
+                    let expected = expected.map_or_else(|| "none".into(), |digest| digest.short());
+                    return Err(refuse(format!("it has digest {}, and `{HEAD}` says {expected}", found.short())));
+                }
+                let manifest = manifest(name, &content)?;
+                let model = Model::read(&manifest).map_err(|e| refuse(e.to_string()))?;
+                check_files(&manifest, &model).map_err(refuse)?;
+                sink.begin(found, bytes)?;
+                sink.write(&content)?;
+                sink.end(found)?;
+                self.manifest = Some((manifest, model));
+                Ok(())
+            }
+            (1, _) => Err(refuse(format!("it stands second; expected `{MANIFEST}`"))),
+            (_, CARD) => {
+                let content = small(name, bytes, TEXT_BYTES, from)?;
+                let text = String::from_utf8(content).map_err(|_| refuse("it is no UTF-8 text".into()))?;
+                self.card = Some(text);
+                Ok(())
+            }
+            _ => self.file(name, bytes, from, sink),
+        }
+    }
+
+    /// A file of the manifest.
+    fn file(&mut self, name: &str, bytes: u64, from: &mut impl Read, sink: &mut impl Sink) -> Result<()> {
+        let refuse = |why: String| BundleError::Entry { entry: name.to_owned(), why };
+        let known = self.manifest.as_ref().and_then(|(manifest, model)| Some((manifest.files.get(name)?, model)));
+        let Some((FileEntry { digest, bytes: expected }, model)) = known else {
+            return Err(refuse(format!("`{MANIFEST}` knows no such file")));
+        };
+        if bytes != *expected {
+            return Err(refuse(format!("it has {bytes} bytes, and `{MANIFEST}` says {expected}")));
+        }
+        let role = name.strip_suffix("/manifest.json").and_then(|role| Role::try_from(role.to_owned()).ok());
+        let role = role.filter(|role| model.parts.contains_key(role));
+        let mut kept = role.as_ref().map(|_| Vec::new());
+        if kept.is_some() {
+            self.manifests += bytes;
+            if self.manifests > MANIFESTS_BYTES {
+                return Err(refuse(format!("the manifests have more than {MANIFESTS_BYTES} bytes together")));
+            }
+        }
+        sink.begin(*digest, bytes)?;
+        let mut hasher = Hasher::default();
+        let mut piece = vec![0; PIECE];
+        let mut left = bytes;
+        while left > 0 {
+            let most = usize::try_from(left).unwrap_or(PIECE).min(PIECE);
+            let count = from.read(&mut piece[..most]).map_err(|e| refuse(format!("it cannot be unpacked: {e}")))?;
+            if count == 0 {
+                return Err(refuse(format!("it is cut: {left} of its {bytes} bytes are missing")));
+            }
+            left -= count as u64;
+            hasher.update(&piece[..count]);
+            sink.write(&piece[..count])?;
+            if let Some(kept) = &mut kept {
+                kept.extend_from_slice(&piece[..count]);
+            }
+        }
+        let found = hasher.finish();
+        if found != *digest {
+            return Err(refuse(format!(
+                "its bytes hash to {}, and `{MANIFEST}` says {}",
+                found.short(),
+                digest.short()
+            )));
+        }
+        sink.end(*digest)?;
+        if let (Some(role), Some(content)) = (role, kept) {
+            self.parts.insert(role, manifest(name, &content)?);
+        }
+        Ok(())
+    }
+
+    /// What an archive that does not go on means.
+    fn cut(&self, error: &std::io::Error) -> BundleError {
+        if self.seen.is_empty() {
+            unreadable(error)
+        } else {
+            BundleError::Damaged(format!("the archive is damaged: {error}"))
+        }
+    }
+
+    fn finish(self) -> Result<Bundle> {
+        let missing = |name: &str| BundleError::Damaged(format!("the bundle has no `{name}`: it is cut, or no bundle"));
+        let head = self.head.ok_or_else(|| missing(HEAD))?;
+        let (manifest, model) = self.manifest.ok_or_else(|| missing(MANIFEST))?;
+        if let Some(name) = manifest.files.keys().find(|name| !self.seen.contains(*name)) {
+            return Err(missing(name));
+        }
+        // Put together anew, of the parts as they say that they are.
+        let whole = model::assemble(&model.generator, model.format, &self.parts);
+        let whole = whole.map_err(|e| BundleError::Damaged(format!("its parts make no model: {e}")))?;
+        let made = Model::read(&whole).map_err(|e| BundleError::Damaged(e.to_string()))?;
+        if whole.files != manifest.files || made.parts != model.parts {
+            let why = format!("the files of `{MANIFEST}` are not those that the manifests of its parts list");
+            return Err(BundleError::Damaged(why));
+        }
+        Ok(Bundle { head, manifest, card: self.card })
+    }
+}
+
+/// An entry that is read into memory.
+fn small(name: &str, bytes: u64, most: u64, from: &mut impl Read) -> Result<Vec<u8>> {
+    let refuse = |why: String| BundleError::Entry { entry: name.to_owned(), why };
+    if bytes > most {
+        return Err(refuse(format!("it has {bytes} bytes; expected at most {most}")));
+    }
+    let mut content = Vec::new();
+    from.take(bytes).read_to_end(&mut content).map_err(|e| refuse(format!("it cannot be unpacked: {e}")))?;
+    if content.len() as u64 != bytes {
+        return Err(refuse(format!("it is cut: {} of its {bytes} bytes are missing", bytes - content.len() as u64)));
+    }
+    Ok(content)
+}
+
+fn head(content: &[u8]) -> Result<Head> {
+    #[derive(Deserialize)]
+    struct Format {
+        format: u64,
+    }
+    let malformed =
+        |e: serde_json::Error| BundleError::Entry { entry: HEAD.into(), why: format!("it does not read: {e}") };
+    let Format { format } = serde_json::from_slice(content).map_err(malformed)?;
+    if format != u64::from(FORMAT) {
+        return Err(BundleError::Newer { found: format });
+    }
+    let head: Head = serde_json::from_slice(content).map_err(malformed)?;
+    if !is_name(head.model.as_str()) {
+        let why = format!("`model` is {:?}, no name of a model", printable(head.model.as_str()));
+        return Err(BundleError::Entry { entry: HEAD.into(), why });
+    }
+    Ok(head)
+}
+
+fn manifest(name: &str, content: &[u8]) -> Result<Manifest> {
+    let refuse = |why: String| BundleError::Entry { entry: name.to_owned(), why };
+    let manifest: Manifest = serde_json::from_slice(content)
+        .map_err(|e| refuse(format!("it is not a manifest that this build reads: {e}")))?;
+    if manifest.format != Manifest::FORMAT {
+        let (found, known) = (manifest.format, Manifest::FORMAT);
+        return Err(refuse(format!("it has format {found}, and this build reads {known}; use a newer build")));
+    }
+    // A blob's name is the digest of its bytes, and a part's manifest is named by that of what was read.
+    if manifest.to_bytes() != content {
+        return Err(refuse("it is not written as manifests are, in canonical JSON".into()));
+    }
+    Ok(manifest)
+}
+
+/// What the model's manifest announces, before any of it is read.
+fn check_files(manifest: &Manifest, model: &Model) -> std::result::Result<(), String> {
+    if manifest.files.len() > FILES {
+        return Err(format!("it lists {} files; expected at most {FILES}", manifest.files.len()));
+    }
+    let mut total = 0u64;
+    for (name, entry) in &manifest.files {
+        check_name(name).map_err(|why| format!("it lists `{}`: {why}", printable(name)))?;
+        if [HEAD, MANIFEST, CARD].contains(&name.as_str()) {
+            return Err(format!("it lists `{name}`, which is a name of the bundle itself"));
+        }
+        if entry.bytes > limits::BLOB_BYTES as u64 {
+            let most = limits::BLOB_BYTES;
+            return Err(format!("it lists `{}` of {} bytes; expected at most {most}", printable(name), entry.bytes));
+        }
+        total = total.saturating_add(entry.bytes);
+    }
+    if total > limits::BUNDLE_BYTES as u64 {
+        return Err(format!("its files have {total} bytes; expected at most {}", limits::BUNDLE_BYTES));
+    }
+    for (role, digest) in &model.parts {
+        let name = format!("{role}/manifest.json");
+        if manifest.files.get(&name).map(|entry| entry.digest) != Some(*digest) {
+            return Err(format!("its part `{role}` is {}, and it lists no `{name}` of this digest", digest.short()));
+        }
+    }
+    if manifest.kind == ArtifactKind::Model { Ok(()) } else { Err("it is of no model".into()) }
+}
+
+/// Behind the archive stand zeros, and not many.
+fn check_padding(rest: impl Read) -> Result<()> {
+    let mut padding = Vec::new();
+    rest.take(PADDING + 1)
+        .read_to_end(&mut padding)
+        .map_err(|e| BundleError::Damaged(format!("its end is damaged: {e}")))?;
+    if padding.len() as u64 > PADDING || padding.iter().any(|byte| *byte != 0) {
+        return Err(BundleError::Damaged("something stands behind the end of the archive".into()));
+    }
+    Ok(())
+}
+
+fn unreadable(error: &std::io::Error) -> BundleError {
+    BundleError::NotABundle(format!("it cannot be unpacked: {error}"))
+}

@@ -1,0 +1,126 @@
+//! `registry export -o FILE.tar.zst` and `registry import`: a version on its way out of a store in one file, and into another one.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::{self, BufWriter};
+use std::path::{Path, PathBuf};
+
+use checkpoint::model::Model;
+use protocol::artifact::Role;
+use protocol::message::ApiError;
+use protocol::{Manifest, ModelName};
+
+use super::export::{Source, whole};
+use super::{Answer, Data, error};
+use crate::bundle::{self, BundleError, Head, ImportError, Writer};
+use crate::{Store, Version};
+
+/// Writes a version to `file`, which must not exist; returns the names of the model's files. A file that is not whole is never there
+/// under its name.
+pub(super) async fn export(source: &impl Source, version: &Version, file: &Path) -> Result<Vec<String>, ApiError> {
+    let refuse = |why: &str| {
+        let hint = "name a file that does not exist, in a folder that does";
+        error("invalid", format!("`{}` {why}", file.display()), Some(hint))
+    };
+    if fs::symlink_metadata(file).is_ok() {
+        return Err(refuse("exists already"));
+    }
+    let Some(name) = file.file_name() else { return Err(refuse("is no name of a file")) };
+    let part = file.with_file_name(format!(".{}.{}.part", name.to_string_lossy(), std::process::id()));
+    let unwritten = |e: &io::Error| error("storage", format!("failed to write `{}`: {e}", part.display()), None);
+    let part = Part(part.clone());
+    let created = File::create_new(&part.0).map_err(|e| unwritten(&e))?;
+    let names = write(source, version, created).await?;
+    fs::rename(&part.0, file).map_err(|e| unwritten(&e))?;
+    Ok(names)
+}
+
+/// A file in the making, which goes with this unless it got its name before.
+struct Part(PathBuf);
+
+impl Drop for Part {
+    fn drop(&mut self) {
+        // It has its name, or there is nobody to tell.
+        let _ = fs::remove_file(&self.0);
+    }
+}
+
+async fn write(source: &impl Source, version: &Version, file: File) -> Result<Vec<String>, ApiError> {
+    let damaged = |e: &dyn std::fmt::Display| error("damaged", e, Some("`registry fsck` checks the store"));
+    let manifest: Manifest = read(source, version.artifact).await?;
+    let model = Model::read(&manifest).map_err(|e| damaged(&e))?;
+    let mut parts = BTreeMap::<Role, Manifest>::new();
+    for (role, digest) in &model.parts {
+        parts.insert(role.clone(), read(source, *digest).await?);
+    }
+    let head = Head {
+        format: bundle::FORMAT,
+        model: version.model.clone(),
+        version: version.version,
+        artifact: version.artifact,
+        metrics: version
+            .metrics
+            .iter()
+            .map(|(name, value)| (name.clone(), value.is_finite().then_some(*value)))
+            .collect(),
+        source: version.source.clone(),
+    };
+    let card = bundle::card(version, &manifest, &model, &parts);
+    let failed = |e: bundle::WriteError| match e {
+        bundle::WriteError::Io(e) => error("storage", e, None),
+        bundle::WriteError::Content(why) => damaged(&why),
+    };
+    let mut writer = Writer::begin(BufWriter::new(file), &head, &manifest, &card).map_err(failed)?;
+    for (name, entry) in &manifest.files {
+        writer.file(name, entry.bytes).map_err(failed)?;
+        let mut write = |piece: &[u8]| writer.write(piece).map_err(io::Error::other);
+        whole(source, entry.digest, &mut write).await?;
+    }
+    let file = writer.finish().map_err(failed)?.into_inner().map_err(|e| error("storage", e.error(), None))?;
+    file.sync_all().map_err(|e| error("storage", e, None))?;
+    Ok(manifest.files.into_keys().collect())
+}
+
+/// A manifest, whose bytes are those that its digest names.
+async fn read(source: &impl Source, digest: protocol::Digest) -> Result<Manifest, ApiError> {
+    let mut bytes = Vec::new();
+    let mut keep = |piece: &[u8]| {
+        bytes.extend_from_slice(piece);
+        if bytes.len() as u64 > bundle::MANIFESTS_BYTES {
+            return Err(io::Error::other(format!("manifest {digest} has more than {} bytes", bundle::MANIFESTS_BYTES)));
+        }
+        Ok(())
+    };
+    whole(source, digest, &mut keep).await?;
+    serde_json::from_slice(&bytes).map_err(|e| error("damaged", e, Some("`registry fsck` checks the store")))
+}
+
+/// Registers what a bundle's file holds in a store that this process holds, as `model` or as it was called there. Messages call the file
+/// `shown`.
+pub async fn import(store: &Store, file: &Path, shown: &str, model: Option<&str>) -> Answer {
+    let model = match model.map(str::parse::<ModelName>).transpose() {
+        Ok(model) => model,
+        Err(e) => return Answer::refused(error("invalid", e, Some("`--model NAME` gives it another name"))),
+    };
+    match store.import_bundle(file, model).await {
+        Ok(version) => Answer::done(Data::Imported { version, file: shown.to_owned() }),
+        Err(ImportError::Write(e)) => Answer::from(e),
+        Err(ImportError::Query(e)) => Answer::from(e),
+        Err(ImportError::File(e)) => Answer::refused(error("invalid", format!("`{shown}`: {e}"), None)),
+        Err(ImportError::Bundle(e)) => {
+            let code = match &e {
+                BundleError::NotABundle(_) | BundleError::Newer { .. } => "invalid",
+                BundleError::Entry { .. } | BundleError::Damaged(_) => "damaged",
+                BundleError::Blob(_) => "storage",
+            };
+            let hint = match code {
+                "damaged" => Some("nothing was registered; export the version again, and compare the files' digests"),
+                "invalid" => {
+                    Some("nothing was registered; `registry export MODEL@ALIAS -o FILE.tar.zst` writes a bundle")
+                }
+                _ => None,
+            };
+            Answer::refused(error(code, format!("`{shown}`: {e}"), hint))
+        }
+    }
+}

@@ -1,0 +1,362 @@
+//! Bundles that are whole, and each way in which one is not.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use std::collections::BTreeMap;
+use std::io::{self, Read, Write as _};
+
+use checkpoint::BlobError;
+
+use checkpoint::model::{Model, assemble, extend};
+use protocol::artifact::{FileEntry, Role};
+use protocol::stage::{DataFormat, Sampler};
+use protocol::{ArtifactKind, Digest, Manifest, ModelName};
+use registry::bundle::{FORMAT, Head, Sink, Writer, card, read};
+use registry::{Holder, Store, Version};
+use serde_json::{Value, json};
+use tar::{EntryType, Header};
+
+const HEAD: &str = "bundle.json";
+const MANIFEST: &str = "manifest.json";
+const CARD: &str = "card.md";
+
+/// A model of two parts whose files are `files`.
+struct Whole {
+    head: Head,
+    manifest: Manifest,
+    files: BTreeMap<Digest, Vec<u8>>,
+}
+
+fn part(kind: ArtifactKind, meta: Value, name: &str, bytes: &[u8]) -> Manifest {
+    let mut manifest = Manifest::new(kind, meta);
+    manifest.files.insert(name.into(), FileEntry { digest: Digest::of(bytes), bytes: bytes.len() as u64 });
+    manifest
+}
+
+fn whole() -> Whole {
+    let (weights, other) = (vec![7; 100_000], b"some weights".to_vec());
+    let vae =
+        part(ArtifactKind::Vae, json!({"features": 263, "mean": [0.5], "std": [1.0]}), "model.safetensors", &weights);
+    let text = Manifest::new(ArtifactKind::TextEncoder, json!({"encoder": "hashed", "dim": 4}));
+    let fits = json!({"vae": vae.digest(), "text": text.digest()});
+    let denoiser = part(ArtifactKind::Denoiser, json!({"fits": fits}), "model.safetensors", &other);
+    let parts = BTreeMap::from([(Role::VAE, vae), (Role::TEXT, text), (Role::DENOISER, denoiser)]);
+    let manifest = assemble("latent-diffusion", DataFormat::Humanml3d, &parts).unwrap();
+    let manifest = extend(&manifest, Some(&Sampler::default()), &BTreeMap::new()).unwrap();
+    let mut files: BTreeMap<Digest, Vec<u8>> = parts.values().map(|part| (part.digest(), part.to_bytes())).collect();
+    files.extend([weights, other].map(|bytes| (Digest::of(&bytes), bytes)));
+    let metrics = BTreeMap::from([("fid".to_owned(), Some(0.25)), ("odd".to_owned(), None)]);
+    let source = json!({"run": "r-1", "stage": "lcm", "metric": "fid", "mode": "min"});
+    let model = ModelName::new("quick");
+    let head = Head { format: FORMAT, model, version: 3, artifact: manifest.digest(), metrics, source };
+    Whole { head, manifest, files }
+}
+
+impl Whole {
+    fn version(&self) -> Version {
+        Version {
+            model: self.head.model.clone(),
+            version: self.head.version,
+            artifact: self.head.artifact,
+            metrics: BTreeMap::from([
+                ("fid".to_owned(), 0.25),
+                ("fid.lower".to_owned(), 0.2),
+                ("fid.upper".to_owned(), 0.3),
+            ]),
+            source: self.head.source.clone(),
+            created_ms: 0,
+            aliases: Vec::new(),
+        }
+    }
+
+    fn card(&self) -> String {
+        let model = Model::read(&self.manifest).unwrap();
+        let parts = model
+            .parts
+            .iter()
+            .map(|(role, digest)| (role.clone(), serde_json::from_slice(&self.files[digest]).unwrap()));
+        card(&self.version(), &self.manifest, &model, &parts.collect())
+    }
+
+    fn bytes(&self) -> Vec<u8> {
+        let mut writer = Writer::begin(Vec::new(), &self.head, &self.manifest, &self.card()).unwrap();
+        for (name, entry) in &self.manifest.files {
+            writer.file(name, entry.bytes).unwrap();
+            for piece in self.files[&entry.digest].chunks(1000) {
+                writer.write(piece).unwrap();
+            }
+        }
+        writer.finish().unwrap()
+    }
+
+    /// Its entries, in order, to be changed and packed again.
+    fn entries(&self) -> Vec<(String, EntryType, Vec<u8>)> {
+        let mut all = vec![
+            (HEAD.to_owned(), EntryType::Regular, serde_json::to_vec(&self.head).unwrap()),
+            (MANIFEST.to_owned(), EntryType::Regular, self.manifest.to_bytes()),
+            (CARD.to_owned(), EntryType::Regular, b"# a card\n".to_vec()),
+        ];
+        let file = |(name, entry): (&String, &FileEntry)| {
+            (name.clone(), EntryType::Regular, self.files[&entry.digest].clone())
+        };
+        all.extend(self.manifest.files.iter().map(file));
+        all
+    }
+}
+
+/// An archive of entries whose names nobody checks.
+fn packed(entries: &[(String, EntryType, Vec<u8>)]) -> Vec<u8> {
+    let mut tar = Vec::new();
+    for (name, kind, content) in entries {
+        let mut header = Header::new_ustar();
+        header.as_old_mut().name[..name.len()].copy_from_slice(name.as_bytes());
+        header.set_entry_type(*kind);
+        header.set_size(content.len() as u64);
+        header.set_cksum();
+        tar.extend_from_slice(header.as_bytes());
+        tar.extend_from_slice(content);
+        tar.resize(tar.len().next_multiple_of(512), 0);
+    }
+    tar.resize(tar.len() + 1024, 0);
+    zstd::encode_all(&tar[..], 1).unwrap()
+}
+
+/// Takes files into memory.
+#[derive(Default)]
+struct Kept {
+    open: Vec<u8>,
+    files: BTreeMap<Digest, Vec<u8>>,
+}
+
+impl Sink for Kept {
+    fn begin(&mut self, _: Digest, _: u64) -> Result<(), BlobError> {
+        self.open.clear();
+        Ok(())
+    }
+
+    fn write(&mut self, piece: &[u8]) -> Result<(), BlobError> {
+        self.open.extend_from_slice(piece);
+        Ok(())
+    }
+
+    fn end(&mut self, digest: Digest) -> Result<(), BlobError> {
+        self.files.insert(digest, std::mem::take(&mut self.open));
+        Ok(())
+    }
+}
+
+fn refused(bytes: &[u8]) -> String {
+    read(bytes, &mut ()).unwrap_err().to_string()
+}
+
+#[test]
+fn what_is_written_is_read() {
+    let whole = whole();
+    let bytes = whole.bytes();
+    assert_eq!(whole.bytes(), bytes, "one version, one file");
+    let mut kept = Kept::default();
+    let found = read(&bytes[..], &mut kept).unwrap();
+    assert_eq!((&found.head, &found.manifest), (&whole.head, &whole.manifest));
+    let mut expected = whole.files.clone();
+    expected.insert(whole.manifest.digest(), whole.manifest.to_bytes());
+    assert_eq!(kept.files, expected);
+    let card = found.card.unwrap();
+    for part in
+        ["# quick, version 3", "| `vae` | a VAE |", "encoder hashed", "263 features", "fid", "--model quick@latest"]
+    {
+        assert!(card.contains(part), "`{part}` is missing in\n{card}");
+    }
+    // A reader that gives a byte at a time, and one packed by other hands.
+    struct Slow<'a>(&'a [u8]);
+    impl Read for Slow<'_> {
+        fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+            let count = out.len().min(1);
+            self.0.read(&mut out[..count])
+        }
+    }
+    assert_eq!(read(Slow(&bytes), &mut ()).unwrap().head, whole.head);
+    assert_eq!(read(&packed(&whole.entries())[..], &mut ()).unwrap().head, whole.head);
+}
+
+#[test]
+fn every_cut_and_every_changed_byte_is_found() {
+    let bytes = whole().bytes();
+    for length in (0..bytes.len()).step_by(7) {
+        let cut = refused(&bytes[..length]);
+        assert!(!cut.is_empty(), "{length}");
+    }
+    let mut unharmed = 0;
+    for at in (0..bytes.len()).step_by(11) {
+        let mut changed = bytes.clone();
+        changed[at] ^= 0x10;
+        // A few bits of the compression's own frame say nothing.
+        if let Ok(found) = read(&changed[..], &mut ()) {
+            assert_eq!(found.manifest, whole().manifest);
+            unharmed += 1;
+        }
+    }
+    assert!(unharmed < 5, "{unharmed}");
+}
+
+#[test]
+fn entries_that_would_do_harm_are_refused() {
+    let whole = whole();
+    let file = |name: &str, kind: EntryType, content: &[u8]| (name.to_owned(), kind, content.to_vec());
+    let regular = EntryType::Regular;
+    for (entry, words) in [
+        (file("../../etc/passwd", regular, b"x"), "`..`"),
+        (file("vae/../../x", regular, b"x"), "`..`"),
+        (file("/etc/passwd", regular, b"x"), "absolute"),
+        (file("C:\\x", regular, b"x"), "absolute"),
+        (file("vae//x", regular, b"x"), "not one of a file within"),
+        (file("./card.md", regular, b"x"), "not one of a file within"),
+        (file("vae/\u{7}x", regular, b"x"), "not one of a file within"),
+        (file("vae/link", EntryType::Symlink, b""), "a link"),
+        (file("vae/link", EntryType::Link, b""), "a link"),
+        (file("vae", EntryType::Directory, b""), "a folder"),
+        (file("vae/pipe", EntryType::Fifo, b""), "neither file nor folder"),
+        (file("././@LongLink", EntryType::GNULongName, &[b'a'; 4096]), "an extension"),
+        (file("pax", EntryType::XHeader, b"12 path=../x\n"), "an extension"),
+        (file("unknown.bin", regular, b"x"), "knows no such file"),
+        (file("vae/model.safetensors", regular, b"x"), "it has 1 bytes"),
+        (file("vae/model.safetensors", regular, &[8; 100_000]), "its bytes hash to"),
+    ] {
+        // In the place of the card, before the files.
+        let mut entries = whole.entries();
+        let name = entry.0.clone();
+        entries[2] = entry;
+        let shown = refused(&packed(&entries));
+        assert!(shown.contains(words), "{name}: {shown}");
+        assert!(!shown.contains('\u{7}'), "{shown:?}");
+    }
+    let mut twice = whole.entries();
+    twice.push(twice[4].clone());
+    assert!(refused(&packed(&twice)).contains("stands twice"));
+    let mut order = whole.entries();
+    order.swap(0, 1);
+    assert!(refused(&packed(&order)).contains("expected `bundle.json`"));
+    order = whole.entries();
+    order.swap(1, 2);
+    assert!(refused(&packed(&order)).contains("expected `manifest.json`"));
+    for gone in 0..whole.entries().len() {
+        let mut entries = whole.entries();
+        let (name, ..) = entries.remove(gone);
+        let read = read(&packed(&entries)[..], &mut ());
+        assert_eq!(read.is_ok(), name == CARD, "{name}");
+    }
+}
+
+#[test]
+fn heads_and_manifests_that_this_build_does_not_read_are_refused() {
+    let whole = whole();
+    let with = |change: &dyn Fn(&mut Value)| {
+        let mut entries = whole.entries();
+        let mut head = serde_json::to_value(&whole.head).unwrap();
+        change(&mut head);
+        entries[0].2 = serde_json::to_vec(&head).unwrap();
+        packed(&entries)
+    };
+    let newer = refused(&with(&|head| *head = json!({"format": 2, "other": true})));
+    assert!(newer.contains("format 2") && newer.contains("newer build"), "{newer}");
+    assert!(refused(&with(&|head| head["model"] = json!("../x"))).contains("no name of a model"));
+    assert!(refused(&with(&|head| head["artifact"] = json!(Digest::of(b"x")))).contains("`bundle.json` says"));
+    assert!(refused(&with(&|head| head["metrics"] = json!("many"))).contains("does not read"));
+
+    // Manifests, with a head that knows them.
+    let with = |change: &dyn Fn(&mut Manifest), raw: &dyn Fn(String) -> String| {
+        let mut entries = whole.entries();
+        let mut manifest = whole.manifest.clone();
+        change(&mut manifest);
+        let bytes = raw(String::from_utf8(manifest.to_bytes()).unwrap()).into_bytes();
+        entries[0].2 = serde_json::to_vec(&Head { artifact: Digest::of(&bytes), ..whole.head.clone() }).unwrap();
+        entries[1].2 = bytes;
+        refused(&packed(&entries))
+    };
+    let same = |text: String| text;
+    let unknown = with(&|_| {}, &|text| text.replace("\"kind\":\"model\"", "\"kind\":\"hologram\""));
+    assert!(unknown.contains("hologram"), "{unknown}");
+    assert!(with(&|m| m.kind = ArtifactKind::Vae, &same).contains("is no model"));
+    assert!(with(&|m| m.format = 9, &same).contains("format 9"));
+    assert!(with(&|_| {}, &|text| format!("{text} ")).contains("canonical JSON"));
+    let entry = |bytes| FileEntry { digest: Digest::of(b"x"), bytes };
+    let lists = |name: &'static str, bytes: u64| with(&move |m| drop(m.files.insert(name.into(), entry(bytes))), &same);
+    assert!(lists("../x", 1).contains("`..`"));
+    assert!(lists("card.md", 1).contains("a name of the bundle itself"));
+    assert!(lists("vae/huge", u64::MAX).contains("expected at most"));
+    // Announced and never there; and there, but of no part.
+    assert!(lists("vae/zzz", 1).contains("`vae/zzz`"));
+    assert!(with(&|m| drop(m.files.remove("vae/manifest.json")), &same).contains("lists no `vae/manifest.json`"));
+    let mut entries = whole.entries();
+    let mut manifest = whole.manifest.clone();
+    manifest.files.insert("vae/extra".into(), entry(1));
+    entries[0].2 = serde_json::to_vec(&Head { artifact: manifest.digest(), ..whole.head.clone() }).unwrap();
+    entries[1].2 = manifest.to_bytes();
+    entries.push(("vae/extra".into(), EntryType::Regular, b"x".to_vec()));
+    assert!(refused(&packed(&entries)).contains("are not those that the manifests of its parts list"));
+}
+
+#[test]
+fn bombs_are_left_at_the_first_byte_too_many() {
+    assert!(refused(b"PK\x03\x04 is a zip").contains("not compressed with zstd"));
+    assert!(refused(b"").contains("fewer than 4"));
+    let nothing = zstd::encode_all(&b""[..], 1).unwrap();
+    assert!(refused(&nothing).contains("has no `bundle.json`"));
+    // A quarter of a gibibyte of zeros in some kilobytes, each where it would be unpacked.
+    let zeros = |count: u64| io::repeat(0).take(count);
+    let bomb = |before: &[u8], size: u64| {
+        let mut encoder = zstd::Encoder::new(Vec::new(), 1).unwrap();
+        encoder.write_all(before).unwrap();
+        io::copy(&mut zeros(size), &mut encoder).unwrap();
+        encoder.finish().unwrap()
+    };
+    let header = |name: &str, size: u64| {
+        let mut header = Header::new_ustar();
+        header.set_path(name).unwrap();
+        header.set_size(size);
+        header.set_cksum();
+        header.as_bytes().to_vec()
+    };
+    let size = 256 << 20;
+    let large = refused(&bomb(&header(HEAD, size), size));
+    assert!(large.contains("expected at most"), "{large}");
+    assert!(refused(&bomb(b"", size)).contains("behind the end of the archive"));
+    // A frame that asks for a window of 128 MiB.
+    let mut encoder = zstd::Encoder::new(Vec::new(), 1).unwrap();
+    encoder.set_parameter(zstd::zstd_safe::CParameter::WindowLog(27)).unwrap();
+    encoder.set_parameter(zstd::zstd_safe::CParameter::EnableLongDistanceMatching(true)).unwrap();
+    encoder.write_all(&header(HEAD, 10)).unwrap();
+    let window = refused(&encoder.finish().unwrap());
+    assert!(window.contains("cannot be unpacked"), "{window}");
+    // Behind a whole archive.
+    let mut behind = zstd::decode_all(&whole().bytes()[..]).unwrap();
+    behind.extend(std::iter::repeat_n(0, 10 * 512));
+    assert!(read(&zstd::encode_all(&behind[..], 1).unwrap()[..], &mut ()).is_ok(), "tar's own padding");
+    behind.push(1);
+    assert!(refused(&zstd::encode_all(&behind[..], 1).unwrap()).contains("behind the end"));
+}
+
+#[tokio::test]
+async fn a_bundle_becomes_a_version_or_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = Store::open(&dir.path().join("store"), Holder::this_process("test")).await.unwrap();
+    let file = dir.path().join("b.tar.zst");
+    let (whole, blobs) = (whole(), || store.blobs().list().unwrap().len());
+    let bytes = whole.bytes();
+    for damaged in [&bytes[..bytes.len() - 9], &bytes[..bytes.len() / 2], b"no bundle"] {
+        std::fs::write(&file, damaged).unwrap();
+        store.import_bundle(&file, None).await.unwrap_err();
+        assert_eq!((blobs(), store.models().await.unwrap().len()), (0, 0), "nothing half-written");
+    }
+    assert_eq!(std::fs::read_dir(dir.path().join("store/staging")).map_or(0, Iterator::count), 0);
+    std::fs::write(&file, &bytes).unwrap();
+    let version = store.import_bundle(&file, None).await.unwrap();
+    assert_eq!((version.model.as_str(), version.version, version.artifact), ("quick", 1, whole.head.artifact));
+    assert!(version.metrics["odd"].is_nan() && version.metrics["fid"] == 0.25);
+    assert_eq!(version.source["imported"]["source"]["run"], "r-1");
+    assert_eq!(store.import_bundle(&file, None).await.unwrap().version, 1, "the same again");
+    let renamed = store.import_bundle(&file, Some(ModelName::new("other"))).await.unwrap();
+    assert_eq!((renamed.model.as_str(), renamed.version), ("other", 1));
+    assert!(store.fsck().await.unwrap().problems.is_empty());
+    let gone = store.gc(0).await.unwrap();
+    assert_eq!(gone.remove, [], "a version needs all of it");
+    assert_eq!(store.resolve("quick@best").await.unwrap().version, 1, "it says which metric decides");
+}

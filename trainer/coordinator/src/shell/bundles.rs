@@ -1,0 +1,81 @@
+//! `POST /v1/bundles`: a bundle of another store becomes a version of this one.
+//!
+//! The body is written to a file first: a bundle is read twice, and nothing of one that does not arrive whole is stored.
+
+use std::fs::File;
+use std::io::Write as _;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use axum::Json;
+use axum::body::Body;
+use axum::extract::{Query, State};
+use axum::http::StatusCode;
+use futures::StreamExt as _;
+use protocol::limits;
+use serde::Deserialize;
+
+use super::actor_handle::ActorHandle;
+use super::blocking::blocking;
+use super::failure::Failure;
+
+/// How long a body may rest before it counts as cut.
+const BODY_IDLE: Duration = Duration::from_secs(30);
+/// Keeps the files of two imports apart.
+static NUMBER: AtomicU64 = AtomicU64::new(0);
+
+/// `?model=`.
+#[derive(Debug, Deserialize)]
+pub(crate) struct BundleQuery {
+    /// What the model is to be called here.
+    model: Option<String>,
+}
+
+/// A file that goes with this.
+struct Spool(PathBuf);
+
+impl Drop for Spool {
+    fn drop(&mut self) {
+        // What stays is emptied when the store is opened again.
+        let _ = std::fs::remove_file(&self.0);
+    }
+}
+
+pub(crate) async fn import(
+    State(actor_handle): State<Arc<ActorHandle>>,
+    Query(query): Query<BundleQuery>,
+    body: Body,
+) -> Result<Json<registry::cli::Answer>, Failure> {
+    let number = NUMBER.fetch_add(1, Ordering::Relaxed);
+    let dir = actor_handle.store.dir().join("staging");
+    let spool = Spool(dir.join(format!("bundle-{number}")));
+    let path = spool.0.clone();
+    let stored = |e: std::io::Error| Failure::new(StatusCode::INSUFFICIENT_STORAGE, "storage", e.to_string());
+    let file = blocking(move || std::fs::create_dir_all(&dir).and_then(|()| File::create(&path))).await;
+    receive(file.map_err(stored)?, body).await?;
+    // The caller knows what its file is called.
+    Ok(Json(registry::cli::import(&actor_handle.store, &spool.0, "bundle", query.model.as_deref()).await))
+}
+
+async fn receive(mut file: File, body: Body) -> Result<(), Failure> {
+    let cut =
+        |why: String| Failure::new(StatusCode::REQUEST_TIMEOUT, "cut", format!("the bundle was cut short: {why}"));
+    let mut body = body.into_data_stream();
+    let mut length = 0u64;
+    loop {
+        let part = match tokio::time::timeout(BODY_IDLE, body.next()).await {
+            Ok(Some(Ok(part))) => part,
+            Ok(Some(Err(error))) => return Err(cut(error.to_string())),
+            Ok(None) => return Ok(()),
+            Err(_) => return Err(cut(format!("nothing came for {} s", BODY_IDLE.as_secs()))),
+        };
+        length += part.len() as u64;
+        if length > limits::BUNDLE_BYTES as u64 {
+            return Err(Failure::too_large(limits::BUNDLE_BYTES));
+        }
+        let written = blocking(move || file.write_all(&part).map(|()| file)).await;
+        file = written.map_err(|e| Failure::new(StatusCode::INSUFFICIENT_STORAGE, "storage", e.to_string()))?;
+    }
+}

@@ -1,0 +1,56 @@
+//! The versions of the registry that a pipeline names in the place of stages, as they are when it is submitted.
+//!
+//! What is found stands in the pipeline from then on, beside the digests of folders: keys are made of it, a run that is resumed keeps it, and
+//! an alias that moves meanwhile changes nothing.
+
+use checkpoint::model::{Model, part_of_kind};
+use protocol::pipeline::Pipeline;
+use protocol::stage::VersionInput;
+use protocol::{ArtifactKind, Digest};
+use registry::{BlobStore, QueryError, ReadStore};
+
+use super::blocking::blocking;
+
+/// Fills in what the pipeline's versions stand for: a whole model, or its part of the kind that the stage reads.
+///
+/// # Errors
+/// Every version that there is not or that has no such part, a line for each; else what keeps the store from answering.
+pub async fn resolve_versions(pipeline: &mut Pipeline, store: &ReadStore) -> Result<(), QueryError> {
+    let mut wrong = Vec::new();
+    for stage in &mut pipeline.stages {
+        for input in stage.versions() {
+            let found = match store.resolve(&input.version).await {
+                Ok(version) => {
+                    let (blobs, input) = (store.blobs().clone(), input.clone());
+                    blocking(move || part(&blobs, version.artifact, &input)).await
+                }
+                Err(error) => Err(error),
+            };
+            match found {
+                Ok(digest) => {
+                    stage.external.insert(input.field, digest);
+                }
+                Err(QueryError::NotFound(why) | QueryError::Invalid(why)) => {
+                    wrong.push(format!("stage `{}`: `{}` is `{}`: {why}", stage.name, input.field, input.version));
+                }
+                Err(error) => return Err(error),
+            }
+        }
+    }
+    if wrong.is_empty() { Ok(()) } else { Err(QueryError::Invalid(wrong.join("\n"))) }
+}
+
+fn damaged(error: impl std::fmt::Display) -> QueryError {
+    QueryError::Blob(error.to_string())
+}
+
+/// What a stage reads of the version that is registered as `artifact`.
+fn part(blobs: &BlobStore, artifact: Digest, input: &VersionInput) -> Result<Digest, QueryError> {
+    let manifest = blobs.manifest(artifact).map_err(damaged)?;
+    let model = Model::read(&manifest).map_err(|e| QueryError::Invalid(e.to_string()))?;
+    let wanted = if input.kind == ArtifactKind::Model { input.part } else { Some(input.kind) };
+    let Some(wanted) = wanted else { return Ok(artifact) };
+    let found = part_of_kind(&model, wanted, |digest| blobs.manifest(digest)).map_err(damaged)?;
+    let (_, digest, _) = found.map_err(|e| QueryError::Invalid(e.to_string()))?;
+    Ok(if input.kind == ArtifactKind::Model { artifact } else { digest })
+}

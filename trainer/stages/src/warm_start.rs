@@ -1,0 +1,155 @@
+//! What a training begins with instead of fresh weights: the settings key `init`, the same for every kind.
+//!
+//! `init` names a stage or a version of the registry. What fits is found by kind of artifact: an artifact of the kind that is trained, or
+//! the one part of that kind that a model has. Tensors are taken over where name and shape are the same; all others stay as they would be
+//! without `init`, and are said. So a VAE of KIT-ML begins with one of HumanML3D, fresh only where features go in and come out. That
+//! nothing fits is an error, and so it is if nothing does but biases and the like, which have one axis. What else differs (statistics of the
+//! data, another text encoder, another noise schedule) is said too, and hinders nothing. Not its job: a checkpoint, which is all of a
+//! training's state and comes after.
+
+use std::collections::BTreeSet;
+
+use burn::module::Module;
+use checkpoint::Blob;
+use checkpoint::model::{Model, part_of_kind};
+use models::flat::{self, Entry};
+use models::names;
+use protocol::{ArtifactKind, Digest, Manifest};
+use serde_json::Value;
+
+use crate::artifacts::{self, MODEL_FILE};
+use crate::context::{AttemptContext, ContextError, GangContext, StageError};
+use crate::parts::{self, model_error};
+
+/// The settings key.
+const INIT: &str = "init";
+
+/// Tensors that the log lists one by one.
+const LISTED: usize = 40;
+
+/// What training begins with, if anything is named.
+#[derive(Debug)]
+pub(crate) struct WarmStart(Option<Weights>);
+
+/// The weights that are taken over.
+#[derive(Debug)]
+struct Weights {
+    digest: Digest,
+    part: Manifest,
+    file: Box<dyn Blob>,
+    taken: usize,
+    /// Those of them that have two axes or more.
+    matrices: usize,
+    fresh: Vec<String>,
+    /// Names of the file that a network of ours has.
+    known: BTreeSet<String>,
+}
+
+impl WarmStart {
+    /// Opens the artifact of `kind` that `init` names or that is a part of the model there.
+    pub(crate) fn find(cx: &dyn AttemptContext, kind: ArtifactKind) -> Result<Self, StageError> {
+        let Some(&digest) = cx.task().inputs.get(INIT) else { return Ok(Self(None)) };
+        let (blobs, manifest) = (cx.blobs(), cx.manifest(digest)?);
+        let (digest, part) = if manifest.kind == ArtifactKind::Model {
+            let model = Model::read(&manifest).map_err(model_error)?;
+            let part = part_of_kind(&model, kind, |digest| parts::manifest(&*blobs, digest, "a part of `init`"))?;
+            let (_, digest, part) = part.map_err(|e| StageError::Input(format!("`{INIT}`: {e}")))?;
+            (digest, part)
+        } else {
+            artifacts::expect(&format!("`{INIT}`"), &manifest, kind)?;
+            (digest, manifest)
+        };
+        let file = artifacts::open(&*blobs, &part, MODEL_FILE)?;
+        Ok(Self(Some(Weights { digest, part, file, taken: 0, matrices: 0, fresh: Vec::new(), known: BTreeSet::new() })))
+    }
+
+    /// `network` with the weights that fit it, of those whose names begin with `prefix`.
+    pub(crate) fn take<M: Module>(&mut self, network: M, prefix: &str) -> Result<M, StageError> {
+        let entries = flat::layout(&network);
+        let Some(values) = self.values(&entries, prefix)? else { return Ok(network) };
+        let mut all = flat::read(&network);
+        let mut rest = all.as_mut_slice();
+        for (entry, values) in entries.iter().zip(values) {
+            let (tensor, later) = rest.split_at_mut(entry.len());
+            if let Some(values) = values {
+                tensor.copy_from_slice(&values);
+            }
+            rest = later;
+        }
+        Ok(flat::write(network, &all))
+    }
+
+    /// The values that fit `entries`, for what is trained besides networks; `None` if nothing is named.
+    pub(crate) fn values(
+        &mut self,
+        entries: &[Entry],
+        prefix: &str,
+    ) -> Result<Option<Vec<Option<Vec<f32>>>>, StageError> {
+        let Some(weights) = &mut self.0 else { return Ok(None) };
+        let file = &weights.file;
+        let found = names::fitting(entries, file.bytes(), &mut |offset, out| file.read_at(offset, out), prefix);
+        let fitted = found.map_err(artifacts::blob_error)?.map_err(corrupt)?;
+        weights.taken += fitted.values.iter().flatten().count();
+        let matrices =
+            entries.iter().zip(&fitted.values).filter(|(entry, values)| values.is_some() && entry.shape.len() > 1);
+        weights.matrices += matrices.count();
+        weights.fresh.extend(fitted.fresh);
+        weights.known.extend(entries.iter().map(|entry| format!("{prefix}{}", entry.name)));
+        Ok(Some(fitted.values))
+    }
+
+    /// Says what was taken over and what was not; `meta` is what the artifact in the making says of itself.
+    ///
+    /// # Errors
+    /// If nothing fitted.
+    pub(crate) fn finish(self, cx: &mut dyn GangContext, meta: &Value) -> Result<(), StageError> {
+        let Some(Weights { digest, part, file, taken, matrices, fresh, known }) = self.0 else { return Ok(()) };
+        let there = names::tensors(file.bytes(), &mut |offset, out| file.read_at(offset, out));
+        let there = there.map_err(artifacts::blob_error)?.map_err(corrupt)?;
+        if matrices == 0 {
+            return Err(StageError::Input(format!(
+                "nothing of `{INIT}` fits: none of its {} tensors, biases and the like aside, has a name and a shape of what is trained here; \
+                 expected such as {}, and it has such as {}; name what was trained by this kind, in this form",
+                there.len(),
+                fresh.first().map_or("none", String::as_str),
+                there.first().map_or_else(|| "none".into(), |entry| format!("{} {:?}", entry.name, entry.shape)),
+            )));
+        }
+        if !cx.leads() {
+            return Ok(());
+        }
+        let (kind, all) = (part.kind.noun(), taken + fresh.len());
+        cx.log(&format!("begins with {taken} of {all} tensors of `{INIT}`, {kind}, {}", digest.short()));
+        list(cx, "fresh", &fresh);
+        let unused: Vec<String> = there
+            .iter()
+            .filter(|entry| !known.contains(&entry.name))
+            .map(|entry| format!("{} {:?}", entry.name, entry.shape))
+            .collect();
+        list(cx, "not used", &unused);
+        let differs = differing(&part.meta, meta);
+        if !differs.is_empty() {
+            cx.log(&format!("`{INIT}` differs in {}; what it learned under those is gone on from", differs.join(", ")));
+        }
+        Ok(())
+    }
+}
+
+/// The first of some tensors, a line for each.
+fn list(cx: &mut dyn GangContext, what: &str, tensors: &[String]) {
+    tensors.iter().take(LISTED).for_each(|tensor| cx.log(&format!("{what}: {tensor}")));
+    if tensors.len() > LISTED {
+        cx.log(&format!("{what}: {} more", tensors.len() - LISTED));
+    }
+}
+
+/// What two metas of one kind say differently, by key.
+fn differing(theirs: &Value, ours: &Value) -> Vec<String> {
+    let (Some(theirs), Some(ours)) = (theirs.as_object(), ours.as_object()) else { return Vec::new() };
+    let differs = |key: &&String| theirs.get(*key) != ours.get(*key);
+    ours.keys().filter(differs).map(|key| format!("`{key}`")).collect()
+}
+
+fn corrupt(error: names::LoadError) -> StageError {
+    StageError::Context(ContextError::Corrupt(format!("the weights of `{INIT}`: {error}")))
+}
