@@ -128,6 +128,7 @@ pub fn tokenizer() -> Vec<Named> {
             with(&|file| file["model"]["merges"] = vec![json!(["a", "b"]); 600_000].into()),
         ),
         ("six hundred thousand added tokens", with(&|file| file["added_tokens"] = vec![json!({}); 600_000].into())),
+        ("a token of sixty thousand letters", long_token()),
         (
             "one letter to eight, a hundred times",
             with(&|file| file["normalizer"] = json!({"type": "Sequence", "normalizers": vec![step.clone(); 100]})),
@@ -135,6 +136,13 @@ pub fn tokenizer() -> Vec<Named> {
         ("steps nested deep", "{\"normalizer\":{\"type\":\"Sequence\",\"normalizers\":[".repeat(20_000).into_bytes()),
         ("lists nested 100,000 deep", "[".repeat(100_000).into_bytes()),
     ]
+}
+
+/// A token that a tree with a level a byte has no stack for.
+fn long_token() -> Vec<u8> {
+    let mut file: serde_json::Value = serde_json::from_slice(&seeds::tokenizer()[1]).expect("one of ours");
+    file["model"]["vocab"][4] = json!(["a".repeat(60_000), -1.5]);
+    file.to_string().into_bytes()
 }
 
 /// Pickles that run a command in Python, archives that unpack to more than they are, and what copies itself.

@@ -7,7 +7,7 @@
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use protocol::limits;
-use serde::de::{IgnoredAny, MapAccess, SeqAccess, Visitor};
+use serde::de::{MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 use serde_json::{Value, json};
 use tokenizers::{PostProcessor as _, TruncationParams};
@@ -26,6 +26,9 @@ const MAPPED_BYTES: usize = 64;
 
 /// Entries of a vocabulary, of its merges, and of the tokens added to it; that of the papers' encoders has at most 49,408.
 const ENTRIES: usize = 500_000;
+
+/// Bytes of a token. The crate keeps some vocabularies as a tree with a level a byte, which takes as much stack where it is dropped.
+const TOKEN_BYTES: usize = 1_024;
 
 /// The parts of `tokenizer.json` that are looked at; vocabulary and merges are counted.
 #[derive(Deserialize)]
@@ -47,43 +50,75 @@ struct LookedModel {
     merges: Count,
 }
 
-/// How many entries a list or a mapping has, of which none is kept.
+/// How many entries a list or a mapping has, and the bytes of the longest text in it, however deep; none is kept.
 #[derive(Default)]
-struct Count(usize);
+struct Count {
+    entries: usize,
+    longest: usize,
+}
+
+impl Count {
+    fn add(&mut self, part: &Self) {
+        self.longest = self.longest.max(part.longest);
+    }
+}
 
 impl<'de> Deserialize<'de> for Count {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        struct Counts;
-
-        impl<'de> Visitor<'de> for Counts {
-            type Value = Count;
-
-            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-                f.write_str("a list or a mapping")
-            }
-
-            fn visit_unit<E>(self) -> Result<Count, E> {
-                Ok(Count(0))
-            }
-
-            fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Count, A::Error> {
-                let mut count = 0;
-                while list.next_element::<IgnoredAny>()?.is_some() {
-                    count += 1;
-                }
-                Ok(Count(count))
-            }
-
-            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Count, A::Error> {
-                let mut count = 0;
-                while map.next_entry::<IgnoredAny, IgnoredAny>()?.is_some() {
-                    count += 1;
-                }
-                Ok(Count(count))
-            }
-        }
-
         deserializer.deserialize_any(Counts)
+    }
+}
+
+struct Counts;
+
+impl<'de> Visitor<'de> for Counts {
+    type Value = Count;
+
+    fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("a value")
+    }
+
+    fn visit_unit<E>(self) -> Result<Count, E> {
+        Ok(Count::default())
+    }
+
+    fn visit_bool<E>(self, _: bool) -> Result<Count, E> {
+        Ok(Count::default())
+    }
+
+    fn visit_i64<E>(self, _: i64) -> Result<Count, E> {
+        Ok(Count::default())
+    }
+
+    fn visit_u64<E>(self, _: u64) -> Result<Count, E> {
+        Ok(Count::default())
+    }
+
+    fn visit_f64<E>(self, _: f64) -> Result<Count, E> {
+        Ok(Count::default())
+    }
+
+    fn visit_str<E>(self, text: &str) -> Result<Count, E> {
+        Ok(Count { entries: 0, longest: text.len() })
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Count, A::Error> {
+        let mut count = Count::default();
+        while let Some(value) = list.next_element::<Count>()? {
+            count.entries += 1;
+            count.add(&value);
+        }
+        Ok(count)
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Count, A::Error> {
+        let mut count = Count::default();
+        while let Some((key, value)) = map.next_entry::<Count, Count>()? {
+            count.entries += 1;
+            count.add(&key);
+            count.add(&value);
+        }
+        Ok(count)
     }
 }
 
@@ -190,9 +225,12 @@ fn parsed(place: &str, json: &[u8]) -> Result<tokenizers::Tokenizer, EncoderErro
     let expected = "expected a `tokenizer.json` as Hugging Face's tokenizers write it";
     let looked: Looked = serde_json::from_slice(json).map_err(|e| refuse(format!("{e}; {expected}")))?;
     let counted = [("model.vocab", &looked.model.vocab), ("model.merges", &looked.model.merges)];
-    for (what, Count(count)) in counted.into_iter().chain([("added_tokens", &looked.added_tokens)]) {
-        if *count > ENTRIES {
-            return Err(refuse(format!("`{what}` has {count} entries; expected at most {ENTRIES}")));
+    for (what, Count { entries, longest }) in counted.into_iter().chain([("added_tokens", &looked.added_tokens)]) {
+        if *entries > ENTRIES {
+            return Err(refuse(format!("`{what}` has {entries} entries; expected at most {ENTRIES}")));
+        }
+        if *longest > TOKEN_BYTES {
+            return Err(refuse(format!("`{what}` has a token of {longest} bytes; expected at most {TOKEN_BYTES}")));
         }
     }
     if looked.model.dropout.is_some_and(|share| share != 0.0) {
@@ -392,6 +430,8 @@ mod tests {
         assert!(refused(&broken, &rules(), 7).contains("is damaged"));
         let merge = with(&|file| file["model"]["merges"] = json!([["a", "zzz"]]));
         assert!(refused(&merge, &rules(), 7).contains("t: "));
+        let long = with(&|file| file["model"]["vocab"]["a".repeat(1_025)] = json!(0));
+        assert!(refused(&long, &rules(), 7).contains("`model.vocab` has a token of 1025 bytes; expected at most 1024"));
         let short = Rules { most: 2, ..rules() };
         assert!(refused(&clip(), &short, 7).contains("leave no room"));
         for text in ["", "{", "[]", "{\"model\": 3}", "\"\\ud800\"", &"[".repeat(10_000)] {
