@@ -168,7 +168,7 @@ impl StageSettings {
         let read = settings.refs().into_iter().filter(|reference| reference.read && names_version(reference.name));
         read.filter_map(|Ref { field, name, target, part, .. }| match target {
             Target::Stage(kind) => Some(VersionInput { field: field.into_owned(), version: name.clone(), kind, part }),
-            Target::Dataset(_) | Target::Folder => None,
+            Target::Dataset(_) | Target::Folder | Target::File => None,
         })
         .collect()
     }

@@ -4,7 +4,7 @@ use super::definition::{IN_EVALUATION, PipelineStage, StageInput};
 use super::graph;
 use super::rules::{Problem, Problems};
 use crate::stage::{Shape, StageSettings, Target};
-use crate::sweep::{Derived, STATE_OUTPUT, Values, beside, evaluated_field, rung_name, with_values};
+use crate::sweep::{Derived, STATE_OUTPUT, Values, beside, evaluated_field, rung_name};
 use crate::{ArtifactKind, StageName, Steps};
 
 /// What is written behind the name of a swept stage to say that its best trial is meant. It always is.
