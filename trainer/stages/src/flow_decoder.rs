@@ -176,10 +176,11 @@ impl Field {
 
     /// With the weights that training is to begin with.
     pub(crate) fn begun_with(self, start: &mut WarmStart) -> Result<Self, StageError> {
-        Ok(match self {
-            Self::Unet(network) => Self::Unet(start.take(network, "")?),
-            Self::Dit(network) => Self::Dit(start.take(network, "")?),
-        })
+        let backbone = match self.backbone {
+            Backbone::Unet(network) => Backbone::Unet(start.take(network, "")?),
+            Backbone::Dit(network) => Backbone::Dit(start.take(network, "")?),
+        };
+        Ok(Self { backbone, ..self })
     }
 
     /// Takes over parameters.

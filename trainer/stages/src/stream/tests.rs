@@ -135,6 +135,7 @@ fn scripted(joining: Joining) -> (Vec<f32>, Generator, MotionStream, Rc<RefCell<
         network: Network::default(),
         mean: vec![0.0; 66],
         std: vec![1.0; 66],
+        projection: None,
         fits: BTreeMap::new(),
     });
     let infills = joining == Joining::Infilling;
