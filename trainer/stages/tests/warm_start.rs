@@ -49,6 +49,7 @@ fn kit_vae(bench: &Bench, like: &TrainVae) -> Digest {
         network: like.network.clone(),
         mean: vec![0.0; features],
         std: vec![1.0; features],
+        projection: None,
     };
     let device = burn::tensor::Device::flex();
     let network = Vae::new(&meta.config(), &mut Init::new(Seed(3), "kit", Positions::Uniform, &device));

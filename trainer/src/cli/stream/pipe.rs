@@ -91,6 +91,7 @@ impl Kept {
             joints: self.joints,
             features: None,
             waypoints: self.waypoints.into_iter().filter(|waypoint| waypoint.frame < frames).collect(),
+            kept: Vec::new(),
         }
     }
 }
