@@ -278,13 +278,13 @@ fn heads_and_manifests_that_this_build_does_not_read_are_refused() {
     assert!(with(&|m| m.format = 9, &same).contains("format 9"));
     assert!(with(&|_| {}, &|text| format!("{text} ")).contains("canonical JSON"));
     let entry = |bytes| FileEntry { digest: Digest::of(b"x"), bytes };
-    let lists = |name: &'static str, bytes: u64| with(&move |m| drop(m.files.insert(name.into(), entry(bytes))), &same);
+    let lists = |name: &'static str, bytes: u64| with(&move |m| _ = m.files.insert(name.into(), entry(bytes)), &same);
     assert!(lists("../x", 1).contains("`..`"));
     assert!(lists("card.md", 1).contains("a name of the bundle itself"));
     assert!(lists("vae/huge", u64::MAX).contains("expected at most"));
     // Announced and never there; and there, but of no part.
     assert!(lists("vae/zzz", 1).contains("`vae/zzz`"));
-    assert!(with(&|m| drop(m.files.remove("vae/manifest.json")), &same).contains("lists no `vae/manifest.json`"));
+    assert!(with(&|m| _ = m.files.remove("vae/manifest.json"), &same).contains("lists no `vae/manifest.json`"));
     let mut entries = whole.entries();
     let mut manifest = whole.manifest.clone();
     manifest.files.insert("vae/extra".into(), entry(1));

@@ -321,7 +321,8 @@ impl MotionStream {
                 let last = rows[rows.len() - width..].to_vec();
                 // What is drawn anew is not looked at, but must be motion.
                 (overlap..total).for_each(|_| rows.extend(&last));
-                generator.edit(&ask.caption, &rows, &[0..overlap], sampler, seed)?.motion
+                let kept = std::iter::once(0..overlap).collect::<Vec<_>>();
+                generator.edit(&ask.caption, &rows, &kept, sampler, seed)?.motion
             }
             _ => generator.generate(&ask.caption, Some(total), sampler, seed)?,
         };
