@@ -107,7 +107,7 @@ fn goes_on(bench: &Bench, model: &[&str], joining: &str) {
     assert_eq!(report["latency_s"]["count"], 3);
     let segments = report["segments"].as_u64().expect("segments");
     assert_eq!(report["junctions"]["measured"], segments - 1, "{report}");
-    println!("{joining}: {report}");
+    eprintln!("{joining}: {report}");
     for file in ["s.html", "s.npy", "s.png"] {
         assert!(fs::metadata(bench.path().join(file)).is_ok_and(|file| file.len() > 1000), "{file}");
     }

@@ -591,8 +591,11 @@ fn discord_gives_what_it_was_published_with() {
     }
 }
 
+/// Tensors by name: shape and values.
+type Named = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
+
 /// Tensors as a safetensors file, some of them changed.
-fn changed(from: &Path, to: &Path, change: &dyn Fn(&mut BTreeMap<String, (Vec<usize>, Vec<f32>)>)) {
+fn changed(from: &Path, to: &Path, change: &dyn Fn(&mut Named)) {
     let bytes = std::fs::read(from).expect("a file of the fixture");
     let stored = safetensors::SafeTensors::deserialize(&bytes).expect("safetensors");
     let floats = |data: &[u8]| data.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
@@ -616,7 +619,7 @@ fn what_makes_no_whole_network_is_refused_with_all_that_is_wrong() {
         statistics: world.statistics(263),
         ..part(ImportedPart::Vae, &to)
     };
-    let mut refused = |change: &dyn Fn(&mut BTreeMap<String, (Vec<usize>, Vec<f32>)>), settings: &ImportModel| {
+    let mut refused = |change: &dyn Fn(&mut Named), settings: &ImportModel| {
         changed(&from, &to, change);
         world.import(settings, &[]).map(|ran| ran.output()).unwrap_err()
     };
