@@ -192,6 +192,10 @@ impl JointMap {
                 names.join(", ")
             )));
         }
+        let aimless = |source: &Source| matches!(source, Source::Between(b) if b.towards.is_none() && b.metres != 0.0);
+        if let Some((joint, _)) = map.joints.iter().find(|(_, source)| aimless(source)) {
+            return Err(fail(format!(" `{joint}` has `metres`, but no `towards` that says where to; name a node")));
+        }
         Ok(map)
     }
 
@@ -386,6 +390,11 @@ mod tests {
             refuse("joints:\n", "joints:\n  pelvis: x\n", "pelvis");
             refuse("name:", "title:", "title");
         }
+        let (_, text) = SHIPPED[0];
+        let pelvis = text.lines().find(|line| line.trim_start().starts_with("pelvis:")).unwrap();
+        let aimless = text.replacen(pelvis, "  pelvis: {between: [a, b], metres: 0.1}", 1);
+        let said = JointMap::parse(Path::new("m.yaml"), &aimless).unwrap_err().to_string();
+        assert!(said.contains("`pelvis` has `metres`, but no `towards`"), "{said}");
         assert!(JointMap::load("nowhere.yaml").unwrap_err().to_string().contains("cmu, lafan1"));
     }
 }
