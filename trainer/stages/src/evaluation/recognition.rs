@@ -99,7 +99,7 @@ mod tests {
 
     use super::*;
 
-    /// Rows in which a channel sways at one of two tempos around one of two places.
+    /// Rows in which some channels sway at one of two tempos around one of two places.
     fn rows(class: usize, number: u64, skeleton: &Skeleton) -> Vec<f32> {
         let mut stream = Stream::new(Seed(3), "rows", class as u64, number);
         let frames = 40 + stream.below(60);
@@ -107,7 +107,7 @@ mod tests {
         let (speed, place) = ([0.2, 0.2, 0.9][class], [0.0, 1.5, 0.0][class]);
         let mut rows: Vec<f32> = (0..frames * skeleton.features).map(|_| stream.range(-0.3, 0.3) as f32).collect();
         for (t, row) in rows.chunks_exact_mut(skeleton.features).enumerate() {
-            row[10] += (place + (t as f64 * speed + phase).sin()) as f32;
+            row[4..44].iter_mut().for_each(|v| *v += (place + (t as f64 * speed + phase).sin()) as f32);
         }
         rows
     }

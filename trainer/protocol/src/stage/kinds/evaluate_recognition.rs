@@ -41,12 +41,31 @@ pub struct EvaluateRecognition {
     pub split: Split,
 }
 
+/// What people ask for first, in words of HumanML3D's captions.
+fn usual() -> Vec<Activity> {
+    let activity = |(name, words): (&str, &[&str])| Activity {
+        name: name.to_owned(),
+        words: words.iter().map(|word| (*word).to_owned()).collect(),
+        sheet: true,
+    };
+    let all: [(&str, &[&str]); 7] = [
+        ("jump", &["jumps", "jumping"]),
+        ("kick", &["kicks", "kicking"]),
+        ("wave", &["waves", "waving"]),
+        ("sit", &["sits", "sitting"]),
+        ("run", &["runs", "running", "jogs", "jogging"]),
+        ("turn", &["turns", "turning"]),
+        ("walk", &["walks", "walking"]),
+    ];
+    all.map(activity).to_vec()
+}
+
 impl Default for EvaluateRecognition {
     fn default() -> Self {
         Self {
             model: "mld".into(),
             dataset: "dataset".into(),
-            activities: vec![],
+            activities: usual(),
             sampler: Sampler::default(),
             motions: 200,
             split: Split::Test,
