@@ -151,11 +151,11 @@ fn ask(frames: Option<usize>) -> Ask {
     Ask { caption: "a person walks".into(), frames, waypoints: vec![] }
 }
 
-/// Laid down by one frame, a segment does not know how fast the stream's end moved, and fades from a guess.
-fn assert_near(found: &[f64], expected: &[f32], joining: Joining) {
-    let tolerance = if joining == Joining::Placement { 0.05 } else { 1e-3 };
-    for (i, (a, b)) in found.iter().zip(expected).enumerate() {
-        assert!((a - f64::from(*b)).abs() < tolerance, "{joining:?}, frame {}: {a} against {b}", i / 66);
+/// Laid down by one frame, a segment does not know how fast the stream's end moved, and fades from a guess; behind the fade it is where it should be.
+fn assert_near(found: &[f64], expected: &[f32], joining: Joining, junctions: &[usize]) {
+    let fades = |t: usize| joining == Joining::Placement && junctions.iter().any(|at| (*at..at + BLEND).contains(&t));
+    for (i, (a, b)) in found.iter().zip(expected).enumerate().filter(|(i, _)| !fades(i / 66)) {
+        assert!((a - f64::from(*b)).abs() < 1e-3, "{joining:?}, frame {}: {a} against {b}", i / 66);
     }
 }
 
@@ -168,16 +168,17 @@ fn segments_of_one_motion_are_that_motion() {
     ] {
         let (rows, generator, mut stream, said) = scripted(joining);
         let whole = recover_joints(&rows, body());
-        let mut all = Vec::new();
+        let (mut all, mut junctions) = (Vec::new(), Vec::new());
         // The last two are longer than the model draws at once, and as long as it likes.
         for (frames, overlap) in [Some(40), Some(33), Some(60), Some(39), None].into_iter().zip(overlaps) {
             let segment = stream.draw(&generator, &ask(frames)).unwrap();
             assert_eq!((segment.frames, segment.overlap), (frames.unwrap_or(80 - overlap), overlap), "{joining:?}");
             assert!(segment.offset < 1e-3, "{}", segment.offset);
+            junctions.push(all.len() / 66);
             all.extend(segment.joints);
             said.borrow_mut().given += segment.frames;
         }
-        assert_near(&all, &whole, joining);
+        assert_near(&all, &whole, joining, &junctions);
         // What was told of the last segment are the six joints of the frames before it, from the origin, facing z.
         if joining == Joining::Control {
             let start = said.borrow().given - 60 - 20;
@@ -202,7 +203,7 @@ fn what_is_taken_back_is_drawn_anew() {
         said.borrow_mut().given = 27;
         let segment = stream.draw(&generator, &ask(Some(40))).unwrap();
         all.extend(segment.joints);
-        assert_near(&all, &recover_joints(&rows, body()), joining);
+        assert_near(&all, &recover_joints(&rows, body()), joining, &[27]);
         // Hardly anything is left to go on from.
         stream.cut(0);
         stream.cut(0);
