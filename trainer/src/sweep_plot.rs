@@ -134,7 +134,7 @@ fn numbers(sweep: &SweepView) -> Vec<String> {
 /// Curves of `metrics` over what the trials differ in: a panel for each, and a line for every choice of the other searched settings.
 ///
 /// # Errors
-/// Which metric no evaluation gave, and what there is.
+/// A metric that no evaluation gave; the message lists those that were given.
 pub(crate) fn curves(run: &RunView, sweep: &SweepView, by: &By, metrics: &[String]) -> Result<String, String> {
     let last = sweep.rungs.len().saturating_sub(1);
     let evaluations: Vec<(&TrialView, &StageView)> = sweep

@@ -1,4 +1,4 @@
-//! Weights as `torch.save` writes them: a zip archive, not compressed, of a pickle that says what there is and of each tensor's numbers.
+//! Weights as `torch.save` writes them: an uncompressed zip archive with a pickle, which lists the tensors, and a file of numbers for each of them.
 //!
 //! The pickle holds a dict from names to tensors, or a dict with that under a key: protocol 2 and the few opcodes that PyTorch's own
 //! reader with `weights_only` allows. The same tensors always give the same bytes.

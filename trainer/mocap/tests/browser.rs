@@ -4,6 +4,8 @@
 //! Wants Chromium or Chrome (on Debian `apt-get install chromium`), or a path to one in `STRIDE_BROWSER`, and says loudly that it skips where there is none. The
 //! browser is spoken to in the DevTools protocol through two named pipes, JSON with a zero behind each message.
 
+mod base64;
+
 use std::fs::{File, OpenOptions};
 use std::io::{Cursor, Read as _, Write as _};
 use std::path::{Path, PathBuf};
@@ -17,6 +19,8 @@ use motion::{Skeleton, features, synthetic};
 use protocol::Seed;
 use protocol::stage::{DataFormat, DataSynthetic};
 use serde_json::{Value, json};
+
+use self::base64::decoded;
 
 /// Until the browser answers.
 const PATIENCE: Duration = Duration::from_secs(90);
@@ -162,23 +166,6 @@ impl Browser {
         let found = self.evaluate(&format!("[...document.querySelectorAll('{selector}')].map({rectangle})"));
         serde_json::from_value(found).expect("rectangles")
     }
-}
-
-fn decoded(text: &str) -> Vec<u8> {
-    let value = |c: u8| match c {
-        b'A'..=b'Z' => c - b'A',
-        b'a'..=b'z' => c - b'a' + 26,
-        b'0'..=b'9' => c - b'0' + 52,
-        b'+' => 62,
-        b'/' => 63,
-        _ => panic!("`{c}` in base64"),
-    };
-    let letters: Vec<u32> = text.trim_end_matches('=').bytes().map(|c| u32::from(value(c))).collect();
-    let group = |four: &[u32]| {
-        let bits: u32 = (0..4).fold(0, |n, k| n << 6 | four.get(k).copied().unwrap_or_default());
-        bits.to_be_bytes()[1..four.len()].to_vec()
-    };
-    letters.chunks(4).flat_map(group).collect()
 }
 
 /// A page with a figure that moves beside one that stands.

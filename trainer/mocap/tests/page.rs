@@ -1,5 +1,7 @@
 //! The viewer's page: complete, closed to what captions hold, and its positions where they were.
 
+mod base64;
+
 use mocap::Body;
 use mocap::html::{MOST_PANELS, Page, Panel, STEP, Section};
 use motion::waypoints::Waypoint;
@@ -7,6 +9,8 @@ use motion::{Skeleton, features, synthetic};
 use protocol::stage::{DataFormat, DataSynthetic};
 use protocol::{Digest, Seed};
 use serde_json::Value;
+
+use self::base64::decoded;
 
 fn motion() -> Vec<f32> {
     let dataset = synthetic::generate(&DataSynthetic { clips: 1, ..DataSynthetic::default() }, Seed(1));
@@ -29,23 +33,6 @@ fn between<'a>(text: &'a str, from: &str, to: &str) -> &'a str {
 
 fn data(page: &str) -> Value {
     serde_json::from_str(between(page, "id=\"motions\">", "</script>")).expect("well formed")
-}
-
-fn decoded(text: &str) -> Vec<u8> {
-    let value = |c: u8| match c {
-        b'A'..=b'Z' => c - b'A',
-        b'a'..=b'z' => c - b'a' + 26,
-        b'0'..=b'9' => c - b'0' + 52,
-        b'+' => 62,
-        b'/' => 63,
-        _ => panic!("`{c}` in base64"),
-    };
-    let letters: Vec<u32> = text.trim_end_matches('=').bytes().map(|c| u32::from(value(c))).collect();
-    let group = |four: &[u32]| {
-        let bits: u32 = (0..4).fold(0, |n, k| n << 6 | four.get(k).copied().unwrap_or_default());
-        bits.to_be_bytes()[1..four.len()].to_vec()
-    };
-    letters.chunks(4).flat_map(group).collect()
 }
 
 #[test]

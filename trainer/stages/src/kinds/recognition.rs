@@ -15,13 +15,11 @@ use motion::dataset::{Dataset, Entry, crop};
 use motion::features::recover_joints;
 use motion::random::permutation;
 use motion::{Skeleton, Stream, draw};
-use protocol::ArtifactKind;
 use protocol::stage::{Activity, EvaluateRecognition, Split};
 use serde_json::json;
 
 use super::entry_draws::{finite, skates};
-use super::{Plain, no_entries, publish_illustrated, word};
-use crate::artifacts;
+use super::{Plain, measured, no_entries, publish_illustrated, word};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::recognition::{Classifier, describe};
 use crate::generator::{self, Batch};
@@ -134,15 +132,7 @@ fn described(dataset: &Dataset, rows: &[f32]) -> Vec<f64> {
 
 impl Plain for EvaluateRecognition {
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
-        let blobs = cx.blobs();
-        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*blobs, &manifest)?;
-        let (_, manifest) = artifacts::input(cx, "model", ArtifactKind::Model)?;
-        let model = generator::open(&manifest, &*blobs, &cx.device())?;
-        generator::check_sampler(&*model, &self.sampler)?;
-        if model.format() != dataset.format {
-            return Err(StageError::Input("`model` draws motions of another skeleton than `dataset` has".into()));
-        }
+        let (dataset, model) = measured(cx, &self.sampler)?;
         if dataset.entries_of(self.split).is_empty() {
             return Err(no_entries(self.split));
         }

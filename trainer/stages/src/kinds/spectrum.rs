@@ -10,15 +10,13 @@ use std::rc::Rc;
 
 use motion::Stream;
 use motion::dataset::crop;
-use protocol::ArtifactKind;
 use protocol::stage::EvaluateSpectrum;
 use serde_json::json;
 
-use super::{Plain, no_entries, publish_report};
-use crate::artifacts;
+use super::{Plain, measured, no_entries, publish_report};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::spectrum::Bands;
-use crate::generator::{self, Batch};
+use crate::generator::Batch;
 
 /// Sums over motions of one step.
 #[derive(Debug, Clone, Default)]
@@ -35,15 +33,7 @@ fn add(to: &mut Vec<f64>, from: &[f64]) {
 
 impl Plain for EvaluateSpectrum {
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
-        let blobs = cx.blobs();
-        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*blobs, &manifest)?;
-        let (_, manifest) = artifacts::input(cx, "model", ArtifactKind::Model)?;
-        let model = generator::open(&manifest, &*blobs, &cx.device())?;
-        generator::check_sampler(&*model, &self.sampler)?;
-        if model.format() != dataset.format {
-            return Err(StageError::Input("`model` draws motions of another skeleton than `dataset` has".into()));
-        }
+        let (dataset, model) = measured(cx, &self.sampler)?;
         let entries: Vec<usize> = dataset.entries_of(self.split).into_iter().take(self.motions).collect();
         if entries.is_empty() {
             return Err(no_entries(self.split));

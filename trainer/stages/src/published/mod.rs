@@ -80,7 +80,7 @@ impl Checkpoint {
     /// The network called `what` that has the tensor `marker`, whose names begin in one of `places`.
     ///
     /// # Errors
-    /// If there is none; says what there is.
+    /// If there is none; the message lists those that the file has.
     pub fn network(&self, what: &str, places: &[&str], marker: &str) -> Result<Found<'_>, StageError> {
         self.find(places, marker).ok_or_else(|| {
             let groups: Vec<String> = self.groups(|_| true).into_keys().take(SHOWN).collect();
