@@ -217,12 +217,15 @@ pub struct VaeRecipe {
     pub joint: Pointwise,
     /// Distance of the local position term.
     pub velocity: Pointwise,
+    /// Distance of the term on feet.
+    pub feet: Pointwise,
 }
 
 impl From<VaeLoss> for VaeRecipe {
     /// Smooth L1 throughout, as published.
     fn from(weights: VaeLoss) -> Self {
-        Self { weights, feature: Pointwise::SmoothL1, joint: Pointwise::SmoothL1, velocity: Pointwise::SmoothL1 }
+        let [feature, joint, velocity, feet] = [Pointwise::SmoothL1; 4];
+        Self { weights, feature, joint, velocity, feet }
     }
 }
 
@@ -235,6 +238,8 @@ pub struct VaeTerms {
     pub joint: Option<Tensor<1>>,
     /// On local positions, which upstream calls velocity.
     pub velocity: Option<Tensor<1>>,
+    /// On the velocities of ankles and feet.
+    pub feet: Option<Tensor<1>>,
     /// Divergence of the posterior.
     pub kl: Option<Tensor<1>>,
 }
@@ -242,7 +247,11 @@ pub struct VaeTerms {
 impl VaeTerms {
     /// The sum of the terms.
     pub fn total(&self) -> Option<Tensor<1>> {
-        [&self.feature, &self.joint, &self.velocity, &self.kl].into_iter().flatten().cloned().reduce(|a, b| a + b)
+        [&self.feature, &self.joint, &self.velocity, &self.feet, &self.kl]
+            .into_iter()
+            .flatten()
+            .cloned()
+            .reduce(|a, b| a + b)
     }
 }
 
@@ -265,16 +274,35 @@ pub fn vae(
     let term = |weight: f64, value: &dyn Fn() -> Tensor<1>| (weight != 0.0).then(|| value() * (weight as f32));
     let positions = body.skeleton.layout().positions;
     let local = |x: &Tensor<3>| x.clone().slice([0..batch, 0..frames, positions.clone()]);
-    let flat = |x: &Tensor<3>| {
-        let joints = body.joints(x.clone()).reshape([batch, frames, 3 * body.skeleton.joints]);
-        joints * (body.metres_per_unit as f32)
-    };
+    // Where the joints are costs many operations, so both terms on them share it.
+    let weighs = weights.joint != 0.0 || weights.feet != 0.0;
+    let metres = |x: &Tensor<3>| body.joints(x.clone()) * (body.metres_per_unit as f32);
+    let joints = weighs.then(|| [metres(&decoded), metres(&features)]);
+    let compared = |x: &Tensor<4>| x.clone().reshape([batch, frames, 3 * body.skeleton.joints]);
     VaeTerms {
         feature: term(weights.feature, &|| frame_weights.compare(recipe.feature, decoded.clone(), features.clone())),
-        joint: term(weights.joint, &|| frame_weights.compare(recipe.joint, flat(&decoded), flat(&features))),
+        joint: joints.as_ref().and_then(|[found, expected]| {
+            term(weights.joint, &|| frame_weights.compare(recipe.joint, compared(found), compared(expected)))
+        }),
         velocity: term(weights.velocity, &|| frame_weights.compare(recipe.velocity, local(&decoded), local(&features))),
+        feet: joints.as_ref().filter(|_| frames > 1).and_then(|[found, expected]| {
+            let moves = |x: &Tensor<4>| foot_velocities(x, body.skeleton);
+            let steps: Vec<usize> = lengths.iter().map(|length| length.saturating_sub(1)).collect();
+            let each = FrameWeights::masked(&steps, frames - 1, &device);
+            term(weights.feet, &|| each.compare(recipe.feet, moves(found), moves(expected)))
+        }),
         kl: term(weights.kl, &|| kl(posterior)),
     }
+}
+
+/// Velocities [B, T - 1, 4 x 3] of ankles and feet, by the second. `joints` [B, T, J, 3].
+fn foot_velocities(joints: &Tensor<4>, skeleton: &Skeleton) -> Tensor<3> {
+    let [batch, frames, _, _] = joints.dims();
+    let feet = skeleton.left_foot.iter().chain(&skeleton.right_foot);
+    let feet = feet.map(|j| joints.clone().slice([0..batch, 0..frames, *j..j + 1, 0..3])).collect();
+    let feet = Tensor::cat(feet, 2).reshape([batch, frames, 12]);
+    let at = |t: std::ops::Range<usize>| feet.clone().slice([0..batch, t, 0..12]);
+    (at(1..frames) - at(0..frames - 1)) * (skeleton.fps as f32)
 }
 
 /// Global joints [B, T, J, 3] of features [B, T, D] that are not normalised; gradients flow through the running sums.
@@ -376,6 +404,29 @@ mod tests {
                 found[i]
             );
         }
+    }
+
+    #[test]
+    fn feet_cost_what_they_slide() {
+        let skeleton = Skeleton::of(DataFormat::Humanml3d);
+        let device = Device::flex();
+        let body = Body::new(skeleton, &vec![0.0; skeleton.features], &vec![1.0; skeleton.features], &device);
+        let stands = vec![0.0; 2 * 5 * skeleton.features];
+        let mut glides = stands.clone();
+        // The second clip, of three frames, glides ahead by a decimetre a frame: 2 m/s. What follows its end counts for nothing.
+        for t in 0..5 {
+            glides[(5 + t) * skeleton.features + 2] = if t < 2 { 0.1 } else { 7.0 };
+        }
+        let rows =
+            |values: &[f32]| Tensor::from_data(TensorData::new(values.to_vec(), [2, 5, skeleton.features]), &device);
+        let weights = VaeLoss { feature: 0.0, joint: 0.0, feet: 3.0, kl: 0.0, ..VaeLoss::default() };
+        let zeros = || Tensor::zeros([2, 1, 1], &device);
+        let posterior = Posterior { mu_bnd: zeros(), logvar_bnd: zeros() };
+        let terms = vae(&weights.into(), &body, rows(&glides), rows(&stands), &posterior, &[5, 3]);
+        assert!(terms.joint.is_none() && terms.feature.is_none());
+        let found = terms.feet.expect("it has a weight").into_data().as_slice::<f32>().unwrap()[0];
+        // Of three axes one, smooth L1 of 2 is 1.5.
+        assert!((found - 3.0 * 1.5 / 3.0).abs() < 1e-5, "{found}");
     }
 
     #[test]

@@ -123,5 +123,6 @@ fn recipe(settings: &Value) -> VaeRecipe {
         feature: distance("lf"),
         joint: distance("lj"),
         velocity: distance("lv"),
+        feet: Pointwise::SmoothL1,
     }
 }

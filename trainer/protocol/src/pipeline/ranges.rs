@@ -102,6 +102,7 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("loss.feature", Real(0.0, 1e6), ""),
     ("loss.joint", Real(0.0, 1e6), ""),
     ("loss.velocity", Real(0.0, 1e6), ""),
+    ("loss.feet", Real(0.0, 1e6), ""),
     ("loss.kl", Real(0.0, 1e6), ""),
     ("loss.position", Real(0.0, 1e6), ""),
     ("loss.commitment", Real(0.0, 1e6), ""),

@@ -81,7 +81,8 @@ impl Objective for VaeObjective {
     }
 
     fn terms(&self) -> Vec<&'static str> {
-        vec![Losses::TOTAL, "feature", "joint", "kl"]
+        let feet = (self.settings.loss.feet != 0.0).then_some("feet");
+        [Losses::TOTAL, "feature", "joint", "kl"].into_iter().chain(feet).collect()
     }
 
     fn load(&mut self, state: &TrainState) {
@@ -114,15 +115,21 @@ impl Objective for VaeObjective {
         let posterior = self.network.encode(rows.clone(), &lengths, &mut dropout);
         let decoded = self.network.decode(posterior.sample(noise), &lengths, frames, &mut dropout);
 
-        // Early in training the joint term's root drift drowns the posture; it may join later.
+        // Early in training the root drift drowns the posture; the terms on joints may join later.
         let mut recipe = VaeRecipe::from(self.settings.loss.clone());
         if step < self.share(self.settings.loss.joint_from) {
             recipe.weights.joint = 0.0;
+            recipe.weights.feet = 0.0;
         }
         let terms = losses::vae(&recipe, &self.body, decoded, rows, &posterior, &lengths);
         let mut losses = Losses::new(global);
-        let named =
-            [("feature", terms.feature), ("joint", terms.joint), ("velocity", terms.velocity), ("kl", terms.kl)];
+        let named = [
+            ("feature", terms.feature),
+            ("joint", terms.joint),
+            ("velocity", terms.velocity),
+            ("feet", terms.feet),
+            ("kl", terms.kl),
+        ];
         for (name, term) in named {
             if let Some(term) = term {
                 // Its weight is in it.

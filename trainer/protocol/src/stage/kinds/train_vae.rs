@@ -16,17 +16,19 @@ pub struct VaeLoss {
     pub joint: f64,
     /// Smooth-L1 on local positions ("velocity" upstream).
     pub velocity: f64,
+    /// Smooth-L1 on how fast ankles and feet move, in m/s: what lets feet stand (our choice; MDM's L_vel and L_foot are its relatives).
+    pub feet: f64,
     /// KL to the standard normal, a mean over all elements.
     pub kl: f64,
     /// Padded frames are left out (v2); off is v1's plain mean.
     pub masked: bool,
-    /// Share of the steps before the joint term joins; early, its root drift drowns the posture.
+    /// Share of the steps before the terms on joints and feet join; early, the root drift drowns the posture.
     pub joint_from: f64,
 }
 
 impl Default for VaeLoss {
     fn default() -> Self {
-        Self { feature: 1.0, joint: 1.0, velocity: 0.0, kl: 1e-4, masked: true, joint_from: 0.0 }
+        Self { feature: 1.0, joint: 1.0, velocity: 0.0, feet: 0.0, kl: 1e-4, masked: true, joint_from: 0.0 }
     }
 }
 
@@ -116,7 +118,11 @@ impl StageSpec for TrainVae {
     }
 
     fn recorded(&self) -> &'static [&'static str] {
-        &["loss", "feature", "joint", "kl"]
+        if self.loss.feet == 0.0 {
+            &["loss", "feature", "joint", "kl"]
+        } else {
+            &["loss", "feature", "joint", "kl", "feet"]
+        }
     }
 
     fn latent(&self) -> Option<LatentShape> {
@@ -130,6 +136,7 @@ impl VaeLoss {
             ("loss.feature", self.feature),
             ("loss.joint", self.joint),
             ("loss.velocity", self.velocity),
+            ("loss.feet", self.feet),
             ("loss.kl", self.kl),
         ] {
             p.not_negative(field, weight);
