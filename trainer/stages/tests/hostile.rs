@@ -82,6 +82,14 @@ fn hostile_networks() -> Vec<Named> {
     let torch = named::torch().into_iter().map(|(what, bytes)| (what, at(0, Form::Torch, &bytes)));
     all.extend(torch);
     all.extend(named::safetensors().into_iter().map(|(what, bytes)| (what, at(1, Form::Safetensors, &bytes))));
+    // A frame behind so many tokens has no position.
+    all.push((
+        "a latent of 249 tokens",
+        changed(0, &|lines| {
+            let token = lines.iter_mut().find(|line| line.contains("global_motion_token")).expect("it has tokens");
+            *token = token.replace(" 2 ", " 498 ");
+        }),
+    ));
     for part in 0..PARTS.len() {
         let each = |change: &dyn Fn(&str) -> String| {
             changed(part, &|lines| lines.iter_mut().for_each(|line| *line = change(line)))

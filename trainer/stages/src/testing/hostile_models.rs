@@ -19,8 +19,8 @@ use models::networks::{
     MomaskConfig, Projection, ResidualTransformer, TimeFeatures, Tokenizer, TrajectoryConfig, TrajectoryEncoder,
     UnetConfig, Vae, VaeConfig,
 };
-use motion::npy;
 use motion::text::EMBEDDING_WIDTH;
+use motion::{Stream, npy};
 use protocol::artifact::Role;
 use protocol::stage::{DataFormat, FlowSolver, ImportModel, ImportedPart, Positions, StageSettings, TokenizerNetwork};
 use protocol::{ArtifactKind, Digest, Manifest, Seed};
@@ -68,6 +68,8 @@ const FEATURES: usize = 263;
 const JOINTS: usize = 22;
 /// Width of everything that may have any.
 const WIDTH: usize = 4;
+/// Frames of what is encoded and drawn.
+const FRAMES: usize = 40;
 /// Codebooks of MoMask's tokenizer.
 const BOOKS: usize = 3;
 /// Bytes of zeros behind a list.
@@ -328,6 +330,8 @@ fn settings(part: ImportedPart, form: Form, bytes: &[u8]) -> ImportModel {
         hint_statistics: statistics.clone(),
         statistics,
         solver: FlowSolver::Euler,
+        solver_steps: 1,
+        timesteps: 50,
         ..ImportModel::default()
     }
 }
@@ -365,18 +369,39 @@ impl World {
         }
     }
 
-    /// Opens what was imported, as the stages and commands that use it do.
+    /// Opens what was imported and puts it to use, as the stages and commands do.
     fn open(&self, part: ImportedPart, digest: Digest) -> Result<(), StageError> {
         let (blobs, device) = (self.bench.blobs(), self.bench.device());
         let manifest = self.bench.manifest(digest)?;
+        let tokenizer = |manifest: &Manifest| TrainedTokenizer::read(&*blobs, manifest, &device);
         match part {
-            ImportedPart::Vae => Autoencoder::read(&*blobs, &manifest, &device).map(drop),
-            ImportedPart::Tokenizer => TrainedTokenizer::read(&*blobs, &manifest, &device).map(drop),
-            ImportedPart::Discord => {
-                FlowDecoder::read(&*blobs, &manifest, (&Role::TOKENIZER, self.tokenizers[0]), &device).map(drop)
+            ImportedPart::Vae => {
+                let vae = Autoencoder::read(&*blobs, &manifest, &device)?;
+                let frames = vae.max_frames().min(FRAMES);
+                let z = vae.encode(vec![0.5; frames * FEATURES], frames).mu;
+                assert_eq!(vae.decode(z, frames).len(), frames * FEATURES);
             }
-            _ => Generator::load(&manifest, &*blobs, &device).map(drop),
+            ImportedPart::Tokenizer => {
+                let tokenizer = tokenizer(&manifest)?;
+                let ids = tokenizer.encode(vec![0.5; FRAMES * FEATURES]);
+                assert_eq!(tokenizer.decode(&ids).len(), FRAMES * FEATURES);
+            }
+            ImportedPart::Discord => {
+                let tokenizer = tokenizer(&self.bench.manifest(self.tokenizers[0])?)?;
+                let role = (&Role::TOKENIZER, self.tokenizers[0]);
+                let decoder = FlowDecoder::read(&*blobs, &manifest, role, &device)?;
+                let rows = decoder.decode(&tokenizer, &[0, 1, 0], &mut Stream::new(Seed(0), "noise", 0, 0));
+                assert_eq!(rows.len(), 12 * FEATURES);
+            }
+            _ => {
+                let generator = Generator::load(&manifest, &*blobs, &device)?;
+                let frames = generator.longest().min(FRAMES);
+                let drawn = generator.generate("a person walks", Some(frames), None, Seed(0));
+                // Weights may lead anywhere, also to where no motion is; only a fault would be ours.
+                accepted(drawn);
+            }
         }
+        Ok(())
     }
 }
 
