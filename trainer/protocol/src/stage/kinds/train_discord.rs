@@ -4,7 +4,10 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::stage::{Batch, Decay, Neighbours, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training, WindowsOf};
+use crate::stage::{
+    Batch, Decay, ImportModel, ImportedPart, Neighbours, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training,
+    WindowsOf,
+};
 use crate::{ArtifactKind, Steps, limits};
 
 /// Frames that one token stands for.
@@ -30,6 +33,47 @@ pub enum FlowPrediction {
     Velocity,
     /// The data, of which the velocity is computed: narrow networks can give that (Li and He, arXiv:2511.13720). The loss is on the data.
     Data,
+}
+
+impl FlowPrediction {
+    /// The word in YAML.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Velocity => "velocity",
+            Self::Data => "data",
+        }
+    }
+
+    /// What the network of the flow decoder that stage `name` gives predicts, as far as the pipeline says it.
+    pub(super) fn of_stage(stages: &Neighbours<'_>, name: &str) -> Option<Self> {
+        let stage = stages.stage(name)?;
+        if let Some(trained) = stage.get::<TrainDiscord>() {
+            return Some(trained.prediction);
+        }
+        if stage.get::<ImportModel>().is_some_and(|import| import.part == ImportedPart::Discord) {
+            return Some(Self::Velocity);
+        }
+        // A student's is its teacher's; what only passes a decoder on says nothing of its own.
+        Self::of_stage(stages, stages.read_by(name, ArtifactKind::FlowDecoder)?)
+    }
+
+    /// Refuses to begin with a network of another prediction than `ours`.
+    pub(super) fn check_init(stages: &Neighbours<'_>, p: &mut Problems, init: &str, ours: Option<Self>) {
+        if let (Some(ours), Some(theirs)) = (ours, Self::of_stage(stages, init))
+            && ours != theirs
+        {
+            let message = format!(
+                "`init` is `{init}`, whose network gives the {}, but the one that is trained here gives the {}",
+                theirs.name(),
+                ours.name()
+            );
+            p.add(
+                "init",
+                message,
+                "what the one learned says nothing to the other; name a decoder of the same `prediction`",
+            );
+        }
+    }
 }
 
 /// How tokens become a condition on each frame, of a U-Net.
@@ -210,6 +254,7 @@ impl StageSpec for TrainDiscord {
             false => ("vae", &self.vae[..]),
         };
         stages.same_skeleton(p, decoded, &self.dataset);
+        FlowPrediction::check_init(stages, p, &self.init, Some(self.prediction));
     }
 
     fn training(&mut self) -> Option<&mut Training> {
