@@ -5,8 +5,8 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::stage::{
-    Batch, Decay, ImportModel, ImportedPart, Neighbours, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training,
-    WindowsOf,
+    Batch, Decay, FlowSolver, ImportModel, ImportedPart, Neighbours, Optimizer, Output, Problems, Ref, Shape,
+    StageSpec, Training, WindowsOf,
 };
 use crate::{ArtifactKind, Steps, limits};
 
@@ -87,17 +87,6 @@ pub enum FlowProjection {
     Repeat,
     /// Two transposed convolutions.
     Transposed,
-}
-
-/// How the flow is followed when motion is decoded.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum FlowSolver {
-    /// One evaluation of the network a step; the paper's text says 16 steps.
-    Euler,
-    /// Two; the released code makes 15 steps.
-    #[default]
-    Midpoint,
 }
 
 /// Size of the network. The default is the published U-Net; the transformer in the code base has 512, 384, 4 and 4.
