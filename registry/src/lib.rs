@@ -27,6 +27,7 @@ pub mod retention;
 mod sqlite;
 mod store;
 mod store_id;
+pub mod testing;
 pub mod versions;
 mod vouched;
 mod write;

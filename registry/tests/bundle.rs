@@ -6,118 +6,59 @@ use std::io::{self, Read, Write as _};
 
 use checkpoint::BlobError;
 
-use checkpoint::model::{Model, assemble, extend};
-use protocol::artifact::{FileEntry, Role};
-use protocol::stage::{DataFormat, Sampler};
+use checkpoint::model::Model;
+use protocol::artifact::FileEntry;
 use protocol::{ArtifactKind, Digest, Manifest, ModelName};
-use registry::bundle::{FORMAT, Head, Sink, Writer, card, read};
+use registry::bundle::{Head, Sink, Writer, card, read};
+use registry::testing::{Entry, Whole, archive, compressed};
 use registry::{Holder, Store, Version};
 use serde_json::{Value, json};
 use tar::{EntryType, Header};
 
 const HEAD: &str = "bundle.json";
-const MANIFEST: &str = "manifest.json";
 const CARD: &str = "card.md";
 
-/// A model of two parts whose files are `files`.
-struct Whole {
-    head: Head,
-    manifest: Manifest,
-    files: BTreeMap<Digest, Vec<u8>>,
-}
-
-fn part(kind: ArtifactKind, meta: Value, name: &str, bytes: &[u8]) -> Manifest {
-    let mut manifest = Manifest::new(kind, meta);
-    manifest.files.insert(name.into(), FileEntry { digest: Digest::of(bytes), bytes: bytes.len() as u64 });
-    manifest
-}
-
+/// What is exported: the VAE's weights are too many for one piece.
 fn whole() -> Whole {
-    let (weights, other) = (vec![7; 100_000], b"some weights".to_vec());
-    let vae =
-        part(ArtifactKind::Vae, json!({"features": 263, "mean": [0.5], "std": [1.0]}), "model.safetensors", &weights);
-    let text = Manifest::new(ArtifactKind::TextEncoder, json!({"encoder": "hashed", "dim": 4}));
-    let fits = json!({"vae": vae.digest(), "text": text.digest()});
-    let denoiser = part(ArtifactKind::Denoiser, json!({"fits": fits}), "model.safetensors", &other);
-    let parts = BTreeMap::from([(Role::VAE, vae), (Role::TEXT, text), (Role::DENOISER, denoiser)]);
-    let manifest = assemble("latent-diffusion", DataFormat::Humanml3d, &parts).unwrap();
-    let manifest = extend(&manifest, Some(&Sampler::default()), &BTreeMap::new()).unwrap();
-    let mut files: BTreeMap<Digest, Vec<u8>> = parts.values().map(|part| (part.digest(), part.to_bytes())).collect();
-    files.extend([weights, other].map(|bytes| (Digest::of(&bytes), bytes)));
-    let metrics = BTreeMap::from([("fid".to_owned(), Some(0.25)), ("odd".to_owned(), None)]);
-    let source = json!({"run": "r-1", "stage": "lcm", "metric": "fid", "mode": "min"});
-    let model = ModelName::new("quick");
-    let head = Head { format: FORMAT, model, version: 3, artifact: manifest.digest(), metrics, source };
-    Whole { head, manifest, files }
+    Whole::of(vec![7; 100_000])
 }
 
-impl Whole {
-    fn version(&self) -> Version {
-        Version {
-            model: self.head.model.clone(),
-            version: self.head.version,
-            artifact: self.head.artifact,
-            metrics: BTreeMap::from([
-                ("fid".to_owned(), 0.25),
-                ("fid.lower".to_owned(), 0.2),
-                ("fid.upper".to_owned(), 0.3),
-            ]),
-            source: self.head.source.clone(),
-            created_ms: 0,
-            aliases: Vec::new(),
-        }
-    }
+fn packed(entries: &[Entry]) -> Vec<u8> {
+    compressed(&archive(entries))
+}
 
-    fn card(&self) -> String {
-        let model = Model::read(&self.manifest).unwrap();
-        let parts = model
-            .parts
-            .iter()
-            .map(|(role, digest)| (role.clone(), serde_json::from_slice(&self.files[digest]).unwrap()));
-        card(&self.version(), &self.manifest, &model, &parts.collect())
-    }
-
-    fn bytes(&self) -> Vec<u8> {
-        let mut writer = Writer::begin(Vec::new(), &self.head, &self.manifest, &self.card()).unwrap();
-        for (name, entry) in &self.manifest.files {
-            writer.file(name, entry.bytes).unwrap();
-            for piece in self.files[&entry.digest].chunks(1000) {
-                writer.write(piece).unwrap();
-            }
-        }
-        writer.finish().unwrap()
-    }
-
-    /// Its entries, in order, to be changed and packed again.
-    fn entries(&self) -> Vec<(String, EntryType, Vec<u8>)> {
-        let mut all = vec![
-            (HEAD.to_owned(), EntryType::Regular, serde_json::to_vec(&self.head).unwrap()),
-            (MANIFEST.to_owned(), EntryType::Regular, self.manifest.to_bytes()),
-            (CARD.to_owned(), EntryType::Regular, b"# a card\n".to_vec()),
-        ];
-        let file = |(name, entry): (&String, &FileEntry)| {
-            (name.clone(), EntryType::Regular, self.files[&entry.digest].clone())
-        };
-        all.extend(self.manifest.files.iter().map(file));
-        all
+fn version(whole: &Whole) -> Version {
+    Version {
+        model: whole.head.model.clone(),
+        version: whole.head.version,
+        artifact: whole.head.artifact,
+        metrics: BTreeMap::from([
+            ("fid".to_owned(), 0.25),
+            ("fid.lower".to_owned(), 0.2),
+            ("fid.upper".to_owned(), 0.3),
+        ]),
+        source: whole.head.source.clone(),
+        created_ms: 0,
+        aliases: Vec::new(),
     }
 }
 
-/// An archive of entries whose names nobody checks.
-fn packed(entries: &[(String, EntryType, Vec<u8>)]) -> Vec<u8> {
-    let mut tar = Vec::new();
-    for (name, kind, content) in entries {
-        let mut header = Header::new_ustar();
-        header.as_old_mut().name[..name.len()].copy_from_slice(name.as_bytes());
-        header.set_entry_type(*kind);
-        header.set_size(content.len() as u64);
-        header.set_cksum();
-        tar.extend_from_slice(header.as_bytes());
-        tar.extend_from_slice(content);
-        tar.resize(tar.len().next_multiple_of(512), 0);
+fn card_of(whole: &Whole) -> String {
+    let model = Model::read(&whole.manifest).unwrap();
+    let parts =
+        model.parts.iter().map(|(role, digest)| (role.clone(), serde_json::from_slice(&whole.files[digest]).unwrap()));
+    card(&version(whole), &whole.manifest, &model, &parts.collect())
+}
+
+fn exported(whole: &Whole) -> Vec<u8> {
+    let mut writer = Writer::begin(Vec::new(), &whole.head, &whole.manifest, &card_of(whole)).unwrap();
+    for (name, entry) in &whole.manifest.files {
+        writer.file(name, entry.bytes).unwrap();
+        for piece in whole.files[&entry.digest].chunks(1000) {
+            writer.write(piece).unwrap();
+        }
     }
-    tar.resize(tar.len() + 1024, 0);
-    zstd::encode_all(&tar[..], 1).unwrap()
+    writer.finish().unwrap()
 }
 
 /// Takes files into memory.
@@ -151,8 +92,8 @@ fn refused(bytes: &[u8]) -> String {
 #[test]
 fn what_is_written_is_read() {
     let whole = whole();
-    let bytes = whole.bytes();
-    assert_eq!(whole.bytes(), bytes, "one version, one file");
+    let bytes = exported(&whole);
+    assert_eq!(exported(&whole), bytes, "one version, one file");
     let mut kept = Kept::default();
     let found = read(&bytes[..], &mut kept).unwrap();
     assert_eq!((&found.head, &found.manifest), (&whole.head, &whole.manifest));
@@ -179,7 +120,7 @@ fn what_is_written_is_read() {
 
 #[test]
 fn every_cut_and_every_changed_byte_is_found() {
-    let bytes = whole().bytes();
+    let bytes = exported(&whole());
     for length in (0..bytes.len()).step_by(7) {
         let cut = refused(&bytes[..length]);
         assert!(!cut.is_empty(), "{length}");
@@ -327,7 +268,7 @@ fn bombs_are_left_at_the_first_byte_too_many() {
     let window = refused(&encoder.finish().unwrap());
     assert!(window.contains("cannot be unpacked"), "{window}");
     // Behind a whole archive.
-    let mut behind = zstd::decode_all(&whole().bytes()[..]).unwrap();
+    let mut behind = zstd::decode_all(&exported(&whole())[..]).unwrap();
     behind.extend(std::iter::repeat_n(0, 10 * 512));
     assert!(read(&zstd::encode_all(&behind[..], 1).unwrap()[..], &mut ()).is_ok(), "tar's own padding");
     behind.push(1);
@@ -340,7 +281,7 @@ async fn a_bundle_becomes_a_version_or_nothing() {
     let store = Store::open(&dir.path().join("store"), Holder::this_process("test")).await.unwrap();
     let file = dir.path().join("b.tar.zst");
     let (whole, blobs) = (whole(), || store.blobs().list().unwrap().len());
-    let bytes = whole.bytes();
+    let bytes = exported(&whole);
     for damaged in [&bytes[..bytes.len() - 9], &bytes[..bytes.len() / 2], b"no bundle"] {
         std::fs::write(&file, damaged).unwrap();
         store.import_bundle(&file, None).await.unwrap_err();

@@ -45,6 +45,9 @@ pub const MISTAKES: usize = 100;
 /// Overrides on one command line.
 pub const OVERRIDES: usize = 1_000;
 
+/// Tokens of a latent. A VAE's tables have 500 positions: for a mean and a deviation of each token, and for the frames of a clip, of which the longest
+/// has fewer than 200.
+pub const LATENT_TOKENS: u64 = 150;
 /// Shards of one stage.
 pub const SHARDS: u64 = 10_000;
 /// Shards of all stages of a pipeline.

@@ -15,6 +15,7 @@ mod diffusion;
 mod distillation;
 mod evaluation;
 mod features;
+mod flow;
 mod frequency;
 mod identity;
 mod kinds;
@@ -36,17 +37,18 @@ pub use data::DataFormat;
 pub use diffusion::{Diffusion, NoiseSchedule, Prediction};
 pub use distillation::{Distance, Distillation};
 pub use evaluation::{Mode, Split};
+pub use flow::FlowSolver;
 pub use frequency::{FrequencyLosses, LowFrequency, Norm, Over, Semantic};
 pub use identity::{Backend, StageIdentity};
 pub use kinds::{
     Activity, ClipIds, ClipOutput, ControlDistance, ControlLoss, ControlMean, DataFeatures, DataOpen, DataSynthetic,
     DistillDiscord, DistillLcm, DistillPcm, EncodeLatents, EncodeTokens, EvaluateControl, EvaluateLatentFid,
     EvaluateRecognition, EvaluateReconstruction, EvaluateSpectrum, EvaluateT2m, EvaluatorNetwork, FlowBackbone,
-    FlowNetwork, FlowPrediction, FlowProjection, FlowSolver, ImportEvaluator, ImportModel, ImportedPart, MdmNetwork,
-    ModelDecoder, MovementPhase, MultiModality, Promote, Register, Resets, Splits, StableMoFusionNetwork,
-    StageSettings, TextActivation, TextEmbed, TextEncoder, TokenGenerator, TokenNetwork, TokenizerLoss,
-    TokenizerNetwork, TrainControl, TrainDiscord, TrainEvaluator, TrainLength, TrainMdm, TrainMld, TrainStableMoFusion,
-    TrainTokenizer, TrainTokens, TrainVae, UpAxis, VaeLoss, Windows, WindowsOf,
+    FlowNetwork, FlowPrediction, FlowProjection, ImportEvaluator, ImportModel, ImportedPart, MdmNetwork, ModelDecoder,
+    MovementPhase, MultiModality, Promote, Register, Resets, Splits, StableMoFusionNetwork, StageSettings,
+    TextActivation, TextEmbed, TextEncoder, TokenGenerator, TokenNetwork, TokenizerLoss, TokenizerNetwork,
+    TrainControl, TrainDiscord, TrainEvaluator, TrainLength, TrainMdm, TrainMld, TrainStableMoFusion, TrainTokenizer,
+    TrainTokens, TrainVae, UpAxis, VaeLoss, Windows, WindowsOf,
 };
 pub use neighbours::{Neighbour, Neighbours};
 pub use network::{LatentShape, Network, Positions};

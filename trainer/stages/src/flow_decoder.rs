@@ -51,7 +51,8 @@ pub struct FlowMeta {
     pub code_dim: usize,
     /// What the velocity is predicted by.
     pub backbone: FlowBackbone,
-    /// What its network gives.
+    /// What its network gives: the velocity, where it is not said.
+    #[serde(default)]
     pub prediction: FlowPrediction,
     /// Size.
     pub network: FlowNetwork,
@@ -175,7 +176,20 @@ impl Field {
     }
 
     /// With the weights that training is to begin with.
+    ///
+    /// # Errors
+    /// If they give something else than this network is to give: their shapes would fit, and what they learned would mean nothing.
     pub(crate) fn begun_with(self, start: &mut WarmStart) -> Result<Self, StageError> {
+        if let Some(theirs) = start.part() {
+            let theirs: FlowMeta = artifacts::meta(theirs, "the flow decoder of `init`")?;
+            if theirs.prediction != self.prediction {
+                return Err(StageError::Input(format!(
+                    "the network of `init` gives the {}, but the one that is trained here gives the {}; name a decoder of the same `prediction`",
+                    theirs.prediction.name(),
+                    self.prediction.name()
+                )));
+            }
+        }
         let backbone = match self.backbone {
             Backbone::Unet(network) => Backbone::Unet(start.take(network, "")?),
             Backbone::Dit(network) => Backbone::Dit(start.take(network, "")?),

@@ -6,6 +6,7 @@
 mod attempt;
 mod gang;
 pub mod hostile;
+pub mod hostile_models;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;

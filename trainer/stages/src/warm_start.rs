@@ -4,8 +4,8 @@
 //! the one part of that kind that a model has. Tensors are taken over where name and shape are the same; all others stay as they would be
 //! without `init`, and are said. So a VAE of KIT-ML begins with one of HumanML3D, fresh only where features go in and come out. That
 //! nothing fits is an error, and so it is if nothing does but biases and the like, which have one axis. What else differs (statistics of the
-//! data, another text encoder, another noise schedule) is said too, and hinders nothing. Not its job: a checkpoint, which is all of a
-//! training's state and comes after.
+//! data, another text encoder, another noise schedule) is said too, and hinders nothing, unless the kind refuses it. Not its job: a checkpoint,
+//! which is all of a training's state and comes after.
 
 use std::collections::BTreeSet;
 
@@ -61,6 +61,11 @@ impl WarmStart {
         };
         let file = artifacts::open(&*blobs, &part, MODEL_FILE)?;
         Ok(Self(Some(Weights { digest, part, file, taken: 0, matrices: 0, fresh: Vec::new(), known: BTreeSet::new() })))
+    }
+
+    /// The artifact whose weights are taken over, if any is named: what hinders that beside names and shapes is for its kind to say.
+    pub(crate) fn part(&self) -> Option<&Manifest> {
+        self.0.as_ref().map(|weights| &weights.part)
     }
 
     /// `network` with the weights that fit it, of those whose names begin with `prefix`.

@@ -1,4 +1,4 @@
-//! The importer of evaluators on changed files, for a time, and on files that were made to do harm; see `hostile::fuzz` for the rules and for what to do with what is found.
+//! The importers of evaluators and of published models on changed files, for a time, and on files that were made to do harm; see `hostile::fuzz` for the rules and for what to do with what is found.
 
 use std::alloc::System;
 use std::path::Path;
@@ -13,11 +13,12 @@ use models::names::to_bytes;
 use models::networks::{Evaluator, EvaluatorConfig, Init};
 use protocol::Seed;
 use protocol::stage::Positions;
+use stages::testing::hostile_models::{self, Form, PARTS};
 
 #[global_allocator]
 static MEMORY: Cap<System> = Cap::new(System, usize::MAX);
 
-const PARTS: [&str; 3] = ["text_encoder", "motion_encoder", "movement_encoder"];
+const NETWORKS: [&str; 3] = ["text_encoder", "motion_encoder", "movement_encoder"];
 
 /// A file behind the byte that says which of two it is.
 fn marked(mark: u8, bytes: Vec<u8>) -> Vec<u8> {
@@ -38,8 +39,8 @@ fn evaluators() -> Vec<Vec<u8>> {
     let device = burn::tensor::Device::flex();
     let network = Evaluator::new(&config, &mut Init::new(Seed(0), "small", Positions::Uniform, &device));
     vec![
-        marked(0, seeds::torch_archive(&PARTS)),
-        marked(0, seeds::torch_legacy(&PARTS)),
+        marked(0, seeds::torch_archive(&NETWORKS)),
+        marked(0, seeds::torch_legacy(&NETWORKS)),
         marked(1, to_bytes(&layout(&network), &flat::read(&network))),
     ]
 }
@@ -53,7 +54,100 @@ fn vocabularies() -> Vec<Vec<u8>> {
     vec![seeds::pickled_rows(&[("sos", 0), ("eos", 1), ("unk", 2), ("walk", 3)])]
 }
 
-const TARGETS: [Target; 2] = [
+/// Of each part a file in each form, and the file of torch in the form before archives.
+fn models() -> Vec<Vec<u8>> {
+    let all = PARTS.into_iter().flat_map(|part| {
+        let small = hostile_models::small(part);
+        [Form::Torch, Form::Safetensors, Form::List].map(|form| hostile_models::marked(part, form, &small))
+    });
+    all.chain([at(0, Form::Torch, &seeds::torch_legacy(&["state_dict"]))]).collect()
+}
+
+/// A file behind the bytes that say of which part and in which form it is.
+fn at(part: usize, form: Form, bytes: &[u8]) -> Vec<u8> {
+    [&[part as u8, form as u8], bytes].concat()
+}
+
+/// A part's list with something else in it.
+fn changed(part: usize, change: &dyn Fn(&mut Vec<String>)) -> Vec<u8> {
+    let list = hostile_models::marked(PARTS[part], Form::List, &hostile_models::small(PARTS[part]));
+    let mut lines: Vec<String> = String::from_utf8_lossy(&list[2..]).lines().map(str::to_owned).collect();
+    change(&mut lines);
+    at(part, Form::List, lines.join("\n").as_bytes())
+}
+
+/// Published weights that run something, lie about their size, or make no network.
+fn hostile_networks() -> Vec<Named> {
+    let mut all = Vec::new();
+    let torch = named::torch().into_iter().map(|(what, bytes)| (what, at(0, Form::Torch, &bytes)));
+    all.extend(torch);
+    all.extend(named::safetensors().into_iter().map(|(what, bytes)| (what, at(1, Form::Safetensors, &bytes))));
+    // A frame behind so many tokens has no position.
+    all.push((
+        "a latent of 249 tokens",
+        changed(0, &|lines| {
+            let token = lines.iter_mut().find(|line| line.contains("global_motion_token")).expect("it has tokens");
+            *token = token.replace(" 2 ", " 498 ");
+        }),
+    ));
+    for part in 0..PARTS.len() {
+        let each = |change: &dyn Fn(&str) -> String| {
+            changed(part, &|lines| lines.iter_mut().for_each(|line| *line = change(line)))
+        };
+        // The first line is of a tensor that the network cannot do without.
+        let first = |element: &str, shape: &str| {
+            changed(part, &|lines| {
+                let name = lines[0].split(' ').nth(1).expect("a name").to_owned();
+                lines[0] = format!("{element} {name} {shape}");
+            })
+        };
+        all.extend([
+            ("nothing at all", at(part, Form::List, b"")),
+            ("a tensor that is missing", changed(part, &|lines| _ = lines.remove(0))),
+            ("a tensor of no number", first("F32", "0")),
+            ("a tensor of 2^60 numbers", first("F32", "1152921504606846976")),
+            ("more numbers than can be counted", first("F32", "4294967295 4294967295 4294967295")),
+            ("an axis of 2^60 beside one of 0", first("F32", "1152921504606846976 0")),
+            ("ten thousand axes", first("F32", &"1 ".repeat(10_000))),
+            ("a tensor of integers", first("I64", "4")),
+            ("tensors of no floats", each(&|line| line.replace("F32", "BOOL"))),
+            ("all tensors of one number", each(&|line| line.split(' ').take(2).collect::<Vec<_>>().join(" "))),
+            (
+                "all axes turned round",
+                each(&|line| {
+                    let words: Vec<&str> = line.split(' ').collect();
+                    let shape: Vec<&str> = words[2..].iter().rev().copied().collect();
+                    format!("F32 {} {}", words[1], shape.join(" "))
+                }),
+            ),
+            (
+                "sixty thousand tensors",
+                changed(part, &|lines| {
+                    lines.extend((0..60_000).map(|i| format!("F32 other.{i} 1")));
+                }),
+            ),
+            (
+                "blocks without end",
+                changed(part, &|lines| {
+                    let more: Vec<String> = lines
+                        .iter()
+                        .filter(|line| line.contains(".0."))
+                        .flat_map(|line| (1..400).map(move |i| line.replacen(".0.", &format!(".{i}."), 1)))
+                        .collect();
+                    lines.extend(more);
+                    lines.remove(0);
+                }),
+            ),
+        ]);
+    }
+    all
+}
+
+const TARGETS: [Target; 3] = [
+    Target::new("model", hostile_models::model, models)
+        .named(hostile_networks)
+        .within(PICKLE_MEMORY)
+        .words("F32 ¦F64 ¦BF16 ¦I64 ¦BOOL ¦ 0 ¦ 1¦\nF32 ¦.weight¦.bias¦.0.¦.1.¦state_dict.¦vae.¦denoiser.¦trans.¦model.¦latent_pre.weight ¦latent_proj.weight ¦time_embedding.cond_proj.weight ¦output_proj_bias ¦net.mid_attn.fn.fn.to_qkv.weight ¦.attn.mask ¦h\0¦R¦."),
     Target::new("evaluator", stages::testing::hostile::evaluator, evaluators)
         .named(hostile_evaluators)
         .within(PICKLE_MEMORY)
@@ -75,8 +169,24 @@ fn evaluator() {
 }
 
 #[test]
+fn model() {
+    run("model");
+}
+
+#[test]
 fn vocabulary() {
     run("vocabulary");
+}
+
+/// A part whose files are all refused would be tried for nothing.
+#[test]
+fn every_part_is_imported_in_every_form() {
+    for part in PARTS {
+        for form in [Form::Torch, Form::Safetensors, Form::List] {
+            let bytes = hostile_models::marked(part, form, &hostile_models::small(part));
+            assert!(hostile_models::model(&bytes), "{}, {form:?}", part.name());
+        }
+    }
 }
 
 #[test]

@@ -2,6 +2,7 @@
 //! that these store, and what is refused.
 
 use std::collections::BTreeMap;
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use burn::module::Module;
@@ -143,8 +144,25 @@ fn exported(world: &World, digest: Digest, layout: Layout) -> BTreeMap<&'static 
     written
 }
 
+/// Keeps an exported file in the folder `STRIDE_EXPORTS`, if that is set, and notes there what it was imported from: `tests/torch_load.py` reads both.
+fn keep(ours: &Path, theirs: &Path, without: &[&str]) {
+    let Some(folder) = std::env::var_os("STRIDE_EXPORTS").map(PathBuf::from) else { return };
+    // A layout's folder has the digest of what was exported in its name.
+    let layout = ours.parent().expect("a folder of a layout");
+    let kept = format!("{}-{}", name(layout), name(ours));
+    std::fs::create_dir_all(&folder).expect("a folder that was asked for");
+    std::fs::copy(ours, folder.join(&kept)).expect("a folder that was asked for");
+    let row =
+        [&[kept, text_of(theirs)][..], &without.iter().map(|begin| (*begin).to_owned()).collect::<Vec<_>>()].concat();
+    let mut pairs = std::fs::OpenOptions::new();
+    let mut pairs =
+        pairs.create(true).append(true).open(folder.join("pairs.tsv")).expect("a folder that was asked for");
+    pairs.write_all(format!("{}\n", row.join("\t")).as_bytes()).expect("a folder that was asked for");
+}
+
 /// Holds an exported file against the one that was imported: the same names and bits, but for names that begin with one of `without`.
 fn expect_file(ours: &Path, theirs: &Path, without: &[&str]) {
+    keep(ours, theirs, without);
     let open = |path: &Path| Weights::open_file(path).unwrap_or_else(|e| panic!("{e}"));
     let (ours_open, theirs_open) = (open(ours), open(theirs));
     let kept = |name: &&String| !without.iter().any(|begin| name.starts_with(begin));

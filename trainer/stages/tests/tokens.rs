@@ -8,11 +8,12 @@ use std::collections::BTreeMap;
 
 use protocol::stage::{
     Batch, CheckpointPolicy, DataSynthetic, Decay, DistillDiscord, EncodeTokens, EvaluateReconstruction,
-    EvaluatorNetwork, FlowNetwork, FlowProjection, FlowSolver, ModelDecoder, MovementPhase, Optimizer, Resets, Sampler,
-    StageSettings, TextEmbed, TokenGenerator, TokenNetwork, TokenizerNetwork, TrainDiscord, TrainEvaluator,
-    TrainTokenizer, TrainTokens, Training,
+    EvaluatorNetwork, FlowNetwork, FlowPrediction, FlowProjection, FlowSolver, ModelDecoder, MovementPhase, Optimizer,
+    Resets, Sampler, StageSettings, TextEmbed, TokenGenerator, TokenNetwork, TokenizerNetwork, TrainDiscord,
+    TrainEvaluator, TrainTokenizer, TrainTokens, Training,
 };
 use protocol::{Digest, Seed, Steps};
+use stages::context::StageError;
 use stages::generate::Generator;
 use stages::testing::{Bench, Script};
 use stages::tokenizer::TrainedTokenizer;
@@ -344,24 +345,53 @@ fn run_up_to(name: &str) -> World {
     world
 }
 
-/// Over one interval the student's jump is the teacher's step of Euler, with which it starts; over shorter ones it has something to learn.
+/// Over one interval the student's jump is the teacher's step of Euler, with which it starts, whatever its network gives; over shorter ones it has
+/// something to learn.
 #[test]
 fn a_student_starts_as_its_teachers_step() {
     let mut world = run_up_to("discord");
+    for prediction in [FlowPrediction::Velocity, FlowPrediction::Data] {
+        let StageSettings::TrainDiscord(flow) = discord() else { unreachable!() };
+        let flow = TrainDiscord { solver: FlowSolver::Euler, prediction, ..flow };
+        let inputs = world.inputs(&[("dataset", "dataset"), ("tokenizer", "residual")]);
+        world.bench.forget("discord");
+        let teacher = world.bench.run("discord", &flow.into(), &inputs).unwrap().output();
+        let inputs = [&inputs[..], &[("teacher", teacher)]].concat();
+        let mut losses = Vec::new();
+        for intervals in [1, 4] {
+            let StageSettings::DistillDiscord(settings) = jumps("", 1) else { unreachable!() };
+            let training = Training { lr: 1e-9, ..settings.training };
+            let settings = DistillDiscord { intervals, training, ..settings };
+            world.bench.forget("jumps");
+            let ran = world.bench.run("jumps", &settings.into(), &inputs).unwrap();
+            losses.push(ran.metrics()["loss"]);
+            assert_eq!(world.bench.manifest(ran.output()).unwrap().meta["prediction"], prediction.name());
+        }
+        assert!(losses[0] < 1e-6 && losses[1] > 1e-4, "{prediction:?}: {losses:?}");
+    }
+}
+
+/// The weights of a network that gives the velocity fit one that gives the data by name and shape, and mean nothing there.
+#[test]
+fn what_begins_with_another_prediction_is_refused() {
+    let mut world = run_up_to("jumps");
     let StageSettings::TrainDiscord(flow) = discord() else { unreachable!() };
-    let flow = TrainDiscord { solver: FlowSolver::Euler, ..flow };
+    let data = TrainDiscord { prediction: FlowPrediction::Data, init: "discord".into(), ..flow.clone() };
     let inputs = world.inputs(&[("dataset", "dataset"), ("tokenizer", "residual")]);
-    let teacher = world.bench.run("discord", &flow.into(), &inputs).unwrap().output();
-    let inputs = [&inputs[..], &[("teacher", teacher)]].concat();
-    let mut loss = |intervals| {
-        let StageSettings::DistillDiscord(settings) = jumps("", 1) else { unreachable!() };
-        let training = Training { lr: 1e-9, ..settings.training };
-        let settings = DistillDiscord { intervals, training, ..settings };
-        world.bench.forget("jumps");
-        world.bench.run("jumps", &settings.into(), &inputs).unwrap().metrics()["loss"]
-    };
-    let (one, four) = (loss(1), loss(4));
-    assert!(one < 1e-6 && four > 1e-4, "{one}, {four}");
+    let velocity = ("init", world.outputs["discord"]);
+    let with = |more: &[(&'static str, Digest)]| [&inputs[..], more].concat();
+    let error = world.bench.run("data", &data.clone().into(), &with(&[velocity])).unwrap_err();
+    let said = "the network of `init` gives the velocity, but the one that is trained here gives the data";
+    assert!(matches!(&error, StageError::Input(error) if error.starts_with(said)), "{error}");
+    assert_eq!(world.bench.checkpoints("data"), [0_u64; 0], "it had begun");
+    let output = world.bench.run("data", &data.clone().into(), &inputs).unwrap().output();
+    let begun = world.bench.run("more", &data.into(), &with(&[("init", output)])).unwrap();
+    assert!(begun.told.log.iter().any(|line| line.starts_with("begins with")), "{:?}", begun.told.log);
+    // A student is of its teacher's prediction.
+    let of_data = with(&[("teacher", output), velocity]);
+    let error = world.bench.run("jumps", &jumps("", 1), &of_data).unwrap_err().to_string();
+    assert!(error.contains(said), "{error}");
+    world.bench.run("jumps", &jumps("", 1), &with(&[("teacher", output), ("init", output)])).unwrap();
 }
 
 #[test]

@@ -32,7 +32,7 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("shards", Whole(1, limits::SHARDS), "shards"),
     ("max_tokens", Whole(0, 4_096), "tokens"),
     // Networks.
-    ("latent.tokens", Whole(1, 4_096), "tokens"),
+    ("latent.tokens", Whole(1, limits::LATENT_TOKENS), "tokens"),
     ("latent.dim", Whole(1, 16_384), "numbers a token"),
     ("network.width", Whole(1, 16_384), "channels"),
     ("network.layers", Whole(1, 255), "layers"),

@@ -25,6 +25,9 @@ stages:
   quick: {kind: model.decoder, model: mld, decoder: latent_flow}
   recon: {kind: evaluate.reconstruction, tokenizer: residual, decoder: flow, evaluator: judge}
   t2m: {kind: evaluate.t2m, model: mmm, evaluator: judge, sampler: {steps: 10, guidance: 0}}
+  whole: {kind: train.discord, prediction: data, tokenizer: residual}
+  again: {kind: train.discord, init: flow, tokenizer: residual}
+  faster: {kind: distill.discord, init: jumps, teacher: flow, tokenizer: residual}
 ";
 
 #[test]
@@ -101,6 +104,20 @@ fn what_does_not_fit_is_refused_where_it_stands() {
             "no latent diffusion",
         ),
         ("model: momask, decoder: flow", "model: judge, decoder: flow", 14, "needs a model"),
+        // Networks that give something else.
+        (
+            "init: flow",
+            "init: whole",
+            24,
+            "`init` is `whole`, whose network gives the data, but the one that is trained here gives the velocity",
+        ),
+        ("init: flow", "prediction: data, init: jumps", 24, "`init` is `jumps`, whose network gives the velocity"),
+        (
+            "init: jumps, teacher: flow",
+            "init: jumps, teacher: whole",
+            25,
+            "gives the velocity, but the one that is trained here gives the data",
+        ),
     ] {
         assert_eq!(GOOD.matches(from).count(), 1, "{from}");
         let shown = read("p.yaml", &GOOD.replacen(from, to, 1), &[]).expect_err(to).to_string();

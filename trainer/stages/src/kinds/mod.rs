@@ -21,6 +21,7 @@ mod latent_data;
 mod latent_fid;
 mod lcm;
 mod length;
+mod measured;
 mod mld;
 mod mmm;
 mod model_decoder;
@@ -44,14 +45,13 @@ use burn::module::Module;
 use burn::tensor::Tensor;
 use checkpoint::model::Drawn;
 use models::flat::{self, add_gradients};
-use motion::{Dataset, Stream};
-use protocol::stage::{Sampler, Split, StageSettings, Training};
+use motion::Stream;
+use protocol::stage::{Split, StageSettings, Training};
 use protocol::{ArtifactKind, Digest};
 use serde_json::{Value, json};
 
 use crate::artifacts;
 use crate::context::{AttemptContext, GangContext, Outcome, Part, StageError};
-use crate::generator::{self, MotionGenerator};
 use crate::train::{Average, Clip, GroupPlan, Losses, SliceResult, Turns};
 
 /// Where a report's details are.
@@ -196,23 +196,6 @@ fn drawn(cx: &dyn AttemptContext) -> Result<Value, StageError> {
     let Some(sampler) = task.settings.sampler() else { return Ok(Value::Null) };
     let drawn = Drawn { model: artifacts::input(cx, "model", ArtifactKind::Model)?.0, sampler: sampler.clone() };
     Ok(artifacts::to_meta(&drawn))
-}
-
-/// The inputs `dataset` and `model` of an evaluation that draws with `sampler`.
-///
-/// # Errors
-/// A model of another skeleton, or without that sampler.
-fn measured(cx: &dyn AttemptContext, sampler: &Sampler) -> Result<(Dataset, Box<dyn MotionGenerator>), StageError> {
-    let blobs = cx.blobs();
-    let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-    let dataset = artifacts::dataset(&*blobs, &manifest)?;
-    let (_, manifest) = artifacts::input(cx, "model", ArtifactKind::Model)?;
-    let model = generator::open(&manifest, &*blobs, &cx.device())?;
-    generator::check_sampler(&*model, sampler)?;
-    if model.format() != dataset.format {
-        return Err(StageError::Input("`model` draws motions of another skeleton than `dataset` has".into()));
-    }
-    Ok((dataset, model))
 }
 
 /// Uploads a report and ends the stage with its metrics.

@@ -19,7 +19,8 @@ use protocol::stage::{Activity, EvaluateRecognition, Split};
 use serde_json::json;
 
 use super::entry_draws::{finite, skates};
-use super::{Plain, measured, no_entries, publish_illustrated, word};
+use super::measured::measured;
+use super::{Plain, no_entries, publish_illustrated, word};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::recognition::{Classifier, describe};
 use crate::generator::{self, Batch};

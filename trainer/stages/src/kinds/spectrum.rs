@@ -13,7 +13,8 @@ use motion::dataset::crop;
 use protocol::stage::EvaluateSpectrum;
 use serde_json::json;
 
-use super::{Plain, measured, no_entries, publish_report};
+use super::measured::measured;
+use super::{Plain, no_entries, publish_report};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::spectrum::Bands;
 use crate::generator::Batch;

@@ -4,9 +4,10 @@
 //! made of them.
 
 use models::networks::{
-    DenoiserConfig, GptConfig, MdmConfig, MmmConfig, MomaskConfig, POSITIONS, Projection, TimeFeatures,
-    TrajectoryConfig, UnetConfig, VaeConfig,
+    DenoiserConfig, GptConfig, MdmConfig, MmmConfig, MomaskConfig, Projection, TimeFeatures, TrajectoryConfig,
+    UnetConfig, VaeConfig,
 };
+use protocol::limits;
 use protocol::stage::{Network, Positions};
 
 use super::{Checkpoint, Found};
@@ -149,9 +150,10 @@ pub fn of_vae(found: &Found<'_>, heads: usize) -> Result<VaeConfig> {
     let projection = found.has("latent_pre.weight");
     let tokens = found.dim("global_motion_token", 0)?;
     // Each latent token has a mean and a deviation, and they stand before the frames.
-    if !tokens.is_multiple_of(2) || tokens >= POSITIONS {
+    let most = 2 * limits::LATENT_TOKENS;
+    if !tokens.is_multiple_of(2) || tokens as u64 > most {
         return Err(
-            found.refuse(format!("`global_motion_token` has {tokens} rows; expected an even number below {POSITIONS}"))
+            found.refuse(format!("`global_motion_token` has {tokens} rows; expected an even number, at most {most}"))
         );
     }
     Ok(VaeConfig {

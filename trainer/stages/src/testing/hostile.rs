@@ -24,14 +24,14 @@ pub fn run(name: &str, bytes: &[u8]) -> bool {
 }
 
 /// A folder of this process.
-fn folder(name: &str) -> PathBuf {
+pub(super) fn folder(name: &str) -> PathBuf {
     let folder = std::env::temp_dir().join(format!("stride-hostile-{}", std::process::id())).join(name);
     fs::create_dir_all(&folder).expect("a folder of ours");
     folder
 }
 
 /// A weak point of ours, rather than of the file.
-fn accepted<T>(result: Result<T, StageError>) -> bool {
+pub(super) fn accepted<T>(result: Result<T, StageError>) -> bool {
     if let Err(error @ StageError::Fault(_)) = &result {
         panic!("{error}");
     }

@@ -4,7 +4,9 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::stage::{Distance, Neighbours, Output, Problems, Ref, Shape, StageSpec, TrainDiscord, Training, WindowsOf};
+use crate::stage::{
+    Distance, FlowPrediction, Neighbours, Output, Problems, Ref, Shape, StageSpec, TrainDiscord, Training, WindowsOf,
+};
 use crate::{ArtifactKind, Steps};
 
 /// Frames that one token stands for.
@@ -107,6 +109,7 @@ impl StageSpec for DistillDiscord {
             let message = format!("`{}` is a student itself", self.teacher);
             p.add("teacher", message, "name a `train.discord` stage");
         }
+        FlowPrediction::check_init(stages, p, &self.init, FlowPrediction::of_stage(stages, &self.teacher));
     }
 
     fn training(&mut self) -> Option<&mut Training> {

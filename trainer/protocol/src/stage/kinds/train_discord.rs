@@ -4,7 +4,10 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::stage::{Batch, Decay, Neighbours, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training, WindowsOf};
+use crate::stage::{
+    Batch, Decay, FlowSolver, ImportModel, ImportedPart, Neighbours, Optimizer, Output, Problems, Ref, Shape,
+    StageSpec, Training, WindowsOf,
+};
 use crate::{ArtifactKind, Steps, limits};
 
 /// Frames that one token stands for.
@@ -32,6 +35,47 @@ pub enum FlowPrediction {
     Data,
 }
 
+impl FlowPrediction {
+    /// The word in YAML.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Velocity => "velocity",
+            Self::Data => "data",
+        }
+    }
+
+    /// What the network of the flow decoder that stage `name` gives predicts, as far as the pipeline says it.
+    pub(super) fn of_stage(stages: &Neighbours<'_>, name: &str) -> Option<Self> {
+        let stage = stages.stage(name)?;
+        if let Some(trained) = stage.get::<TrainDiscord>() {
+            return Some(trained.prediction);
+        }
+        if stage.get::<ImportModel>().is_some_and(|import| import.part == ImportedPart::Discord) {
+            return Some(Self::Velocity);
+        }
+        // A student's is its teacher's; what only passes a decoder on says nothing of its own.
+        Self::of_stage(stages, stages.read_by(name, ArtifactKind::FlowDecoder)?)
+    }
+
+    /// Refuses to begin with a network of another prediction than `ours`.
+    pub(super) fn check_init(stages: &Neighbours<'_>, p: &mut Problems, init: &str, ours: Option<Self>) {
+        if let (Some(ours), Some(theirs)) = (ours, Self::of_stage(stages, init))
+            && ours != theirs
+        {
+            let message = format!(
+                "`init` is `{init}`, whose network gives the {}, but the one that is trained here gives the {}",
+                theirs.name(),
+                ours.name()
+            );
+            p.add(
+                "init",
+                message,
+                "what the one learned says nothing to the other; name a decoder of the same `prediction`",
+            );
+        }
+    }
+}
+
 /// How tokens become a condition on each frame, of a U-Net.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
@@ -43,17 +87,6 @@ pub enum FlowProjection {
     Repeat,
     /// Two transposed convolutions.
     Transposed,
-}
-
-/// How the flow is followed when motion is decoded.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum FlowSolver {
-    /// One evaluation of the network a step; the paper's text says 16 steps.
-    Euler,
-    /// Two; the released code makes 15 steps.
-    #[default]
-    Midpoint,
 }
 
 /// Size of the network. The default is the published U-Net; the transformer in the code base has 512, 384, 4 and 4.
@@ -210,6 +243,7 @@ impl StageSpec for TrainDiscord {
             false => ("vae", &self.vae[..]),
         };
         stages.same_skeleton(p, decoded, &self.dataset);
+        FlowPrediction::check_init(stages, p, &self.init, Some(self.prediction));
     }
 
     fn training(&mut self) -> Option<&mut Training> {
