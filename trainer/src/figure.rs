@@ -13,6 +13,8 @@ const TOP: f64 = 64.0;
 const BOTTOM: f64 = 56.0;
 /// Panels beside each other.
 const COLUMNS: usize = 2;
+/// Between the middles of two numbers below an axis, at least.
+const APART: f64 = 44.0;
 /// Colours of lines; a ninth has the first one's again.
 const COLOURS: [&str; 8] = ["#246ec8", "#d65430", "#2f8f5b", "#8a5bb5", "#c79a1b", "#4aa3b8", "#b0477a", "#6b6f76"];
 
@@ -105,11 +107,12 @@ fn draw(out: &mut String, panel: &Panel, names: &[&String]) {
         line(format_args!(r##"<line x1="{LEFT}" x2="{end}" y1="{at:.1}" y2="{at:.1}" stroke="#dedfe0"/>"##));
         line(format_args!(r#"<text x="{:.1}" y="{:.1}" text-anchor="end">{label}</text>"#, LEFT - 8.0, at + 4.0));
     }
-    // The values themselves where they are few.
+    // The values themselves where they are few and their numbers do not touch.
     let mut values: Vec<f64> = all.iter().map(|point| point.0).collect();
     values.sort_by(f64::total_cmp);
     values.dedup();
-    let marks = if (1..=8).contains(&values.len()) { values } else { x.marks() };
+    let apart = values.windows(2).all(|pair| x.at(pair[1]) - x.at(pair[0]) >= APART);
+    let marks = if (1..=8).contains(&values.len()) && apart { values } else { x.marks() };
     for mark in marks {
         let whole = mark.fract() == 0.0 && mark.abs() < 1e6;
         let label = if whole { format!("{mark:.0}") } else { print::number(mark) };
@@ -163,5 +166,20 @@ mod tests {
             assert!((LEFT..=WIDTH - RIGHT).contains(&x) && (TOP..=HEIGHT - BOTTOM).contains(&y), "{x} {y}");
         }
         assert!(svg("nothing", &[]).ends_with("</svg>\n"));
+    }
+
+    #[test]
+    fn numbers_below_an_axis_do_not_touch() {
+        for values in [vec![0.89, 0.9, 1.7, 5.6], vec![1.0, 2.0, 4.0, 8.0, 15.0, 30.0], vec![3.0]] {
+            let lines = BTreeMap::from([(String::new(), values.iter().map(|x| (*x, 1.0)).collect())]);
+            let picture = svg("a title", &[Panel { x: "seconds".into(), y: "fid".into(), lines }]);
+            let below = format!("y=\"{}\" text-anchor=\"middle\"", HEIGHT - BOTTOM + 18.0);
+            let places: Vec<f64> = picture
+                .lines()
+                .filter(|line| line.contains(&below))
+                .map(|line| line.split('"').nth(1).unwrap().parse().unwrap())
+                .collect();
+            assert!(!places.is_empty() && places.windows(2).all(|pair| pair[1] - pair[0] >= APART - 0.2), "{places:?}");
+        }
     }
 }
