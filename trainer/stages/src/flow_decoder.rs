@@ -51,8 +51,7 @@ pub struct FlowMeta {
     pub code_dim: usize,
     /// What the velocity is predicted by.
     pub backbone: FlowBackbone,
-    /// What its network gives: the velocity, where it is not said.
-    #[serde(default)]
+    /// What its network gives.
     pub prediction: FlowPrediction,
     /// Size.
     pub network: FlowNetwork,

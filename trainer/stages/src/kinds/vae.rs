@@ -1,7 +1,7 @@
 //! `train.vae`: the motion VAE. Source: MLD (arXiv:2212.04048) and MotionLCM v2: smooth-L1 on normalised features and on joints in metres, KL
 //! as a mean over all elements.
 //!
-//! Ours: an optional first phase on short windows, a joint term that may join late, and batches of similar length. The unmasked loss of
+//! Ours: an optional first phase on short windows, a term on the speed of feet, terms on joints and feet that may join late, and batches of similar length. The unmasked loss of
 //! v1 counts padding up to the longest clip of a slice, not of the batch.
 
 use burn::tensor::{Device, Tensor, TensorData};
@@ -10,7 +10,7 @@ use models::losses::{self, Body, VaeRecipe};
 use models::networks::{Init, Vae};
 use motion::Stream;
 use motion::dataset::{Dataset, crop, window};
-use protocol::stage::{Split, TrainVae};
+use protocol::stage::{Split, StageSpec, TrainVae};
 use protocol::{ArtifactKind, Seed};
 
 use super::{Gang, group, no_clips, slice_result};
@@ -81,8 +81,7 @@ impl Objective for VaeObjective {
     }
 
     fn terms(&self) -> Vec<&'static str> {
-        let feet = (self.settings.loss.feet != 0.0).then_some("feet");
-        [Losses::TOTAL, "feature", "joint", "kl"].into_iter().chain(feet).collect()
+        self.settings.recorded().to_vec()
     }
 
     fn load(&mut self, state: &TrainState) {
