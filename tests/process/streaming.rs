@@ -176,6 +176,8 @@ fn mistakes(bench: &Bench) {
     bench.run(&[&base[..], &["--control-part", "motionlcm-control-mini@staging"]].concat()).expect_code(0);
     let said = bench.run(&["generate", "walks", "--control-scale", "2", "-o", "w.npy", "--model", "base@staging"]);
     assert!(said.expect_code(2).stderr.contains("`--control-scale` says nothing without"));
+    let said = bench.run(&["generate", "walks", "--refine", "1001", "-o", "w.npy", "--model", "base@staging"]);
+    assert!(said.expect_code(2).stderr.contains("1001 is not in 0..=1000"));
 
     let told = |waypoints: &str| format!("a person walks\n{{\"caption\": \"w\", \"waypoints\": {waypoints}}}\n");
     for (input, model, wanted) in [

@@ -12,6 +12,7 @@ pub mod features;
 pub mod files;
 pub mod folder_digest;
 pub mod npy;
+pub mod paths;
 pub mod placement;
 pub mod quaternion;
 pub mod random;

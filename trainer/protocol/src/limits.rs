@@ -71,6 +71,9 @@ pub const EVALUATED_MOTIONS: usize = 1_000_000;
 /// Repeats of cases that one evaluation of control draws all entries of.
 pub const CONTROL_CASES: usize = 10_000;
 
+/// Steps that a drawn latent is refined by.
+pub const REFINE_STEPS: usize = 1000;
+
 // Files that somebody else made.
 
 /// Bytes of one clip's features.

@@ -9,6 +9,7 @@
 //! A store outlives the build that wrote it. Every struct that has a `Default` fills in what an older build did not write; a field that
 //! joins one that has none ([`Training`], [`Batch`]) brings `#[serde(default)]` along.
 
+mod augment;
 mod control;
 mod data;
 mod diffusion;
@@ -32,6 +33,7 @@ use std::collections::BTreeSet;
 use crate::model_ref::names_version;
 use crate::{ArtifactKind, Digest, Steps};
 
+pub use augment::Augment;
 pub use control::{ControlHints, ControlSetting};
 pub use data::DataFormat;
 pub use diffusion::{Diffusion, NoiseSchedule, Prediction};

@@ -10,7 +10,8 @@ use motion::Skeleton;
 use motion::waypoints::{self, Waypoint};
 use protocol::Manifest;
 use protocol::artifact::Role;
-use stages::control::{Hint, metres};
+use protocol::limits::REFINE_STEPS;
+use stages::control::{Heed, Hint, metres};
 use stages::generate::{Generated, Generator};
 
 use super::model::{self, Found};
@@ -32,6 +33,10 @@ pub(super) struct ControlArgs {
     /// How strongly positions are heeded; 0 not at all [default: 1, as trained]
     #[arg(long, value_name = "S")]
     control_scale: Option<f64>,
+    /// Refines what was drawn: N steps that move the latent until the decoded motion passes the positions, at the cost of decoding it 3 N times
+    /// [default: 0]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(..=REFINE_STEPS as u64))]
+    refine: Option<u64>,
     /// Takes the control part of another model, MODEL@ALIAS or MODEL:VERSION, which must have been trained for this one
     #[arg(long, value_name = "MODEL", visible_alias = "control-part")]
     control_from: Option<String>,
@@ -41,7 +46,7 @@ pub(super) struct ControlArgs {
 #[derive(Debug)]
 pub(super) struct Told {
     hint: Hint,
-    scale: f64,
+    heed: Heed,
     pub(super) waypoints: Vec<Waypoint>,
 }
 
@@ -66,13 +71,14 @@ impl ControlArgs {
 
     /// Refuses options that say how to heed a path where nobody may give one.
     pub(super) fn check(&self, streams: bool) -> Result<()> {
-        let scale = self.control_scale.unwrap_or(1.0);
+        let Heed { scale, .. } = self.heed();
         if !(scale >= 0.0 && scale.is_finite()) {
             return Err(Problem::usage(format!("`--control-scale` is {scale}; expected 0 or more")));
         }
         let given = [
             (!self.joints.is_empty(), "joints"),
             (self.control_scale.is_some(), "control-scale"),
+            (self.refine.is_some(), "refine"),
             (self.control_from.is_some(), "control-from"),
         ];
         match given.into_iter().find(|(given, _)| *given && !streams && self.control.is_none()) {
@@ -83,9 +89,9 @@ impl ControlArgs {
         }
     }
 
-    /// How strongly positions are heeded.
-    pub(super) fn scale(&self) -> f64 {
-        self.control_scale.unwrap_or(1.0)
+    /// How positions are heeded.
+    pub(super) fn heed(&self) -> Heed {
+        Heed { scale: self.control_scale.unwrap_or(1.0), refine: self.refine.unwrap_or(0) as usize }
     }
 
     /// Joints that are told.
@@ -148,7 +154,7 @@ impl ControlArgs {
         }
         let mut hint = Hint::none(frames, skeleton.joints);
         waypoints.iter().for_each(|waypoint| hint.tell(waypoint.frame, waypoint.joint, waypoint.position));
-        Ok(Some(Told { hint, scale: self.scale(), waypoints }))
+        Ok(Some(Told { hint, heed: self.heed(), waypoints }))
     }
 }
 
@@ -156,9 +162,9 @@ impl ControlArgs {
 pub(super) const TRAIN: &str = "a `train.control` stage gives a model that has one";
 
 impl Told {
-    /// Positions and how strongly they are heeded.
-    pub(super) fn request(&self) -> (&Hint, f64) {
-        (&self.hint, self.scale)
+    /// Positions and how they are heeded.
+    pub(super) fn request(&self) -> (&Hint, Heed) {
+        (&self.hint, self.heed)
     }
 
     /// How far `motion` is from it.

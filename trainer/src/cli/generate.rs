@@ -149,8 +149,8 @@ async fn stream(args: GenerateArgs) -> Result<u8> {
     let found = found(&args).await?;
     let (device, _) = model::device(args.backend.as_deref())?;
     let GenerateArgs { stream, steps, sampler, sentences, control, out, .. } = args;
-    let (seed, scale, joints) = (sentences.seed(), control.scale(), control.joints().to_vec());
-    let opening = Opening { found, device, steps, sampler, seed, scale, joints };
+    let (seed, heed, joints) = (sentences.seed(), control.heed(), control.joints().to_vec());
+    let opening = Opening { found, device, steps, sampler, seed, heed, joints };
     stream::stream(stream, opening, out, |fps| sentences.bound(fps)).await
 }
 

@@ -12,11 +12,11 @@ use bytemuck::Pod;
 use bytes::Bytes;
 use checkpoint::model::{self, Parts};
 use checkpoint::{Blob, BlobError, Blobs};
-use motion::Values;
 use motion::dataset::{Caption, Dataset, PackError, Split};
+use motion::{Stream, Values, paths};
 use protocol::artifact::{FileEntry, Role};
-use protocol::stage::{DataFormat, Diffusion, Family, LatentShape, Network};
-use protocol::{ArtifactKind, Digest, Manifest};
+use protocol::stage::{Augment, DataFormat, Diffusion, Family, LatentShape, Network};
+use protocol::{ArtifactKind, Digest, Manifest, Seed, StageName};
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use serde::de::DeserializeOwned;
@@ -96,9 +96,50 @@ pub struct LatentsMeta {
     pub captions: Vec<Vec<usize>>,
     /// Frames of each row.
     pub lengths: Vec<usize>,
-    /// First frame of each row in its entry; none in what an older build encoded.
-    #[serde(default)]
+    /// First frame of each row in its entry.
     pub starts: Vec<usize>,
+    /// How paths of training crops were changed, if they were.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub augmented: Option<Augmented>,
+}
+
+/// Other paths of crops; see [`motion::paths`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Augmented {
+    /// What was asked for.
+    pub augment: Augment,
+    /// What the changes were drawn with.
+    pub seed: Seed,
+    /// The stage that drew them.
+    pub stage: StageName,
+}
+
+impl LatentsMeta {
+    /// The feature rows `[length, D]`, not normalised, that `row` was encoded from.
+    ///
+    /// # Panics
+    /// If `dataset` is not the one that was encoded.
+    pub fn rows(&self, dataset: &Dataset, row: usize) -> Vec<f32> {
+        let cut = (self.starts[row], self.lengths[row]);
+        crop_rows(dataset, (row / self.crops, row % self.crops), cut, self.augmented.as_ref())
+    }
+}
+
+/// The feature rows `[length, D]`, not normalised, of crop `c` of `entry`, given its first frame and length.
+pub fn crop_rows(
+    dataset: &Dataset,
+    (entry, c): (usize, usize),
+    (start, length): (usize, usize),
+    augmented: Option<&Augmented>,
+) -> Vec<f32> {
+    let (of, skeleton) = (&dataset.entries[entry], dataset.skeleton());
+    let width = skeleton.features;
+    let mut rows = dataset.features(of)[start * width..(start + length) * width].to_vec();
+    if let Some(by) = augmented.filter(|_| of.split == Split::Train) {
+        let mut draw = Stream::new(by.seed, &format!("{}/path", by.stage), c as u64, entry as u64);
+        paths::augment(&mut rows, skeleton, &by.augment, &mut draw);
+    }
+    rows
 }
 
 /// Meta of an artifact of kind `denoiser`.
@@ -480,6 +521,8 @@ impl Latents {
 
 #[cfg(test)]
 mod tests {
+    use protocol::stage::DataSynthetic;
+
     use super::*;
 
     #[test]
@@ -498,6 +541,29 @@ mod tests {
         let error = Tensors::default().with("b", [1], vec![0.0]).take("mu", 1, "latents.safetensors").unwrap_err();
         assert_eq!(error.to_string(), "latents.safetensors: no tensor `mu`; there are [\"b\"]");
         assert!(Tensors::from_bytes(Bytes::from_static(&[1, 2, 3]), "x").is_err());
+    }
+
+    #[test]
+    fn crops_of_the_training_split_follow_other_paths_and_each_its_own() {
+        let settings = DataSynthetic { clips: 30, ..DataSynthetic::default() };
+        let dataset = motion::synthetic::generate(&settings, Seed(2));
+        let augment = Augment { bend: 0.5, stretch: 0.2 };
+        let by = Augmented { augment, seed: Seed(3), stage: "latents".into() };
+        let path = |entry: usize, c: usize, by: Option<&Augmented>| -> Vec<f32> {
+            crop_rows(&dataset, (entry, c), (0, 40), by).chunks_exact(263).flat_map(|row| row[..3].to_vec()).collect()
+        };
+        let mut changed = 0;
+        for (entry, of) in dataset.entries.iter().enumerate() {
+            let recorded = path(entry, 0, None);
+            assert_eq!(path(entry, 0, Some(&by)), path(entry, 0, Some(&by)));
+            if of.split == Split::Train {
+                changed += usize::from(path(entry, 0, Some(&by)) != recorded);
+                assert!(path(entry, 0, Some(&by)) != path(entry, 1, Some(&by)), "{}", of.id);
+            } else {
+                assert_eq!(path(entry, 0, Some(&by)), recorded, "{}", of.id);
+            }
+        }
+        assert_eq!(changed, dataset.entries_of(protocol::stage::Split::Train).len());
     }
 
     #[test]

@@ -41,12 +41,15 @@ pub struct Hint {
     positions: Vec<f32>,
     /// [frames, joints].
     given: Vec<bool>,
+    /// [frames, joints]: what nobody but refinement looks at.
+    wanted: Vec<bool>,
 }
 
 impl Hint {
     /// Nothing told of a motion.
     pub fn none(frames: usize, joints: usize) -> Self {
-        Self { joints, positions: vec![0.0; frames * joints * AXES], given: vec![false; frames * joints] }
+        let none = vec![false; frames * joints];
+        Self { joints, positions: vec![0.0; frames * joints * AXES], given: none.clone(), wanted: none }
     }
 
     /// `joints` of a motion of `count` joints, `[frames, count, 3]` in metres, at `frames`.
@@ -67,8 +70,20 @@ impl Hint {
     /// If the motion has no such frame or joint.
     pub fn tell(&mut self, frame: usize, joint: usize, position: [f32; 3]) {
         let at = frame * self.joints + joint;
-        self.given[at] = true;
+        (self.given[at], self.wanted[at]) = (true, false);
         self.positions[at * AXES..(at + 1) * AXES].copy_from_slice(&position);
+    }
+
+    /// Tells refinement alone where a joint should be at a frame: one that the control part was not trained to be told. What is told stays.
+    ///
+    /// # Panics
+    /// If the motion has no such frame or joint.
+    pub fn want(&mut self, frame: usize, joint: usize, position: [f32; 3]) {
+        let at = frame * self.joints + joint;
+        if !self.given[at] {
+            self.wanted[at] = true;
+            self.positions[at * AXES..(at + 1) * AXES].copy_from_slice(&position);
+        }
     }
 
     /// Joints of the skeleton.
@@ -88,8 +103,16 @@ impl Hint {
 
     /// Frame, joint and position of all that is told, frame by frame.
     pub fn iter(&self) -> impl Iterator<Item = (usize, usize, [f32; 3])> {
-        let told = self.given.iter().enumerate().filter(|(_, given)| **given);
-        told.map(|(i, _)| {
+        self.positions(&self.given)
+    }
+
+    /// The same of what refinement alone is told.
+    pub(crate) fn wanted(&self) -> impl Iterator<Item = (usize, usize, [f32; 3])> {
+        self.positions(&self.wanted)
+    }
+
+    fn positions(&self, of: &[bool]) -> impl Iterator<Item = (usize, usize, [f32; 3])> {
+        of.iter().enumerate().filter(|(_, counts)| **counts).map(|(i, _)| {
             let at = i * AXES;
             (i / self.joints, i % self.joints, [self.positions[at], self.positions[at + 1], self.positions[at + 2]])
         })
@@ -99,6 +122,21 @@ impl Hint {
     pub fn errors(&self, motion: &[f32], threshold: f64) -> Option<ControlErrors> {
         let wide = |values: &[f32]| values.iter().map(|v| f64::from(*v)).collect::<Vec<_>>();
         ControlErrors::of(&wide(motion), &wide(&self.positions), &self.given, threshold)
+    }
+}
+
+/// How told positions are heeded.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Heed {
+    /// What the ControlNet's residuals are multiplied by; 1 as trained, 0 not at all.
+    pub scale: f64,
+    /// Steps of descent that the drawn latents are refined by.
+    pub refine: usize,
+}
+
+impl Default for Heed {
+    fn default() -> Self {
+        Self { scale: 1.0, refine: 0 }
     }
 }
 

@@ -17,7 +17,7 @@ use protocol::stage::{DataFormat, Sampler};
 use protocol::{ArtifactKind, Manifest, Seed};
 
 use crate::context::StageError;
-use crate::control::{ControlMeta, Hint};
+use crate::control::{ControlMeta, Heed, Hint};
 use crate::generator::{self, Batch, ControlRequest, Edit, Lap, MotionGenerator, Seeds, Text};
 use crate::length::Lengths;
 use crate::parts::{self, model_error};
@@ -207,9 +207,9 @@ impl Generator {
         prompt: &str,
         sampler: Option<&Sampler>,
         seed: Seed,
-        (hint, scale): (&Hint, f64),
+        (hint, heed): (&Hint, Heed),
     ) -> Result<Generated, StageError> {
-        let control = ControlRequest { hints: std::slice::from_ref(hint), scale };
+        let control = ControlRequest { hints: std::slice::from_ref(hint), heed };
         self.draw(prompt, Some(hint.frames()), sampler, seed, Some(control))
     }
 

@@ -17,6 +17,7 @@ pub mod motion_networks;
 pub mod networks;
 pub mod parts;
 pub mod published;
+mod refine;
 mod solo;
 pub mod stream;
 pub mod testing;

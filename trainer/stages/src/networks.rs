@@ -115,6 +115,11 @@ impl Autoencoder {
         &self.meta
     }
 
+    /// Where it computes.
+    pub(crate) fn device(&self) -> &Device {
+        &self.device
+    }
+
     /// Longest motion that it has positions for, both ways.
     pub fn max_frames(&self) -> usize {
         POSITIONS - 2 * self.meta.latent.tokens

@@ -25,7 +25,7 @@ use protocol::Seed;
 use protocol::stage::{ControlSetting, Sampler};
 
 use crate::context::StageError;
-use crate::control::{Hint, share};
+use crate::control::{Heed, Hint, share};
 use crate::generate::Generator;
 
 /// Percent of a segment that are frames of the one before it, where the control part's training does not say: tau of MotionLCM.
@@ -40,8 +40,8 @@ pub struct Settings {
     pub sampler: Option<Sampler>,
     /// Another one gives another stream.
     pub seed: Seed,
-    /// How strongly told positions are heeded; 1 as trained.
-    pub scale: f64,
+    /// How told positions are heeded.
+    pub heed: Heed,
     /// Frames of the last segment that the next one is told; without it a share of the segment.
     pub overlap: Option<usize>,
     /// Frames in which what differs at a junction fades.
@@ -314,7 +314,7 @@ impl MotionStream {
         let drawn = match self.joining {
             Joining::Control if overlap > 0 || !ask.waypoints.is_empty() => {
                 let hint = self.hint(ask, total, overlap, place);
-                generator.generate_controlled(&ask.caption, sampler, seed, (&hint, self.settings.scale))?
+                generator.generate_controlled(&ask.caption, sampler, seed, (&hint, self.settings.heed))?
             }
             Joining::Infilling if overlap >= self.unit => {
                 let mut rows = self.tail.features[(self.tail.frames() - overlap) * width..].to_vec();
@@ -333,18 +333,18 @@ impl MotionStream {
     fn hint(&self, ask: &Ask, total: usize, overlap: usize, place: Placement) -> Hint {
         let mut hint = Hint::none(total, self.skeleton.joints);
         let start = self.tail.frames() - overlap;
-        let mut tell = |frame: usize, joint: usize, world: Vec3| {
-            hint.tell(frame, joint, place.to_clip(world).map(|v| v as f32));
-        };
+        let clip = |world: Vec3| place.to_clip(world).map(|v| v as f32);
         for frame in 0..overlap {
-            for joint in &self.told {
-                if let Some(world) = self.joint(start + frame, *joint) {
-                    tell(frame, *joint, world);
+            for joint in 0..self.skeleton.joints {
+                match self.joint(start + frame, joint).map(clip) {
+                    Some(position) if self.told.contains(&joint) => hint.tell(frame, joint, position),
+                    Some(position) => hint.want(frame, joint, position),
+                    None => {}
                 }
             }
         }
         for waypoint in ask.waypoints.iter().filter(|waypoint| overlap + waypoint.frame < total) {
-            tell(overlap + waypoint.frame, waypoint.joint, waypoint.position.map(f64::from));
+            hint.tell(overlap + waypoint.frame, waypoint.joint, clip(waypoint.position.map(f64::from)));
         }
         hint
     }

@@ -12,7 +12,7 @@ use protocol::stage::{
 };
 use protocol::{Digest, Manifest, Seed, Steps};
 use stages::context::Outcome;
-use stages::control::{Hint, metres};
+use stages::control::{Heed, Hint, metres};
 use stages::generate::Generator;
 use stages::testing::{Bench, Script};
 
@@ -206,7 +206,7 @@ fn a_control_part_learns_and_is_heeded() {
         let free = generator(&bench, &bench.manifest(outputs[base]).expect("stored"));
         let sampler = Sampler { steps: if base == "pcm" { 2 } else { 1 }, guidance: 2.0, ..Sampler::default() };
         let draw = |scale| {
-            let told = (&hint(60), scale);
+            let told = (&hint(60), Heed { scale, ..Heed::default() });
             controlled.generate_controlled("a person walks", Some(&sampler), Seed(3), told).expect("a motion").features
         };
         let without = free.generate("a person walks", Some(60), Some(&sampler), Seed(3)).expect("a motion").features;
@@ -218,8 +218,20 @@ fn a_control_part_learns_and_is_heeded() {
         let skeleton = motion::Skeleton::of(protocol::stage::DataFormat::Humanml3d);
         let errors = hint(60).errors(&metres(&draw(1.0), skeleton), 0.5).expect("something is told");
         assert!(errors.average.is_finite());
+        let refined = |steps| {
+            let told = (&hint(60), Heed { refine: steps, ..Heed::default() });
+            let motion = controlled.generate_controlled("a person walks", Some(&sampler), Seed(3), told);
+            hint(60)
+                .errors(&metres(&motion.expect("a motion").features, skeleton), 0.5)
+                .expect("something is told")
+                .average
+        };
+        let (few, many) = (refined(5), refined(40));
+        eprintln!("{base}: {:.3} m off as drawn, {few:.3} and {many:.3} m refined", errors.average);
+        assert!(few < errors.average && many < 0.7 * errors.average, "{base}: {} to {few} to {many}", errors.average);
+        assert_eq!(refined(5), few);
 
-        let told = (&hint(60), 1.0);
+        let told = (&hint(60), Heed::default());
         let refused =
             free.generate_controlled("a person walks", Some(&sampler), Seed(3), told).unwrap_err().to_string();
         assert!(refused.contains("no control part"), "{refused}");
@@ -236,6 +248,7 @@ fn control_is_measured_by_case() {
         joints: vec!["pelvis".into(), "six".into()],
         percent: vec![25.0],
         frames: vec![2],
+        refine: 2,
         sampler: Sampler { steps: 1, guidance: 2.0, ..Sampler::default() },
         repeats: 2,
         all_if_small: true,

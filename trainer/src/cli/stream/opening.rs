@@ -7,6 +7,7 @@ use burn::tensor::Device;
 use clap::Args;
 use motion::Skeleton;
 use protocol::Seed;
+use stages::control::Heed;
 use stages::generate::Generator;
 use stages::stream::{BLEND, MotionStream, Settings};
 
@@ -72,8 +73,8 @@ pub(in crate::cli) struct Opening {
     pub(in crate::cli) steps: Option<usize>,
     pub(in crate::cli) sampler: SamplerArgs,
     pub(in crate::cli) seed: u64,
-    /// How strongly positions are heeded.
-    pub(in crate::cli) scale: f64,
+    /// How positions are heeded.
+    pub(in crate::cli) heed: Heed,
     pub(in crate::cli) joints: Vec<String>,
 }
 
@@ -107,7 +108,7 @@ impl Opening {
         let settings = Settings {
             sampler: Some(sampler),
             seed: Seed(self.seed),
-            scale: self.scale,
+            heed: self.heed,
             overlap: overlap.map(usize::from),
             blend: usize::from(blend),
         };

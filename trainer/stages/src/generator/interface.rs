@@ -7,7 +7,7 @@ use protocol::Digest;
 use protocol::stage::{DataFormat, Family, LatentShape, Sampler};
 
 use crate::context::StageError;
-use crate::control::{ControlMeta, Hint};
+use crate::control::{ControlMeta, Heed, Hint};
 use crate::text::TextEncoder;
 
 /// A caption as a generator wants it: what it asked its text encoder for.
@@ -38,8 +38,8 @@ pub struct Batch<'a> {
 pub struct ControlRequest<'a> {
     /// For each motion, as long as it.
     pub hints: &'a [Hint],
-    /// How strongly they are heeded; 1 as trained, 0 not at all.
-    pub scale: f64,
+    /// How they are heeded.
+    pub heed: Heed,
 }
 
 impl std::fmt::Debug for Batch<'_> {

@@ -18,6 +18,7 @@ use crate::control::{ControlMeta, TrainedControl};
 use crate::flow_decoder::{FlowDecoder, UNIT};
 use crate::networks::{Autoencoder, Conditions, Denoiser, SeeLatents};
 use crate::parts::{self, model_error};
+use crate::refine::refine;
 use crate::text::{self, TextEncoder};
 
 /// Its name in manifests.
@@ -115,7 +116,17 @@ impl MotionGenerator for LatentDiffusion {
     }
 
     fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError> {
-        let z = self.steered(batch.texts, batch.seeds, sampler, batch.control, &mut |_, _| {})?;
+        let mut z = self.steered(batch.texts, batch.seeds, sampler, batch.control, &mut |_, _| {})?;
+        if let Some(ControlRequest { hints, heed }) = batch.control
+            && heed.refine > 0
+        {
+            if self.decoder.is_some() {
+                return Err(StageError::Input(
+                    "the model's motions are decoded by a flow, through which latents cannot be refined".into(),
+                ));
+            }
+            refine(&self.vae, &mut z, batch.lengths, hints, heed.refine);
+        }
         lap(Lap::Sampled);
         let mut motions = match &self.decoder {
             None => self.vae.decode_ragged(z, batch.lengths),
@@ -169,7 +180,7 @@ impl LatentDiffusion {
         let text = texts.iter().flat_map(|text| text.values.iter().copied()).collect();
         let conditions = Conditions { text, null: self.null.clone(), noise: fill(0) };
         let steering = match (control, &self.control) {
-            (Some(request), Some(control)) => Some(control.steer(request.hints, request.scale)),
+            (Some(request), Some(control)) => Some(control.steer(request.hints, request.heed.scale)),
             _ => None,
         };
         self.denoiser.sample_seen(&conditions, sampler, steering.as_ref(), &mut |step| fill(1 + step), see)

@@ -161,11 +161,8 @@ impl Controlled {
     fn hints(&self, batch: &LatentSlice) -> Vec<Hint> {
         let (meta, skeleton) = (self.data.meta(), self.dataset.skeleton());
         let one = |((pick, row), length): ((&Pick, &usize), &usize)| {
-            let features = self.dataset.features(&self.dataset.entries[row / meta.crops]);
-            let start = meta.starts[*row];
-            let crop = &features[start * skeleton.features..(start + length) * skeleton.features];
             let told = self.told(*pick, *length);
-            Hint::of(&metres(crop, skeleton), skeleton.joints, &told.joints, &told.frames)
+            Hint::of(&metres(&meta.rows(&self.dataset, *row), skeleton), skeleton.joints, &told.joints, &told.frames)
         };
         batch.picks.iter().zip(&batch.rows).zip(&batch.lengths).map(one).collect()
     }
@@ -281,10 +278,6 @@ fn clips(cx: &dyn AttemptContext, data: &LatentData) -> Result<Dataset, StageErr
     let dataset = artifacts::dataset(&*cx.blobs(), &manifest)?;
     let meta = data.meta();
     let rows = meta.splits.len() * meta.crops;
-    if meta.starts.len() != rows {
-        let text = "`latents` do not say where their crops begin: an older build encoded them; encode them again";
-        return Err(StageError::Input(text.into()));
-    }
     let fits = |row: usize| {
         let entry = dataset.entries.get(row / meta.crops);
         entry.is_some_and(|entry| meta.starts[row] + meta.lengths[row] <= entry.len)

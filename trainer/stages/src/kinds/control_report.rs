@@ -20,7 +20,7 @@ use super::entry_draws::{Draw, EntryDraws, finite, skates};
 use super::{Map, REPORT_FILE, drawn};
 use crate::artifacts::{self, Tensors};
 use crate::context::{AttemptContext, Outcome, StageError};
-use crate::control::{Hint, metres, share, told_frames};
+use crate::control::{Heed, Hint, metres, share, told_frames};
 use crate::evaluation::frechet::to_f64;
 use crate::evaluation::interval::Interval;
 use crate::generator::{self, Batch, ControlRequest, MotionGenerator, Texts};
@@ -115,7 +115,8 @@ impl Maker<'_> {
         let captions: Vec<usize> = draws.iter().map(|d| d.caption).collect();
         let texts = self.texts.get(&captions, |caption| plan.of.dataset.captions[caption].text.as_str())?;
         let lengths: Vec<usize> = draws.iter().map(|d| d.len).collect();
-        let control = hints.map(|hints| ControlRequest { hints, scale: plan.settings.scale });
+        let heed = Heed { scale: plan.settings.scale, refine: plan.settings.refine };
+        let control = hints.map(|hints| ControlRequest { hints, heed });
         let batch = Batch { texts: &texts, lengths: &lengths, seeds, control };
         generator::motions(self.generator, batch, &plan.settings.sampler, &mut |_| {})
     }
@@ -236,6 +237,7 @@ impl Map for EvaluateControl {
             "evaluator": plan.of.evaluator,
             "words": plan.of.trained.meta().words,
             "scale": self.scale,
+            "refine": self.refine,
             "threshold": self.threshold,
         });
         let names: Vec<&str> = plan.cases.iter().map(|case| case.name.as_str()).collect();

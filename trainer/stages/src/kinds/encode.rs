@@ -13,7 +13,7 @@ use protocol::{ArtifactKind, Digest};
 use serde::{Deserialize, Serialize};
 
 use super::Map;
-use crate::artifacts::{self, LATENTS_FILE, LatentsMeta, Tensors, VaeMeta, to_meta};
+use crate::artifacts::{self, Augmented, LATENTS_FILE, LatentsMeta, Tensors, VaeMeta, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::latent_fid::standard_deviation;
 use crate::networks::Autoencoder;
@@ -46,7 +46,7 @@ impl Map for EncodeLatents {
         let range = shard_range(dataset.entries.len(), index, of);
         let purpose = format!("{}/crop", cx.task().name);
         let seed = cx.task().seed;
-        let (size, width) = (latent.tokens * latent.dim, dataset.mean.len());
+        let size = latent.tokens * latent.dim;
         let (mut mu, mut sigma) = (Vec::new(), Vec::new());
         let mut meta = LatentsMeta {
             format,
@@ -57,14 +57,17 @@ impl Map for EncodeLatents {
             captions: Vec::new(),
             lengths: Vec::new(),
             starts: Vec::new(),
+            augmented: (!self.augment.is_none()).then(|| Augmented {
+                augment: self.augment.clone(),
+                seed,
+                stage: cx.task().name.clone(),
+            }),
         };
         for (done, e) in range.clone().enumerate() {
             if cx.interrupted() {
                 return Ok(Outcome::Yielded { at: 0 });
             }
             let entry = &dataset.entries[e];
-            let mut rows = dataset.features(entry).to_vec();
-            vae.normalise(&mut rows);
             let crops: Vec<(usize, usize)> = (0..self.crops)
                 .map(|c| crop(&mut Stream::new(seed, &purpose, c as u64, e as u64), entry.len, dataset.skeleton()))
                 .collect();
@@ -76,10 +79,9 @@ impl Map for EncodeLatents {
             mu.resize(at + self.crops * size, 0.0);
             sigma.resize(at + self.crops * size, 0.0);
             for (frames, members) in by_length {
-                let batch: Vec<f32> = members
-                    .iter()
-                    .flat_map(|&c| rows[crops[c].0 * width..(crops[c].0 + frames) * width].iter().copied())
-                    .collect();
+                let rows = |c: &usize| artifacts::crop_rows(&dataset, (e, *c), crops[*c], meta.augmented.as_ref());
+                let mut batch: Vec<f32> = members.iter().flat_map(rows).collect();
+                vae.normalise(&mut batch);
                 let posterior = vae.encode(batch, frames);
                 for (i, c) in members.into_iter().enumerate() {
                     let to = at + c * size..at + (c + 1) * size;

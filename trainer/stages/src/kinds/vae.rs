@@ -1,15 +1,15 @@
 //! `train.vae`: the motion VAE. Source: MLD (arXiv:2212.04048) and MotionLCM v2: smooth-L1 on normalised features and on joints in metres, KL
 //! as a mean over all elements.
 //!
-//! Ours: an optional first phase on short windows, a term on the speed of feet, terms on joints and feet that may join late, and batches of similar length. The unmasked loss of
-//! v1 counts padding up to the longest clip of a slice, not of the batch.
+//! Ours: an optional first phase on short windows, a term on the speed of feet, terms on joints and feet that may join late, other paths, and batches
+//! of similar length. The unmasked loss of v1 counts padding up to the longest clip of a slice, not of the batch.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use models::kernels::Dropout;
 use models::losses::{self, Body, VaeRecipe};
 use models::networks::{Init, Vae};
-use motion::Stream;
 use motion::dataset::{Dataset, crop, window};
+use motion::{Stream, paths};
 use protocol::stage::{Split, StageSpec, TrainVae};
 use protocol::{ArtifactKind, Seed};
 
@@ -102,6 +102,8 @@ impl Objective for VaeObjective {
             let from = &self.dataset.features(entry)[start * width..(start + len) * width];
             let to = &mut rows[b * frames * width..][..len * width];
             to.copy_from_slice(from);
+            let mut draw = Stream::new(self.seed, &format!("{}/path", self.purpose), pick.place, phase);
+            paths::augment(to, self.dataset.skeleton(), &self.settings.augment, &mut draw);
             self.dataset.normalise(to);
             let size = latent.tokens * latent.dim;
             let mut draw = Stream::new(self.seed, &format!("{}/noise", self.purpose), pick.place, phase);

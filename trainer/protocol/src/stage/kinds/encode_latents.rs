@@ -4,7 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
-use crate::stage::{Output, Problems, Ref, Shape, StageSpec};
+use crate::stage::{Augment, Output, Problems, Ref, Shape, StageSpec};
 
 /// `encode.latents`: posteriors of random crops, computed once.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -16,20 +16,22 @@ pub struct EncodeLatents {
     pub vae: String,
     /// Random crops per entry.
     pub crops: usize,
+    /// Crops of the training split follow other paths than were recorded, for a `train.control` on little data.
+    pub augment: Augment,
     /// Shards.
     pub shards: usize,
 }
 
 impl Default for EncodeLatents {
     fn default() -> Self {
-        Self { dataset: "dataset".into(), vae: "vae".into(), crops: 8, shards: 8 }
+        Self { dataset: "dataset".into(), vae: "vae".into(), crops: 8, augment: Augment::default(), shards: 8 }
     }
 }
 
 impl StageSpec for EncodeLatents {
     const KIND: &'static str = "encode.latents";
-    // 2: says where in its clip each crop begins.
-    const VERSION: u32 = 2;
+    // 2: says where in its clip each crop begins. 3: and how its path was changed.
+    const VERSION: u32 = 3;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "latents", kind: ArtifactKind::Latents };
 
@@ -42,6 +44,7 @@ impl StageSpec for EncodeLatents {
 
     fn check(&self, p: &mut Problems) {
         p.positive("crops", self.crops);
+        self.augment.check(p);
         p.shards(self.shards);
     }
 

@@ -31,6 +31,8 @@ pub struct EvaluateControl {
     pub threshold: f64,
     /// What the ControlNet's residuals are multiplied by.
     pub scale: f64,
+    /// Steps by which drawn latents are refined until their motions pass the positions; 0, as published, refines nothing.
+    pub refine: usize,
     /// Sampler.
     pub sampler: Sampler,
     /// Repeats with other noise, captions, crops and pools.
@@ -55,6 +57,7 @@ impl Default for EvaluateControl {
             frames: Vec::new(),
             threshold: 0.5,
             scale: 1.0,
+            refine: 0,
             sampler: Sampler { steps: 1, ..Sampler::default() },
             repeats: 20,
             split: Split::Val,
@@ -93,6 +96,9 @@ impl StageSpec for EvaluateControl {
         }
         p.above_zero("threshold", self.threshold);
         p.not_negative("scale", self.scale);
+        if self.refine > limits::REFINE_STEPS {
+            p.add("refine", format!("`refine` is {}; expected at most {}", self.refine, limits::REFINE_STEPS), "");
+        }
         self.sampler.check(p);
         p.positive("repeats", self.repeats);
         p.shards(self.shards);

@@ -4,7 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
-use crate::stage::{Batch, LatentShape, Network, Output, Problems, Ref, Shape, StageSpec, Training};
+use crate::stage::{Augment, Batch, LatentShape, Network, Output, Problems, Ref, Shape, StageSpec, Training};
 
 /// Weights of the VAE loss. Source: MotionLCM v2 (feature 1, joint 1, velocity 0, KL 1e-4).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -66,6 +66,8 @@ pub struct TrainVae {
     pub loss: VaeLoss,
     /// Curriculum.
     pub windows: Windows,
+    /// Clips follow other paths than were recorded, each time another: on little data paths are otherwise learned by heart, and new ones missed.
+    pub augment: Augment,
     /// Exponential moving average of the weights that is kept as the result; 0 keeps the weights themselves.
     pub ema: f64,
     /// Stage that gives a VAE whose weights training begins with where their shapes fit, or a version such as `motionlcm@prod`; empty
@@ -85,6 +87,7 @@ impl Default for TrainVae {
             network: Network::default(),
             loss: VaeLoss::default(),
             windows: Windows::default(),
+            augment: Augment::default(),
             ema: 0.0,
             init: String::new(),
             training: Training::published(1_150_000, 128, 2e-4),
@@ -109,6 +112,7 @@ impl StageSpec for TrainVae {
         self.network.check(p);
         self.loss.check(p);
         self.windows.check(p, self.training.batch.slices);
+        self.augment.check(p);
         p.fraction("ema", self.ema, true);
         self.training.check(p);
     }

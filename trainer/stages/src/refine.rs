@@ -1,0 +1,124 @@
+//! Moves drawn latents until their motions pass the positions that they are told. Source: optimisation at sampling time, as of noise in DNO
+//! (Karunratanakul et al., CVPR 2024) and of logits in MaskControl (Pinyoanuntapong et al., 2024).
+//!
+//! Ours: what is moved is the latent that was drawn, so that no gradient goes through the denoiser. Minimised is the mean squared distance of told
+//! positions in metres, that of wanted ones, and how far the motion is from what was drawn: its poses stay, and the root's pace and turn change
+//! smoothly. By Adam, whose rate falls along half a cosine. Each motion's result depends on that motion alone.
+
+use std::f64::consts::PI;
+
+use burn::tensor::{Device, Tensor, TensorData};
+use models::losses::{Body, ControlTarget, Pointwise};
+use models::optim::AdamW;
+use motion::Skeleton;
+
+use crate::control::Hint;
+use crate::networks::Autoencoder;
+
+/// First rate, in a latent's own unit.
+const RATE: f64 = 0.1;
+/// Metres squared that weigh as much as poses whose features all changed by one deviation.
+const POSE: f64 = 0.1;
+/// The same of how much the root's change of pace and turn differs from frame to frame.
+const ROOT: f64 = 0.1;
+/// Features of the root's turn and pace.
+const MOVES: usize = 3;
+/// Features of the root.
+const ROOTS: usize = 4;
+const ADAM: AdamW = AdamW { beta1: 0.9, beta2: 0.99, eps: 1e-8, weight_decay: 0.0 };
+
+/// Refines latents `[batch, N, d]` of motions of `lengths` frames, at least two, in so many `steps`, towards what `hints` tell and want.
+pub(crate) fn refine(vae: &Autoencoder, z: &mut [f32], lengths: &[usize], hints: &[Hint], steps: usize) {
+    let meta = vae.meta();
+    let (skeleton, latent, device) = (Skeleton::of(meta.format), meta.latent, vae.device());
+    let body = Body::new(skeleton, &meta.mean, &meta.std, device);
+    let told = Target::new(hints, |hint| hint.iter().collect(), device);
+    let wanted = Target::new(hints, |hint| hint.wanted().collect(), device);
+    let tracked = device.clone().autodiff();
+    let at = |z: &[f32], device| {
+        Tensor::<3>::from_data(TensorData::new(z.to_vec(), [lengths.len(), latent.tokens, latent.dim]), device)
+    };
+    let as_drawn = AsDrawn::new(vae.decode_tensor(at(z, device), lengths), lengths);
+    let (mut m, mut v) = (vec![0.0; z.len()], vec![0.0; z.len()]);
+    for step in 0..steps {
+        let z_bnd = at(z, &tracked).require_grad();
+        let features = vae.decode_tensor(z_bnd.clone(), lengths);
+        let joints = body.joints(features.clone()) * skeleton.metres_per_unit;
+        let loss = told.loss(joints.clone()) + wanted.loss(joints) + as_drawn.loss(features);
+        let gradient = z_bnd.grad(&loss.backward()).expect("motion depends on its latent");
+        let gradient = gradient.into_data().try_into_vec::<f32>().expect("networks compute in f32");
+        let lr = RATE * (1.0 + (PI * step as f64 / steps as f64).cos()) / 2.0;
+        ADAM.step(step as u64 + 1, lr, z, &gradient, &mut m, &mut v);
+    }
+}
+
+/// What holds motions of a batch where they were drawn.
+struct AsDrawn {
+    /// [B, T, D], normalised, 0 past each motion's end.
+    features: Tensor<3>,
+    /// [B, 1, 1]: what makes a mean of a sum over a motion's pose features.
+    poses: Tensor<3>,
+    /// [B, T - 1, 1]: the same of what differs between two frames of it, 0 past its end.
+    moves: Tensor<3>,
+}
+
+impl AsDrawn {
+    fn new(features: Tensor<3>, lengths: &[usize]) -> Self {
+        let [batch, frames, width] = features.dims();
+        let row = |values: Vec<f64>, frames: usize| {
+            let values: Vec<f32> = values.into_iter().map(|v| v as f32).collect();
+            Tensor::from_data(TensorData::new(values, [batch, frames, 1]), &features.device())
+        };
+        let poses = lengths.iter().map(|len| POSE / (len * (width - ROOTS)) as f64).collect();
+        let each = |len: &usize| {
+            let pairs = len - 1;
+            let weight = ROOT / (pairs * MOVES) as f64;
+            (0..frames - 1).map(move |t| if t < pairs { weight } else { 0.0 })
+        };
+        let moves = lengths.iter().flat_map(each).collect();
+        let (poses, moves) = (row(poses, 1), row(moves, frames - 1));
+        Self { features, poses, moves }
+    }
+
+    fn loss(&self, features: Tensor<3>) -> Tensor<1> {
+        let [_, frames, width] = features.dims();
+        let away = features - self.features.clone();
+        let root = away.clone().narrow(2, 0, MOVES);
+        let moves = root.clone().narrow(1, 1, frames - 1) - root.narrow(1, 0, frames - 1);
+        let poses = away.narrow(2, ROOTS, width - ROOTS).powi_scalar(2) * self.poses.clone();
+        poses.sum() + (moves.powi_scalar(2) * self.moves.clone()).sum()
+    }
+}
+
+/// Positions that motions of a batch should pass.
+struct Target {
+    of: ControlTarget,
+    /// What makes a mean of the sum over a motion's positions.
+    weights: Vec<f32>,
+}
+
+impl Target {
+    /// Of those positions of each hint that `which` gives, in metres.
+    fn new(hints: &[Hint], which: impl Fn(&Hint) -> Vec<(usize, usize, [f32; 3])>, device: &Device) -> Self {
+        let frames = hints.iter().map(Hint::frames).max().unwrap_or_default();
+        let joints = hints.first().map(Hint::joints).unwrap_or_default();
+        let size = frames * joints * 3;
+        let (mut values, mut given) = (vec![0.0; hints.len() * size], vec![false; hints.len() * size]);
+        for (b, hint) in hints.iter().enumerate() {
+            for (frame, joint, position) in which(hint) {
+                let at = b * size + (frame * joints + joint) * 3;
+                values[at..at + 3].copy_from_slice(&position);
+                given[at..at + 3].fill(true);
+            }
+        }
+        let as_they_are = (&vec![0.0; 3 * joints][..], &vec![1.0; 3 * joints][..]);
+        let of = ControlTarget::new(&values, &given, (hints.len(), frames, joints), as_they_are, true, device);
+        let weights = of.entries().iter().map(|own| 1.0 / (*own).max(1) as f32).collect();
+        Self { of, weights }
+    }
+
+    /// The mean squared distance of each motion's joints `[batch, frames, joints, 3]`, summed over the batch.
+    fn loss(&self, joints: Tensor<4>) -> Tensor<1> {
+        self.of.loss(joints, Pointwise::L2, &self.weights)
+    }
+}
