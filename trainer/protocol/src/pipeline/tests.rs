@@ -520,9 +520,10 @@ fn a_hand_made_pipeline_is_checked() {
 
 #[test]
 fn every_shipped_pipeline_is_valid() {
-    let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../configs");
+    let root = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../..");
     let mut seen = 0;
-    for entry in std::fs::read_dir(&folder).unwrap() {
+    let folders = ["configs", "docs/results"].map(|folder| std::fs::read_dir(root.join(folder)).unwrap());
+    for entry in folders.into_iter().flatten() {
         let path = entry.unwrap().path();
         if path.extension().is_some_and(|extension| extension == "yaml") {
             let text = std::fs::read_to_string(&path).unwrap();
