@@ -27,7 +27,7 @@ const MOVES: usize = 3;
 const ROOTS: usize = 4;
 const ADAM: AdamW = AdamW { beta1: 0.9, beta2: 0.99, eps: 1e-8, weight_decay: 0.0 };
 
-/// Refines latents `[batch, N, d]` of motions of `lengths` frames, at least two, in so many `steps`, towards what `hints` tell and want.
+/// Refines latents `[batch, N, d]` of motions of `lengths` frames in so many `steps`, towards what `hints` tell and want.
 pub(crate) fn refine(vae: &Autoencoder, z: &mut [f32], lengths: &[usize], hints: &[Hint], steps: usize) {
     let meta = vae.meta();
     let (skeleton, latent, device) = (Skeleton::of(meta.format), meta.latent, vae.device());
@@ -58,8 +58,8 @@ struct AsDrawn {
     features: Tensor<3>,
     /// [B, 1, 1]: what makes a mean of a sum over a motion's pose features.
     poses: Tensor<3>,
-    /// [B, T - 1, 1]: the same of what differs between two frames of it, 0 past its end.
-    moves: Tensor<3>,
+    /// [B, T - 1, 1]: the same of what differs between two frames of it, 0 past its end; `None` if no motion has two.
+    moves: Option<Tensor<3>>,
 }
 
 impl AsDrawn {
@@ -71,22 +71,23 @@ impl AsDrawn {
         };
         let poses = lengths.iter().map(|len| POSE / (len * (width - ROOTS)) as f64).collect();
         let each = |len: &usize| {
-            let pairs = len - 1;
-            let weight = ROOT / (pairs * MOVES) as f64;
+            let pairs = len.saturating_sub(1);
+            let weight = ROOT / (pairs.max(1) * MOVES) as f64;
             (0..frames - 1).map(move |t| if t < pairs { weight } else { 0.0 })
         };
-        let moves = lengths.iter().flat_map(each).collect();
-        let (poses, moves) = (row(poses, 1), row(moves, frames - 1));
+        let moves = (frames > 1).then(|| row(lengths.iter().flat_map(each).collect(), frames - 1));
+        let poses = row(poses, 1);
         Self { features, poses, moves }
     }
 
     fn loss(&self, features: Tensor<3>) -> Tensor<1> {
         let [_, frames, width] = features.dims();
         let away = features - self.features.clone();
-        let root = away.clone().narrow(2, 0, MOVES);
+        let poses = away.clone().narrow(2, ROOTS, width - ROOTS).powi_scalar(2) * self.poses.clone();
+        let Some(weights) = &self.moves else { return poses.sum() };
+        let root = away.narrow(2, 0, MOVES);
         let moves = root.clone().narrow(1, 1, frames - 1) - root.narrow(1, 0, frames - 1);
-        let poses = away.narrow(2, ROOTS, width - ROOTS).powi_scalar(2) * self.poses.clone();
-        poses.sum() + (moves.powi_scalar(2) * self.moves.clone()).sum()
+        poses.sum() + (moves.powi_scalar(2) * weights.clone()).sum()
     }
 }
 

@@ -231,6 +231,10 @@ fn a_control_part_learns_and_is_heeded() {
         // The decoder of so small a VAE can do little.
         assert!(few < errors.average && many < 0.9 * errors.average, "{base}: {} to {few} to {many}", errors.average);
         assert_eq!(refined(5), few);
+        // A motion of one frame does not move.
+        let told = (&hint(1), Heed { refine: 2, ..Heed::default() });
+        let one = controlled.generate_controlled("a person walks", Some(&sampler), Seed(3), told).expect("a motion");
+        assert_eq!(one.frames, 1);
 
         let told = (&hint(60), Heed::default());
         let refused =
