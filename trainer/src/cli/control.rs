@@ -33,7 +33,7 @@ pub(super) struct ControlArgs {
     /// How strongly positions are heeded; 0 not at all [default: 1, as trained]
     #[arg(long, value_name = "S")]
     control_scale: Option<f64>,
-    /// Refines what was drawn: N steps that move the latent until the decoded motion passes the positions, at the cost of decoding it 3 N times
+    /// Refines what was drawn: N steps that move the latent until the decoded motion passes the positions, at the cost of decoding it about 4 N times
     /// [default: 0]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(..=REFINE_STEPS as u64))]
     refine: Option<u64>,

@@ -103,19 +103,16 @@ impl Hint {
 
     /// Frame, joint and position of all that is told, frame by frame.
     pub fn iter(&self) -> impl Iterator<Item = (usize, usize, [f32; 3])> {
-        self.positions(&self.given)
-    }
-
-    /// The same of what refinement alone is told.
-    pub(crate) fn wanted(&self) -> impl Iterator<Item = (usize, usize, [f32; 3])> {
-        self.positions(&self.wanted)
-    }
-
-    fn positions(&self, of: &[bool]) -> impl Iterator<Item = (usize, usize, [f32; 3])> {
-        of.iter().enumerate().filter(|(_, counts)| **counts).map(|(i, _)| {
+        let told = self.given.iter().enumerate().filter(|(_, given)| **given);
+        told.map(|(i, _)| {
             let at = i * AXES;
             (i / self.joints, i % self.joints, [self.positions[at], self.positions[at + 1], self.positions[at + 2]])
         })
+    }
+
+    /// What refinement alone is told, as if all were told it.
+    pub(crate) fn wants(&self) -> Self {
+        Self { given: self.wanted.clone(), ..self.clone() }
     }
 
     /// How far a motion `[frames, joints, 3]` in metres is from it; `None` if nothing is told.

@@ -12,7 +12,7 @@ use models::losses::{Body, ControlTarget, Pointwise};
 use models::optim::AdamW;
 use motion::Skeleton;
 
-use crate::control::Hint;
+use crate::control::{Hint, NormalisedHints};
 use crate::networks::Autoencoder;
 
 /// First rate, in a latent's own unit.
@@ -21,10 +21,6 @@ const RATE: f64 = 0.1;
 const POSE: f64 = 0.1;
 /// The same of how much the root's change of pace and turn differs from frame to frame.
 const ROOT: f64 = 0.1;
-/// Features of the root's turn and pace.
-const MOVES: usize = 3;
-/// Features of the root.
-const ROOTS: usize = 4;
 const ADAM: AdamW = AdamW { beta1: 0.9, beta2: 0.99, eps: 1e-8, weight_decay: 0.0 };
 
 /// Refines latents `[batch, N, d]` of motions of `lengths` frames in so many `steps`, towards what `hints` tell and want.
@@ -32,13 +28,13 @@ pub(crate) fn refine(vae: &Autoencoder, z: &mut [f32], lengths: &[usize], hints:
     let meta = vae.meta();
     let (skeleton, latent, device) = (Skeleton::of(meta.format), meta.latent, vae.device());
     let body = Body::new(skeleton, &meta.mean, &meta.std, device);
-    let told = Target::new(hints, |hint| hint.iter().collect(), device);
-    let wanted = Target::new(hints, |hint| hint.wanted().collect(), device);
+    let told = Target::new(hints, device);
+    let wanted = Target::new(&hints.iter().map(Hint::wants).collect::<Vec<_>>(), device);
     let tracked = device.clone().autodiff();
     let at = |z: &[f32], device| {
         Tensor::<3>::from_data(TensorData::new(z.to_vec(), [lengths.len(), latent.tokens, latent.dim]), device)
     };
-    let as_drawn = AsDrawn::new(vae.decode_tensor(at(z, device), lengths), lengths);
+    let as_drawn = AsDrawn::new(vae.decode_tensor(at(z, device), lengths), lengths, skeleton);
     let (mut m, mut v) = (vec![0.0; z.len()], vec![0.0; z.len()]);
     for step in 0..steps {
         let z_bnd = at(z, &tracked).require_grad();
@@ -56,6 +52,10 @@ pub(crate) fn refine(vae: &Autoencoder, z: &mut [f32], lengths: &[usize], hints:
 struct AsDrawn {
     /// [B, T, D], normalised, 0 past each motion's end.
     features: Tensor<3>,
+    /// Features of the root's turn and pace, which come first.
+    root: usize,
+    /// The first feature of the pose.
+    pose: usize,
     /// [B, 1, 1]: what makes a mean of a sum over a motion's pose features.
     poses: Tensor<3>,
     /// [B, T - 1, 1]: the same of what differs between two frames of it, 0 past its end; `None` if no motion has two.
@@ -63,29 +63,31 @@ struct AsDrawn {
 }
 
 impl AsDrawn {
-    fn new(features: Tensor<3>, lengths: &[usize]) -> Self {
+    fn new(features: Tensor<3>, lengths: &[usize], skeleton: &Skeleton) -> Self {
         let [batch, frames, width] = features.dims();
+        let layout = skeleton.layout();
+        let (root, pose) = (layout.root_velocity.end, layout.positions.start);
         let row = |values: Vec<f64>, frames: usize| {
             let values: Vec<f32> = values.into_iter().map(|v| v as f32).collect();
             Tensor::from_data(TensorData::new(values, [batch, frames, 1]), &features.device())
         };
-        let poses = lengths.iter().map(|len| POSE / (len * (width - ROOTS)) as f64).collect();
+        let poses = lengths.iter().map(|len| POSE / (len * (width - pose)) as f64).collect();
         let each = |len: &usize| {
             let pairs = len.saturating_sub(1);
-            let weight = ROOT / (pairs.max(1) * MOVES) as f64;
+            let weight = ROOT / (pairs.max(1) * root) as f64;
             (0..frames - 1).map(move |t| if t < pairs { weight } else { 0.0 })
         };
         let moves = (frames > 1).then(|| row(lengths.iter().flat_map(each).collect(), frames - 1));
         let poses = row(poses, 1);
-        Self { features, poses, moves }
+        Self { features, root, pose, poses, moves }
     }
 
     fn loss(&self, features: Tensor<3>) -> Tensor<1> {
         let [_, frames, width] = features.dims();
         let away = features - self.features.clone();
-        let poses = away.clone().narrow(2, ROOTS, width - ROOTS).powi_scalar(2) * self.poses.clone();
+        let poses = away.clone().narrow(2, self.pose, width - self.pose).powi_scalar(2) * self.poses.clone();
         let Some(weights) = &self.moves else { return poses.sum() };
-        let root = away.narrow(2, 0, MOVES);
+        let root = away.narrow(2, 0, self.root);
         let moves = root.clone().narrow(1, 1, frames - 1) - root.narrow(1, 0, frames - 1);
         poses.sum() + (moves.powi_scalar(2) * weights.clone()).sum()
     }
@@ -99,21 +101,12 @@ struct Target {
 }
 
 impl Target {
-    /// Of those positions of each hint that `which` gives, in metres.
-    fn new(hints: &[Hint], which: impl Fn(&Hint) -> Vec<(usize, usize, [f32; 3])>, device: &Device) -> Self {
-        let frames = hints.iter().map(Hint::frames).max().unwrap_or_default();
-        let joints = hints.first().map(Hint::joints).unwrap_or_default();
-        let size = frames * joints * 3;
-        let (mut values, mut given) = (vec![0.0; hints.len() * size], vec![false; hints.len() * size]);
-        for (b, hint) in hints.iter().enumerate() {
-            for (frame, joint, position) in which(hint) {
-                let at = b * size + (frame * joints + joint) * 3;
-                values[at..at + 3].copy_from_slice(&position);
-                given[at..at + 3].fill(true);
-            }
-        }
-        let as_they_are = (&vec![0.0; 3 * joints][..], &vec![1.0; 3 * joints][..]);
-        let of = ControlTarget::new(&values, &given, (hints.len(), frames, joints), as_they_are, true, device);
+    /// Of what is told, in metres.
+    fn new(hints: &[Hint], device: &Device) -> Self {
+        let coordinates = 3 * hints.first().map(Hint::joints).unwrap_or_default();
+        let (zero, one) = (vec![0.0; coordinates], vec![1.0; coordinates]);
+        let told = NormalisedHints::of(hints, &zero, &one);
+        let of = ControlTarget::new(&told.values, &told.given, told.shape, (&zero, &one), true, device);
         let weights = of.entries().iter().map(|own| 1.0 / (*own).max(1) as f32).collect();
         Self { of, weights }
     }
