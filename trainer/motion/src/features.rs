@@ -15,7 +15,7 @@
 
 mod recover;
 
-pub use recover::{mirror_joints, recover_from_rotations, recover_joints, recover_joints_wide, root_path};
+pub use recover::{follow_path, mirror_joints, recover_from_rotations, recover_joints, recover_joints_wide, root_path};
 
 use crate::quaternion::{self as quat, Quat, Vec3};
 use crate::skeleton::Skeleton;

@@ -11,6 +11,7 @@ pub mod draw;
 pub mod features;
 pub mod files;
 pub mod folder_digest;
+pub mod footing;
 pub mod npy;
 pub mod paths;
 pub mod placement;

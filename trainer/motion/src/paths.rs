@@ -8,7 +8,6 @@
 use protocol::stage::Augment;
 
 use crate::features;
-use crate::quaternion::{self as quat, Vec3};
 use crate::random::Stream;
 use crate::skeleton::Skeleton;
 
@@ -58,17 +57,7 @@ impl Change {
             row[0] = (f64::from(row[0]) + turn / 2.0) as f32;
             row[1..3].iter_mut().for_each(|way| *way = (f64::from(*way) * self.pace) as f32);
         }
-        let joints = features::recover_joints_wide(rows, skeleton);
-        let frames: Vec<&[f64]> = joints.chunks_exact(3 * skeleton.joints).collect();
-        let path = features::root_path(rows, skeleton);
-        let velocities = skeleton.layout().velocities;
-        for (t, row) in rows.chunks_exact_mut(width).enumerate().take(last) {
-            let at = |frame: usize, j: usize| -> Vec3 { std::array::from_fn(|axis| frames[frame][3 * j + axis]) };
-            for (j, to) in row[velocities.clone()].chunks_exact_mut(3).enumerate() {
-                let moved = quat::rotate(path[t].0, quat::sub(at(t + 1, j), at(t, j)));
-                to.iter_mut().zip(moved).for_each(|(to, value)| *to = value as f32);
-            }
-        }
+        features::follow_path(rows, skeleton);
     }
 }
 
@@ -87,6 +76,7 @@ mod tests {
     use super::*;
     use crate::dataset::Entry;
     use crate::features::{recover_joints, recover_joints_wide};
+    use crate::quaternion::{self as quat, Vec3};
     use crate::synthetic;
 
     /// A synthetic walk: rows `[80, D]`.

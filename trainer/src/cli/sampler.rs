@@ -15,6 +15,9 @@ pub(super) struct SamplerArgs {
     /// What follows the predictions: ddpm, ddim, dpm-solver, dpm-solver++, sde-dpm-solver++ [default: as the model was measured]
     #[arg(long, value_name = "SOLVER", value_parser = solver)]
     solver: Option<Solver>,
+    /// Whether the root goes where standing feet let it: true or false [default: as the model was measured]
+    #[arg(long, value_name = "BOOL")]
+    footing: Option<bool>,
 }
 
 /// A solver by its word in settings.
@@ -40,11 +43,12 @@ impl SamplerArgs {
                 && self.guidance.is_none_or(|guidance| guidance == sampler.guidance)
                 && (self.timesteps.is_empty() || self.timesteps == sampler.timesteps)
                 && self.solver.is_none_or(|solver| solver == sampler.solver)
+                && self.footing.is_none_or(|footing| footing == sampler.footing)
         };
         let meant = measured.iter().filter(|(_, sampler)| as_asked(sampler));
         let meant = measured_with(meant.map(|(name, sampler)| (name.as_str(), sampler))).map_err(|differ| {
             format!(
-                "it was measured in several ways: {differ}; say which with --steps, --guidance, --timesteps or --solver"
+                "it was measured in several ways: {differ}; say which with --steps, --guidance, --timesteps, --solver or --footing"
             )
         })?;
         // What was measured in one way only is drawn that way but for what is asked.
@@ -61,6 +65,7 @@ impl SamplerArgs {
             guidance: self.guidance.unwrap_or(base.guidance),
             timesteps,
             solver: self.solver.unwrap_or(base.solver),
+            footing: self.footing.unwrap_or(base.footing),
         })
     }
 }
@@ -75,8 +80,12 @@ mod tests {
 
     #[test]
     fn a_model_is_drawn_as_it_was_measured_but_for_what_is_asked() {
-        let args =
-            |guidance, timesteps: &[usize]| SamplerArgs { guidance, timesteps: timesteps.to_vec(), solver: None };
+        let args = |guidance, timesteps: &[usize]| SamplerArgs {
+            guidance,
+            timesteps: timesteps.to_vec(),
+            solver: None,
+            footing: None,
+        };
         let own = sampler(2, 6.5, &[999, 499]);
         let of = |args: SamplerArgs, steps| args.sampler(steps, own.clone(), &[]);
         assert_eq!(of(args(None, &[]), None), Ok(own.clone()));
@@ -85,6 +94,8 @@ mod tests {
         assert_eq!(of(args(None, &[699]), None), Ok(sampler(1, 6.5, &[699])), "timesteps say the steps");
         let asked = SamplerArgs { solver: solver("ddim").ok(), ..args(None, &[]) };
         assert_eq!(of(asked, None), Ok(Sampler { solver: Solver::Ddim, ..own.clone() }));
+        let asked = SamplerArgs { footing: Some(true), ..args(None, &[]) };
+        assert_eq!(of(asked, None), Ok(Sampler { footing: true, ..own.clone() }));
         assert!(solver("euler").unwrap_err().contains("dpm-solver++"), "says which there are");
 
         let one = |name: &str, sampler| (name.to_owned(), sampler);

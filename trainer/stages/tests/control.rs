@@ -125,20 +125,21 @@ fn run(bench: &mut Bench, name: &str, settings: &StageSettings, inputs: &Inputs)
 fn p6_members_kills_and_resumes_change_no_byte() {
     let (mut bench, outputs) = world(v2());
     bench.checkpoint.every = Steps(3);
-    let latent_only = ControlLoss { control: 0.0, ..ControlLoss::default() };
+    let latent_only = ControlLoss { tokens: 0.5, control: 0.0, ..ControlLoss::default() };
     let cases = [
-        ("on-lcm", "lcm", temporal(), true),
-        ("on-mld", "mld", spatial(), true),
-        ("on-pcm", "pcm", TrainControl { loss: latent_only, ..temporal() }, false),
+        ("on-lcm", "lcm", temporal(), ["latent", "control"]),
+        ("on-mld", "mld", spatial(), ["latent", "control"]),
+        ("on-pcm", "pcm", TrainControl { loss: latent_only, ..temporal() }, ["latent", "tokens"]),
     ];
-    for (name, base, settings, motion) in cases {
+    for (name, base, settings, terms) in cases {
         let (settings, inputs) = (StageSettings::from(settings), inputs(&outputs, base));
         let ran = bench.run(name, &settings, &inputs).unwrap_or_else(|e| panic!("{name}: {e}"));
         let expected = ran.output();
-        for (term, there) in [("latent", true), ("control", motion)] {
+        for term in ["latent", "tokens", "control"] {
             let values: Vec<f64> =
                 ran.told.records.iter().filter(|(_, key, _)| key == term).map(|(_, _, value)| *value).collect();
             assert_eq!(values.len(), STEPS as usize, "{name}");
+            let there = terms.contains(&term);
             assert_eq!(values.iter().any(|value| *value > 0.0), there, "{name}: {term} is {values:?}");
         }
         // All parts of the base stay as they are.
@@ -215,7 +216,23 @@ fn a_control_part_learns_and_is_heeded() {
         assert!(silent < 1e-5, "{base}: scale 0 moves a feature by {silent}");
         assert_ne!(draw(1.0), without);
         assert_eq!(draw(1.0), draw(1.0));
+        // Feet hold the path of what is told none, and nothing else of it.
+        let feet = Sampler { footing: true, ..sampler.clone() };
+        let held = free.generate("a person walks", Some(60), Some(&feet), Seed(3)).expect("a motion").features;
         let skeleton = motion::Skeleton::of(protocol::stage::DataFormat::Humanml3d);
+        let layout = skeleton.layout();
+        for (t, (was, is)) in without.chunks(skeleton.features).zip(held.chunks(skeleton.features)).enumerate() {
+            let pose = layout.root_height.start..layout.velocities.start;
+            assert_eq!((was[0], &was[pose.clone()]), (is[0], &is[pose]), "{base}: frame {t}");
+            assert_eq!(
+                was[layout.root_velocity.clone()] != is[layout.root_velocity.clone()],
+                t < 59,
+                "{base}: frame {t}"
+            );
+        }
+        let told = (&hint(60), Heed::default());
+        let told = controlled.generate_controlled("a person walks", Some(&feet), Seed(3), told).expect("a motion");
+        assert_eq!(told.features, draw(1.0), "{base}: it goes where it is told");
         let errors = hint(60).errors(&metres(&draw(1.0), skeleton), 0.5).expect("something is told");
         assert!(errors.average.is_finite());
         let refined = |steps| {

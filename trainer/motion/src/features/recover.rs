@@ -50,6 +50,22 @@ pub fn recover_joints_wide(features: &[f32], skeleton: &Skeleton) -> Vec<f64> {
     joints
 }
 
+/// Makes the displacements of joints in rows `[L, D]`, which must not be normalised, those that positions, turns and the root's way come to. The last row
+/// leads nowhere and keeps its own.
+pub fn follow_path(features: &mut [f32], skeleton: &Skeleton) {
+    let joints = recover_joints_wide(features, skeleton);
+    let frames: Vec<&[f64]> = joints.chunks_exact(3 * skeleton.joints).collect();
+    let path = root_path(features, skeleton);
+    let velocities = skeleton.layout().velocities;
+    for ((row, pair), (heading, _)) in features.chunks_exact_mut(skeleton.features).zip(frames.windows(2)).zip(path) {
+        for (j, to) in row[velocities.clone()].chunks_exact_mut(3).enumerate() {
+            let moved: Vec3 = std::array::from_fn(|axis| pair[1][3 * j + axis] - pair[0][3 * j + axis]);
+            let moved = quat::rotate(heading, moved);
+            to.iter_mut().zip(moved).for_each(|(to, value)| *to = value as f32);
+        }
+    }
+}
+
 /// Global joints `[L, J, 3]` from the rotation features of rows `[L, D]` and the bone lengths `[J]`.
 pub fn recover_from_rotations(features: &[f32], skeleton: &Skeleton, lengths: &[f64]) -> Vec<f32> {
     let width = 3 * skeleton.joints;

@@ -129,6 +129,7 @@ const RANGES: &[(&str, Range, &str)] = &[
     // Control.
     ("hints.density", Real(0.0, 100.0), "percent of the frames"),
     ("loss.latent", Real(0.0, 1e6), ""),
+    ("loss.tokens", Real(0.0, 1e6), ""),
     ("loss.control", Real(0.0, 1e6), ""),
     ("embedding", Whole(1, 16_384), "channels"),
     ("trajectory_lr", Real(0.0, 1e3), ""),

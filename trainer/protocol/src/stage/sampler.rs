@@ -65,11 +65,14 @@ pub struct Sampler {
     pub timesteps: Vec<usize>,
     /// What follows the predictions.
     pub solver: Solver,
+    /// Lets the root of a drawn motion go where its standing feet let it, so that they do not slide (ours). A motion that is told positions goes there
+    /// instead, and one of which a part is drawn anew keeps the path of what stays.
+    pub footing: bool,
 }
 
 impl Default for Sampler {
     fn default() -> Self {
-        Self { steps: 1, guidance: 7.5, timesteps: Vec::new(), solver: Solver::Own }
+        Self { steps: 1, guidance: 7.5, timesteps: Vec::new(), solver: Solver::Own, footing: false }
     }
 }
 
@@ -78,6 +81,9 @@ impl std::fmt::Display for Sampler {
         write!(f, "{} step(s), guidance {}", self.steps, self.guidance)?;
         if self.solver != Solver::Own {
             write!(f, ", {}", self.solver.name())?;
+        }
+        if self.footing {
+            write!(f, ", feet held")?;
         }
         match self.timesteps.is_empty() {
             true => Ok(()),

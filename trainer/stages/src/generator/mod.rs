@@ -16,6 +16,7 @@ use std::rc::Rc;
 use burn::tensor::Device;
 use checkpoint::Blobs;
 use checkpoint::model::Model;
+use motion::{Skeleton, footing};
 use protocol::Manifest;
 use protocol::stage::Sampler;
 
@@ -87,8 +88,12 @@ pub fn motions(
             return Err(StageError::Fault("hints are not of the motions that are drawn".into()));
         }
     }
-    let motions = generator.draw(batch, sampler, lap)?;
+    let mut motions = generator.draw(batch, sampler, lap)?;
     finite(motions.iter().flatten())?;
+    if sampler.footing && batch.control.is_none() {
+        motions.iter_mut().for_each(|motion| footing::hold(motion, Skeleton::of(generator.format())));
+        lap(Lap::Decoded);
+    }
     Ok(motions)
 }
 

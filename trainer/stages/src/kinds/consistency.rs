@@ -63,7 +63,7 @@ pub(super) struct SolverStep {
 impl Distiller {
     /// Reads the inputs and builds the networks.
     pub(super) fn read(cx: &mut dyn GangContext, settings: &Distillation) -> Result<Self, StageError> {
-        let data = LatentData::read(cx, &settings.training)?;
+        let data = LatentData::read(cx, &settings.training, 1)?;
         let blobs = cx.blobs();
         let (_, manifest) = artifacts::input(cx, "teacher", ArtifactKind::Model)?;
         let base = Model::read(&manifest).map_err(model_error)?;

@@ -8,6 +8,8 @@
 //! A phased student (MotionPCM) is trained alike, which nobody has published: from a given `z_t` its jump to any edge differs from the true one by a
 //! constant times the error of the clean latent, so that one loss serves both students.
 //!
+//! Ours: `loss.tokens` compares the trajectory encoder's tokens with `z_0` themselves.
+//!
 //! Departs: a sample of which nothing is told adds nothing to the motion term, where two of the three published means divide by zero. Hints of KIT-ML
 //! are in metres too, so that one weight suits both datasets.
 
@@ -42,8 +44,12 @@ use crate::train::{Clip, GroupPlan, Losses, Objective, Pick, SliceResult, TrainS
 use crate::warm_start::WarmStart;
 use crate::weights;
 
+/// Batches that are sorted by length together: what a step costs is reading and decoding whole clips.
+const POOL: usize = 8;
 /// The term on latents.
 const LATENT: &str = "latent";
+/// The term on the trajectory encoder's tokens.
+const TOKENS: &str = "tokens";
 /// The term on joints.
 const CONTROL: &str = "control";
 
@@ -91,7 +97,7 @@ impl Objective for Controlled {
     }
 
     fn terms(&self) -> Vec<&'static str> {
-        vec![Losses::TOTAL, LATENT, CONTROL]
+        vec![Losses::TOTAL, LATENT, TOKENS, CONTROL]
     }
 
     fn load(&mut self, state: &TrainState) {
@@ -108,10 +114,15 @@ impl Objective for Controlled {
         let noise = self.data.noise("noise", &batch.picks);
         let (a, e) = unzip(timesteps.iter().map(|t| self.noise.add_noise(*t)));
         let noisy = affine(batch.clean_bnd.clone(), noise.clone(), &a, &e);
-        let out = self.predict(&batch, &noisy, &timesteps, &hints, (step, slice as u64));
+        let mut drop = self.dropout(self.settings.network.dropout, 1, (step, slice as u64));
+        let tokens = self.trajectory.forward(&hints.on(&self.device), &mut drop);
+        let out = self.predict(&batch, &noisy, &timesteps, tokens.clone(), (step, slice as u64));
 
         let loss = &self.settings.loss;
         let mut all = Losses::new(self.settings.training.batch.global);
+        if loss.tokens > 0.0 {
+            all.add(TOKENS, losses::mse(tokens, batch.clean_bnd.clone()), loss.tokens);
+        }
         let found = clean(&self.noise, noisy, out.clone(), &timesteps);
         if loss.latent > 0.0 {
             let sum = match self.base_meta.family {
@@ -167,14 +178,18 @@ impl Controlled {
         batch.picks.iter().zip(&batch.rows).zip(&batch.lengths).map(one).collect()
     }
 
+    fn dropout(&self, probability: f64, network: u64, (step, slice): (u64, u64)) -> Dropout {
+        Dropout::new(probability, self.seed ^ network, step, slice)
+    }
+
     /// The controlled denoiser's output, on the tape of what is trained.
     fn predict(
         &self,
         batch: &LatentSlice,
         noisy_bnd: &Tensor<3>,
         timesteps: &[usize],
-        hints: &NormalisedHints,
-        (step, slice): (u64, u64),
+        tokens_bnd: Tensor<3>,
+        at: (u64, u64),
     ) -> Tensor<3> {
         let (low, high) = self.settings.guidance;
         #[expect(clippy::cast_possible_truncation, reason = "a scale")]
@@ -183,13 +198,10 @@ impl Controlled {
             let scales: Vec<f32> = batch.picks.iter().map(w).collect();
             guidance_embedding(&scales, self.base_meta.guidance_dim, &self.device)
         });
-        let dropout = |probability, network: u64| Dropout::new(probability, self.seed ^ network, step, slice);
-        let mut drop = dropout(self.settings.network.dropout, 1);
-        let tokens = self.trajectory.forward(&hints.on(&self.device), &mut drop);
-        let mut drop = dropout(self.base_meta.network.dropout, 2);
+        let mut drop = self.dropout(self.base_meta.network.dropout, 2, at);
         let text = &batch.text_blc;
         let residuals =
-            self.control.residuals(noisy_bnd.clone(), timesteps, text.clone(), guidance.clone(), tokens, &mut drop);
+            self.control.residuals(noisy_bnd.clone(), timesteps, text.clone(), guidance.clone(), tokens_bnd, &mut drop);
         let control = Control { residuals: &residuals, scale: 1.0 };
         let off = &mut Dropout::off();
         self.base.forward_controlled(noisy_bnd.clone(), timesteps, text.clone(), guidance, control, off)
@@ -294,7 +306,7 @@ fn clips(cx: &dyn AttemptContext, data: &LatentData) -> Result<Dataset, StageErr
 impl Gang for TrainControl {
     fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
         let blobs = cx.blobs();
-        let data = LatentData::read(cx, &self.training)?;
+        let data = LatentData::read(cx, &self.training, POOL)?;
         let (_, manifest) = artifacts::input(cx, "model", ArtifactKind::Model)?;
         let model = Model::read(&manifest).map_err(model_error)?;
         let denoiser = parts::part(&*blobs, &model, &Role::DENOISER, ArtifactKind::Denoiser)?;

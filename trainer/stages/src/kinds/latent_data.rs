@@ -1,5 +1,6 @@
 //! Examples of the stages that train in the latent space: a latent drawn from its posterior, its caption, and keyed draws about it.
 
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 
 use burn::tensor::{Device, Tensor, TensorData};
@@ -24,7 +25,9 @@ pub(super) struct LatentData {
     latents: Latents,
     embeddings: Embeddings,
     train: Vec<usize>,
-    order: Order,
+    order: RefCell<Order>,
+    /// Whether batches are sorted by length.
+    sorted: bool,
     seed: Seed,
     stage: StageName,
     slices: usize,
@@ -49,8 +52,9 @@ pub(super) struct LatentSlice {
 }
 
 impl LatentData {
-    /// Reads the inputs `latents` and `text`.
-    pub(super) fn read(cx: &dyn AttemptContext, training: &Training) -> Result<Self, StageError> {
+    /// Reads the inputs `latents` and `text`. Of `pool` batches those examples stand together whose motions are of like length; one that looks at no motion
+    /// needs but one.
+    pub(super) fn read(cx: &dyn AttemptContext, training: &Training, pool: usize) -> Result<Self, StageError> {
         let blobs = cx.blobs();
         let (_, manifest) = artifacts::input(cx, "latents", ArtifactKind::Latents)?;
         let latents = Latents::read(&*blobs, &manifest)?;
@@ -69,8 +73,18 @@ impl LatentData {
             return Err(no_clips());
         }
         let seed = cx.task().seed;
-        let order = Order::new(seed, stage.as_str(), train.len(), training.batch.global, 1);
-        Ok(Self { latents, embeddings, train, order, seed, stage, slices: training.batch.slices, device: cx.device() })
+        let order = RefCell::new(Order::new(seed, stage.as_str(), train.len(), training.batch.global, pool));
+        Ok(Self {
+            latents,
+            embeddings,
+            train,
+            order,
+            sorted: pool > 1,
+            seed,
+            stage,
+            slices: training.batch.slices,
+            device: cx.device(),
+        })
     }
 
     /// The VAE whose latents these are.
@@ -110,8 +124,8 @@ impl LatentData {
     }
 
     /// The whole batch of `step`.
-    pub(super) fn picks(&mut self, step: u64) -> Vec<Pick> {
-        self.order.batch(step, |_| 0)
+    pub(super) fn picks(&self, step: u64) -> Vec<Pick> {
+        self.order.borrow_mut().batch(step, |pick| if self.sorted { self.meta().lengths[self.row(pick)] } else { 0 })
     }
 
     /// The row of the latents that [`slice`](Self::slice) takes for an example.
@@ -121,8 +135,8 @@ impl LatentData {
     }
 
     /// Slice `slice` of the batch of `step`. With probability `drop` a caption is replaced by the empty one.
-    pub(super) fn slice(&mut self, step: u64, slice: usize, drop: f64) -> LatentSlice {
-        let range = self.order.slice(slice, self.slices);
+    pub(super) fn slice(&self, step: u64, slice: usize, drop: f64) -> LatentSlice {
+        let range = self.order.borrow().slice(slice, self.slices);
         let picks: Vec<Pick> = self.picks(step)[range].to_vec();
         let latent = self.latents.meta.latent;
         let (size, crops) = (latent.tokens * latent.dim, self.latents.meta.crops);

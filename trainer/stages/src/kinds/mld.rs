@@ -136,7 +136,7 @@ impl Decoded {
 
 impl Gang for TrainMld {
     fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
-        let data = LatentData::read(cx, &self.training)?;
+        let data = LatentData::read(cx, &self.training, 1)?;
         let (vae_digest, vae_part) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
         let vae: VaeMeta = artifacts::meta(&vae_part, "the VAE")?;
         let text_part = data.text_encoder(cx)?;

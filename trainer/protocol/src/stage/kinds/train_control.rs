@@ -39,6 +39,9 @@ pub enum ControlMean {
 pub struct ControlLoss {
     /// Weight of the latent term: the clean latent that a student predicts, or the noise that a teacher does.
     pub latent: f64,
+    /// Weight of a term of ours on the trajectory encoder's tokens, which are shaped as latents are: how far they are from the clean latent. It teaches the
+    /// encoder without the ControlNet between, whose layers are zero at first.
+    pub tokens: f64,
     /// Weight of the motion term, which compares joints through the frozen decoder; 0 leaves the decoder out.
     pub control: f64,
     /// Distance of the motion term.
@@ -52,7 +55,7 @@ pub struct ControlLoss {
 impl Default for ControlLoss {
     fn default() -> Self {
         let (distance, mean) = (ControlDistance::default(), ControlMean::default());
-        Self { latent: 1.0, control: 1.0, distance, mean, metres: false }
+        Self { latent: 1.0, tokens: 0.0, control: 1.0, distance, mean, metres: false }
     }
 }
 
@@ -114,6 +117,8 @@ impl Default for TrainControl {
 
 impl StageSpec for TrainControl {
     const KIND: &'static str = "train.control";
+    // 2: batches of like length.
+    const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
 
@@ -130,6 +135,7 @@ impl StageSpec for TrainControl {
     fn check(&self, p: &mut Problems) {
         self.hints.check(p);
         p.not_negative("loss.latent", self.loss.latent);
+        p.not_negative("loss.tokens", self.loss.tokens);
         p.not_negative("loss.control", self.loss.control);
         if self.loss.latent == 0.0 && self.loss.control == 0.0 {
             p.add("loss.latent", "`loss.latent` and `loss.control` are both 0, so nothing is learned", "");
@@ -170,6 +176,6 @@ impl StageSpec for TrainControl {
     }
 
     fn recorded(&self) -> &'static [&'static str] {
-        &["loss", "latent", "control"]
+        &["loss", "latent", "tokens", "control"]
     }
 }
