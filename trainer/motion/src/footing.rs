@@ -97,7 +97,7 @@ mod tests {
         let dataset = synthetic::generate(&DataSynthetic { clips: 12, ..DataSynthetic::default() }, Seed(5));
         for clip in &dataset.clips[..12] {
             let true_path = features::root_path(&clip.features, skeleton);
-            let mut rows = clip.features.clone();
+            let mut rows = clip.features.to_vec();
             for row in rows.chunks_exact_mut(skeleton.features) {
                 row[1] += 0.02;
                 row[2] -= 0.03;
