@@ -185,7 +185,7 @@ fn models_are_drawn_as_they_were_measured(bench: &Bench) {
     let own = generate(&["--model", "smoke@staging"]);
     assert_eq!(
         own["sampler"],
-        serde_json::json!({"steps": 1, "guidance": 2.5, "timesteps": [], "solver": "own"}),
+        serde_json::json!({"steps": 1, "guidance": 2.5, "timesteps": [], "solver": "own", "footing": false}),
         "{own}"
     );
     let drawn = features();
@@ -203,7 +203,7 @@ fn models_are_drawn_as_they_were_measured(bench: &Bench) {
     let started = generate(&["--stage", "lcm", "--timesteps", "799"]);
     assert_eq!(
         started["sampler"],
-        serde_json::json!({"steps": 1, "guidance": 2.5, "timesteps": [799], "solver": "own"}),
+        serde_json::json!({"steps": 1, "guidance": 2.5, "timesteps": [799], "solver": "own", "footing": false}),
         "{started}"
     );
     let refused = bench.run(&["generate", "x", "--stage", "pcm", "--timesteps", "799", "-o", "x.npy"]).expect_code(2);
