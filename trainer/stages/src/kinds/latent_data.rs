@@ -26,8 +26,6 @@ pub(super) struct LatentData {
     embeddings: Embeddings,
     train: Vec<usize>,
     order: RefCell<Order>,
-    /// Whether batches are sorted by length.
-    sorted: bool,
     seed: Seed,
     stage: StageName,
     slices: usize,
@@ -74,17 +72,7 @@ impl LatentData {
         }
         let seed = cx.task().seed;
         let order = RefCell::new(Order::new(seed, stage.as_str(), train.len(), training.batch.global, pool));
-        Ok(Self {
-            latents,
-            embeddings,
-            train,
-            order,
-            sorted: pool > 1,
-            seed,
-            stage,
-            slices: training.batch.slices,
-            device: cx.device(),
-        })
+        Ok(Self { latents, embeddings, train, order, seed, stage, slices: training.batch.slices, device: cx.device() })
     }
 
     /// The VAE whose latents these are.
@@ -125,7 +113,9 @@ impl LatentData {
 
     /// The whole batch of `step`.
     pub(super) fn picks(&self, step: u64) -> Vec<Pick> {
-        self.order.borrow_mut().batch(step, |pick| if self.sorted { self.meta().lengths[self.row(pick)] } else { 0 })
+        let mut order = self.order.borrow_mut();
+        let sorted = order.is_pooled();
+        order.batch(step, |pick| if sorted { self.meta().lengths[self.row(pick)] } else { 0 })
     }
 
     /// The row of the latents that [`slice`](Self::slice) takes for an example.

@@ -36,6 +36,11 @@ impl Order {
         Self { seed, purpose: purpose.to_owned(), examples, batch, pool, epochs: HashMap::new() }
     }
 
+    /// Whether several batches are sorted together.
+    pub fn is_pooled(&self) -> bool {
+        self.pool > 1
+    }
+
     fn at(&mut self, place: u64) -> Pick {
         let n = self.examples as u64;
         let epoch = place / n;

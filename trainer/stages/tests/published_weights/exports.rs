@@ -1,0 +1,68 @@
+//! Weights out again: the files of a layout, held against those that were imported.
+
+use std::collections::BTreeMap;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use checkpoint::Blobs as _;
+use checkpoint::published::Layout;
+use protocol::Digest;
+use text_models::{StoredTensor, Weights};
+
+use crate::fixtures::name;
+use crate::world::{World, text_of};
+
+/// The files of a layout, written below `folder`, by name.
+pub(crate) fn exported(world: &World, digest: Digest, layout: Layout) -> BTreeMap<&'static str, PathBuf> {
+    let (manifest, blobs) = (world.manifest(digest), world.bench.blobs());
+    let folder = world.folder.path().join(format!("{}-{}", layout.name(), digest.short()));
+    std::fs::create_dir_all(&folder).expect("a test's own files");
+    let mut written = BTreeMap::new();
+    for planned in layout.plan(&manifest).expect("a layout for it").files {
+        let read = |name: &str| {
+            let bytes = blobs.get(manifest.files[name].digest).expect("stored");
+            (name.to_owned(), bytes.to_vec())
+        };
+        let bytes: BTreeMap<String, Vec<u8>> = planned.reads().map(read).collect();
+        let path = folder.join(planned.name);
+        if planned.write(|| std::fs::File::create(&path), &bytes).expect("it is written") > 0 {
+            written.insert(planned.name, path);
+        }
+    }
+    written
+}
+
+/// Keeps an exported file in the folder `STRIDE_EXPORTS`, if that is set, and notes there what it was imported from: `tests/torch_load.py` reads both.
+fn keep(ours: &Path, theirs: &Path, without: &[&str]) {
+    let Some(folder) = std::env::var_os("STRIDE_EXPORTS").map(PathBuf::from) else { return };
+    // A layout's folder has the digest of what was exported in its name.
+    let layout = ours.parent().expect("a folder of a layout");
+    let kept = format!("{}-{}", name(layout), name(ours));
+    std::fs::create_dir_all(&folder).expect("a folder that was asked for");
+    std::fs::copy(ours, folder.join(&kept)).expect("a folder that was asked for");
+    let row =
+        [&[kept, text_of(theirs)][..], &without.iter().map(|begin| (*begin).to_owned()).collect::<Vec<_>>()].concat();
+    let mut pairs = std::fs::OpenOptions::new();
+    let mut pairs =
+        pairs.create(true).append(true).open(folder.join("pairs.tsv")).expect("a folder that was asked for");
+    pairs.write_all(format!("{}\n", row.join("\t")).as_bytes()).expect("a folder that was asked for");
+}
+
+/// Holds an exported file against the one that was imported: the same names and bits, but for names that begin with one of `without`.
+pub(crate) fn expect_file(ours: &Path, theirs: &Path, without: &[&str]) {
+    keep(ours, theirs, without);
+    let open = |path: &Path| Weights::open_file(path).unwrap_or_else(|e| panic!("{e}"));
+    let (ours_open, theirs_open) = (open(ours), open(theirs));
+    let kept = |name: &&String| !without.iter().any(|begin| name.starts_with(begin));
+    let names: Vec<&String> = theirs_open.tensors().keys().filter(kept).collect();
+    assert!(!names.is_empty());
+    assert_eq!(ours_open.tensors().keys().collect::<Vec<_>>(), names, "{}", theirs.display());
+    for (name, tensor) in ours_open.tensors() {
+        let other = &theirs_open.tensors()[name];
+        assert_eq!(tensor.shape, other.shape, "{name}");
+        let bits = |tensor: &StoredTensor| -> Vec<u32> {
+            tensor.values().expect("numbers").into_iter().map(f32::to_bits).collect()
+        };
+        assert_eq!(bits(tensor), bits(other), "{}: {name}", theirs.display());
+    }
+}
