@@ -73,6 +73,8 @@ pub const CONTROL_CASES: usize = 10_000;
 
 /// Steps that a drawn latent is refined by.
 pub const REFINE_STEPS: usize = 1000;
+/// Rounds of feedback on a drawn latent.
+pub const FEEDBACK_ROUNDS: usize = 100;
 
 // Files that somebody else made.
 

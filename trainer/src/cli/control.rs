@@ -10,9 +10,10 @@ use motion::Skeleton;
 use motion::waypoints::{self, Waypoint};
 use protocol::Manifest;
 use protocol::artifact::Role;
-use protocol::limits::REFINE_STEPS;
-use stages::control::{Heed, Hint, metres};
+use protocol::limits::{FEEDBACK_ROUNDS, REFINE_STEPS};
+use stages::control::Heed;
 use stages::generate::{Generated, Generator};
+use stages::hint::{Hint, metres};
 
 use super::model::{self, Found};
 use crate::problem::{Problem, Result};
@@ -33,6 +34,9 @@ pub(super) struct ControlArgs {
     /// How strongly positions are heeded; 0 not at all [default: 1, as trained]
     #[arg(long, value_name = "S")]
     control_scale: Option<f64>,
+    /// Rounds in which the control part corrects what was drawn [default: as many as it was trained with]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(..=FEEDBACK_ROUNDS as u64))]
+    feedback: Option<u64>,
     /// Refines what was drawn: N steps that move the latent until the decoded motion passes the positions, at the cost of decoding it about 4 N times
     /// [default: 0]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(..=REFINE_STEPS as u64))]
@@ -78,6 +82,7 @@ impl ControlArgs {
         let given = [
             (!self.joints.is_empty(), "joints"),
             (self.control_scale.is_some(), "control-scale"),
+            (self.feedback.is_some(), "feedback"),
             (self.refine.is_some(), "refine"),
             (self.control_from.is_some(), "control-from"),
         ];
@@ -91,7 +96,11 @@ impl ControlArgs {
 
     /// How positions are heeded.
     pub(super) fn heed(&self) -> Heed {
-        Heed { scale: self.control_scale.unwrap_or(1.0), refine: self.refine.unwrap_or(0) as usize }
+        Heed {
+            scale: self.control_scale.unwrap_or(1.0),
+            feedback: self.feedback.map(|rounds| rounds as usize),
+            refine: self.refine.unwrap_or(0) as usize,
+        }
     }
 
     /// Joints that are told.

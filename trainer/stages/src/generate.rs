@@ -17,8 +17,9 @@ use protocol::stage::{DataFormat, Sampler};
 use protocol::{ArtifactKind, Manifest, Seed};
 
 use crate::context::StageError;
-use crate::control::{ControlMeta, Heed, Hint};
+use crate::control::{ControlMeta, Heed};
 use crate::generator::{self, Batch, ControlRequest, Edit, Lap, MotionGenerator, Seeds, Text};
+use crate::hint::Hint;
 use crate::length::Lengths;
 use crate::parts::{self, model_error};
 

@@ -17,8 +17,8 @@ use protocol::{Manifest, Seed};
 
 use crate::artifacts::{self, DenoiserMeta, VaeMeta};
 use crate::context::StageError;
-use crate::control::Steering;
 use crate::kinds::word;
+use crate::steering::Steering;
 use crate::weights;
 
 /// Width of the time sinusoid in every published denoiser.

@@ -12,7 +12,7 @@ use models::losses::{Body, ControlTarget, Pointwise};
 use models::optim::AdamW;
 use motion::Skeleton;
 
-use crate::control::{Hint, NormalisedHints};
+use crate::hint::{Hint, NormalisedHints};
 use crate::networks::Autoencoder;
 
 /// First rate, in a latent's own unit.

@@ -25,8 +25,9 @@ use protocol::Seed;
 use protocol::stage::{ControlSetting, Sampler};
 
 use crate::context::StageError;
-use crate::control::{Heed, Hint, share};
+use crate::control::Heed;
 use crate::generate::Generator;
+use crate::hint::{Hint, share};
 
 /// Percent of a segment that are frames of the one before it, where the control part's training does not say: tau of MotionLCM.
 const OVERLAP_PERCENT: f64 = 25.0;

@@ -6,14 +6,16 @@ use burn::tensor::Device;
 use checkpoint::model::{self, Model};
 use protocol::artifact::Role;
 use protocol::stage::{
-    Batch, ControlDistance, ControlHints, ControlLoss, ControlMean, ControlSetting, DataSynthetic, Decay, DistillLcm,
-    DistillPcm, Distillation, EncodeLatents, EvaluateControl, EvaluatorNetwork, LatentShape, MovementPhase, Network,
-    Optimizer, Sampler, StageSettings, TextEmbed, TrainControl, TrainEvaluator, TrainMld, TrainVae, Training,
+    Batch, ControlDistance, ControlFeedback, ControlHints, ControlLoss, ControlMean, ControlSetting, DataSynthetic,
+    Decay, DistillLcm, DistillPcm, Distillation, EncodeLatents, EvaluateControl, EvaluatorNetwork, LatentShape,
+    MovementPhase, Network, Optimizer, Sampler, StageSettings, TextEmbed, TrainControl, TrainEvaluator, TrainMld,
+    TrainVae, Training,
 };
 use protocol::{Digest, Manifest, Seed, Steps};
 use stages::context::Outcome;
-use stages::control::{Heed, Hint, metres};
+use stages::control::Heed;
 use stages::generate::Generator;
+use stages::hint::{Hint, metres};
 use stages::testing::{Bench, Script};
 
 const STEPS: u64 = 9;
@@ -126,21 +128,25 @@ fn p6_members_kills_and_resumes_change_no_byte() {
     let (mut bench, outputs) = world(v2());
     bench.checkpoint.every = Steps(3);
     let latent_only = ControlLoss { tokens: 0.5, control: 0.0, ..ControlLoss::default() };
-    let cases = [
-        ("on-lcm", "lcm", temporal(), ["latent", "control"]),
-        ("on-mld", "mld", spatial(), ["latent", "control"]),
-        ("on-pcm", "pcm", TrainControl { loss: latent_only, ..temporal() }, ["latent", "tokens"]),
+    let rounds = |rounds| ControlFeedback { rounds, ..ControlFeedback::default() };
+    let on_mld = TrainControl { feedback: rounds(2), ..spatial() };
+    let on_pcm = TrainControl { feedback: rounds(1), loss: latent_only, ..temporal() };
+    let cases: [(&str, &str, TrainControl, &[&str]); 3] = [
+        ("on-lcm", "lcm", temporal(), &["latent", "control"]),
+        ("on-mld", "mld", on_mld, &["latent", "control", "feedback_latent", "feedback_control"]),
+        ("on-pcm", "pcm", on_pcm, &["latent", "tokens", "feedback_latent"]),
     ];
     for (name, base, settings, terms) in cases {
         let (settings, inputs) = (StageSettings::from(settings), inputs(&outputs, base));
         let ran = bench.run(name, &settings, &inputs).unwrap_or_else(|e| panic!("{name}: {e}"));
         let expected = ran.output();
-        for term in ["latent", "tokens", "control"] {
+        for term in ["latent", "tokens", "control", "feedback_latent", "feedback_control"] {
             let values: Vec<f64> =
                 ran.told.records.iter().filter(|(_, key, _)| key == term).map(|(_, _, value)| *value).collect();
-            assert_eq!(values.len(), STEPS as usize, "{name}");
             let there = terms.contains(&term);
-            assert_eq!(values.iter().any(|value| *value > 0.0), there, "{name}: {term} is {values:?}");
+            let positive = values.iter().filter(|value| **value > 0.0).count();
+            let steps = if there { STEPS as usize } else { 0 };
+            assert_eq!(positive, steps, "{name}: {term} is {values:?}");
         }
         // All parts of the base stay as they are.
         let read = |digest| Model::read(&bench.manifest(digest).unwrap()).unwrap().parts;
@@ -258,6 +264,45 @@ fn a_control_part_learns_and_is_heeded() {
             free.generate_controlled("a person walks", Some(&sampler), Seed(3), told).unwrap_err().to_string();
         assert!(refused.contains("no control part"), "{refused}");
     }
+}
+
+/// Rounds of feedback bring what was drawn nearer to what is told, each motion by itself; without them the part draws as it would have without the network.
+#[test]
+fn feedback_corrects_what_was_drawn() {
+    let (mut bench, outputs) = world(v2());
+    let settings = |rounds| TrainControl {
+        network: Network { dropout: 0.0, ..network() },
+        training: Training { lr: 5e-3, ..training(160) },
+        hints: ControlHints { density: (100.0, 100.0), ..ControlHints::default() },
+        loss: ControlLoss { latent: 0.0, ..ControlLoss::default() },
+        feedback: ControlFeedback { rounds, lr: 1e-2 },
+        ..temporal()
+    };
+    let plain = run(&mut bench, "control", &settings(0).into(), &inputs(&outputs, "lcm"));
+    bench.forget("control");
+    let ran = bench.run("control", &settings(2).into(), &inputs(&outputs, "lcm")).expect("it trains");
+    let last = |term: &str| {
+        let values = ran.told.records.iter().filter(|(_, key, _)| key == term).map(|(_, _, value)| *value);
+        values.skip(140).sum::<f64>() / 20.0
+    };
+    let (drawn, corrected) = (last("control"), last("feedback_control"));
+    eprintln!("the motion term is {drawn:.3} as drawn, {corrected:.3} after feedback");
+    assert!(corrected < 0.95 * drawn, "{drawn} to {corrected}");
+
+    let [plain, corrects] =
+        [plain, ran.output()].map(|digest| generator(&bench, &bench.manifest(digest).expect("stored")));
+    let sampler = Sampler { steps: 1, guidance: 2.0, ..Sampler::default() };
+    let draw = |of: &Generator, heed| {
+        let told = (&hint(60), heed);
+        of.generate_controlled("a person walks", Some(&sampler), Seed(3), told).expect("a motion").features
+    };
+    let rounds = |feedback| Heed { feedback, ..Heed::default() };
+    assert_eq!(draw(&corrects, rounds(Some(0))), draw(&plain, rounds(None)), "the other two networks learn alike");
+    assert_eq!(draw(&plain, rounds(Some(3))), draw(&plain, rounds(None)), "no network, no rounds");
+    assert_eq!(draw(&corrects, rounds(Some(2))), draw(&corrects, rounds(None)), "as many as in training");
+    assert_ne!(draw(&corrects, rounds(Some(1))), draw(&corrects, rounds(None)));
+    let silent = Heed { scale: 0.0, ..Heed::default() };
+    assert_eq!(draw(&corrects, silent), draw(&plain, silent));
 }
 
 /// A report has the same bytes for any number of shards, and measures with the part and without.

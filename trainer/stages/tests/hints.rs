@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use protocol::stage::ControlSetting;
 use safetensors::{Dtype, SafeTensors};
 use serde_json::Value;
-use stages::control::{Hint, NormalisedHints, share, told_frames};
+use stages::hint::{Hint, NormalisedHints, share, told_frames};
 
 /// The fixtures of groups whose names begin so, if they are there.
 fn folders(prefix: &str) -> Vec<PathBuf> {

@@ -14,6 +14,7 @@ mod dit;
 mod embedding;
 mod encoder;
 mod evaluator;
+mod feedback;
 mod gpt;
 mod init;
 mod length;
@@ -39,6 +40,7 @@ pub use encoder::Layers;
 pub use evaluator::{
     BiGru, Conv, Deconv, Evaluator, EvaluatorConfig, MotionEncoder, MovementDecoder, MovementEncoder, TextEncoder,
 };
+pub use feedback::{Feedback, FeedbackConfig};
 pub use gpt::{Gpt, GptConfig};
 pub use init::Init;
 pub use length::LengthEstimator;

@@ -189,7 +189,8 @@ fn kind_of_value(property: &Value) -> String {
     if let Some(lead) = property["x-refers-to"].as_str() {
         return lead[..1].to_lowercase() + &lead[1..];
     }
-    let whole = property["type"] == "integer" || property["x-unit"] == "steps";
+    let optional = property["type"] == json!(["integer", "null"]);
+    let whole = optional || property["type"] == "integer" || property["x-unit"] == "steps";
     let words: Vec<&str> = match (&property["oneOf"], &property["enum"]) {
         (Value::Array(words), _) => words.iter().filter_map(|word| word["const"].as_str()).collect(),
         (_, Value::Array(words)) => words.iter().filter_map(Value::as_str).collect(),
@@ -197,6 +198,7 @@ fn kind_of_value(property: &Value) -> String {
     };
     let base = match (&property["type"], property.get("prefixItems")) {
         _ if !words.is_empty() => words.iter().map(|word| format!("`{word}`")).collect::<Vec<_>>().join(", "),
+        _ if optional => "whole number or nothing".to_owned(),
         _ if whole => "whole number".to_owned(),
         (Value::String(word), _) if word == "number" => "number".to_owned(),
         (Value::String(word), _) if word == "boolean" => "`true` or `false`".to_owned(),

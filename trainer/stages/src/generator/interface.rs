@@ -7,7 +7,8 @@ use protocol::Digest;
 use protocol::stage::{DataFormat, Family, LatentShape, Sampler};
 
 use crate::context::StageError;
-use crate::control::{ControlMeta, Heed, Hint};
+use crate::control::{ControlMeta, Heed};
+use crate::hint::Hint;
 use crate::text::TextEncoder;
 
 /// A caption as a generator wants it: what it asked its text encoder for.

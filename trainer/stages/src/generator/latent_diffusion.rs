@@ -117,6 +117,9 @@ impl MotionGenerator for LatentDiffusion {
 
     fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError> {
         let mut z = self.steered(batch.texts, batch.seeds, sampler, batch.control, &mut |_, _| {})?;
+        if let (Some(ControlRequest { hints, heed }), Some(control)) = (batch.control, &self.control) {
+            z = control.correct(&self.vae, z, batch.lengths, (hints, heed));
+        }
         if let Some(ControlRequest { hints, heed }) = batch.control
             && heed.refine > 0
         {

@@ -21,7 +21,7 @@ use protocol::Manifest;
 use protocol::stage::Sampler;
 
 use crate::context::StageError;
-use crate::control::Hint;
+use crate::hint::Hint;
 use crate::parts::model_error;
 
 pub(crate) use feature_diffusion::NAME as FEATURE_DIFFUSION;

@@ -8,7 +8,9 @@
 //! A phased student (MotionPCM) is trained alike, which nobody has published: from a given `z_t` its jump to any edge differs from the true one by a
 //! constant times the error of the clean latent, so that one loss serves both students.
 //!
-//! Ours: `loss.tokens` compares the trajectory encoder's tokens with `z_0` themselves.
+//! Ours: `loss.tokens` compares the trajectory encoder's tokens with `z_0` themselves. `feedback` trains a third network, which corrects what was
+//! predicted in rounds; each round's latent and motion have the same terms as the prediction, in the mean over rounds, and no gradient goes from a round to
+//! what was before it.
 //!
 //! Departs: a sample of which nothing is told adds nothing to the motion term, where two of the three published means divide by zero. Hints of KIT-ML
 //! are in metres too, so that one weight suits both datasets.
@@ -16,17 +18,19 @@
 use std::collections::BTreeMap;
 
 use burn::module::Module;
-use burn::tensor::{Device, Tensor};
+use burn::tensor::{Device, Gradients, Tensor};
 use checkpoint::model::{self, Model, Parts};
 use models::diffusion::{Grid, Schedule, TIMESTEPS, affine, unzip};
 use models::flat::{self, Entry};
 use models::kernels::Dropout;
 use models::losses::{self, Body, ControlTarget, Pointwise};
-use models::networks::{Control, Denoiser, Init, TrajectoryEncoder, copied_from, guidance_embedding};
+use models::networks::{Control, Denoiser, Feedback, Init, TrajectoryEncoder, copied_from, guidance_embedding};
 use motion::Skeleton;
 use motion::dataset::Dataset;
 use protocol::artifact::Role;
-use protocol::stage::{ControlDistance, ControlMean, ControlSetting, Family, Positions, TrainControl, Training};
+use protocol::stage::{
+    ControlDistance, ControlFeedback, ControlMean, ControlSetting, Family, Positions, TrainControl, Training,
+};
 use protocol::{ArtifactKind, Digest, Manifest, Seed};
 
 use super::frequency::clean;
@@ -34,10 +38,9 @@ use super::latent_data::{LatentData, LatentSlice};
 use super::{Gang, dropout_seed, group};
 use crate::artifacts::{self, DenoiserMeta, Draft, VaeMeta, to_meta};
 use crate::context::{AttemptContext, GangContext, Outcome, StageError};
-use crate::control::{
-    CONTROLNET_PREFIX, ControlMeta, Hint, NormalisedHints, TRAJECTORY_PREFIX, joint_statistics, metres, told_count,
-    told_frames,
-};
+use crate::control::{CONTROLNET_PREFIX, ControlMeta, FEEDBACK_PREFIX, TRAJECTORY_PREFIX};
+use crate::feedback::Seen;
+use crate::hint::{Hint, NormalisedHints, joint_statistics, metres, told_count, told_frames};
 use crate::networks::Autoencoder;
 use crate::parts::{self, model_error};
 use crate::train::{Clip, GroupPlan, Losses, Objective, Pick, SliceResult, TrainState, Trained, train};
@@ -52,6 +55,10 @@ const LATENT: &str = "latent";
 const TOKENS: &str = "tokens";
 /// The term on joints.
 const CONTROL: &str = "control";
+/// The term on latents after rounds of feedback, in the mean over rounds.
+const FEEDBACK_LATENT: &str = "feedback_latent";
+/// The term on joints then.
+const FEEDBACK_CONTROL: &str = "feedback_control";
 
 /// What the motion term looks through.
 struct Decoder {
@@ -59,6 +66,32 @@ struct Decoder {
     body: Body,
     /// Metres in one unit of the data.
     metres: f32,
+}
+
+/// Compares motions with what was told of them.
+struct MotionTerm<'a> {
+    decoder: &'a Decoder,
+    /// Frames of each motion.
+    lengths: &'a [usize],
+    target: ControlTarget,
+    distance: Pointwise,
+    /// Of each motion.
+    weights: Vec<f32>,
+}
+
+impl MotionTerm<'_> {
+    /// Features [B, T, D] of the motions of latents.
+    fn decode(&self, latent_bnd: Tensor<3>) -> Tensor<3> {
+        self.decoder.vae.decode_tensor(latent_bnd, self.lengths)
+    }
+
+    /// The distance of their joints from those that were told, summed over the slice so that dividing by the global batch gives the mean that is asked
+    /// for.
+    fn of(&self, features: Tensor<3>) -> Tensor<1> {
+        let (joints, metres) = (self.decoder.body.joints(features), self.decoder.metres);
+        let joints = if metres == 1.0 { joints } else { joints * metres };
+        self.target.loss(joints, self.distance, &self.weights)
+    }
 }
 
 struct Controlled {
@@ -72,6 +105,7 @@ struct Controlled {
     meta: ControlMeta,
     control: Denoiser,
     trajectory: TrajectoryEncoder,
+    feedback: Option<Feedback>,
     decoder: Option<Decoder>,
     noise: Schedule,
     seed: u64,
@@ -90,26 +124,40 @@ impl Objective for Controlled {
         let lr = if self.settings.trajectory_lr > 0.0 { self.settings.trajectory_lr } else { training.lr };
         let clip = (training.max_grad_norm > 0.0).then_some(Clip { norm: training.max_grad_norm, together: "control" });
         let own = Training { lr, ..training.clone() };
-        vec![
+        let mut groups = vec![
             GroupPlan { clip, ..group("controlnet", &self.control, training, 0.0) },
             GroupPlan { clip, ..group("trajectory", &self.trajectory, &own, 0.0) },
-        ]
+        ];
+        if let Some(network) = &self.feedback {
+            let ControlFeedback { lr, .. } = self.settings.feedback;
+            let own = Training { lr: if lr > 0.0 { lr } else { training.lr }, ..training.clone() };
+            let clip = clip.map(|clip| Clip { together: "feedback", ..clip });
+            groups.push(GroupPlan { clip, ..group("feedback", network, &own, 0.0) });
+        }
+        groups
     }
 
     fn terms(&self) -> Vec<&'static str> {
-        vec![Losses::TOTAL, LATENT, TOKENS, CONTROL]
+        let mut terms = vec![Losses::TOTAL, LATENT, TOKENS, CONTROL];
+        if self.feedback.is_some() {
+            terms.extend([FEEDBACK_LATENT, FEEDBACK_CONTROL]);
+        }
+        terms
     }
 
     fn load(&mut self, state: &TrainState) {
         state.groups[0].trained().assign(&mut self.control);
         state.groups[1].trained().assign(&mut self.trajectory);
+        if let Some(network) = &mut self.feedback {
+            state.groups[2].trained().assign(network);
+        }
     }
 
     fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
         let whole = self.data.picks(step);
         let batch = self.data.slice(step, slice, 0.0);
-        let hints = self.hints(&batch);
-        let hints = NormalisedHints::of(&hints, &self.meta.mean, &self.meta.std);
+        let told = self.hints(&batch);
+        let hints = NormalisedHints::of(&told, &self.meta.mean, &self.meta.std);
         let timesteps: Vec<usize> = batch.picks.iter().map(|pick| self.timestep(*pick)).collect();
         let noise = self.data.noise("noise", &batch.picks);
         let (a, e) = unzip(timesteps.iter().map(|t| self.noise.add_noise(*t)));
@@ -126,21 +174,30 @@ impl Objective for Controlled {
         let found = clean(&self.noise, noisy, out.clone(), &timesteps);
         if loss.latent > 0.0 {
             let sum = match self.base_meta.family {
-                Family::Mld => losses::mse(out, self.noise.target(batch.clean_bnd, noise, &timesteps)),
-                _ => losses::mse(found.clone(), batch.clean_bnd),
+                Family::Mld => losses::mse(out, self.noise.target(batch.clean_bnd.clone(), noise, &timesteps)),
+                _ => losses::mse(found.clone(), batch.clean_bnd.clone()),
             };
             all.add(LATENT, sum, loss.latent);
         }
         if let Some(decoder) = &self.decoder {
-            all.add(CONTROL, self.motion_term(decoder, found, &batch.lengths, &hints, &whole), loss.control);
+            let motion = self.motion_term(decoder, &batch, &hints, &whole);
+            let mut features = None;
+            if loss.control > 0.0 {
+                let decoded = motion.decode(found.clone());
+                all.add(CONTROL, motion.of(decoded.clone()), loss.control);
+                features = Some(decoded.inner());
+            }
+            if let Some(network) = &self.feedback {
+                let drop = |round| self.dropout(self.settings.network.dropout, 3 + round, (step, slice as u64));
+                self.rounds(&mut all, network, &motion, (found.inner(), features), (&batch, &told), &drop);
+            }
         }
         let total = all.total().ok_or_else(|| StageError::Fault("every weight of the loss is 0".into()))?;
         let mut gradients = total.backward();
-        let (mut first, mut second) = (vec![0.0; self.control.num_params()], vec![0.0; self.trajectory.num_params()]);
-        flat::add_gradients(&self.control, &mut gradients, &mut first);
-        flat::add_gradients(&self.trajectory, &mut gradients, &mut second);
+        let mut of = vec![taken(&self.control, &mut gradients), taken(&self.trajectory, &mut gradients)];
+        of.extend(self.feedback.as_ref().map(|network| taken(network, &mut gradients)));
         let terms = all.values(&self.terms());
-        Ok(SliceResult { gradients: vec![first, second], terms, ..SliceResult::default() })
+        Ok(SliceResult { gradients: of, terms, ..SliceResult::default() })
     }
 }
 
@@ -207,16 +264,14 @@ impl Controlled {
         self.base.forward_controlled(noisy_bnd.clone(), timesteps, text.clone(), guidance, control, off)
     }
 
-    /// The distance of the decoded motion's joints from those that were told, summed over the slice so that dividing by the global batch gives the
-    /// mean that is asked for.
-    fn motion_term(
+    /// What compares a slice's motions with what was told of them.
+    fn motion_term<'a>(
         &self,
-        decoder: &Decoder,
-        found_bnd: Tensor<3>,
-        lengths: &[usize],
+        decoder: &'a Decoder,
+        slice: &'a LatentSlice,
         hints: &NormalisedHints,
         batch: &[Pick],
-    ) -> Tensor<1> {
+    ) -> MotionTerm<'a> {
         let loss = &self.settings.loss;
         let distance = match loss.distance {
             ControlDistance::L2 => Pointwise::L2,
@@ -241,9 +296,41 @@ impl Controlled {
             ControlMean::Sample => entries.iter().map(|own| 1.0 / (*own).max(1) as f32).collect(),
             ControlMean::Coordinate => entries.iter().map(|own| 1.0 / (3 * own).max(1) as f32).collect(),
         };
-        let joints = decoder.body.joints(decoder.vae.decode_tensor(found_bnd, lengths));
-        let joints = if decoder.metres == 1.0 { joints } else { joints * decoder.metres };
-        target.loss(joints, distance, &weights)
+        MotionTerm { decoder, lengths: &slice.lengths, target, distance, weights }
+    }
+
+    /// Adds the terms of the rounds of feedback on latents [B, N, d] and their motions' features [B, T, D], if they are decoded already. Each round
+    /// begins with what the one before came to and trains on its own result alone, so that the network learns to answer what it will see.
+    fn rounds(
+        &self,
+        all: &mut Losses,
+        network: &Feedback,
+        motion: &MotionTerm<'_>,
+        (mut latent_bnd, mut features): (Tensor<3>, Option<Tensor<3>>),
+        (batch, told): (&LatentSlice, &[Hint]),
+        drop: &dyn Fn(u64) -> Dropout,
+    ) {
+        let (loss, rounds) = (&self.settings.loss, self.settings.feedback.rounds);
+        let (mut latents, mut motions) = (Vec::new(), Vec::new());
+        for round in 0..rounds {
+            let now = features.take().unwrap_or_else(|| motion.decode(latent_bnd.clone()));
+            let seen = Seen::of(&motion.decoder.vae, now, &batch.lengths, told);
+            let changed = latent_bnd.clone() + seen.change(network, latent_bnd, &mut drop(round as u64));
+            latents.push(losses::mse(changed.clone(), batch.clean_bnd.clone()));
+            latent_bnd = changed.clone().inner();
+            if loss.control > 0.0 {
+                let decoded = motion.decode(changed);
+                motions.push(motion.of(decoded.clone()));
+                features = Some(decoded.inner());
+            }
+        }
+        let mean = |terms: Vec<Tensor<1>>| Tensor::cat(terms, 0).sum() / rounds as f32;
+        if loss.latent > 0.0 {
+            all.add(FEEDBACK_LATENT, mean(latents), loss.latent);
+        }
+        if loss.control > 0.0 {
+            all.add(FEEDBACK_CONTROL, mean(motions), loss.control);
+        }
     }
 
     /// Uploads the model that was controlled, with the control part beside its others.
@@ -251,18 +338,25 @@ impl Controlled {
         let named = |prefix: &str, entries: &[Entry]| -> Vec<Entry> {
             entries.iter().map(|e| Entry { name: format!("{prefix}{}", e.name), shape: e.shape.clone() }).collect()
         };
-        let [control, trajectory] = &state.groups[..] else {
-            return Err(StageError::Fault("two networks were trained".into()));
-        };
-        let (control, trajectory) =
-            (named(CONTROLNET_PREFIX, &control.entries), named(TRAJECTORY_PREFIX, &trajectory.entries));
+        let prefixes = [CONTROLNET_PREFIX, TRAJECTORY_PREFIX, FEEDBACK_PREFIX];
+        let names: Vec<Vec<Entry>> =
+            state.groups.iter().zip(prefixes).map(|(group, prefix)| named(prefix, &group.entries)).collect();
+        let networks: Vec<(&[Entry], &[f32])> =
+            names.iter().enumerate().map(|(i, names)| (&names[..], state.result(i))).collect();
         let mut part = Draft::new(cx, ArtifactKind::Control, to_meta(&self.meta));
-        weights::add_all(&mut part, &[(&control, state.result(0)), (&trajectory, state.result(1))])?;
+        weights::add_all(&mut part, &networks)?;
         let part = part.into_manifest();
         cx.put_manifest(&part)?;
         let model = model::extend(base, None, &BTreeMap::from([(Role::CONTROL, part)])).map_err(model_error)?;
         Ok(cx.put_manifest(&model)?)
     }
+}
+
+/// What of `gradients` is a network's.
+fn taken<M: Module>(network: &M, gradients: &mut Gradients) -> Vec<f32> {
+    let mut own = vec![0.0; network.num_params()];
+    flat::add_gradients(network, gradients, &mut own);
+    own
 }
 
 /// A model that has a denoiser of latents, of which these are.
@@ -323,6 +417,7 @@ impl Gang for TrainControl {
             std,
             fits: Parts::from([(Role::DENOISER, denoiser.digest())]),
             projection: None,
+            feedback: self.feedback.rounds,
         };
         let device = cx.device();
         let tracked = device.clone().autodiff();
@@ -335,8 +430,10 @@ impl Gang for TrainControl {
         let mut start = WarmStart::find(cx, ArtifactKind::Control)?;
         let control = start.take(control, CONTROLNET_PREFIX)?;
         let trajectory = start.take(trajectory, TRAJECTORY_PREFIX)?;
+        let feedback = meta.feedback(&base_meta, &mut init);
+        let feedback = feedback.map(|network| start.take(network, FEEDBACK_PREFIX)).transpose()?;
         start.finish(cx, &to_meta(&meta))?;
-        let decoder = if self.loss.control > 0.0 {
+        let decoder = if self.loss.control > 0.0 || feedback.is_some() {
             let part = parts::part(&*blobs, &model, &Role::VAE, ArtifactKind::Vae)?;
             let vae: VaeMeta = artifacts::meta(&part, "the VAE")?;
             let skeleton = Skeleton::of(vae.format);
@@ -358,6 +455,7 @@ impl Gang for TrainControl {
             meta,
             control,
             trajectory,
+            feedback,
             decoder,
             seed: dropout_seed(cx),
             device,

@@ -20,10 +20,11 @@ use super::entry_draws::{Draw, EntryDraws, finite, skates};
 use super::{Map, REPORT_FILE, drawn};
 use crate::artifacts::{self, Tensors};
 use crate::context::{AttemptContext, Outcome, StageError};
-use crate::control::{Heed, Hint, metres, share, told_frames};
+use crate::control::Heed;
 use crate::evaluation::frechet::to_f64;
 use crate::evaluation::interval::Interval;
 use crate::generator::{self, Batch, ControlRequest, MotionGenerator, Texts};
+use crate::hint::{Hint, metres, share, told_frames};
 
 /// Where a shard's values are.
 const VALUES_FILE: &str = "values.safetensors";
@@ -115,7 +116,8 @@ impl Maker<'_> {
         let captions: Vec<usize> = draws.iter().map(|d| d.caption).collect();
         let texts = self.texts.get(&captions, |caption| plan.of.dataset.captions[caption].text.as_str())?;
         let lengths: Vec<usize> = draws.iter().map(|d| d.len).collect();
-        let heed = Heed { scale: plan.settings.scale, refine: plan.settings.refine };
+        let EvaluateControl { scale, feedback, refine, .. } = *plan.settings;
+        let heed = Heed { scale, feedback, refine };
         let control = hints.map(|hints| ControlRequest { hints, heed });
         let batch = Batch { texts: &texts, lengths: &lengths, seeds, control };
         generator::motions(self.generator, batch, &plan.settings.sampler, &mut |_| {})
@@ -237,6 +239,7 @@ impl Map for EvaluateControl {
             "evaluator": plan.of.evaluator,
             "words": plan.of.trained.meta().words,
             "scale": self.scale,
+            "feedback": self.feedback,
             "refine": self.refine,
             "threshold": self.threshold,
         });

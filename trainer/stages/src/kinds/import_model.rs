@@ -344,6 +344,7 @@ impl Import<'_> {
             std,
             fits: Parts::from([(Role::DENOISER, part.digest())]),
             projection: departing(config.projection, config.dim != config.width),
+            feedback: 0,
         };
         let control = self.network(&control, |init| meta.controlnet(&base, init))?.under(CONTROLNET_PREFIX);
         let trajectory = self.network(&trajectory, |init| meta.trajectory(&base, init))?.under(TRAJECTORY_PREFIX);

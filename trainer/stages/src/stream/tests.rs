@@ -136,6 +136,7 @@ fn scripted(joining: Joining) -> (Vec<f32>, Generator, MotionStream, Rc<RefCell<
         mean: vec![0.0; 66],
         std: vec![1.0; 66],
         projection: None,
+        feedback: 0,
         fits: BTreeMap::new(),
     });
     let infills = joining == Joining::Infilling;

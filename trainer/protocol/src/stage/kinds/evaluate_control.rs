@@ -29,8 +29,10 @@ pub struct EvaluateControl {
     pub frames: Vec<usize>,
     /// Metres beyond which a position is missed.
     pub threshold: f64,
-    /// What the ControlNet's residuals are multiplied by.
+    /// What the ControlNet's residuals, and what feedback changes, are multiplied by.
     pub scale: f64,
+    /// Rounds of feedback on drawn latents; as many as the control part was trained with if nothing is said.
+    pub feedback: Option<usize>,
     /// Steps by which drawn latents are refined until their motions pass the positions; 0, as published, refines nothing.
     pub refine: usize,
     /// Sampler.
@@ -57,6 +59,7 @@ impl Default for EvaluateControl {
             frames: Vec::new(),
             threshold: 0.5,
             scale: 1.0,
+            feedback: None,
             refine: 0,
             sampler: Sampler { steps: 1, ..Sampler::default() },
             repeats: 20,
@@ -96,6 +99,12 @@ impl StageSpec for EvaluateControl {
         }
         p.above_zero("threshold", self.threshold);
         p.not_negative("scale", self.scale);
+        if let Some(rounds) = self.feedback
+            && rounds > limits::FEEDBACK_ROUNDS
+        {
+            let most = limits::FEEDBACK_ROUNDS;
+            p.add("feedback", format!("`feedback` is {rounds}; expected at most {most}"), "");
+        }
         if self.refine > limits::REFINE_STEPS {
             p.add("refine", format!("`refine` is {}; expected at most {}", self.refine, limits::REFINE_STEPS), "");
         }

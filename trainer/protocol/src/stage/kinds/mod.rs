@@ -49,7 +49,7 @@ pub use import_model::{ImportModel, ImportedPart, TextActivation};
 pub use model_decoder::ModelDecoder;
 pub use register::{Promote, Register};
 pub use text_embed::{ClipIds, ClipOutput, TextEmbed, TextEncoder};
-pub use train_control::{ControlDistance, ControlLoss, ControlMean, TrainControl};
+pub use train_control::{ControlDistance, ControlFeedback, ControlLoss, ControlMean, TrainControl};
 pub use train_discord::{FlowBackbone, FlowNetwork, FlowPrediction, FlowProjection, TrainDiscord};
 pub use train_evaluator::{EvaluatorNetwork, MovementPhase, TrainEvaluator};
 pub use train_length::TrainLength;

@@ -4,6 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
+use crate::limits;
 use crate::stage::control::check_skeleton;
 use crate::stage::{ControlHints, Neighbours, Network, Output, Problems, Ref, Shape, StageSpec, Training};
 
@@ -59,6 +60,18 @@ impl Default for ControlLoss {
     }
 }
 
+/// Rounds in which a drawn latent is corrected, of ours: it is decoded, and a network that is told how far its motion is from the positions changes it.
+/// The denoiser is not asked again.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct ControlFeedback {
+    /// Rounds, each of which decodes what was drawn and changes its latent by what a network makes of how far the motion is from the positions; 0, as
+    /// published, has no such network.
+    pub rounds: usize,
+    /// The learning rate of the network of `feedback`; 0 takes `lr`.
+    pub lr: f64,
+}
+
 /// `train.control`: a trajectory encoder and a ControlNet beside the frozen denoiser of a latent model. Defaults are MotionLCM v2's temporal
 /// setting.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -80,7 +93,9 @@ pub struct TrainControl {
     pub guidance: (f64, f64),
     /// A student trains at timesteps `k - 1`, `2k - 1` and so on to 999 (v2: k = 100); 1 takes all timesteps (v1). A teacher takes all.
     pub skip: usize,
-    /// Size of the trajectory encoder. The ControlNet has the denoiser's.
+    /// Rounds of feedback on what was drawn.
+    pub feedback: ControlFeedback,
+    /// Size of the trajectory encoder, and of the network of `feedback`. The ControlNet has the denoiser's.
     pub network: Network,
     /// Width of the layers between trajectory tokens and ControlNet.
     pub embedding: usize,
@@ -90,7 +105,7 @@ pub struct TrainControl {
     /// denoiser's weights.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub init: String,
-    /// The rest. Gradients of both networks are clipped together.
+    /// The rest. Gradients of ControlNet and trajectory encoder are clipped together, those of the network of `feedback` by themselves.
     #[serde(flatten)]
     pub training: Training,
 }
@@ -106,6 +121,7 @@ impl Default for TrainControl {
             loss: ControlLoss::default(),
             guidance: (5.0, 15.0),
             skip: 100,
+            feedback: ControlFeedback::default(),
             network: Network::default(),
             embedding: 256,
             trajectory_lr: 0.0,
@@ -152,6 +168,11 @@ impl StageSpec for TrainControl {
         self.network.check(p);
         p.positive("embedding", self.embedding);
         p.not_negative("trajectory_lr", self.trajectory_lr);
+        p.not_negative("feedback.lr", self.feedback.lr);
+        if self.feedback.rounds > limits::FEEDBACK_ROUNDS {
+            let (rounds, most) = (self.feedback.rounds, limits::FEEDBACK_ROUNDS);
+            p.add("feedback.rounds", format!("`feedback.rounds` is {rounds}; expected at most {most}"), "");
+        }
         self.training.check(p);
     }
 
@@ -176,6 +197,9 @@ impl StageSpec for TrainControl {
     }
 
     fn recorded(&self) -> &'static [&'static str] {
-        &["loss", "latent", "tokens", "control"]
+        match self.feedback.rounds {
+            0 => &["loss", "latent", "tokens", "control"],
+            _ => &["loss", "latent", "tokens", "control", "feedback_latent", "feedback_control"],
+        }
     }
 }

@@ -1,0 +1,80 @@
+//! The feedback network: how a latent should change, given where its motion is and how far that is from where it should be. Source: iterative error
+//! feedback (Carreira et al., CVPR 2016) and learned descent (Song et al., ECCV 2020), which fit poses to images so; ours for motions.
+//!
+//! A transformer over the N tokens of the latent and the frames of its motion; the first N outputs, through a Linear that is zero at first, are the
+//! change. So a fresh one changes nothing.
+
+use burn::module::{Module, Param};
+use burn::tensor::Tensor;
+
+use super::vae::Positions;
+use super::{Init, Linear, SkipStack, StackConfig};
+use crate::kernels::{Dropout, KeyMask};
+
+/// Size of a feedback network.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FeedbackConfig {
+    /// N tokens of a latent.
+    pub tokens: usize,
+    /// Their width d.
+    pub dim: usize,
+    /// Numbers that it is told of a frame.
+    pub inputs: usize,
+    /// The transformer.
+    pub stack: StackConfig,
+}
+
+/// The feedback network.
+#[derive(Module, Debug)]
+pub struct Feedback {
+    /// Learned tokens [N, H].
+    pub latent_token: Param<Tensor<2>>,
+    /// d -> H.
+    pub latent_embedding: Linear,
+    /// What is told of a frame -> H.
+    pub frame_embedding: Linear,
+    /// Positions of tokens and frames.
+    pub position_encoder: Positions,
+    /// The transformer.
+    pub encoder: SkipStack,
+    /// H -> d.
+    pub change: Linear,
+}
+
+impl Feedback {
+    /// A fresh one.
+    pub fn new(config: &FeedbackConfig, init: &mut Init<'_>) -> Self {
+        let FeedbackConfig { tokens, dim, inputs, stack } = config;
+        Self {
+            latent_token: init.normal([*tokens, stack.width]),
+            latent_embedding: Linear::new(init, *dim, stack.width),
+            frame_embedding: Linear::new(init, *inputs, stack.width),
+            position_encoder: Positions::new(init, stack.width),
+            encoder: SkipStack::new(init, stack),
+            change: Linear::zero(init, stack.width, *dim),
+        }
+    }
+
+    /// The change [B, N, d] of latents [B, N, d], of whose motions `frames_btf` [B, T, inputs] are told; motion b has `lengths[b]` frames.
+    ///
+    /// # Panics
+    /// If a motion is longer than there are positions.
+    pub fn forward(
+        &self,
+        latent_bnd: Tensor<3>,
+        frames_btf: Tensor<3>,
+        lengths: &[usize],
+        dropout: &mut Dropout,
+    ) -> Tensor<3> {
+        let [batch, tokens, _] = latent_bnd.dims();
+        let [_, frames, _] = frames_btf.dims();
+        let width = self.latent_token.dims()[1];
+        let own = self.latent_token.val().reshape([1, tokens, width]);
+        let latent = self.latent_embedding.forward(latent_bnd) + own;
+        let x = Tensor::cat(vec![latent, self.frame_embedding.forward(frames_btf)], 1);
+        let x = x + self.position_encoder.rows(tokens + frames);
+        let mask = KeyMask::new(lengths, tokens);
+        let out = self.encoder.forward(x, None, Some(&mask), dropout);
+        self.change.forward(out.slice([0..batch, 0..tokens, 0..width]))
+    }
+}
