@@ -4,7 +4,7 @@
 //! (tables of positions, masks) in `constants.safetensors`. A layout says in how many files these go, what stands before the names there, and under
 //! which key of a torch file they lie. Not its job: where a part's bytes come from.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::{Seek, Write};
 
 use protocol::{ArtifactKind, Manifest};
@@ -85,6 +85,15 @@ pub struct Plan {
     pub files: Vec<Planned>,
     /// Parts that hold weights and are in none of them.
     pub left_out: Vec<String>,
+}
+
+/// What came of writing a file.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Written {
+    /// Tensors in it.
+    pub tensors: usize,
+    /// Networks of parts that the layout has no place for, as `control/feedback`.
+    pub left_out: BTreeSet<String>,
 }
 
 impl Layout {
@@ -224,8 +233,7 @@ impl Planned {
         names.into_iter()
     }
 
-    /// Writes it to what `open` gives; `bytes` holds every file that it [reads](Self::reads). Gives the number of its tensors: a file of none is not
-    /// opened.
+    /// Writes it to what `open` gives; `bytes` holds every file that it [reads](Self::reads). A file of no tensors is not opened.
     ///
     /// # Errors
     /// If one of them is no safetensors file, or of another network than the layout is for.
@@ -233,7 +241,7 @@ impl Planned {
         &self,
         open: impl FnOnce() -> std::io::Result<W>,
         bytes: &BTreeMap<String, Vec<u8>>,
-    ) -> Result<usize, ExportError> {
+    ) -> Result<Written, ExportError> {
         let mut parsed = BTreeMap::new();
         for file in self.reads() {
             let damaged = |why: String| ExportError::Damaged { file: file.to_owned(), why };
@@ -245,6 +253,7 @@ impl Planned {
             parsed.insert(file, tensors);
         }
         let mut all: BTreeMap<String, TensorView<'_>> = BTreeMap::new();
+        let mut left_out = BTreeSet::new();
         for (file, names) in &self.files {
             let Some(tensors) = parsed.get(file.as_str()) else { continue };
             let marker = format!("{}{}", names.from, names.marker);
@@ -260,6 +269,9 @@ impl Planned {
                 )));
             }
             for (name, view) in tensors.iter() {
+                if !self.files.iter().any(|(other, names)| other == file && name.starts_with(names.from)) {
+                    left_out.insert(format!("{}/{}", names.role, name.split('.').next().unwrap_or_default()));
+                }
                 if let Some(rest) = name.strip_prefix(names.from) {
                     all.insert(self.renamed(names, rest), view);
                 }
@@ -267,7 +279,7 @@ impl Planned {
         }
         let count = all.len();
         if count == 0 {
-            return Ok(0);
+            return Ok(Written { tensors: 0, left_out });
         }
         if self.torch {
             let tensor = |(name, view): (&String, &_)| (name.clone(), torch::Tensor::of(view));
@@ -277,7 +289,7 @@ impl Planned {
             let bytes = serialize(all, None).map_err(fault)?;
             open()?.write_all(&bytes)?;
         }
-        Ok(count)
+        Ok(Written { tensors: count, left_out })
     }
 
     /// What a tensor is called there.
@@ -324,7 +336,7 @@ mod tests {
 
     fn written(planned: &Planned, bytes: &BTreeMap<String, Vec<u8>>) -> Result<(usize, Vec<u8>), ExportError> {
         let mut out = Cursor::new(Vec::new());
-        let count = planned.write(|| Ok(&mut out), bytes)?;
+        let count = planned.write(|| Ok(&mut out), bytes)?.tensors;
         Ok((count, out.into_inner()))
     }
 
@@ -353,6 +365,18 @@ mod tests {
         let text = String::from_utf8_lossy(&out);
         assert!(count == 5 && text.contains("state_dict") && expected.iter().all(|name| text.contains(name)));
         assert!(plan.left_out.is_empty(), "a text encoder is somebody else's: {:?}", plan.left_out);
+
+        // Feedback is ours: theirs has no place for it, ours has.
+        let control = [control[0], control[1], "feedback.change.weight"];
+        let parts = [parts[0], parts[1], ("control", &control[..])];
+        let (manifest, bytes) = model("latent-diffusion", &parts);
+        for (layout, tensors, left_out) in
+            [(Layout::MotionLcm, 5, vec!["control/feedback"]), (Layout::Safetensors, 6, Vec::new())]
+        {
+            let written =
+                layout.plan(&manifest).unwrap().files[0].write(|| Ok(Cursor::new(Vec::new())), &bytes).unwrap();
+            assert_eq!((written.tensors, written.left_out.iter().map(String::as_str).collect()), (tensors, left_out));
+        }
     }
 
     #[test]

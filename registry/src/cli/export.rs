@@ -5,7 +5,7 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Component, Path};
 
-use checkpoint::published::{ExportError, Layout, Planned};
+use checkpoint::published::{ExportError, Layout, Planned, Written};
 use protocol::message::ApiError;
 use protocol::{Digest, Manifest};
 use sha2::{Digest as _, Sha256};
@@ -61,10 +61,12 @@ pub(super) async fn weights(
     if !single {
         empty_folder(path)?;
     }
-    let mut names = Vec::new();
+    let (mut names, mut left_out) = (Vec::new(), plan.left_out);
     for planned in &plan.files {
         let to = if single { path.to_owned() } else { path.join(planned.name) };
-        if written(source, &manifest, planned, &to).await? {
+        let written = written(source, &manifest, planned, &to).await?;
+        left_out.extend(written.left_out);
+        if written.tensors > 0 {
             names.push(if single { layout.name().to_owned() } else { planned.name.to_owned() });
         }
     }
@@ -72,11 +74,11 @@ pub(super) async fn weights(
         let hint = Some("`--layout safetensors` takes every model");
         return Err(error("invalid", format!("`{}` has no weights for `{}`", version.model, layout.name()), hint));
     }
-    Ok((names, plan.left_out))
+    Ok((names, left_out))
 }
 
 /// Writes one file of a layout, if the model has what is in it.
-async fn written(source: &impl Source, manifest: &Manifest, planned: &Planned, to: &Path) -> Result<bool, ApiError> {
+async fn written(source: &impl Source, manifest: &Manifest, planned: &Planned, to: &Path) -> Result<Written, ApiError> {
     let mut files = BTreeMap::new();
     for name in planned.reads() {
         let Some(entry) = manifest.files.get(name) else { continue };
@@ -84,11 +86,10 @@ async fn written(source: &impl Source, manifest: &Manifest, planned: &Planned, t
         whole(source, entry.digest, &mut |part| bytes.write_all(part)).await?;
         files.insert(name.to_owned(), bytes);
     }
-    let count = planned.write(|| File::create_new(to).map(io::BufWriter::new), &files).map_err(|e| match e {
+    planned.write(|| File::create_new(to).map(io::BufWriter::new), &files).map_err(|e| match e {
         ExportError::Write(e) => failed(to, &e),
         e => refused(&e),
-    })?;
-    Ok(count > 0)
+    })
 }
 
 fn refused(e: &ExportError) -> ApiError {

@@ -25,7 +25,7 @@ pub(crate) fn exported(world: &World, digest: Digest, layout: Layout) -> BTreeMa
         };
         let bytes: BTreeMap<String, Vec<u8>> = planned.reads().map(read).collect();
         let path = folder.join(planned.name);
-        if planned.write(|| std::fs::File::create(&path), &bytes).expect("it is written") > 0 {
+        if planned.write(|| std::fs::File::create(&path), &bytes).expect("it is written").tensors > 0 {
             written.insert(planned.name, path);
         }
     }
