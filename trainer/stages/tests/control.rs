@@ -4,12 +4,13 @@ use std::collections::BTreeMap;
 
 use burn::tensor::Device;
 use checkpoint::model::{self, Model};
+use motion::Skeleton;
 use protocol::artifact::Role;
 use protocol::stage::{
-    Batch, ControlDistance, ControlFeedback, ControlHints, ControlLoss, ControlMean, ControlSetting, DataSynthetic,
-    Decay, DistillLcm, DistillPcm, Distillation, EncodeLatents, EvaluateControl, EvaluatorNetwork, LatentShape,
-    MovementPhase, Network, Optimizer, Sampler, StageSettings, TextEmbed, TrainControl, TrainEvaluator, TrainMld,
-    TrainVae, Training,
+    Batch, ControlDistance, ControlFeedback, ControlHints, ControlLoss, ControlMean, ControlSetting, DataFormat,
+    DataSynthetic, Decay, DistillLcm, DistillPcm, Distillation, EncodeLatents, EvaluateControl, EvaluatorNetwork,
+    LatentShape, MovementPhase, Network, Optimizer, Sampler, StageSettings, TextEmbed, TrainControl, TrainEvaluator,
+    TrainMld, TrainVae, Training,
 };
 use protocol::{Digest, Manifest, Seed, Steps};
 use stages::context::Outcome;
@@ -225,7 +226,7 @@ fn a_control_part_learns_and_is_heeded() {
         // Feet hold the path of what is told none, and nothing else of it.
         let feet = Sampler { footing: true, ..sampler.clone() };
         let held = free.generate("a person walks", Some(60), Some(&feet), Seed(3)).expect("a motion").features;
-        let skeleton = motion::Skeleton::of(protocol::stage::DataFormat::Humanml3d);
+        let skeleton = Skeleton::of(DataFormat::Humanml3d);
         let layout = skeleton.layout();
         for (t, (was, is)) in without.chunks(skeleton.features).zip(held.chunks(skeleton.features)).enumerate() {
             let pose = layout.root_height.start..layout.velocities.start;
@@ -303,6 +304,25 @@ fn feedback_corrects_what_was_drawn() {
     assert_ne!(draw(&corrects, rounds(Some(1))), draw(&corrects, rounds(None)));
     let silent = Heed { scale: 0.0, ..Heed::default() };
     assert_eq!(draw(&corrects, silent), draw(&plain, silent));
+
+    // A round that leads away is not heeded: more rounds come as near as fewer, though each change is many times what it was in training.
+    for scale in [1.0, 30.0] {
+        let off = [0, 1, 2, 4].map(|rounds| {
+            let features = draw(&corrects, Heed { scale, feedback: Some(rounds), ..Heed::default() });
+            distance(&hint(60), &metres(&features, Skeleton::of(DataFormat::Humanml3d)))
+        });
+        eprintln!("at scale {scale} {off:.3?} m off after none, one, two and four rounds");
+        assert!(off.windows(2).all(|pair| pair[1] <= pair[0] + 1e-6), "scale {scale}: {off:?}");
+    }
+}
+
+/// Root mean square distance of a motion `[frames, joints, 3]` from what is told of it, metres.
+fn distance(hint: &Hint, motion: &[f32]) -> f64 {
+    let square = |(t, j, position): (usize, usize, [f32; 3])| -> f64 {
+        let at = 3 * (t * hint.joints() + j);
+        position.iter().zip(&motion[at..]).map(|(told, found)| f64::from(told - found).powi(2)).sum()
+    };
+    (hint.iter().map(square).sum::<f64>() / hint.told() as f64).sqrt()
 }
 
 /// A report has the same bytes for any number of shards, and measures with the part and without.

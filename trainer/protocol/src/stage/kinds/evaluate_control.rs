@@ -31,7 +31,8 @@ pub struct EvaluateControl {
     pub threshold: f64,
     /// What the ControlNet's residuals, and what feedback changes, are multiplied by.
     pub scale: f64,
-    /// Rounds of feedback on drawn latents; as many as the control part was trained with if nothing is said.
+    /// Rounds of feedback on drawn latents, of which each motion keeps the one that brought it nearest; as many as the control part was trained with if
+    /// nothing is said.
     pub feedback: Option<usize>,
     /// Steps by which drawn latents are refined until their motions pass the positions; 0, as published, refines nothing.
     pub refine: usize,
