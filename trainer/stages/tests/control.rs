@@ -293,26 +293,39 @@ fn feedback_corrects_what_was_drawn() {
     let [plain, corrects] =
         [plain, ran.output()].map(|digest| generator(&bench, &bench.manifest(digest).expect("stored")));
     let sampler = Sampler { steps: 1, guidance: 2.0, ..Sampler::default() };
-    let draw = |of: &Generator, heed| {
-        let told = (&hint(60), heed);
-        of.generate_controlled("a person walks", Some(&sampler), Seed(3), told).expect("a motion").features
+    let draw = |of: &Generator, hint: &Hint, seed: u64, heed: Heed| {
+        of.generate_controlled("a person walks", Some(&sampler), Seed(seed), (hint, heed)).expect("a motion").features
     };
     let rounds = |feedback| Heed { feedback, ..Heed::default() };
-    assert_eq!(draw(&corrects, rounds(Some(0))), draw(&plain, rounds(None)), "the other two networks learn alike");
-    assert_eq!(draw(&plain, rounds(Some(3))), draw(&plain, rounds(None)), "no network, no rounds");
-    assert_eq!(draw(&corrects, rounds(Some(2))), draw(&corrects, rounds(None)), "as many as in training");
-    assert_ne!(draw(&corrects, rounds(Some(1))), draw(&corrects, rounds(None)));
-    let silent = Heed { scale: 0.0, ..Heed::default() };
-    assert_eq!(draw(&corrects, silent), draw(&plain, silent));
+    let skeleton = Skeleton::of(DataFormat::Humanml3d);
+    // What another motion of the same model does, in all frames, as in training.
+    let other = metres(&draw(&plain, &Hint::none(60, skeleton.joints), 100, Heed::default()), skeleton);
+    let told = Hint::of(&other, skeleton.joints, &[0, 10, 11, 15, 20, 21], &(0..60).collect::<Vec<_>>());
+    let off =
+        |hint: &Hint, seed: u64, heed: Heed| distance(hint, &metres(&draw(&corrects, hint, seed, heed), skeleton));
 
-    // A round that leads away is not heeded: more rounds come as near as fewer, though each change is many times what it was in training.
-    for scale in [1.0, 30.0] {
-        let off = [0, 1, 2, 4].map(|rounds| {
-            let features = draw(&corrects, Heed { scale, feedback: Some(rounds), ..Heed::default() });
-            distance(&hint(60), &metres(&features, Skeleton::of(DataFormat::Humanml3d)))
-        });
-        eprintln!("at scale {scale} {off:.3?} m off after none, one, two and four rounds");
-        assert!(off.windows(2).all(|pair| pair[1] <= pair[0] + 1e-6), "scale {scale}: {off:?}");
+    let same = |a: Vec<f32>, b: Vec<f32>, why: &str| assert!(a == b, "{why}");
+    let of = |generator, heed| draw(generator, &told, 3, heed);
+    same(of(&corrects, rounds(Some(0))), of(&plain, rounds(None)), "the other two networks learn alike");
+    same(of(&plain, rounds(Some(3))), of(&plain, rounds(None)), "no network, no rounds");
+    same(of(&corrects, rounds(Some(2))), of(&corrects, rounds(None)), "as many as in training");
+    let silent = Heed { scale: 0.0, ..Heed::default() };
+    same(of(&corrects, silent), of(&plain, silent), "at scale 0 nothing is changed");
+
+    let mean = |count: usize| (0..8).map(|seed| off(&told, seed, rounds(Some(count)))).sum::<f64>() / 8.0;
+    let (none, two) = (mean(0), mean(2));
+    eprintln!("{none:.3} m off without feedback, {two:.3} m after two rounds");
+    assert!(two < none, "{none} m to {two} m");
+
+    // A round that leads away is not heeded: more rounds come as near as fewer, also on another path and when each change is many times what it was in
+    // training.
+    for (hint, scale) in [(&told, 1.0), (&hint(60), 1.0), (&hint(60), 30.0)] {
+        for seed in 0..4 {
+            let off =
+                [0, 1, 2, 4].map(|rounds| off(hint, seed, Heed { scale, feedback: Some(rounds), ..Heed::default() }));
+            eprintln!("at scale {scale} {off:.3?} m off after none, one, two and four rounds");
+            assert!(off.windows(2).all(|pair| pair[1] <= pair[0] + 1e-6), "scale {scale}: {off:?}");
+        }
     }
 }
 
