@@ -2,6 +2,7 @@
 # Starts published recipes at their own widths, in a few small steps on made-up clips: tests/recipes.sh [RECIPE...]
 # Each is planned, then run with one worker, with two and with three, and once with the trainer killed in every training stage and started again; the
 # digests of all must be equal. RECIPE is a name in configs/; without one, those of Free-T2M and of control.
+# A worker of free-stablemofusion takes 12 GB of memory, and its store some 25 GB of disk.
 # TRAINER is the program (a release build: an unoptimised one takes ten times as long), STEPS those of each training, BATCH the examples of a step, in three slices.
 set -euo pipefail
 root=$(cd "$(dirname "$0")/.." && pwd)
@@ -31,7 +32,7 @@ for recipe in "${recipes[@]}"; do
     sets=(--set 'dataset={format: synthetic, clips: 40, val: 0.1, test: 0.2}' --set 'text={encoder: hashed}')
     for stage in $(training "$file"); do
         sets+=(--set "stages.$stage.steps=$steps" --set "stages.$stage.warmup=0" --set "stages.$stage.batch={global: $batch, slices: 3}")
-        sets+=(--set "stages.$stage.checkpoint.every=1")
+        sets+=(--set "stages.$stage.checkpoint={every: 1, keep: {latest: 1}}")
         # What is trained in batches of its own is cut into three slices too.
         case $(kind "$file" "$stage") in
         train.evaluator) sets+=(--set "stages.$stage.movement.batch=$batch") ;;
@@ -51,6 +52,7 @@ for recipe in "${recipes[@]}"; do
         echo "== $recipe: $workers worker(s)" >&2
         all "$workers" "$work/$recipe-$workers" "$work/$workers.digests"
         diff "$work/1.digests" "$work/$workers.digests"
+        rm -rf "$work/$recipe-$workers"
     done
     echo "== $recipe: killed in every training stage" >&2
     store=$work/$recipe-killed
@@ -65,5 +67,5 @@ for recipe in "${recipes[@]}"; do
     all 2 "$store" "$work/killed.digests"
     diff "$work/1.digests" "$work/killed.digests"
     echo "$recipe: $(wc -l <"$work/1.digests") stages, the same digests with 1, 2 and 3 workers and after kills in $(training "$file" | wc -l) trainings"
-    rm -rf "$work/$recipe"-*
+    rm -rf "$store"
 done

@@ -56,14 +56,20 @@ impl Group {
     /// `None`, loudly, where groups cannot be made.
     fn new(bytes: u64) -> Option<Self> {
         let name = format!("stride-{}", std::process::id());
-        let limits = [("/sys/fs/cgroup/memory", "memory.limit_in_bytes"), ("/sys/fs/cgroup", "memory.max")];
-        for (root, limit) in limits {
+        // Of the first version the second bound is that of memory and swap together, of the second that of swap alone.
+        let limits = [
+            ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.memsw.limit_in_bytes", bytes),
+            ("/sys/fs/cgroup", "memory.max", "memory.swap.max", 0),
+        ];
+        for (root, limit, with_swap, swapped) in limits {
             let group = Path::new(root).join(&name);
             if fs::create_dir(&group).is_err() {
                 continue;
             }
             let group = Self(group);
             if fs::write(group.0.join(limit), bytes.to_string()).is_ok() {
+                // Not there where the kernel does not count swap.
+                let _ = fs::write(group.0.join(with_swap), swapped.to_string());
                 return Some(group);
             }
         }
