@@ -2,7 +2,7 @@
 # Starts published recipes at their own widths, in a few small steps on made-up clips: tests/recipes.sh [RECIPE...]
 # Each is planned, then run with one worker, with two and with three, and once with the trainer killed in every training stage and started again; the
 # digests of all must be equal. RECIPE is a name in configs/; without one, those of Free-T2M and of control.
-# A worker of free-stablemofusion takes 12 GB of memory, and its store some 25 GB of disk.
+# A worker of free-stablemofusion takes 12 GB of memory, a training state of it 4.8 GB of disk.
 # TRAINER is the program (a release build: an unoptimised one takes ten times as long), STEPS those of each training, BATCH the examples of a step, in three slices.
 set -euo pipefail
 root=$(cd "$(dirname "$0")/.." && pwd)

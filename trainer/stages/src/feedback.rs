@@ -1,5 +1,5 @@
 //! Rounds of feedback: a drawn latent is decoded, its motion held against the positions that it was told, and the latent changed by what a
-//! [`Feedback`] network makes of the difference. Source: as there; ours for motions.
+//! [`Feedback`] network makes of the difference. Its sources stand there; for motions it is ours. Not its job: what trains it (`train.control`).
 //!
 //! The network is told of each frame where the root is and which way it faces, and of each joint that is told there how far it is off and how fast that
 //! grows, seen from the root: a latent says how a motion goes on from frame to frame, in the root's own directions, and a path says where it should be.

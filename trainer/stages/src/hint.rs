@@ -3,6 +3,8 @@
 //! Positions are global joints in metres, of a motion that starts at the origin and faces z, as HumanML3D's do. The networks see them as
 //! `(position - mean) / std` a joint and axis; a mask says which are told, since 0 is a position like any other. Mean and deviation are those of the
 //! training entries; upstream reads a file of OmniControl's, which is of HumanML3D alone, and whose making is not documented.
+//!
+//! Not its job: the networks that heed positions (`control`).
 
 use burn::tensor::Device;
 use models::networks::Hints;

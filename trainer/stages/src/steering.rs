@@ -1,4 +1,5 @@
-//! What a ControlNet adds to the denoiser that it steers. Source: MotionLCM (Dai et al., ECCV 2024).
+//! What a ControlNet adds to the denoiser that it steers. Source: MotionLCM (Dai et al., ECCV 2024). Not its job: reading the part (`control`), asking the
+//! denoiser (`networks`).
 
 use burn::tensor::Tensor;
 use models::kernels::Dropout;
