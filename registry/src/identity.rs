@@ -24,7 +24,7 @@
 //! | a | a, of a later epoch | any | refused: another copy of the database uses the blobs |
 
 use std::fmt;
-use std::fs::{self, File};
+use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
@@ -35,7 +35,7 @@ use checkpoint::BlobError;
 use serde::{Deserialize, Serialize};
 
 use crate::blob::Backend;
-use crate::blob::disk::write_whole;
+use crate::blob::disk::{regular, write_whole};
 use crate::catalog::Records;
 use crate::folder;
 use crate::store_id::{StoreId, Stored};
@@ -207,7 +207,7 @@ fn witness_path(dir: &Path) -> PathBuf {
 
 /// A file's text if the file is there.
 fn read_if_there(path: &Path) -> io::Result<Option<String>> {
-    match fs::read_to_string(path) {
+    match regular(OpenOptions::new().read(true), path).and_then(io::read_to_string) {
         Ok(text) => Ok(Some(text)),
         Err(e) if is_absent(&e) => Ok(None),
         Err(e) => Err(e),

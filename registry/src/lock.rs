@@ -11,6 +11,8 @@ use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
+use crate::blob::disk::regular;
+
 /// Who holds a store.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Holder {
@@ -67,7 +69,7 @@ impl SharedLock {
     /// `None` if somebody holds the store. A store without the file is held by nobody, and not locked: it is being made, or was
     /// put there without it.
     pub(crate) fn try_take(path: &Path) -> io::Result<Option<Self>> {
-        let file = match File::open(path) {
+        let file = match regular(OpenOptions::new().read(true), path) {
             Ok(file) => file,
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
             Err(e) => return Err(e),
@@ -82,7 +84,7 @@ impl SharedLock {
 
 /// Who holds the store whose lock is at `path`, if somebody does.
 pub(crate) fn holder(path: &Path) -> io::Result<Option<Holder>> {
-    let file = match File::open(path) {
+    let file = match regular(OpenOptions::new().read(true), path) {
         Ok(file) => file,
         Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
         Err(e) => return Err(e),
@@ -115,9 +117,9 @@ impl CollectionLock {
 
     async fn wait(dir: &Path, lock: fn(&File) -> Result<(), TryLockError>) -> io::Result<Self> {
         let path = Self::path(dir);
-        let file = match File::open(&path) {
+        let file = match regular(OpenOptions::new().read(true), &path) {
             Err(e) if e.kind() == io::ErrorKind::NotFound => {
-                OpenOptions::new().write(true).create(true).truncate(false).open(&path)?
+                regular(OpenOptions::new().write(true).create(true).truncate(false), &path)?
             }
             opened => opened?,
         };
@@ -136,7 +138,7 @@ impl StoreLock {
     pub(crate) async fn take(path: &Path, holder: Holder) -> io::Result<Taken> {
         let until = Instant::now() + READERS_END;
         loop {
-            let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)?;
+            let file = regular(OpenOptions::new().read(true).write(true).create(true).truncate(false), path)?;
             match file.try_lock() {
                 Ok(()) => {
                     let lock = Self { file, holder: Mutex::new(holder.clone()) };
@@ -244,6 +246,25 @@ mod tests {
         drop(first);
         assert!(matches!(StoreLock::take(&path, Holder::this_process("third")).await.unwrap(), Taken::Ours(_)));
     }
+
+    #[tokio::test]
+    async fn a_planted_link_is_not_followed_and_what_it_names_stays() {
+        let dir = tempfile::tempdir().unwrap();
+        let victim = dir.path().join("victim");
+        std::fs::write(&victim, "what somebody else keeps, longer than a lock's line is, so that a cut would show\n")
+            .unwrap();
+        let before = std::fs::read(&victim).unwrap();
+        for name in ["lock", "collecting"] {
+            std::os::unix::fs::symlink(&victim, dir.path().join(name)).unwrap();
+        }
+        let path = dir.path().join("lock");
+        let error = StoreLock::take(&path, Holder::this_process("a test")).await.err().expect("refused");
+        assert!(error.to_string().contains("symbolic link"), "{error}");
+        assert!(SharedLock::try_take(&path).is_err() && holder(&path).is_err());
+        assert!(CollectionLock::collect(dir.path()).await.is_err());
+        assert_eq!(std::fs::read(&victim).unwrap(), before);
+    }
+
     #[tokio::test]
     async fn readers_share_what_nobody_holds_and_are_waited_for() {
         let dir = tempfile::tempdir().unwrap();

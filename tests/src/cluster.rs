@@ -152,6 +152,9 @@ impl Cluster {
     pub fn join_at(&mut self, url: &str, name: &str, wrap: &[String], more: &[&str]) {
         let mut arguments = vec!["worker", "join", url, "--name", name];
         arguments.extend_from_slice(more);
+        if !self.address.ip().is_loopback() {
+            arguments.push("--insecure");
+        }
         let worker = self.spawn(name, wrap, &arguments);
         if let Some(mut old) = self.workers.insert(name.to_owned(), worker) {
             assert!(!old.alive(), "worker {name} was replaced while it ran");
@@ -221,6 +224,9 @@ impl Cluster {
     pub fn submit(&self, config: &Path, more: &[&str]) -> String {
         let (config, url) = (config.display().to_string(), self.url());
         let mut arguments = vec!["submit", &config, "--server", &url, "-o", "json"];
+        if !self.address.ip().is_loopback() {
+            arguments.push("--insecure");
+        }
         arguments.extend_from_slice(more);
         let said = self.bench.run(&arguments).expect_code(0);
         said.json()["run"].as_str().expect("a run").to_owned()

@@ -70,7 +70,10 @@ impl From<access::ConnectError> for Problem {
         match error {
             access::ConnectError::File(error) => error.into(),
             access::ConnectError::Holder { .. } => Self::new(exit::UNAUTHORISED, error),
-            _ => Self::new(exit::USAGE, error),
+            _ => {
+                let hint = error.advice().map(str::to_owned);
+                Self { hint, ..Self::new(exit::USAGE, error) }
+            }
         }
     }
 }

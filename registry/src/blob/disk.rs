@@ -83,7 +83,14 @@ fn is_dir(path: &Path) -> bool {
 
 /// Opens a regular file. Symbolic links are not followed, and a pipe that somebody put there does not block.
 pub(crate) fn regular(options: &mut OpenOptions, path: &Path) -> io::Result<File> {
-    let file = options.custom_flags((OFlag::O_NOFOLLOW | OFlag::O_NONBLOCK).bits()).open(path)?;
+    let file = options.custom_flags((OFlag::O_NOFOLLOW | OFlag::O_NONBLOCK).bits()).open(path);
+    let file = file.map_err(|error| match nix::errno::Errno::from_raw(error.raw_os_error().unwrap_or_default()) {
+        nix::errno::Errno::ELOOP => {
+            let message = format!("`{}` is a symbolic link, which is not followed", path.display());
+            io::Error::new(io::ErrorKind::InvalidInput, message)
+        }
+        _ => error,
+    })?;
     if file.metadata()?.is_file() {
         return Ok(file);
     }
@@ -105,7 +112,9 @@ pub(crate) fn free_bytes(path: &Path) -> io::Result<u64> {
 /// Replaces a small file: after a loss of power it holds the old bytes or the new ones.
 pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let fresh = path.with_extension("new");
-    let mut file = File::create(&fresh)?;
+    // New, so that nothing that lay under the name is written through.
+    let _ = fs::remove_file(&fresh);
+    let mut file = OpenOptions::new().write(true).create_new(true).open(&fresh)?;
     file.write_all(bytes)?;
     file.sync_all()?;
     fs::rename(&fresh, path)?;

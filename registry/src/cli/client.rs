@@ -229,9 +229,8 @@ async fn with(
 
 fn refused(e: &ConnectError) -> Answer {
     match e {
-        ConnectError::File(file) => Answer::refused(error("invalid", e, file.advice())),
         ConnectError::Holder { .. } => Answer::refused(error("unauthorized", e, None)),
-        _ => Answer::refused(error("invalid", e, None)),
+        _ => Answer::refused(error("invalid", e, e.advice())),
     }
 }
 

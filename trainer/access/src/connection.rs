@@ -1,5 +1,6 @@
 //! A server as a client sees it.
 
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -25,6 +26,9 @@ pub enum ConnectError {
     /// A certificate was pinned and nothing would be checked against it.
     #[error("`{0}` is not encrypted, so there is nothing to check with --ca; expected `https://`")]
     Plain(String),
+    /// Everybody on the way would read the token.
+    #[error("the token would cross the network to `{0}` unencrypted")]
+    Unencrypted(String),
     /// A file with a secret or a certificate is not used.
     #[error(transparent)]
     File(#[from] FileError),
@@ -41,6 +45,19 @@ pub enum ConnectError {
     Client(String),
 }
 
+impl ConnectError {
+    /// What to do about it.
+    pub fn advice(&self) -> Option<&str> {
+        match self {
+            Self::Unencrypted(_) => Some(
+                "ask it by `https://`, with --ca FILE if its certificate is your own; on a network that only you see, or one that encrypts by itself, say --insecure",
+            ),
+            Self::File(file) => file.advice(),
+            Self::Url { .. } | Self::Plain(_) | Self::Holder { .. } | Self::Client(_) => None,
+        }
+    }
+}
+
 /// A server's address, with the token that is shown to it and whom to believe that it is the one.
 #[derive(Debug, Clone)]
 pub struct Server {
@@ -51,7 +68,19 @@ pub struct Server {
 
 impl Server {
     /// A server at `url`; a host and a port alone are taken for `http://`. With `ca`, only what that certificate signs is believed.
+    ///
+    /// # Errors
+    /// [`ConnectError::Unencrypted`] if the token would leave this machine over plain HTTP, besides wrong addresses and files.
     pub fn new(url: &str, token: Option<Token>, ca: Option<&Path>) -> Result<Self, ConnectError> {
+        let server = Self::insecure(url, token, ca)?;
+        if server.token.is_some() && !server.is_encrypted() && !server.is_local() {
+            return Err(ConnectError::Unencrypted(server.base));
+        }
+        Ok(server)
+    }
+
+    /// The same, and the token may cross a network unencrypted.
+    pub fn insecure(url: &str, token: Option<Token>, ca: Option<&Path>) -> Result<Self, ConnectError> {
         let base = url.trim().trim_end_matches('/');
         let base = if base.contains("://") { base.to_owned() } else { format!("http://{base}") };
         let wrong = |why: String| ConnectError::Url { url: url.to_owned(), why };
@@ -84,6 +113,22 @@ impl Server {
     /// Its address, without a slash at the end.
     pub fn url(&self) -> &str {
         &self.base
+    }
+
+    /// Whether TLS protects what passes.
+    pub fn is_encrypted(&self) -> bool {
+        self.base.starts_with("https://")
+    }
+
+    /// Whether the address is this machine's own, so that no packet leaves it. A name counts only if it is `localhost`.
+    fn is_local(&self) -> bool {
+        let url = Url::parse(&self.base).ok();
+        let host = url.as_ref().and_then(Url::host_str).unwrap_or_default();
+        let name = host.trim_end_matches('.');
+        match host.trim_matches(['[', ']']).parse::<IpAddr>() {
+            Ok(address) => address.is_loopback() || address.is_unspecified(),
+            Err(_) => name.eq_ignore_ascii_case("localhost"),
+        }
     }
 
     /// A call of `path`, which begins with a slash.
@@ -140,6 +185,31 @@ mod tests {
         assert_eq!(url("http://[::1]:7700").unwrap(), "http://[::1]:7700");
         for wrong in ["", "ftp://host", "http://host/path", "http://user@host:1", "http://host?x", "unix:///run"] {
             assert!(matches!(url(wrong), Err(ConnectError::Url { .. })), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_token_leaves_this_machine_encrypted_or_by_wish() {
+        let token: Token = "0123456789abcdef".parse().unwrap();
+        let new = |url: &str| Server::new(url, Some(token.clone()), None);
+        for far in [
+            "10.0.0.7:7700",
+            "http://stride.lab",
+            "http://localhost.evil.example",
+            "http://[2001:db8::1]:1",
+            "http://127.0.0.1.nip.io",
+        ] {
+            let error = new(far).unwrap_err();
+            assert!(matches!(error, ConnectError::Unencrypted(_)), "{far}: {error}");
+            assert!(error.advice().unwrap().contains("--insecure"));
+            assert!(!error.to_string().contains("0123"), "{error}");
+            assert!(Server::new(far, None, None).is_ok(), "{far}: no token, nothing to protect");
+            assert!(Server::insecure(far, Some(token.clone()), None).is_ok(), "{far}");
+        }
+        for near in
+            ["127.0.0.1:7700", "http://127.8.9.1", "http://[::1]:7700", "http://LOCALHOST:1", "https://stride.lab"]
+        {
+            assert!(new(near).is_ok(), "{near}");
         }
     }
 

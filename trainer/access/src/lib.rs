@@ -8,6 +8,7 @@
 //! Not its job: which call needs which scope. That stands beside the routes, in the coordinator.
 
 mod connection;
+pub mod file;
 pub mod local;
 mod options;
 mod scope;

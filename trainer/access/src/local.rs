@@ -6,7 +6,11 @@ use std::io::{self, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
+use crate::file::read_regular;
 use crate::secret::Token;
+
+/// The file has one token.
+const FILE_BYTES: u64 = 4096;
 
 fn path(dir: &Path) -> PathBuf {
     dir.join("token")
@@ -38,7 +42,7 @@ impl Drop for Published {
 
 /// The token of the process that holds the store in `dir`; `None` if there is none.
 pub fn read(dir: &Path) -> io::Result<Option<Token>> {
-    match fs::read_to_string(path(dir)) {
+    match read_regular(&path(dir), FILE_BYTES).map(|bytes| String::from_utf8_lossy(&bytes).into_owned()) {
         Ok(text) => text.parse().map(Some).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error)),
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
         Err(error) => Err(error),

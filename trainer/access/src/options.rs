@@ -37,12 +37,16 @@ pub struct ConnectionOptions {
     /// Certificate (PEM) that signs the server's; no other is trusted [default: the system's]
     #[arg(long, env = "STRIDE_CA", value_name = "FILE", global = true)]
     pub ca: Option<PathBuf>,
+    /// Let tokens and data cross a network without TLS: everybody who sees the traffic has them
+    #[arg(long, global = true)]
+    pub insecure: bool,
 }
 
 impl ConnectionOptions {
     /// The server at `url`.
     pub fn connect(&self, url: &str) -> Result<Server, ConnectError> {
-        Server::new(url, self.token.read()?, self.ca.as_deref())
+        let (token, ca) = (self.token.read()?, self.ca.as_deref());
+        if self.insecure { Server::insecure(url, token, ca) } else { Server::new(url, token, ca) }
     }
 }
 

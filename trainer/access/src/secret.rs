@@ -1,13 +1,14 @@
 //! Tokens as texts, and the files they stand in.
 
 use std::fmt;
-use std::fs::File;
 use std::io::Read;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use protocol::Digest;
+
+use crate::file::open_regular;
 
 /// Shorter tokens could be guessed.
 const SHORTEST: usize = 16;
@@ -128,11 +129,8 @@ impl FileError {
 /// The text of a file that must not be readable by everybody.
 pub(crate) fn read_secret(path: &Path) -> Result<String, FileError> {
     let failed = |error: std::io::Error| FileError::new(path, error);
-    let file = File::open(path).map_err(failed)?;
+    let file = open_regular(path).map_err(failed)?;
     let metadata = file.metadata().map_err(failed)?;
-    if metadata.is_dir() {
-        return Err(FileError::new(path, "is a folder, expected a file"));
-    }
     let mode = metadata.permissions().mode() & 0o777;
     if mode & 0o007 != 0 {
         return Err(FileError::new(path, format!("is open to every user of this machine (mode {mode:03o})"))

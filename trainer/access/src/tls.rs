@@ -8,7 +8,11 @@ use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::{ClientConfig, ConfigBuilder, RootCertStore, ServerConfig, WantsVerifier};
 
+use crate::file::read_regular;
 use crate::secret::{FileError, read_secret};
+
+/// Bytes of a file of certificates.
+const CERTIFICATE_BYTES: u64 = 16 << 20;
 
 fn provider() -> Arc<CryptoProvider> {
     Arc::new(ring::default_provider())
@@ -61,7 +65,7 @@ pub fn install_provider() {
 
 fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, FileError> {
     let wrong = |error: &dyn std::fmt::Display| FileError::new(path, format!("has no certificate in PEM: {error}"));
-    let bytes = std::fs::read(path).map_err(|error| FileError::new(path, error))?;
+    let bytes = read_regular(path, CERTIFICATE_BYTES).map_err(|error| FileError::new(path, error))?;
     let all: Vec<_> =
         CertificateDer::pem_slice_iter(&bytes).collect::<Result<_, _>>().map_err(|error| wrong(&error))?;
     if all.is_empty() {

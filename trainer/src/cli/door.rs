@@ -17,20 +17,16 @@ pub(super) struct DoorArgs {
     /// Its private key (PEM), closed to other users
     #[arg(long, env = "STRIDE_TLS_KEY", value_name = "FILE", requires = "tls_cert")]
     tls_key: Option<PathBuf>,
-    /// Listen beyond this machine without TLS: anybody who sees the traffic has the tokens
-    #[arg(long)]
-    insecure: bool,
     /// A name by which callers know this server, besides the machine's own; may be repeated
     #[arg(long, env = "STRIDE_HOST", value_name = "NAME", value_delimiter = ',')]
     host: Vec<String>,
 }
 
 impl DoorArgs {
-    /// A server at `listen` for those who show one of `tokens`.
-    pub(super) fn config(&self, listen: SocketAddr, tokens: Tokens) -> Result<Config> {
+    /// A server at `listen` for those who show one of `tokens`; beyond this machine without TLS only if `insecure`.
+    pub(super) fn config(&self, listen: SocketAddr, tokens: Tokens, insecure: bool) -> Result<Config> {
         let tls = self.tls_cert.as_deref().zip(self.tls_key.as_deref());
         let tls = tls.map(|(certificate, key)| access::tls::server(certificate, key)).transpose()?;
-        let (hosts, insecure) = (self.host.clone(), self.insecure);
-        Ok(Config { hosts, tls, insecure, ..Config::server(listen, tokens) })
+        Ok(Config { hosts: self.host.clone(), tls, insecure, ..Config::server(listen, tokens) })
     }
 }

@@ -148,10 +148,11 @@ async fn stream(args: GenerateArgs) -> Result<u8> {
     args.out.files(1)?;
     let found = found(&args).await?;
     let (device, _) = model::device(args.backend.as_deref())?;
-    let GenerateArgs { stream, steps, sampler, sentences, control, out, .. } = args;
+    let GenerateArgs { stream, steps, sampler, sentences, control, out, target, .. } = args;
     let (seed, heed, joints) = (sentences.seed(), control.heed(), control.joints().to_vec());
     let opening = Opening { found, device, steps, sampler, seed, heed, joints };
-    stream::stream(stream, opening, out, |fps| sentences.bound(fps)).await
+    let insecure = target.server.connection.insecure;
+    stream::stream(stream, opening, out, insecure, |fps| sentences.bound(fps)).await
 }
 
 pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {

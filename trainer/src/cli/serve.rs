@@ -28,6 +28,9 @@ pub(crate) struct ServeArgs {
     token: TokenOptions,
     #[command(flatten)]
     door: DoorArgs,
+    /// Listen beyond this machine without TLS: anybody who sees the traffic has the tokens
+    #[arg(long)]
+    insecure: bool,
     /// The store's folder
     #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR")]
     store: PathBuf,
@@ -44,7 +47,7 @@ impl ServeArgs {
         if let Some(token) = &self.token.token {
             tokens.add("admin", Scopes::all(), token);
         }
-        self.door.config(self.bind, tokens)
+        self.door.config(self.bind, tokens, self.insecure)
     }
 }
 

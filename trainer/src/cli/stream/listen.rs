@@ -82,6 +82,7 @@ impl Drop for Ends {
 pub(super) async fn listen(
     args: StreamArgs,
     opening: Opening,
+    insecure: bool,
     bound: impl Fn(f64) -> Result<Option<u64>>,
 ) -> Result<u8> {
     let failed = |error| Problem::failed(format!("cannot listen for signals: {error}"));
@@ -90,7 +91,7 @@ pub(super) async fn listen(
     let (Some(address), Some(file)) = (args.listen, &args.listen_token_file) else {
         return Err(Problem::usage("`--listen` wants an address and `--listen-token-file`"));
     };
-    let config = args.door.config(address, Tokens::read(file)?)?;
+    let config = args.door.config(address, Tokens::read(file)?, insecure)?;
     // Said before the model is loaded.
     let door = Door::open(&config).await?;
     let streams = usize::from(args.streams);

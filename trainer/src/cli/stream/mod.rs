@@ -14,15 +14,17 @@ use crate::problem::Result;
 
 pub(super) use self::opening::{Opening, StreamArgs};
 
-/// Streams until its input or its output ends. `bound` gives the frames at a rate after which it does in any case.
+/// Streams until its input or its output ends. `bound` gives the frames at a rate after which it does in any case; `insecure` allows
+/// to listen beyond this machine without TLS.
 pub(super) async fn stream(
     args: StreamArgs,
     opening: Opening,
     out: OutArgs,
+    insecure: bool,
     bound: impl Fn(f64) -> Result<Option<u64>>,
 ) -> Result<u8> {
     if args.listen.is_some() {
-        return listen::listen(args, opening, bound).await;
+        return listen::listen(args, opening, insecure, bound).await;
     }
     let outs = out.files(1)?;
     let (generator, beginning) = opening.open(args.overlap, args.blend)?;
