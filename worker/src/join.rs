@@ -116,6 +116,12 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
             "`{name}` is not a worker name: expected a letter or digit, then letters, digits, `.`, `_` or `-`, at most 64"
         )));
     }
+    if !options.server.is_encrypted() && !options.server.is_local() {
+        tracing::warn!(
+            "`{}` has no TLS: its token, the gangs' secrets and all data cross the network readable; so does what peers exchange, to anybody who saw a secret",
+            options.server.url()
+        );
+    }
     let runtime = runtime::Builder::new_multi_thread().worker_threads(1).thread_name("http").enable_all().build();
     let runtime = runtime.map_err(system("the HTTP thread"))?;
     let client = Client::new(options.server.clone(), runtime.handle().clone());

@@ -121,7 +121,7 @@ impl Server {
     }
 
     /// Whether the address is this machine's own, so that no packet leaves it. A name counts only if it is `localhost`.
-    fn is_local(&self) -> bool {
+    pub fn is_local(&self) -> bool {
         let url = Url::parse(&self.base).ok();
         let host = url.as_ref().and_then(Url::host_str).unwrap_or_default();
         let name = host.trim_end_matches('.');

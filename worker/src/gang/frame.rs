@@ -11,20 +11,20 @@
 //! | 16 | 4 | `a`, by kind |
 //! | 20 | 4 | `b`, by kind |
 //! | 24 | 4 | payload length in bytes |
-//! | 28 | 16 | tag: keyed BLAKE3, cut to 16 bytes, of the frame's number, bytes 0..28 and the payload |
+//! | 28 | 16 | tag: of the frame's number, bytes 0..28 and the payload ([`seal`](super::seal)) |
 //!
 //! A payload is at most [`MAX_PAYLOAD`] long, which is checked before anything is allocated; what is longer travels in
-//! pieces. Each direction of a connection has a key of its own, which the handshake agrees on ([`Seal`]), and counts its frames from 0.
-//! The count is part of what the tag vouches for and is not sent: a frame that was changed, left out, repeated, reordered or recorded
-//! elsewhere has another tag, and ends the connection. Frames of the handshake come before there is a key; theirs is all zero, so that
-//! the tag is a checksum, and the handshake proves the rest.
+//! pieces. The payload is encrypted where the connection leaves the machine; the tag has the number of the frame in it, so a frame that
+//! was changed, left out, repeated, reordered or recorded elsewhere ends the connection. Frames of the handshake come before there is a key: their tag
+//! is a checksum, and the handshake proves the rest.
 
 use std::io::{self, Read, Write};
+
+use super::seal::{Seal, TAG};
 
 const MAGIC: [u8; 4] = *b"STR3";
 /// What the tag vouches for, of a header.
 const SIGNED: usize = 28;
-const TAG: usize = 16;
 const HEADER: usize = SIGNED + TAG;
 
 /// Longest payload. Small enough that on a slow network too every frame is a timely sign of life.
@@ -161,41 +161,8 @@ pub(crate) enum FrameError {
     Forged(u64),
 }
 
-/// What vouches for the frames of one direction of a connection: a key, and the number of the next frame.
-#[derive(Clone)]
-pub(crate) struct Seal {
-    key: [u8; 32],
-    next: u64,
-}
-
-impl std::fmt::Debug for Seal {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Seal").field("next", &self.next).finish_non_exhaustive()
-    }
-}
-
-impl Seal {
-    /// For frames under `key`, which no other connection has.
-    pub(crate) fn new(key: [u8; 32]) -> Self {
-        Self { key, next: 0 }
-    }
-
-    /// For a single frame of a handshake: a checksum.
-    fn open() -> Self {
-        Self::new([0; 32])
-    }
-
-    /// The tag of the next frame.
-    fn tag(&mut self, signed: &[u8], payload: &[u8]) -> blake3::Hash {
-        let mut hasher = blake3::Hasher::new_keyed(&self.key);
-        hasher.update(&self.next.to_le_bytes()).update(signed).update(payload);
-        self.next += 1;
-        hasher.finalize()
-    }
-}
-
-/// The bytes of the header of the next frame under `seal`. The payload is not copied.
-pub(crate) fn header(head: Head, payload: &[u8], seal: &mut Seal) -> [u8; HEADER] {
+/// The bytes of the next frame under `seal`: its header, and its payload as it is sent. A payload that stays readable is not copied.
+pub(crate) fn sealed<'a>(head: Head, payload: &'a [u8], seal: &'a mut Seal) -> ([u8; HEADER], &'a [u8]) {
     let mut bytes = [0; HEADER];
     let length = u32::try_from(payload.len()).expect("a payload is cut into pieces before");
     bytes[0..4].copy_from_slice(&MAGIC);
@@ -204,25 +171,26 @@ pub(crate) fn header(head: Head, payload: &[u8], seal: &mut Seal) -> [u8; HEADER
     bytes[16..20].copy_from_slice(&head.a.to_le_bytes());
     bytes[20..24].copy_from_slice(&head.b.to_le_bytes());
     bytes[24..28].copy_from_slice(&length.to_le_bytes());
-    let tag = seal.tag(&bytes[..SIGNED], payload);
-    bytes[SIGNED..].copy_from_slice(&tag.as_bytes()[..TAG]);
-    bytes
+    let (tag, payload) = seal.seal(&bytes[..SIGNED], payload);
+    bytes[SIGNED..].copy_from_slice(&tag);
+    (bytes, payload)
 }
 
 /// Writes a frame of a handshake.
 pub(crate) fn write(out: &mut impl Write, head: Head, payload: &[u8]) -> io::Result<()> {
-    write_sealed(out, head, payload, &mut Seal::open())
+    write_sealed(out, head, payload, &mut Seal::checksum())
 }
 
 /// Writes a frame at once. For handshakes and tests; a running link interleaves checks (`Link::send`).
 pub(crate) fn write_sealed(out: &mut impl Write, head: Head, payload: &[u8], seal: &mut Seal) -> io::Result<()> {
-    out.write_all(&header(head, payload, seal))?;
+    let (header, payload) = sealed(head, payload, seal);
+    out.write_all(&header)?;
     out.write_all(payload)
 }
 
 /// Reads a frame of a handshake.
 pub(crate) fn read(from: &mut impl Read) -> Result<Frame, FrameError> {
-    read_sealed(from, MAX_HANDSHAKE, &mut Seal::open())
+    read_sealed(from, MAX_HANDSHAKE, &mut Seal::checksum())
 }
 
 /// Reads the next frame under `seal`, whose payload has at most `limit` bytes.
@@ -248,14 +216,9 @@ pub(crate) fn read_sealed(from: &mut impl Read, limit: usize, seal: &mut Seal) -
         Payload::Bytes(vec![0; length as usize])
     };
     read_all(from, payload.bytes_mut())?;
-    let number = seal.next;
-    let tag = seal.tag(&bytes[..SIGNED], payload.bytes_mut());
-    // In constant time: a guess of the tag must not be told how much of it is right.
-    let mut found = *tag.as_bytes();
-    found[..TAG].copy_from_slice(&bytes[SIGNED..]);
-    if tag != blake3::Hash::from_bytes(found) {
-        return Err(FrameError::Forged(number));
-    }
+    let (signed, tag) = bytes.split_at(SIGNED);
+    let tag = tag.try_into().expect("a header ends with its tag");
+    seal.open(signed, payload.bytes_mut(), tag).map_err(FrameError::Forged)?;
     let step = u64::from(word(8)) | u64::from(word(12)) << 32;
     Ok(Frame { kind, step, a: word(16), b: word(20), payload })
 }
@@ -276,7 +239,7 @@ mod tests {
     use super::*;
 
     fn seal() -> Seal {
-        Seal::new([7; 32])
+        Seal::tagged([7; 32])
     }
 
     fn sample() -> Vec<u8> {
@@ -326,7 +289,7 @@ mod tests {
         assert_eq!(steps(&[0, 0]), [Some(0), None], "sent again");
         assert_eq!(steps(&[0, 2]), [Some(0), None], "one left out");
         assert_eq!(steps(&[1, 0]), [None, None], "in another order");
-        let mut other = Seal::new([8; 32]);
+        let mut other = Seal::tagged([8; 32]);
         assert!(read_sealed(&mut frames[0].as_slice(), MAX_PAYLOAD, &mut other).is_err(), "under another key");
         assert!(read(&mut frames[0].as_slice()).is_err(), "as a checksum");
     }
@@ -341,7 +304,7 @@ mod tests {
 
     #[test]
     fn an_oversized_frame_is_refused_by_its_header_alone() {
-        let mut bytes = header(Head::new(Kind::State, 0, 0, 0), &[], &mut seal()).to_vec();
+        let mut bytes = sealed(Head::new(Kind::State, 0, 0, 0), &[], &mut seal()).0.to_vec();
         bytes[24..28].copy_from_slice(&u32::MAX.to_le_bytes());
         // No payload follows: a reader that allocated or waited for it first would answer `Closed`.
         let error = read_one(&bytes).expect_err("too long");
@@ -359,9 +322,12 @@ mod tests {
             let rate = 500.0 * MAX_PAYLOAD as f64 / begun.elapsed().as_secs_f64() / 1e9;
             eprintln!("{what}: {rate:.2} GB/s on frames of {MAX_PAYLOAD} bytes");
         };
-        let mut seal = seal();
+        let (mut tagged, mut encrypted) = (seal(), Seal::encrypted([7; 32]));
         time("keyed BLAKE3", &mut || {
-            std::hint::black_box(seal.tag(&[0; SIGNED], &payload));
+            std::hint::black_box(tagged.seal(&[0; SIGNED], &payload));
+        });
+        time("AES-256-GCM", &mut || {
+            std::hint::black_box(encrypted.seal(&[0; SIGNED], &payload));
         });
         time("HMAC-SHA256", &mut || {
             let mut mac = hmac::Hmac::<sha2::Sha256>::new_from_slice(&[7; 32]).expect("any length");

@@ -3,7 +3,8 @@
 //! Four frames: the dialer names task, generation, ranks and a nonce; the one dialled answers with its own nonce and
 //! `HMAC-SHA256(secret, "accept" .. names .. nonces)`; the dialer checks it and answers with the same under `"dial"`; the
 //! one dialled checks that and welcomes it. Both nonces are fresh, so no recorded proof is of use; the two words differ,
-//! so that a proof cannot be sent back to who made it. The secret itself never travels.
+//! so that a proof cannot be sent back to who made it. The secret itself never travels. The frames that follow are encrypted if one of
+//! the two sees the connection leave its machine; the dialer's view is among the names, so nobody on the way can change it.
 
 use std::io::{self, Read, Write};
 use std::net::TcpStream;
@@ -15,7 +16,8 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use sha2::Sha256;
 
-use super::frame::{self, FrameError, Head, Kind, Seal};
+use super::frame::{self, FrameError, Head, Kind};
+use super::seal::{Seal, leaves_the_machine};
 
 /// How long a handshake may take, all frames together.
 pub(super) const PATIENCE: Duration = Duration::from_secs(5);
@@ -57,11 +59,15 @@ pub(crate) struct Dial {
     pub(crate) generation: Generation,
     pub(crate) from: usize,
     pub(crate) to: usize,
+    /// Whether the dialer sees the connection leave its machine.
+    leaves: bool,
     nonce: [u8; 16],
 }
 
 #[derive(Serialize, Deserialize)]
 struct Challenge {
+    /// Whether what follows is encrypted.
+    encrypts: bool,
     nonce: [u8; 16],
     proof: [u8; 32],
 }
@@ -77,25 +83,33 @@ fn nonce() -> Result<[u8; 16], HandshakeError> {
     Ok(bytes)
 }
 
-fn mac(secret: &str, word: &str, dial: &Dial, nonce: &[u8; 16]) -> Hmac<Sha256> {
+/// What the one dialled adds to what the dialer said.
+#[derive(Clone, Copy)]
+struct Answer {
+    encrypts: bool,
+    nonce: [u8; 16],
+}
+
+fn mac(secret: &str, word: &str, dial: &Dial, answer: &Answer) -> Hmac<Sha256> {
     let mut mac = Hmac::<Sha256>::new_from_slice(secret.as_bytes()).expect("HMAC takes a key of any length");
     // Lengths in front, so that no two different lists of fields are the same bytes.
-    for field in [word.as_bytes(), dial.task.as_str().as_bytes(), &dial.nonce, nonce] {
+    for field in [word.as_bytes(), dial.task.as_str().as_bytes(), &dial.nonce, &answer.nonce] {
         mac.update(&(field.len() as u64).to_le_bytes());
         mac.update(field);
     }
-    for number in [dial.generation.0, dial.from as u64, dial.to as u64] {
+    let flags = u64::from(dial.leaves) | u64::from(answer.encrypts) << 1;
+    for number in [dial.generation.0, dial.from as u64, dial.to as u64, flags] {
         mac.update(&number.to_le_bytes());
     }
     mac
 }
 
-fn proof(secret: &str, word: &str, dial: &Dial, nonce: &[u8; 16]) -> [u8; 32] {
-    mac(secret, word, dial, nonce).finalize().into_bytes().into()
+fn proof(secret: &str, word: &str, dial: &Dial, answer: &Answer) -> [u8; 32] {
+    mac(secret, word, dial, answer).finalize().into_bytes().into()
 }
 
-fn check(secret: &str, word: &str, dial: &Dial, nonce: &[u8; 16], proof: &[u8; 32]) -> Result<(), HandshakeError> {
-    mac(secret, word, dial, nonce).verify_slice(proof).map_err(|_| HandshakeError::Secret(dial.generation))
+fn check(secret: &str, word: &str, dial: &Dial, answer: &Answer, proof: &[u8; 32]) -> Result<(), HandshakeError> {
+    mac(secret, word, dial, answer).verify_slice(proof).map_err(|_| HandshakeError::Secret(dial.generation))
 }
 
 /// What vouches for the frames after a handshake.
@@ -107,9 +121,10 @@ pub(crate) struct Session {
     pub(crate) receives: Seal,
 }
 
-fn session(secret: &str, dial: &Dial, nonce: &[u8; 16], dialed: bool) -> Session {
-    let dialer = Seal::new(proof(secret, "frames of the dialer", dial, nonce));
-    let dialled = Seal::new(proof(secret, "frames of the one dialled", dial, nonce));
+fn session(secret: &str, dial: &Dial, answer: &Answer, dialed: bool) -> Session {
+    let seal = if answer.encrypts { Seal::encrypted } else { Seal::tagged };
+    let dialer = seal(proof(secret, "frames of the dialer", dial, answer));
+    let dialled = seal(proof(secret, "frames of the one dialled", dial, answer));
     let (sends, receives) = if dialed { (dialer, dialled) } else { (dialled, dialer) };
     Session { sends, receives }
 }
@@ -174,13 +189,15 @@ pub(crate) fn dial(
     secret: &str,
 ) -> Result<Session, HandshakeError> {
     let stream = &mut Hurried::new(stream, Instant::now())?;
-    let dial = Dial { task: task.clone(), generation, from, to, nonce: nonce()? };
+    let leaves = leaves_the_machine(stream.stream)?;
+    let dial = Dial { task: task.clone(), generation, from, to, leaves, nonce: nonce()? };
     send(stream, Kind::Dial, &dial)?;
-    let challenge: Challenge = receive(stream, Kind::Challenge)?;
-    check(secret, "accept", &dial, &challenge.nonce, &challenge.proof)?;
-    send(stream, Kind::Proof, &Proof { proof: proof(secret, "dial", &dial, &challenge.nonce) })?;
+    let Challenge { encrypts, nonce, proof: theirs } = receive(stream, Kind::Challenge)?;
+    let answer = Answer { encrypts, nonce };
+    check(secret, "accept", &dial, &answer, &theirs)?;
+    send(stream, Kind::Proof, &Proof { proof: proof(secret, "dial", &dial, &answer) })?;
     receive::<()>(stream, Kind::Welcome)?;
-    Ok(session(secret, &dial, &challenge.nonce, true))
+    Ok(session(secret, &dial, &answer, true))
 }
 
 /// The first frame of the side that was dialled: what the dialer wants.
@@ -190,12 +207,13 @@ pub(super) fn wanted(stream: &mut Hurried<'_>) -> Result<Dial, HandshakeError> {
 
 /// The rest of that side. After it the dialer is known to be of the generation.
 pub(super) fn accept(stream: &mut Hurried<'_>, dial: &Dial, secret: &str) -> Result<Session, HandshakeError> {
-    let nonce = nonce()?;
-    send(stream, Kind::Challenge, &Challenge { nonce, proof: proof(secret, "accept", dial, &nonce) })?;
-    let answer: Proof = receive(stream, Kind::Proof)?;
-    check(secret, "dial", dial, &nonce, &answer.proof)?;
+    let answer = Answer { encrypts: dial.leaves || leaves_the_machine(stream.stream)?, nonce: nonce()? };
+    let Answer { encrypts, nonce } = answer;
+    send(stream, Kind::Challenge, &Challenge { encrypts, nonce, proof: proof(secret, "accept", dial, &answer) })?;
+    let theirs: Proof = receive(stream, Kind::Proof)?;
+    check(secret, "dial", dial, &answer, &theirs.proof)?;
     send(stream, Kind::Welcome, &())?;
-    Ok(session(secret, dial, &nonce, false))
+    Ok(session(secret, dial, &answer, false))
 }
 
 #[cfg(test)]
@@ -245,7 +263,8 @@ mod tests {
 
     #[test]
     fn a_recorded_proof_is_of_no_use() {
-        let dial = Dial { task: TaskId::from("t"), generation: Generation(1), from: 1, to: 0, nonce: [7; 16] };
+        let dial =
+            Dial { task: TaskId::from("t"), generation: Generation(1), from: 1, to: 0, leaves: false, nonce: [7; 16] };
         let mut recorded = None;
         let mut play = || {
             let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
@@ -254,13 +273,34 @@ mod tests {
             let stream = &mut Hurried::new(&stream, Instant::now()).expect("connected");
             send(stream, Kind::Dial, &dial).expect("sent");
             let challenge: Challenge = receive(stream, Kind::Challenge).expect("challenged");
-            let proof = *recorded.get_or_insert_with(|| proof("s", "dial", &dial, &challenge.nonce));
+            let Challenge { encrypts, nonce, .. } = challenge;
+            let proof = *recorded.get_or_insert_with(|| proof("s", "dial", &dial, &Answer { encrypts, nonce }));
             send(stream, Kind::Proof, &Proof { proof }).expect("sent");
             server.join().expect("no panic")
         };
         assert!(play().is_ok(), "who knows the secret is let in");
         let again = play();
         assert!(matches!(again, Err(HandshakeError::Secret(_))), "who has only heard it is not: {again:?}");
+    }
+
+    /// Somebody on the way who says in the dialer's place that the connection stays on its machine.
+    #[test]
+    fn encryption_cannot_be_talked_away() {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
+        let stream = TcpStream::connect(listener.local_addr().expect("bound")).expect("listening");
+        let server = thread::spawn(move || answer(&listener, "s"));
+        let stream = &mut Hurried::new(&stream, Instant::now()).expect("connected");
+        let said =
+            Dial { task: TaskId::from("t"), generation: Generation(1), from: 1, to: 0, leaves: true, nonce: [1; 16] };
+        send(stream, Kind::Dial, &Dial { leaves: false, ..said.clone() }).expect("sent");
+        let challenge: Challenge = receive(stream, Kind::Challenge).expect("challenged");
+        assert!(!challenge.encrypts, "it was told that nobody sees the connection");
+        let heard = Answer { encrypts: challenge.encrypts, nonce: challenge.nonce };
+        let refused = check("s", "accept", &said, &heard, &challenge.proof);
+        assert!(matches!(refused, Err(HandshakeError::Secret(_))), "the dialer takes an answer to what it did not say");
+        let changed = Answer { encrypts: true, ..heard };
+        assert!(check("s", "accept", &Dial { leaves: false, ..said }, &changed, &challenge.proof).is_err());
+        drop(server);
     }
 
     #[test]
@@ -276,7 +316,8 @@ mod tests {
         let stream = TcpStream::connect(listener.local_addr().expect("bound")).expect("listening");
         let server = thread::spawn(move || answer(&listener, "yours"));
         let stream = &mut Hurried::new(&stream, Instant::now()).expect("connected");
-        let dial = Dial { task: TaskId::from("t"), generation: Generation(1), from: 1, to: 0, nonce: [0; 16] };
+        let dial =
+            Dial { task: TaskId::from("t"), generation: Generation(1), from: 1, to: 0, leaves: false, nonce: [0; 16] };
         send(stream, Kind::Dial, &dial).expect("sent");
         let challenge: Challenge = receive(stream, Kind::Challenge).expect("challenged");
         // The best a stranger can do: send the other's proof back.

@@ -7,7 +7,8 @@ use std::net::TcpStream;
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-use super::frame::{self, Head, Seal};
+use super::frame::{self, Head};
+use super::seal::Seal;
 use crate::event_count::lock;
 
 /// The write timeout of a link's socket.
@@ -50,7 +51,7 @@ impl Writer {
         patience: Duration,
         abort: &dyn Fn() -> bool,
     ) -> io::Result<()> {
-        let header = frame::header(head, payload, &mut self.seal);
+        let (header, payload) = frame::sealed(head, payload, &mut self.seal);
         for mut rest in [header.as_slice(), payload] {
             let mut moved = Instant::now();
             while !rest.is_empty() {

@@ -20,10 +20,11 @@ use protocol::{Generation, WorkerId};
 use tokio::sync::Notify;
 
 use super::endpoint::{Endpoint, Gang};
-use super::frame::{self, Frame, FrameError, Head, Kind, MAX_PAYLOAD, Seal};
+use super::frame::{self, Frame, FrameError, Head, Kind, MAX_PAYLOAD};
 use super::handshake::{self, HandshakeError, Session};
 use super::link::{BLINK, Link, Writer};
 use super::member::{MeshConfig, Phase, Timing, spawn};
+use super::seal::Seal;
 use crate::event_count::{EventCount, lock};
 
 /// Frames of a state that are queued for a member that takes them more slowly than they come, each of a megabyte at most.

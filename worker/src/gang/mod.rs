@@ -7,6 +7,7 @@ mod handshake;
 mod link;
 pub(crate) mod member;
 pub(crate) mod mesh;
+mod seal;
 pub(crate) mod tree;
 
 #[cfg(test)]

@@ -1,5 +1,6 @@
 //! Gangs of threads over loopback, with a coordinator of a few lines that does what the real one does about losses.
 
+mod eavesdropper;
 mod silence;
 mod states;
 mod strangers;

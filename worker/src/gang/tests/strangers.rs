@@ -4,8 +4,8 @@ use std::io::Write as _;
 use std::net::{SocketAddr, TcpStream};
 
 use super::*;
-use crate::gang::frame::Seal;
 use crate::gang::handshake::{self, Session};
+use crate::gang::seal::Seal;
 
 #[test]
 fn a_peer_with_another_secret_never_gets_in() {
@@ -50,7 +50,7 @@ fn a_changed_frame_ends_the_connection() {
 /// What somebody on the way could do without the key: send a frame of its own, or a recorded one again.
 #[test]
 fn a_frame_that_the_peer_did_not_send_there_ends_the_connection() {
-    let forged = misbehave(|_| frame_under(&mut Seal::new([0; 32])));
+    let forged = misbehave(|_| frame_under(&mut Seal::tagged([0; 32])));
     assert!(forged.missing()[0].contains("frame 0"), "{:?}", forged.missing());
     let repeated = misbehave(|seal| frame_under(seal).repeat(2));
     assert!(repeated.missing()[0].contains("frame 1"), "{:?}", repeated.missing());
@@ -62,7 +62,7 @@ fn a_frame_that_the_peer_did_not_send_there_ends_the_connection() {
 #[test]
 fn an_oversized_frame_ends_the_connection_without_being_read() {
     misbehave(|seal| {
-        let mut bytes = frame::header(Head::new(Kind::State, 0, 0, 0), &[], seal).to_vec();
+        let mut bytes = frame::sealed(Head::new(Kind::State, 0, 0, 0), &[], seal).0.to_vec();
         bytes[24..28].copy_from_slice(&(frame::MAX_PAYLOAD as u32 + 1).to_le_bytes());
         bytes
     })
