@@ -28,7 +28,8 @@ enum Means {
     /// Readable, and vouched for by keyed BLAKE3.
     Tagged([u8; 32]),
     /// Encrypted and vouched for.
-    Encrypted(LessSafeKey),
+    /// Boxed: an expanded key takes 544 bytes.
+    Encrypted(Box<LessSafeKey>),
 }
 
 impl std::fmt::Debug for Seal {
@@ -47,7 +48,7 @@ impl Seal {
     /// Frames that are encrypted under `key`, which no other direction of a connection has.
     pub(crate) fn encrypted(key: [u8; 32]) -> Self {
         let key = UnboundKey::new(&AES_256_GCM, &key).expect("the cipher's keys have 32 bytes");
-        Self { means: Means::Encrypted(LessSafeKey::new(key)), next: 0, encrypted: Vec::new() }
+        Self { means: Means::Encrypted(Box::new(LessSafeKey::new(key))), next: 0, encrypted: Vec::new() }
     }
 
     /// For a single frame of a handshake: a checksum.
