@@ -1,7 +1,8 @@
-//! Times a training step of the VAE and of the denoiser, with Burn's operations and with the fused kernels, alternating in one run:
-//! medians, so that a busy moment counts little.
+//! Times a training step of the VAE and of the denoiser with Burn's operations and with the fused kernels. The two
+//! alternate in one run and medians are printed, so that a busy moment of the machine counts little.
 //!
-//! `cargo bench -p models`, on one thread: `RAYON_NUM_THREADS=1`. A number after `--` is how many steps of each are timed.
+//! Run it with `RAYON_NUM_THREADS=1 cargo bench -p models` for one thread. A number after `--` sets the timed steps of
+//! each.
 #![expect(clippy::print_stdout, reason = "a bench prints what it measured")]
 
 use std::time::{Duration, Instant};
@@ -35,7 +36,7 @@ impl<M: Module> Trained<M> {
         Self { network, m: zeros.clone(), v: zeros, params, done: 0 }
     }
 
-    /// One update, as the training loop does it.
+    /// Runs one update, as the training loop does.
     fn step(&mut self, loss: impl FnOnce(&M) -> Tensor<1>) {
         let mut gradients = loss(&self.network).backward();
         let mut flat = vec![0.0; self.params.len()];
@@ -131,7 +132,7 @@ fn race<S>(name: &str, samples: usize, count: usize, make: impl Fn() -> S, mut s
         let taken = start.elapsed();
         let start = Instant::now();
         kernels::stock(|| step(&mut stock));
-        // The first two turns warm caches and the allocator up.
+        // The first two turns warm up caches and the allocator.
         if turn >= 2 {
             fast.push(taken);
             slow.push(start.elapsed());

@@ -1,12 +1,12 @@
-//! Which devices there are, and opening one.
+//! Lists the devices of the compiled backends and opens one.
 //!
-//! A backend is in the program or not by a Cargo feature; which of those is used is decided here, once, from the
-//! pipeline's setting, never from an environment variable or a "best available" guess.
+//! A Cargo feature decides which backends are compiled in. The pipeline's setting selects one of them here, in one
+//! place; neither an environment variable nor a "best available" guess takes part.
 
 use burn::tensor::Device;
 use protocol::stage::Backend;
 
-/// Why a device cannot be opened.
+/// A device cannot be opened.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DeviceError {
     /// The program was built without the backend.
@@ -15,11 +15,10 @@ pub enum DeviceError {
     /// The machine has fewer devices.
     #[error("backend `{}` has {found} device(s), so there is no number {index}; see `trainer devices`", .backend.name())]
     NotFound {
-        /// The backend.
         backend: Backend,
-        /// Which device was asked for.
+        /// The requested index.
         index: usize,
-        /// How many there are.
+        /// Devices of the backend on this machine.
         found: usize,
     },
 }
@@ -27,19 +26,18 @@ pub enum DeviceError {
 /// A device of this machine, or a backend that could have some.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DeviceInfo {
-    /// The backend.
     pub backend: Backend,
-    /// Number among the backend's devices, as [`open`] takes it; `None` if the backend has none here.
+    /// Index among the backend's devices, as [`open`] takes it; `None` if the backend has none on this machine.
     pub index: Option<usize>,
-    /// What the backend calls it.
+    /// The backend's name for the device.
     pub name: String,
-    /// What a user should know about it.
+    /// Advice for the user, for instance the reason that the backend has no device.
     pub note: String,
 }
 
 const BACKENDS: [Backend; 4] = [Backend::Flex, Backend::Ndarray, Backend::Wgpu, Backend::Cuda];
 
-/// The devices of a backend, or the reason that there cannot be any.
+/// Returns the devices of a backend, or the reason that there are none.
 fn devices(backend: Backend) -> Result<Vec<Device>, DeviceError> {
     match backend {
         #[cfg(feature = "flex")]
@@ -59,7 +57,7 @@ fn devices(backend: Backend) -> Result<Vec<Device>, DeviceError> {
     }
 }
 
-/// Device number `index` of a backend, without autodiff.
+/// Opens device number `index` of a backend, without autodiff.
 ///
 /// # Errors
 /// If the program was built without the backend, or the machine has fewer such devices.
@@ -71,12 +69,12 @@ pub fn open(backend: Backend, index: usize) -> Result<Device, DeviceError> {
     Ok(found.swap_remove(index))
 }
 
-/// Whether `device` has a memory of its own, in which what training changes should stay from step to step.
+/// Returns true if `device` has memory of its own. Training then keeps its state there from step to step.
 pub fn is_accelerator(device: &Device) -> bool {
     identity(device).is_some()
 }
 
-/// What an accelerator calls itself, and whether it is hardware rather than a program on the CPU.
+/// Returns the accelerator's own name, and true if it is hardware rather than an emulation on the CPU.
 #[cfg(any(feature = "wgpu", feature = "cuda"))]
 fn identity(device: &Device) -> Option<(String, bool)> {
     device.identity().map(|identity| (identity.name, identity.physical.is_some()))
@@ -87,7 +85,7 @@ fn identity(_: &Device) -> Option<(String, bool)> {
     None
 }
 
-/// Every device of every backend in this program, and a line for each backend that has none or is not built in.
+/// Lists every device of every backend, and one line for each backend that has none or is not built in.
 pub fn available() -> Vec<DeviceInfo> {
     BACKENDS.into_iter().flat_map(list).collect()
 }

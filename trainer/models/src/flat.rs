@@ -1,4 +1,5 @@
-//! Parameters and gradients as flat f32 buffers in declaration order: what is reduced, clipped, updated, saved and compared.
+//! Parameters and gradients as flat f32 buffers in declaration order, for reduction, clipping, updates, storage and
+//! comparison.
 
 use std::convert::Infallible;
 
@@ -10,9 +11,8 @@ use crate::device::is_accelerator;
 /// One parameter tensor inside a flat buffer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Entry {
-    /// Published name.
+    /// Published name, such as `blocks.3.weight`.
     pub name: String,
-    /// Shape.
     pub shape: Vec<usize>,
 }
 
@@ -22,26 +22,26 @@ impl Entry {
         self.shape.iter().product()
     }
 
-    /// Whether there are none.
+    /// Returns true if the tensor has no elements.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 }
 
-/// Sequences whose fields are numbered: `main_3` is entry 3 of `main`. Those of `at` have no name of their own: `at_2` is entry 2.
+/// Containers whose fields are numbered: `main_3` is entry 3 of `main`. `at` has no name of its own: `at_2` is entry 2.
 const SEQUENCES: [&str; 7] = ["main", "output", "output_net", "at", "blocks", "time_embed", "time_mlp"];
 
-/// Names and shapes in declaration order. Paths are the published names, but for entries of upstream's sequences, whose others
-/// have no parameters: `emb_proj` is `emb_proj.1`, and a field `main_3` is `main.3`.
+/// Lists names and shapes in declaration order. Field paths are the published names, with two exceptions: a field
+/// `main_3` is `main.3`, and `emb_proj` is `emb_proj.1`, because entry 0 of upstream's sequence has no parameters.
 pub fn layout<M: Module>(module: &M) -> Vec<Entry> {
     struct Layout(Vec<String>, Vec<Entry>);
     impl ModuleVisitor for Layout {
         fn enter_module(&mut self, name: &str, container: &str) {
-            // Which variant an entry of a sequence is has no place in its name.
+            // The name of an enum's variant is not part of a published path.
             if container.starts_with("Enum:") {
                 return self.0.push(String::new());
             }
-            // A name that is a word of Rust's.
+            // A field named like a Rust keyword is written `r#name`.
             let name = name.strip_prefix("r#").unwrap_or(name);
             let entry =
                 name.rsplit_once('_').filter(|(sequence, n)| SEQUENCES.contains(sequence) && n.parse::<u32>().is_ok());
@@ -69,7 +69,7 @@ pub fn layout<M: Module>(module: &M) -> Vec<Entry> {
     visitor.1
 }
 
-/// All parameters, one after the other.
+/// Reads all parameters, one after the other.
 pub fn read<M: Module>(module: &M) -> Vec<f32> {
     struct Read(Vec<f32>);
     impl ModuleVisitor for Read {
@@ -83,7 +83,7 @@ pub fn read<M: Module>(module: &M) -> Vec<f32> {
     visitor.0
 }
 
-/// The module with its parameters replaced by `flat`; identities and gradient tracking stay.
+/// Replaces the module's parameters by `flat`; parameter ids and gradient tracking stay.
 ///
 /// # Panics
 /// If `flat` has another length than the module has parameters.
@@ -98,11 +98,11 @@ pub fn write<M: Module>(module: M, mut flat: &[f32]) -> M {
     module
 }
 
-/// The module with the parameters that `fill` gives, one after the other; identities and gradient tracking stay. After an error it is
-/// asked no more.
+/// Replaces the module's parameters by the values that `fill` writes, tensor by tensor; ids and gradient tracking stay.
+/// After an error `fill` is not called again.
 ///
 /// # Errors
-/// What `fill` says.
+/// The first error of `fill`.
 pub fn replace<M: Module, E>(module: M, fill: impl FnMut(&mut [f32]) -> Result<(), E>) -> Result<M, E> {
     struct Replace<F, E> {
         fill: F,
@@ -131,7 +131,7 @@ pub fn replace<M: Module, E>(module: M, fill: impl FnMut(&mut [f32]) -> Result<(
     mapper.failed.map_or(Ok(module), Err)
 }
 
-/// Replaces the parameters of `module` by `flat`, as [`write`] does, tensor by tensor: old and new ones are not all in memory together.
+/// Replaces the parameters of `module` by `flat` like [`write`], but never holds all old and all new tensors in memory.
 ///
 /// # Panics
 /// As [`write`].
@@ -142,23 +142,23 @@ pub fn assign<M: Module>(module: &mut M, flat: &[f32]) {
             param.map(|old| Tensor::zeros([1; D], &old.device()))
         }
     }
-    // Clones share their tensors, and what is shared is freed by nobody: the only whole one is taken out.
+    // Clones share their tensors, and a shared tensor is never freed. So the only complete module is moved out.
     let hollow = module.clone().map(&mut Hollow);
     let whole = std::mem::replace(module, hollow);
     *module = write(whole, flat);
 }
 
-/// Parameters as one flat buffer, where they are.
+/// Parameters as one flat buffer, on the host or on an accelerator.
 #[derive(Debug, Clone, Copy)]
 pub enum Values<'a> {
-    /// On the host.
+    /// A slice in host memory.
     Host(&'a [f32]),
-    /// On an accelerator, without autodiff: [N].
+    /// A tensor [N] on an accelerator, without autodiff.
     Device(&'a Tensor<1>),
 }
 
 impl Values<'_> {
-    /// How many.
+    /// Number of parameters.
     pub fn len(self) -> usize {
         match self {
             Self::Host(values) => values.len(),
@@ -166,7 +166,7 @@ impl Values<'_> {
         }
     }
 
-    /// Whether there are none.
+    /// Returns true if the buffer has no elements.
     pub fn is_empty(self) -> bool {
         self.len() == 0
     }
@@ -174,16 +174,16 @@ impl Values<'_> {
     /// Replaces the parameters of `module`, as [`assign`] does.
     ///
     /// # Panics
-    /// If these are not as many as the module's parameters.
+    /// If the buffer has another length than the module has parameters.
     pub fn assign<M: Module>(self, module: &mut M) {
         assert_eq!(self.len(), module.num_params(), "parameters of the module");
         self.assign_first(module);
     }
 
-    /// Replaces the parameters of `module` by the first of these.
+    /// Replaces the parameters of `module` by the first values of the buffer.
     ///
     /// # Panics
-    /// If these are less than the module's parameters.
+    /// If the buffer is shorter than the module's parameters.
     pub fn assign_first<M: Module>(self, module: &mut M) {
         match self {
             Self::Host(values) => assign(module, &values[..module.num_params()]),
@@ -192,7 +192,7 @@ impl Values<'_> {
     }
 }
 
-/// Cuts parameters from a flat tensor on their device.
+/// Cuts parameters from a flat tensor on its device.
 struct Cut<'a> {
     values: &'a Tensor<1>,
     at: usize,
@@ -211,7 +211,8 @@ impl ModuleMapper for Cut<'_> {
     }
 }
 
-/// Adds the gradients of all parameters to `out`, in the order of [`read`]. A parameter that took no part adds nothing.
+/// Adds the gradients of all parameters to `out`, in the order of [`read`]. A parameter without a gradient adds
+/// nothing.
 ///
 /// # Panics
 /// If `out` has another length than the module has parameters.
@@ -220,7 +221,7 @@ pub fn add_gradients<M: Module>(module: &M, gradients: &mut Gradients, out: &mut
         gradients: &'a mut Gradients,
         out: &'a mut [f32],
         at: usize,
-        /// What lies on an accelerator, and where it belongs: it comes over together.
+        /// Gradients on an accelerator with their offsets in `out`; one transfer copies them all.
         there: Vec<(usize, Tensor<1>)>,
     }
     fn add(gradient: Tensor<1>, mut to: impl FnMut(&[f32])) {

@@ -6,25 +6,25 @@
 use burn::tensor::{Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 
-/// `t data + (1 - t) noise` for a time each; [B, T, F].
+/// Interpolates `t data + (1 - t) noise` with one time per clip; [B, T, F].
 pub fn between(data_btf: Tensor<3>, noise_btf: Tensor<3>, times: &[f32]) -> Tensor<3> {
     let t = Tensor::<3>::from_data(TensorData::new(times.to_vec(), [times.len(), 1, 1]), &data_btf.device());
     let rest = t.clone().neg() + 1.0;
     data_btf * t + noise_btf * rest
 }
 
-/// How the flow is followed.
+/// Numerical solver of the flow.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Solver {
-    /// One evaluation an interval.
+    /// One evaluation per interval.
     Euler,
-    /// Two: the velocity in the middle of the interval, where half a step of Euler's leads.
+    /// Two evaluations per interval: the second is at its middle, after half an Euler step.
     Midpoint,
 }
 
 impl Solver {
-    /// Evaluations of the network for so many intervals.
+    /// Evaluations of the network for `intervals` intervals.
     pub fn evaluations(self, intervals: usize) -> usize {
         match self {
             Self::Euler => intervals,
@@ -32,7 +32,7 @@ impl Solver {
         }
     }
 
-    /// One step of each sample of `x_btf` from its time in `from` to that in `to`.
+    /// Moves each sample of `x_btf` one step, from its time in `from` to its time in `to`.
     pub fn step(
         self,
         x_btf: Tensor<3>,
@@ -57,15 +57,16 @@ impl Solver {
     }
 }
 
-/// Where a straight line from `x_btf` leads at time 1: `x + (1 - t) v`, for a time each.
+/// The end at time 1 of a straight line from `x_btf`: `x + (1 - t) v`, with one time per clip.
 pub fn to_data(x_btf: Tensor<3>, velocity_btf: Tensor<3>, times: &[f32]) -> Tensor<3> {
     let rest: Vec<f32> = times.iter().map(|t| 1.0 - t).collect();
     let rest = Tensor::<3>::from_data(TensorData::new(rest, [times.len(), 1, 1]), &x_btf.device());
     x_btf + velocity_btf * rest
 }
 
-/// Draws with a network whose line leads to the data from anywhere on the flow: in each of `steps` equal intervals a jump to the data, and back to
-/// the next one's beginning with `fresh` noise. One clip; the last jump is the result.
+/// Samples one clip with a network whose line leads to the data from any point of the flow. Each of `steps` equal
+/// intervals jumps to the data and back to the start of the next interval with `fresh` noise. The last jump is the
+/// result.
 pub fn jump(
     steps: usize,
     noise_btf: Tensor<3>,
@@ -81,9 +82,10 @@ pub fn jump(
     x
 }
 
-/// Follows `velocity` from `noise_btf` at time 0 to 1 in equal intervals; `see` gets the state at each end of an interval, the noise first.
+/// Follows `velocity` from `noise_btf` at time 0 to time 1 in equal intervals. `see` receives the state at each end of
+/// an interval, beginning with the noise.
 ///
-/// Times are those of an f32 grid `k / intervals`, and steps its differences, as upstream's solver has them.
+/// Times are those of an f32 grid `k / intervals`, and steps are its differences, as in upstream's solver.
 pub fn follow(
     solver: Solver,
     intervals: usize,
@@ -125,13 +127,13 @@ mod tests {
         let off = |x: Tensor<3>| (x - data.clone()).abs().max().into_scalar::<f32>();
         assert!(off(follow(Solver::Euler, 4, noise.clone(), |_, _| target.clone(), |_| ())) < 1e-6);
         assert!(off(between(data.clone(), noise.clone(), &[1.0])) < 1e-6);
-        // dx/dt = x: e times what it began with.
+        // dx/dt = x grows to e times the initial value.
         let grown = |solver, n| {
             let end = follow(solver, n, noise.clone(), |x, _| x, |_| ()) / noise.clone();
             (end.mean().into_scalar::<f32>() - std::f32::consts::E).abs()
         };
         assert!(grown(Solver::Midpoint, 8) < 0.1 * grown(Solver::Euler, 16));
-        // A step of a sample is the one that is followed; a jump along a straight line lands on the data from anywhere.
+        // A single step equals the followed one; a jump along a straight line ends at the data from any point.
         let one = Solver::Midpoint.step(noise.clone(), &[0.0], &[1.0], |x, _| x);
         assert!(
             (one - follow(Solver::Midpoint, 1, noise.clone(), |x, _| x, |_| ())).abs().max().into_scalar::<f32>()

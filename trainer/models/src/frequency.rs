@@ -1,11 +1,13 @@
-//! Frequencies of a motion along time, and the losses of Free-T2M (Chen et al., 2025) that look at them.
+//! Frequencies of a motion along time, and the frequency losses of Free-T2M (Chen et al., 2025).
 //!
-//! The orthonormal cosine transform of n frames has coefficient k at `k fps / (2 n)` Hz; the lowest K of them are the slow part of a
-//! motion. It is linear, so the slow part of a difference is the difference of the slow parts, and one pass is enough. The transform is over
-//! the valid frames of each clip. Which noise levels a term acts on is a [`Stage`].
+//! The orthonormal cosine transform of n frames has coefficient k at `k fps / (2 n)` Hz; the lowest K coefficients are
+//! the slow part of a motion. The transform is linear, so the slow part of a difference is the difference of the slow
+//! parts, and one pass is enough. It covers the valid frames of each clip. A [`Stage`] selects the noise levels at
+//! which a term acts.
 //!
-//! Departs: the released code transforms 196 frames whatever a clip's length, which lengths of 196 for all give, and the paper prints no K.
-//! Its semantic term has no gradient (embeddings are taken without graph); here the prediction's embedding has one.
+//! Departs: the released code transforms 196 frames for every clip; lengths of 196 for all clips reproduce that. The
+//! paper prints no K. The released semantic term has no gradient, because its embeddings are computed without a graph;
+//! here the embedding of the prediction has one.
 //!
 //! As in [`crate::losses`], a term is the sum over examples of per-example values, so that slices add up.
 
@@ -20,31 +22,32 @@ use crate::losses::Pointwise;
 pub struct Stage(RangeInclusive<usize>);
 
 impl Stage {
-    /// These timesteps, both ends included.
+    /// Selects these timesteps, both ends included.
     pub fn new(timesteps: RangeInclusive<usize>) -> Self {
         Self(timesteps)
     }
 
-    /// The timesteps t of `steps` whose share `t / steps` lies in `from..=to`: what "30 to 50 of 50" is for other numbers of steps.
+    /// Selects timesteps t of `steps` with `t / steps` in `from..=to`; it scales "30 to 50 of 50" to other numbers of
+    /// steps.
     pub fn of_shares(from: f64, to: f64, steps: usize) -> Self {
         let at = |share: f64| share * steps as f64;
-        // A share such as .6 times 50 may come out a hair above 30.
+        // Rounding may put a product such as .6 times 50 slightly above 30.
         Self((at(from) - 1e-6).ceil().max(0.0) as usize..=(at(to) + 1e-6).floor() as usize)
     }
 
-    /// Whether the term acts at `t`.
+    /// Returns true if the term acts at `t`.
     pub fn has(&self, t: usize) -> bool {
         self.0.contains(&t)
     }
 
-    /// 1 for each timestep at which it acts, 0 for each other.
+    /// Returns 1 for each timestep at which the term acts and 0 for the others.
     pub fn mask(&self, timesteps: &[usize]) -> Vec<f32> {
         timesteps.iter().map(|t| if self.has(*t) { 1.0 } else { 0.0 }).collect()
     }
 }
 
-/// The first `keep` rows of the orthonormal cosine transform of `length` frames, [keep, frames]; zero past the length, and in rows that so
-/// few frames do not have.
+/// The first `keep` rows of the orthonormal cosine transform of `length` frames, [keep, frames]. Columns past the
+/// length are zero, and so are rows past `length`.
 fn basis(length: usize, frames: usize, keep: usize) -> Vec<f32> {
     let n = length as f64;
     let value = |k: usize, i: usize| {
@@ -58,28 +61,28 @@ fn basis(length: usize, frames: usize, keep: usize) -> Vec<f32> {
     (0..keep).flat_map(|k| (0..frames).map(move |i| value(k, i))).collect()
 }
 
-/// [B, keep, T] of clips with these lengths.
+/// Transforms [B, keep, T] of clips with these lengths.
 fn bases(lengths: &[usize], frames: usize, keep: usize, device: &Device) -> Tensor<3> {
     let values = lengths.iter().flat_map(|length| basis(*length, frames, keep)).collect();
     Tensor::from_data(TensorData::new(values, [lengths.len(), keep, frames]), device)
 }
 
-/// The lowest `keep` coefficients of the cosine transform of `x_btd` [B, T, D] along time, [B, keep, D]; of clip b the first `lengths[b]` frames
-/// are transformed.
+/// The lowest `keep` coefficients of the cosine transform of `x_btd` [B, T, D] along time, [B, keep, D]. The transform
+/// of clip b covers its first `lengths[b]` frames.
 pub fn coefficients(x_btd: Tensor<3>, lengths: &[usize], keep: usize) -> Tensor<3> {
     let frames = x_btd.dims()[1];
     bases(lengths, frames, keep, &x_btd.device()).matmul(x_btd)
 }
 
-/// What the lowest `keep` coefficients hold of `x_btd` [B, T, D]; zero past a clip's length.
+/// The part of `x_btd` [B, T, D] in its lowest `keep` coefficients; zero past a clip's length.
 pub fn low_pass(x_btd: Tensor<3>, lengths: &[usize], keep: usize) -> Tensor<3> {
     let frames = x_btd.dims()[1];
     let basis = bases(lengths, frames, keep, &x_btd.device());
     basis.clone().swap_dims(1, 2).matmul(basis.matmul(x_btd))
 }
 
-/// How far the slow part of `found` is from that of `expected` [B, T, D]: for each clip the mean over its frames and features, times
-/// `weights[b]`, summed.
+/// Distance between the slow parts of `found` and `expected` [B, T, D]: the mean over a clip's frames and features,
+/// times `weights[b]`, summed over clips.
 pub fn low_frequency(
     found: Tensor<3>,
     expected: Tensor<3>,
@@ -95,16 +98,16 @@ pub fn low_frequency(
     (slow * Tensor::<3>::from_data(TensorData::new(each, [batch, 1, 1]), &device)).sum()
 }
 
-/// How the agreement of two embeddings becomes a loss.
+/// The loss of the cosine S of two embeddings.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Agreement {
-    /// `1 - S`: pulls everywhere. The released code.
+    /// `1 - S`: a gradient everywhere, as in the released code.
     Cosine,
-    /// `max(0, threshold - S)`: pulls below a threshold.
+    /// `max(0, threshold - S)`: a gradient only below the threshold.
     Below(f64),
 }
 
-/// Cosines [B] of rows [B, E]. As PyTorch has it, a norm below 1e-8 counts as 1e-8.
+/// Cosines [B] of rows [B, E]. As in PyTorch, a norm below 1e-8 counts as 1e-8.
 pub fn cosines(a_be: Tensor<2>, b_be: Tensor<2>) -> Tensor<1> {
     let batch = a_be.dims()[0];
     let norm = |x: &Tensor<2>| x.clone().square().sum_dim(1).clamp_min(1e-16).sqrt();
@@ -112,7 +115,7 @@ pub fn cosines(a_be: Tensor<2>, b_be: Tensor<2>) -> Tensor<1> {
     ((a_be * b_be).sum_dim(1) / norms).reshape([batch])
 }
 
-/// How little the embeddings of predictions agree with those of their targets [B, E], times `weights[b]`, summed.
+/// Disagreement of the embeddings of predictions with those of their targets [B, E], times `weights[b]`, summed.
 pub fn semantic(found_be: Tensor<2>, expected_be: Tensor<2>, agreement: Agreement, weights: &[f32]) -> Tensor<1> {
     let device = found_be.device();
     let s = cosines(found_be, expected_be);
@@ -151,7 +154,7 @@ mod tests {
         let three = [1.598_488, 2.460_231, 3.605_829, 4.229_153, 3.788_614, 2.351_278, 0.582_662, -0.616_255];
         close(low_pass(x.clone(), &[8], 3), &three);
         close(low_pass(x.clone(), &[8], 8), &X);
-        // Of three frames there are three coefficients, and what stands behind them is not seen.
+        // Three frames have three coefficients; the frames after them have no effect.
         close(low_pass(x, &[3], 5), &[1.0, 2.0, 4.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
     }
 

@@ -1,6 +1,6 @@
 //! The published networks, their samplers, and the CPU kernels under them.
 //!
-//! Not its job: stages, stores, workers, where data comes from.
+//! Not its job: stages, stores, workers, and the source of the data.
 
 pub mod device;
 pub mod diffusion;
@@ -16,8 +16,8 @@ pub mod quantizer;
 pub mod resident;
 pub mod tokens;
 
-/// The instruction set that the kernels of this process dispatch to: ours, Burn's and those of `gemm` look for the same features. Another
-/// one rounds differently, so workers of one stage must agree on it.
+/// The instruction set of this process's kernels: ours, Burn's and those of `gemm` detect the same features. Another
+/// instruction set rounds differently, so workers of one stage must agree on it.
 pub fn instruction_set() -> &'static str {
     #[cfg(target_arch = "x86_64")]
     {
@@ -25,7 +25,7 @@ pub fn instruction_set() -> &'static str {
             return "avx512";
         }
         if std::arch::is_x86_feature_detected!("avx512f") {
-            // Without the extensions that ours need: `gemm` goes wide and our kernels do not.
+            // Without the extensions that our kernels need: `gemm` uses its wide version and our kernels do not.
             return "avx512f";
         }
         if kernels::simd::has_middle() {

@@ -1,13 +1,13 @@
 //! The training losses, in a form that adds up over slices of a batch.
 //!
-//! Every function returns the *sum over the examples* of per-example means, shape [1]: the caller that adds the slices divides
-//! by the global batch, and gets the mean over the batch however it was cut.
+//! Every function returns the *sum over the examples* of per-example means, shape [1]. The caller adds the slices and
+//! divides by the global batch. The result is the mean over the batch for any division into slices.
 //!
 //! Source: MLD and MotionLCM (VAE terms, noise loss), Luo et al. (pseudo-Huber), Lim and Ye, arXiv:1705.02894 (hinge).
-//! Departs: MotionLCM divides the joint term of KIT-ML like HumanML3D's although its unit is not the metre; here
-//! [`Body::metres_per_unit`] says what one unit is.
+//! Departs: MotionLCM divides the joint term of KIT-ML like that of HumanML3D although its unit is not the metre; here
+//! [`Body::metres_per_unit`] is the length of one unit.
 //!
-//! Not its job: dividing by the batch, which network the arguments come from.
+//! Not its job: dividing by the batch, and choosing the network that computes the arguments.
 
 use burn::tensor::activation::relu;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -21,14 +21,14 @@ pub fn mse(found: Tensor<3>, expected: Tensor<3>) -> Tensor<1> {
     per_example((found - expected).square())
 }
 
-/// `sqrt((found - expected)^2 + c^2) - c`, mean of each example, summed. [B, N, d]. For differences well below `c` it
-/// is squared error over 2c, well above it absolute error.
+/// `sqrt((found - expected)^2 + c^2) - c`, mean of each example, summed. [B, N, d]. It approximates squared error over
+/// 2c for differences well below `c`, and absolute error well above it.
 pub fn pseudo_huber(found: Tensor<3>, expected: Tensor<3>, c: f64) -> Tensor<1> {
     let c = c as f32;
     per_example(((found - expected).square() + c * c).sqrt() - c)
 }
 
-/// Divergence from the standard normal, mean of each example, summed.
+/// KL divergence from the standard normal, mean of each example, summed.
 pub fn kl(posterior: &Posterior) -> Tensor<1> {
     let (mu, logvar) = (posterior.mu_bnd.clone(), posterior.logvar_bnd.clone());
     per_example((mu.square() + logvar.clone().exp() - 1.0 - logvar) * 0.5)
@@ -42,7 +42,7 @@ pub fn hinge_discriminator(real: Vec<Tensor<3>>, fake: Vec<Tensor<3>>) -> Tensor
     total(terms) / heads
 }
 
-/// Hinge loss of what the discriminator judges: scores of fakes above 1. As [`hinge_discriminator`].
+/// Hinge loss of the generator: scores of fakes above 1. Shapes and sums as in [`hinge_discriminator`].
 pub fn hinge_generator(fake: Vec<Tensor<3>>) -> Tensor<1> {
     let heads = fake.len() as f32;
     total(fake.into_iter().map(|fake| per_example(relu(1.0 - fake)))) / heads
@@ -59,14 +59,14 @@ fn per_example(elements: Tensor<3>) -> Tensor<1> {
     elements.sum() / ((tokens * width) as f32)
 }
 
-/// How two numbers are compared.
+/// Distance of two numbers with difference `d`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Pointwise {
     /// `d^2 / 2` up to 1, `|d| - 1/2` beyond.
     SmoothL1,
-    /// `|d|`.
+    /// Absolute error, `|d|`.
     L1,
-    /// `d^2`.
+    /// Squared error, `d^2`.
     L2,
 }
 
@@ -84,20 +84,20 @@ impl Pointwise {
     }
 }
 
-/// Which frames of a padded batch count, and for how much.
+/// Weight of each frame of a padded batch.
 #[derive(Debug, Clone)]
 pub struct FrameWeights {
-    /// [B, T, 1].
+    /// Weights of shape [B, T, 1].
     weights: Tensor<3>,
 }
 
 impl FrameWeights {
-    /// Of clip b the first `lengths[b]` frames, each with weight `1 / lengths[b]`.
+    /// Counts the first `lengths[b]` frames of clip b, each with weight `1 / lengths[b]`.
     pub fn masked(lengths: &[usize], frames: usize, device: &Device) -> Self {
         Self::of(lengths, frames, device, |length, t| if t < length { 1.0 / length as f32 } else { 0.0 })
     }
 
-    /// Every frame, padding too, with weight 1 / T (v1).
+    /// Counts every frame with weight 1 / T, padding included (v1).
     pub fn plain(lengths: &[usize], frames: usize, device: &Device) -> Self {
         Self::of(lengths, frames, device, |_, _| 1.0 / frames as f32)
     }
@@ -114,18 +114,18 @@ impl FrameWeights {
     }
 }
 
-/// What turns normalised features into joints.
+/// Conversion of normalised features into joints.
 #[derive(Debug, Clone)]
 pub struct Body {
     skeleton: &'static Skeleton,
-    /// What joints are multiplied by before they are compared; `Skeleton::metres_per_unit`, or 1 to keep the data's unit.
+    /// Factor on joints before they are compared: `Skeleton::metres_per_unit`, or 1 to keep the data's unit.
     pub metres_per_unit: f64,
     mean: Tensor<3>,
     std: Tensor<3>,
 }
 
 impl Body {
-    /// `mean` and `std` [D] are the normalisation of the features.
+    /// Creates the conversion; `mean` and `std` [D] are the normalisation of the features.
     ///
     /// # Panics
     /// If they are not as wide as the skeleton's feature rows.
@@ -141,26 +141,26 @@ impl Body {
     }
 }
 
-/// Where joints of a batch should be, to be compared with where they are. Source: MotionLCM, whose temporal setting compares normalised
-/// coordinates and whose spatial one compares metres.
+/// Target positions of the joints of a batch, for a loss on the positions found. Source: MotionLCM, whose temporal
+/// setting compares normalised coordinates and whose spatial setting compares metres.
 #[derive(Debug, Clone)]
 pub struct ControlTarget {
-    /// [B, T, joints x 3].
+    /// Target coordinates [B, T, joints x 3].
     target: Tensor<3>,
-    /// 1 where a coordinate counts.
+    /// 1 for a coordinate that counts, 0 for the others.
     given: Tensor<3>,
-    /// Frames and joints of each sample that count.
+    /// Number of frames and joints of each sample that count.
     entries: Vec<usize>,
-    /// Mean and deviation of each coordinate [1, 1, joints x 3], if normalised ones are compared.
+    /// Mean and deviation of each coordinate [1, 1, joints x 3], if normalised coordinates are compared.
     normal: Option<(Tensor<3>, Tensor<3>)>,
 }
 
 impl ControlTarget {
-    /// Of hints [B, T, joints, 3] that `mean` and `std` [joints x 3] have normalised, of which those count that are `given`. With `metres` they are
-    /// brought back to the data's unit before anything is compared.
+    /// Creates targets from hints [B, T, joints, 3] that are normalised by `mean` and `std` [joints x 3]; only those
+    /// marked in `given` count. With `metres` the hints are converted back to the data's unit before the comparison.
     ///
     /// # Panics
-    /// If a list has another length than its shape says.
+    /// If a list has another length than its shape requires.
     pub fn new(
         hints: &[f32],
         given: &[bool],
@@ -186,13 +186,14 @@ impl ControlTarget {
         }
     }
 
-    /// How many frames and joints of each sample count.
+    /// Number of frames and joints of each sample that count.
     pub fn entries(&self) -> Vec<usize> {
         self.entries.clone()
     }
 
-    /// The distances of `joints` [B, T, joints, 3], in the data's unit, from where they should be: for each sample their sum over the
-    /// coordinates that count, times `weights[b]`, summed. A sample of which nothing counts adds nothing, whatever its weight.
+    /// The distance of `joints` [B, T, joints, 3], in the data's unit, from their targets. It is summed over the
+    /// coordinates of a sample that count, multiplied by `weights[b]`, and summed over samples. A sample without such
+    /// coordinates adds nothing.
     pub fn loss(&self, joints: Tensor<4>, distance: Pointwise, weights: &[f32]) -> Tensor<1> {
         let found = joints.reshape(self.target.dims());
         let found = match &self.normal {
@@ -217,12 +218,12 @@ pub struct VaeRecipe {
     pub joint: Pointwise,
     /// Distance of the local position term.
     pub velocity: Pointwise,
-    /// Distance of the term on feet.
+    /// Distance of the term on foot velocities.
     pub feet: Pointwise,
 }
 
 impl From<VaeLoss> for VaeRecipe {
-    /// Smooth L1 throughout, as published.
+    /// Uses smooth L1 for all terms, as published.
     fn from(weights: VaeLoss) -> Self {
         let [feature, joint, velocity, feet] = [Pointwise::SmoothL1; 4];
         Self { weights, feature, joint, velocity, feet }
@@ -232,15 +233,15 @@ impl From<VaeLoss> for VaeRecipe {
 /// The VAE's terms, each already multiplied by its weight; a term of weight 0 is absent.
 #[derive(Debug, Clone)]
 pub struct VaeTerms {
-    /// On normalised features.
+    /// The term on normalised features.
     pub feature: Option<Tensor<1>>,
-    /// On recovered joints.
+    /// The term on recovered joints.
     pub joint: Option<Tensor<1>>,
-    /// On local positions, which upstream calls velocity.
+    /// The term on local positions, which upstream calls velocity.
     pub velocity: Option<Tensor<1>>,
-    /// On the velocities of ankles and feet.
+    /// The term on the velocities of ankles and feet.
     pub feet: Option<Tensor<1>>,
-    /// Divergence of the posterior.
+    /// The KL divergence of the posterior.
     pub kl: Option<Tensor<1>>,
 }
 
@@ -255,7 +256,7 @@ impl VaeTerms {
     }
 }
 
-/// The VAE's loss. `decoded` and `features` [B, T, D], normalised.
+/// Computes the VAE's loss. `decoded` and `features` [B, T, D], normalised.
 pub fn vae(
     recipe: &VaeRecipe,
     body: &Body,
@@ -274,7 +275,7 @@ pub fn vae(
     let term = |weight: f64, value: &dyn Fn() -> Tensor<1>| (weight != 0.0).then(|| value() * (weight as f32));
     let positions = body.skeleton.layout().positions;
     let local = |x: &Tensor<3>| x.clone().slice([0..batch, 0..frames, positions.clone()]);
-    // Where the joints are costs many operations, so both terms on them share it.
+    // Recovering the joints takes many operations, so both terms on joints share the result.
     let weighs = weights.joint != 0.0 || weights.feet != 0.0;
     let metres = |x: &Tensor<3>| body.joints(x.clone()) * (body.metres_per_unit as f32);
     let joints = weighs.then(|| [metres(&decoded), metres(&features)]);
@@ -295,7 +296,7 @@ pub fn vae(
     }
 }
 
-/// Velocities [B, T - 1, 4 x 3] of ankles and feet, by the second. `joints` [B, T, J, 3].
+/// Velocities [B, T - 1, 4 x 3] of ankles and feet, per second. `joints` [B, T, J, 3].
 fn foot_velocities(joints: &Tensor<4>, skeleton: &Skeleton) -> Tensor<3> {
     let [batch, frames, _, _] = joints.dims();
     let feet = skeleton.left_foot.iter().chain(&skeleton.right_foot);
@@ -307,14 +308,14 @@ fn foot_velocities(joints: &Tensor<4>, skeleton: &Skeleton) -> Tensor<3> {
 
 /// Global joints [B, T, J, 3] of features [B, T, D] that are not normalised; gradients flow through the running sums.
 ///
-/// The differentiable twin of `motion::features::recover_joints`: the turn feature is half the yaw increment, so its
-/// running sum `a_t` (over rows before t) is the angle of the heading's quaternion and `2 a_t` the yaw; turn and velocity
-/// of the last row are not used.
+/// The differentiable equivalent of `motion::features::recover_joints`. The turn feature is half the yaw increment. So
+/// its running sum `a_t` (over rows before t) is the angle of the heading's quaternion, and `2 a_t` is the yaw. Turn
+/// and velocity of the last row are not used.
 pub fn joints(features: Tensor<3>, skeleton: &Skeleton) -> Tensor<4> {
     let [batch, frames, _] = features.dims();
     let (device, others) = (features.device(), skeleton.joints - 1);
     let columns = |range: std::ops::Range<usize>| features.clone().slice([0..batch, 0..frames, range]);
-    // Row t of what leads *to* frame t; nothing leads to the first.
+    // Row t holds the increment that leads *to* frame t; the first row is zero.
     let before = |x: Tensor<3>| {
         let width = x.dims()[2];
         let first = Tensor::zeros([batch, 1, width], &device);
@@ -413,7 +414,8 @@ mod tests {
         let body = Body::new(skeleton, &vec![0.0; skeleton.features], &vec![1.0; skeleton.features], &device);
         let stands = vec![0.0; 2 * 5 * skeleton.features];
         let mut glides = stands.clone();
-        // The second clip, of three frames, glides ahead by a decimetre a frame: 2 m/s. What follows its end counts for nothing.
+        // The second clip has three frames and glides ahead by a decimetre a frame: 2 m/s. Frames after its end have no
+        // effect.
         for t in 0..5 {
             glides[(5 + t) * skeleton.features + 2] = if t < 2 { 0.1 } else { 7.0 };
         }
@@ -425,7 +427,7 @@ mod tests {
         let terms = vae(&weights.into(), &body, rows(&glides), rows(&stands), &posterior, &[5, 3]);
         assert!(terms.joint.is_none() && terms.feature.is_none());
         let found = terms.feet.expect("it has a weight").into_data().as_slice::<f32>().unwrap()[0];
-        // Of three axes one, smooth L1 of 2 is 1.5.
+        // One axis of three counts; smooth L1 of 2 is 1.5.
         assert!((found - 3.0 * 1.5 / 3.0).abs() < 1e-5, "{found}");
     }
 

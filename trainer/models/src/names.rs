@@ -1,4 +1,4 @@
-//! Safetensors under the published names: what is exported, imported and kept in artifacts.
+//! Safetensors under the published names, for export, import and artifacts.
 
 use std::collections::BTreeMap;
 use std::convert::Infallible;
@@ -10,32 +10,32 @@ use safetensors::tensor::{Dtype, Metadata, TensorInfo};
 
 use crate::flat::{Entry, layout, read, replace};
 
-/// Why weights do not fit a network.
+/// Weights do not fit a network.
 #[derive(Debug, thiserror::Error)]
 pub enum LoadError {
-    /// Not a safetensors file.
+    /// The bytes are not a safetensors file.
     #[error("not a readable safetensors file: {0}")]
     Unreadable(#[from] safetensors::SafeTensorError),
-    /// Other names or shapes than the network has.
+    /// Names or shapes differ from the network's.
     #[error("the weights do not fit the network; missing: [{}]; unused: [{}]", missing.join(", "), unused.join(", "))]
     Mismatch {
-        /// Names with shapes that the network has and the file has not.
+        /// Names with shapes that the network has and the file lacks.
         missing: Vec<String>,
-        /// Names with shapes that the file has and the network has not.
+        /// Names with shapes that the file has and the network lacks.
         unused: Vec<String>,
     },
 }
 
-/// Parameters as the safetensors file that they are kept as, in pieces that lie where they are: no second copy of large weights is made.
+/// Parameters as the pieces of their safetensors file. The pieces borrow the values: large weights are not copied.
 #[derive(Debug)]
 pub struct Weights<'a> {
     header: Vec<u8>,
-    /// In the order of the file.
+    /// Tensors in the order of the file.
     tensors: Vec<&'a [f32]>,
 }
 
 impl<'a> Weights<'a> {
-    /// Tensors named by `entries`, cut out of a flat buffer.
+    /// Names the tensors of a flat buffer by `entries`.
     ///
     /// # Panics
     /// As [`of`](Self::of).
@@ -43,8 +43,8 @@ impl<'a> Weights<'a> {
         Self::of(&[(entries, flat)])
     }
 
-    /// Tensors of several buffers, each with the entries that name its parts, in one file. The file is in the order and with the alignment of
-    /// the `safetensors` crate.
+    /// Names tensors of several buffers, each with the entries of its parts, for one file. The file has the order and
+    /// alignment of the `safetensors` crate.
     ///
     /// # Panics
     /// If a buffer has another length than its entries have elements, or two entries have one name.
@@ -74,13 +74,13 @@ impl<'a> Weights<'a> {
         Self { header, tensors: by_name.into_values().map(|(_, tensor)| tensor).collect() }
     }
 
-    /// The bytes of the file, one piece after the other.
+    /// Returns the bytes of the file, one piece after the other.
     pub fn pieces(&self) -> Vec<&[u8]> {
         std::iter::once(&self.header[..]).chain(self.tensors.iter().map(|tensor| cast_slice(tensor))).collect()
     }
 }
 
-/// Tensors named by `entries`, cut out of a flat buffer, as one file.
+/// Serialises the tensors that `entries` cuts from a flat buffer as one file.
 pub fn to_bytes(entries: &[Entry], flat: &[f32]) -> Vec<u8> {
     Weights::new(entries, flat).pieces().concat()
 }
@@ -89,12 +89,12 @@ pub fn to_bytes(entries: &[Entry], flat: &[f32]) -> Vec<u8> {
 #[derive(Debug)]
 struct Header {
     metadata: Metadata,
-    /// Where its tensors begin.
+    /// Offset of the first tensor's data in the file.
     data: u64,
 }
 
 impl Header {
-    /// Of a file of `bytes` bytes, of which `read` fills a buffer with those at an offset.
+    /// Reads the header of a file of `bytes` bytes; `read` fills a buffer with the bytes at an offset.
     fn read<E>(bytes: u64, read: &mut ReadAt<'_, E>) -> Result<Result<Self, LoadError>, E> {
         let unreadable = |e: SafeTensorError| Ok(Err(LoadError::Unreadable(e)));
         let mut length = [0; 8];
@@ -121,7 +121,7 @@ impl Header {
         Ok(Ok(Self { metadata, data: 8 + length }))
     }
 
-    /// Where the tensors of `entries` are in the file, whose names begin with `prefix` there.
+    /// Finds the offsets in the file of the tensors of `entries`, whose names there start with `prefix`.
     fn places(&self, entries: &[Entry], prefix: &str) -> Result<Vec<u64>, LoadError> {
         let mut unused: BTreeMap<String, &TensorInfo> = self.metadata.tensors().into_iter().collect();
         unused.retain(|name, _| name.starts_with(prefix));
@@ -146,19 +146,19 @@ impl Header {
     }
 }
 
-/// What of a file fitted a network.
+/// The tensors of a file that fit a network.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Fitted {
-    /// Values by tensor of the network, in its order; none of a tensor that the file has not, or has in another shape or type.
+    /// Values by tensor of the network, in its order; `None` if the file lacks the tensor or has another shape or type.
     pub values: Vec<Option<Vec<f32>>>,
-    /// Those without values: name and shape, and what the file has under the name.
+    /// Names and shapes of the tensors without values, and the file's shape under the same name.
     pub fresh: Vec<String>,
 }
 
-/// The tensors of a file that fit `entries` by name, behind `prefix`, and by shape. `read` is as in [`load_from`].
+/// Reads the tensors of a file that fit `entries` by name, after `prefix`, and by shape. `read` is as in [`load_from`].
 ///
 /// # Errors
-/// What `read` says; inside, that the file is not safetensors. That nothing fits is none.
+/// The error of `read`; the inner error if the file is not safetensors. A file in which nothing fits is no error.
 pub fn fitting<E>(
     entries: &[Entry],
     bytes: u64,
@@ -194,7 +194,7 @@ pub fn fitting<E>(
     Ok(Ok(fitted))
 }
 
-/// The names and shapes of a file's tensors. `read` is as in [`load_from`].
+/// Reads the names and shapes of a file's tensors. `read` is as in [`load_from`].
 ///
 /// # Errors
 /// As [`fitting`].
@@ -204,23 +204,23 @@ pub fn tensors<E>(bytes: u64, read: &mut ReadAt<'_, E>) -> Result<Result<Vec<Ent
     Ok(Header::read(bytes, read)?.map(entries))
 }
 
-/// The largest header that is read; that of a thousand tensors has a hundred kilobytes.
+/// The largest header that is read; the header of a thousand tensors has some hundred kilobytes.
 const HEADER_BYTES: u64 = 16 << 20;
 
-/// Fills a buffer with what begins at an offset of a file.
+/// Fills a buffer with the bytes at an offset of a file.
 pub type ReadAt<'a, E> = dyn FnMut(u64, &mut [u8]) -> Result<(), E> + 'a;
 
-/// Reads a file that is in memory.
+/// Adapts bytes in memory to [`ReadAt`].
 fn in_memory(bytes: &[u8]) -> impl FnMut(u64, &mut [u8]) -> Result<(), Infallible> {
     |offset, out| {
-        // The header was held against the length.
+        // The header was checked against the length.
         let from = usize::try_from(offset).unwrap_or(usize::MAX);
         out.copy_from_slice(&bytes[from..from + out.len()]);
         Ok(())
     }
 }
 
-/// A flat buffer in the order of `entries`, out of the tensors of `bytes` whose names start with `prefix`.
+/// Reads a flat buffer in the order of `entries` from the tensors of `bytes` whose names start with `prefix`.
 ///
 /// # Errors
 /// If the file is not safetensors, or its names or shapes are not those of `entries`.
@@ -246,12 +246,12 @@ fn read_values<E>(place: u64, values: &mut [f32], read: &mut ReadAt<'_, E>) -> R
     Ok(())
 }
 
-/// The module's parameters under their published names.
+/// Serialises the module's parameters under their published names.
 pub fn save<M: Module>(module: &M) -> Vec<u8> {
     to_bytes(&layout(module), &read(module))
 }
 
-/// The module with the parameters of `bytes` whose names start with `prefix`.
+/// Loads into the module the parameters of `bytes` whose names start with `prefix`.
 ///
 /// # Errors
 /// As [`from_bytes`].
@@ -260,10 +260,11 @@ pub fn load<M: Module>(module: M, bytes: &[u8], prefix: &str) -> Result<M, LoadE
     loaded
 }
 
-/// As [`load`], from a file of `bytes` bytes of which `read` fills a buffer with those at an offset, tensor by tensor.
+/// Loads like [`load`] from a file of `bytes` bytes, tensor by tensor; `read` fills a buffer with the bytes at an
+/// offset.
 ///
 /// # Errors
-/// What `read` says; inside, as [`from_bytes`].
+/// The error of `read`; the inner error as [`from_bytes`].
 pub fn load_from<M: Module, E>(
     module: M,
     bytes: u64,

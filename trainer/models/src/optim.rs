@@ -1,20 +1,20 @@
 //! AdamW, the moving average, clipping and the learning rate, on flat buffers (see [`crate::flat`]).
 //!
 //! Source: Loshchilov and Hutter, arXiv:1711.05101, in the arithmetic of PyTorch: decay first, `eps` added outside the
-//! bias-corrected root. Burn's optimizers are not used: their state depends on random parameter ids and they clip each
-//! tensor by itself.
+//! bias-corrected root. Burn's optimizers are not used: their state depends on random parameter ids, and they clip each
+//! tensor separately.
 //!
-//! Every element's result depends on that element alone, and sums run in one fixed order, so the bits do not depend on
-//! how many threads or workers there are.
+//! Every element's result depends on that element alone, and sums run in one fixed order. So the bits do not depend on
+//! the number of threads or workers.
 
 use protocol::stage::{Decay, Optimizer, Training};
 
-/// AdamW's constants.
+/// Constants of the AdamW optimizer.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdamW {
-    /// First moment's decay.
+    /// Decay of the first moment.
     pub beta1: f64,
-    /// Second moment's decay.
+    /// Decay of the second moment.
     pub beta2: f64,
     /// Added to the root of the second moment.
     pub eps: f64,
@@ -22,22 +22,22 @@ pub struct AdamW {
     pub weight_decay: f64,
 }
 
-/// What one update multiplies by.
+/// Factors of one update.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Rates {
-    /// The parameters: weight decay.
+    /// Factor of the parameters, the weight decay.
     pub(crate) keep: f32,
-    /// The first moment: the rate without its bias.
+    /// Factor of the first moment: the learning rate, bias-corrected.
     pub(crate) rate: f32,
-    /// The root of the second moment, against its bias.
+    /// Factor of the root of the second moment, its bias correction.
     pub(crate) unbias: f32,
-    /// What comes new into the first moment.
+    /// Factor of the gradient in the first moment.
     pub(crate) new1: f32,
-    /// What stays of the second moment.
+    /// Factor of the old second moment.
     pub(crate) beta2: f32,
-    /// What comes new into it.
+    /// Factor of the squared gradient in the second moment.
     pub(crate) new2: f32,
-    /// Added to the root.
+    /// Added to the root of the second moment.
     pub(crate) eps: f32,
 }
 
@@ -48,7 +48,7 @@ impl From<&Optimizer> for AdamW {
 }
 
 impl AdamW {
-    /// The constants of update number `t`, counted from 1, with rate `lr`.
+    /// Computes the factors of update number `t`, counted from 1, with learning rate `lr`.
     ///
     /// # Panics
     /// If `t` is 0.
@@ -66,7 +66,8 @@ impl AdamW {
         }
     }
 
-    /// Update number `t`, counted from 1, with rate `lr`, in one pass over the five buffers. `m` and `v` start at zero.
+    /// Makes update number `t`, counted from 1, with rate `lr`, in one pass over the buffers. `m` and `v` start at
+    /// zero.
     ///
     /// # Panics
     /// If the buffers differ in length, or `t` is 0.
@@ -82,7 +83,7 @@ impl AdamW {
     }
 }
 
-/// `target <- decay target + (1 - decay) source`.
+/// Moves the average: `target <- decay target + (1 - decay) source`.
 ///
 /// # Panics
 /// If the lengths differ.
@@ -94,7 +95,7 @@ pub fn ema(target: &mut [f32], source: &[f32], decay: f64) {
     }
 }
 
-/// L2 norm in f64. Eight running sums over every eighth element, added in order: fast, and the same bits everywhere.
+/// L2 norm in f64. Eight running sums over every eighth element are added in order: fast, and the same bits everywhere.
 pub fn global_norm(values: &[f32]) -> f64 {
     let mut sums = [0.0_f64; 8];
     let chunks = values.chunks_exact(8);
@@ -110,25 +111,25 @@ pub fn global_norm(values: &[f32]) -> f64 {
     sums.iter().sum::<f64>().sqrt()
 }
 
-/// What gradients of this norm are multiplied by so that it becomes at most `max`; 1 if it is below, or `max` is 0.
+/// The factor that scales gradients of this norm to at most `max`; 1 if the norm is below it, or `max` is 0.
 pub fn clip_factor(norm: f64, max: f64) -> f64 {
     if max == 0.0 { 1.0 } else { (max / (norm + 1e-6)).min(1.0) }
 }
 
-/// Updates of one step of [`Decay::Staircase`], and what the rate is multiplied by after it.
+/// Updates per step of [`Decay::Staircase`], and the rate's factor after each.
 const STAIR: u64 = 5_000;
 const STEP_DOWN: f64 = 0.9;
 
-/// The learning rate as a function of how many updates came before.
+/// The learning rate as a function of the number of updates made.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LrSchedule {
     /// Rate at the end of the warm-up.
     pub peak: f64,
-    /// Updates of linear warm-up, the first at rate 0.
+    /// Updates of linear warm-up; the first has rate 0.
     pub warmup: u64,
-    /// Updates in all; the cosine ends there.
+    /// Total number of updates; the cosine ends there.
     pub steps: u64,
-    /// What follows the warm-up.
+    /// The decay after the warm-up.
     pub decay: Decay,
 }
 
@@ -139,7 +140,7 @@ impl From<&Training> for LrSchedule {
 }
 
 impl LrSchedule {
-    /// Rate of the update after `done` updates.
+    /// The rate of the next update after `done` updates.
     pub fn at(&self, done: u64) -> f64 {
         if done < self.warmup {
             return self.peak * done as f64 / self.warmup as f64;
@@ -170,7 +171,7 @@ mod tests {
         let stairs = LrSchedule { decay: Decay::Staircase, ..constant };
         assert_eq!((stairs.at(0), stairs.at(4_999)), (2.0, 2.0));
         assert!((stairs.at(5_000) - 1.8).abs() < 1e-12 && (stairs.at(49_999) / 2.0 - 0.9_f64.powi(9)).abs() < 1e-12);
-        // A run shorter than its warm-up never leaves it.
+        // A run shorter than its warm-up stays in it.
         assert_eq!(LrSchedule { warmup: 10, steps: 5, ..rates }.at(4), 0.8);
     }
 

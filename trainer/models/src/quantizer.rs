@@ -1,11 +1,11 @@
-//! Codebooks: which code a row takes, and how codes follow the rows that take them.
+//! Codebooks: the assignment of rows to codes, and the updates of codes from their rows.
 //!
-//! Source: the exponential-moving-average quantiser with resets of T2M-GPT (Zhang et al., CVPR 2023; van den Oord et al., arXiv:1711.00937,
-//! appendix A.1), stacked on residuals by MoMask (Guo et al., CVPR 2024), with another reset rule in MMM (Pinyoanuntapong et al., CVPR 2024).
-//! Notation: N rows of width d, K codes.
+//! Source: the exponential-moving-average quantiser with resets of T2M-GPT (Zhang et al., CVPR 2023; van den Oord et
+//! al., arXiv:1711.00937, appendix A.1). MoMask (Guo et al., CVPR 2024) stacks it on residuals; MMM (Pinyoanuntapong et
+//! al., CVPR 2024) has another reset rule. Notation: N rows of width d, K codes.
 //!
-//! Codes are f32 buffers on the host: no optimizer changes them, and all that changes them is a sum over the rows of a batch, so that a batch
-//! may be cut in slices. Draws are arguments.
+//! Codes are f32 buffers on the host that no optimizer changes. Every update is computed from sums over the rows of a
+//! batch, so a batch may be cut into slices. Draws are arguments.
 //!
 //! Departs: scores leave out the rows' own norms, which are the same for every code.
 
@@ -13,29 +13,29 @@ use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::kernels;
 
-/// What is kept of a codebook's statistics in each update.
+/// Decay of a codebook's running statistics in each update.
 pub const MU: f64 = 0.99;
 /// Temperature of drawn codes, fixed in MoMask's training pass.
 pub const TEMPERATURE: f32 = 0.5;
-/// The id that stands for no code: it adds the zero vector.
+/// The id of "no code": it adds the zero vector.
 pub const NO_CODE: i64 = -1;
-/// Updates of MMM's quantiser from one look at unused codes to the next.
+/// Updates of MMM's quantiser between two checks for unused codes.
 const LOOK_EVERY: f32 = 20.0;
 
-/// Fills draws for one row: layer, row, and a uniform number in [0, 1) for each code.
+/// Fills the draws of one row: layer, row, and one uniform number in [0, 1) per code.
 pub type Uniforms<'a> = &'a mut dyn FnMut(usize, usize, &mut [f32]);
 
-/// The same of one layer: row, and a number for each code.
+/// Fills the draws of one row of one layer: row, and one uniform number per code.
 pub type LayerUniforms<'a> = &'a mut dyn FnMut(usize, &mut [f32]);
 
-/// `-log(-log(u))`, with both arguments at least 1e-20.
+/// The Gumbel variable `-log(-log(u))`, with both arguments at least 1e-20.
 pub fn gumbel(uniform: f32) -> f32 {
     const LEAST: f32 = 1e-20;
     -((-(uniform.max(LEAST).ln())).max(LEAST).ln())
 }
 
-/// The code of each of `rows` [N, d] in `codes` [K, d]: the nearest, or with `uniforms` the largest of `-distance / 0.5 + gumbel`, the
-/// distance squared. The first of several that are equal.
+/// The code of each of `rows` [N, d] in `codes` [K, d]: the nearest one. With `uniforms` it is the largest of
+/// `-distance / 0.5 + gumbel`, the distance squared. Ties go to the first.
 ///
 /// # Panics
 /// If there are no codes.
@@ -66,7 +66,7 @@ pub fn assign(
     products.chunks_exact(k).enumerate().map(code).collect()
 }
 
-/// Where the largest value is first; 0 if there is none.
+/// The index of the first largest value; 0 if there are no values.
 pub fn first_largest(values: impl Iterator<Item = f32>) -> usize {
     let mut best = (0, f32::NEG_INFINITY);
     for (i, value) in values.enumerate() {
@@ -77,17 +77,17 @@ pub fn first_largest(values: impl Iterator<Item = f32>) -> usize {
     best.0
 }
 
-/// What one layer did with the rows.
+/// The input and result of one layer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LayerPass {
-    /// Rows that the layer saw, [N, d]: what the layers before it left over.
+    /// Rows that the layer quantises, [N, d]: the residuals of the layers before it.
     pub rows: Vec<f32>,
     /// Code of each row.
     pub codes: Vec<usize>,
 }
 
 impl LayerPass {
-    /// For each of `count` codes how many rows took it, and their sum [K, d].
+    /// The number of rows of each of `count` codes, and their sum [K, d].
     pub fn statistics(&self, count: usize, width: usize) -> (Vec<f32>, Vec<f32>) {
         let (mut counts, mut sums) = (vec![0.0; count], vec![0.0; count * width]);
         for (row, code) in self.rows.chunks_exact(width).zip(&self.codes) {
@@ -98,18 +98,18 @@ impl LayerPass {
     }
 }
 
-/// Rows through a stack of codebooks, each of which quantises what those before it left over.
+/// Quantisation of rows by a stack of codebooks, each of which quantises the residuals of those before it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Pass {
-    /// The layers that took part.
+    /// The active layers, in order.
     pub layers: Vec<LayerPass>,
-    /// Sum of the codes taken, [N, d].
+    /// Sum of the assigned codes, [N, d].
     pub sum: Vec<f32>,
     width: usize,
 }
 
 impl Pass {
-    /// Quantises `rows` [N, d] by the first `active` of the layers. `codebook` gives a layer's codes [K, d] for the rows that it sees.
+    /// Quantises `rows` [N, d] by the first `active` layers. `codebook` returns a layer's codes [K, d] for its rows.
     pub fn through<'a>(
         rows: Vec<f32>,
         width: usize,
@@ -143,30 +143,30 @@ impl Pass {
         Self { layers, sum, width }
     }
 
-    /// The quantised rows as the decoder gets them, [N, d], and the commitment: squared distances of each active layer's rows to their
-    /// codes, summed over rows and width, and over layers.
+    /// The quantised rows as the decoder receives them, [N, d], and the commitment loss. The loss is the squared
+    /// distance of each active layer's rows to their codes, summed over rows, width and layers.
     ///
-    /// `rows` are those of [`through`](Self::through), tracked. The gradient of the quantised rows reaches them once for every active layer,
-    /// as each of upstream's layers passes it straight through.
+    /// `rows` are those of [`through`](Self::through), tracked. The gradient of the quantised rows reaches them once
+    /// for every active layer, because each of upstream's layers passes it straight through.
     pub fn straight_through(&self, rows_nd: Tensor<2>) -> (Tensor<2>, Tensor<1>) {
         let dims = rows_nd.dims();
         let device = rows_nd.device();
         let constant = |values: Vec<f32>| Tensor::<2>::from_data(TensorData::new(values, dims), &device);
         let passed = rows_nd.clone() * self.layers.len() as f32;
         let quantised = passed.clone() - passed.detach() + constant(self.sum.clone());
-        // What a layer saw less its code is what the next one saw.
+        // The residual of a layer is the input of the next.
         let after = self.layers.iter().skip(1).map(|layer| layer.rows.clone());
         let whole = &self.layers[0].rows;
         let last = whole.iter().zip(&self.sum).map(|(row, sum)| row - sum).collect();
         let commitment = after.chain([last]).map(|left| {
-            // Of the tracked rows everything up to this layer's code is taken off.
+            // Everything up to this layer's code is subtracted from the tracked rows.
             let taken = whole.iter().zip(&left).map(|(row, left)| row - left).collect();
             (rows_nd.clone() - constant(taken)).square().sum()
         });
         (quantised, commitment.reduce(|a, b| a + b).expect("a layer is active"))
     }
 
-    /// Ids by row and layer, [N, layers], [`NO_CODE`] for the layers that took no part.
+    /// Ids by row and layer, [N, layers], with [`NO_CODE`] for inactive layers.
     pub fn ids(&self, layers: usize) -> Vec<i64> {
         let rows = self.sum.len() / self.width;
         let id = |row: usize, layer: usize| self.layers.get(layer).map_or(NO_CODE, |pass| pass.codes[row] as i64);
@@ -174,7 +174,7 @@ impl Pass {
     }
 }
 
-/// Sums of codes [N, d] for ids [N, layers]; [`NO_CODE`] and layers that `ids` leaves out add nothing.
+/// Sums of codes [N, d] for ids [N, layers]; [`NO_CODE`] and layers missing from `ids` add nothing.
 ///
 /// # Panics
 /// If an id is neither a code nor [`NO_CODE`].
@@ -189,7 +189,7 @@ pub fn look_up(ids: &[i64], layers: usize, books: &[Vec<f32>], width: usize) -> 
     out
 }
 
-/// How many codes are in use, in effect: `exp(-sum p log(p + 1e-7))` of their shares.
+/// The effective number of codes in use: `exp(-sum p log(p + 1e-7))` of their shares.
 pub fn perplexity(counts: &[f32]) -> f64 {
     let all: f64 = counts.iter().map(|c| f64::from(*c)).sum();
     let entropy = |count: &f32| {
@@ -199,13 +199,14 @@ pub fn perplexity(counts: &[f32]) -> f64 {
     (-counts.iter().map(entropy).sum::<f64>()).exp()
 }
 
-/// Deviation of the noise on repeated rows.
+/// Standard deviation of the noise on repeated rows.
 fn spread(width: usize) -> f32 {
     (0.01 / (width as f64).sqrt()) as f32
 }
 
-/// Rows to be codes: the first `count` of `rows` [N, d]. Where there are fewer they are repeated, and `noise` (standard normal, as many
-/// values as the repeated rows have, see [`noise_len`]) times `0.01 / sqrt(d)` is added to all of them.
+/// Candidates for new codes: the first `count` of `rows` [N, d]. Fewer rows are repeated, and `0.01 / sqrt(d)` times
+/// `noise` is added to all of them. `noise` is standard normal, one value per element of the repeated rows (see
+/// [`noise_len`]).
 pub fn candidates(rows: &[f32], count: usize, width: usize, noise: impl FnOnce(usize) -> Vec<f32>) -> Vec<f32> {
     let wanted = count * width;
     match noise_len(rows.len(), wanted) {
@@ -217,12 +218,12 @@ pub fn candidates(rows: &[f32], count: usize, width: usize, noise: impl FnOnce(u
     }
 }
 
-/// How many values of noise [`candidates`] takes for so many values of rows and of codes.
+/// The number of noise values that [`candidates`] needs for `rows` values of rows and `wanted` values of codes.
 pub fn noise_len(rows: usize, wanted: usize) -> usize {
     if rows >= wanted { 0 } else { rows * wanted.div_ceil(rows.max(1)) }
 }
 
-/// One codebook and what its codes follow.
+/// One codebook and its running statistics.
 #[derive(Debug)]
 pub struct Book<'a> {
     /// Codes, [K, d].
@@ -234,14 +235,14 @@ pub struct Book<'a> {
 }
 
 impl Book<'_> {
-    /// The first codes: sums equal to them, counts 1.
+    /// Sets the initial codes, with sums equal to them and counts of 1.
     pub fn start(&mut self, codes: &[f32]) {
         self.codes.copy_from_slice(codes);
         self.sums.copy_from_slice(codes);
         self.counts.fill(1.0);
     }
 
-    /// Sums and counts follow those of a batch.
+    /// Updates running sums and counts with those of a batch.
     fn follow(&mut self, sums: &[f32], counts: &[f32]) {
         let (keep, take) = (MU as f32, (1.0 - MU) as f32);
         // Two roundings: a count of one row in the first update must stay exactly 1.
@@ -252,9 +253,11 @@ impl Book<'_> {
         follow(self.counts, counts);
     }
 
-    /// Sets codes for which `stays` to sum over count, the others to their row of `replacements`; gives how many of those there were.
+    /// Sets codes for which `stays` to sum over count, and the others to their row of `replacements`. Returns the
+    /// number of replaced codes.
     ///
-    /// Counts below the smallest normal number are of codes that nobody has taken for some thousand steps: such a code keeps its value.
+    /// A count below the smallest normal number means that no row used the code for thousands of steps; it keeps its
+    /// value.
     fn set(&mut self, replacements: Option<&[f32]>, stays: impl Fn(usize, f32) -> bool) -> usize {
         let width = self.codes.len() / self.counts.len();
         let mut replaced = 0;
@@ -273,15 +276,16 @@ impl Book<'_> {
         replaced
     }
 
-    /// One update of T2M-GPT and MoMask: codes with a running count of at least 1 move to their mean, all others become their row of
-    /// `replacements` [K, d], in every update until their count has grown. Gives how many did.
+    /// Makes one update of T2M-GPT and MoMask: codes with a running count of at least 1 move to their mean. All others
+    /// are set to their row of `replacements` [K, d], in every update until their count has grown. Returns the number
+    /// of replaced codes.
     pub fn update(&mut self, sums: &[f32], counts: &[f32], replacements: &[f32]) -> usize {
         self.follow(sums, counts);
         self.set(Some(replacements), |_, count| count >= 1.0)
     }
 
-    /// One update of MMM: all codes move to their means, but for every 21st update, which replaces those whose count is below 1 and that
-    /// `used` does not remember. `since` counts updates since the last such; both start as zeros.
+    /// Makes one update of MMM: all codes move to their means. Every 21st update instead replaces codes that were not
+    /// in use (`used`) since their start. `since` counts updates since the last such update. Both start as zeros.
     pub fn update_remembering(
         &mut self,
         sums: &[f32],

@@ -1,8 +1,8 @@
-//! Parameters, moments and average of one optimizer on an accelerator, where they stay from step to step.
+//! Parameters, moments and average of one optimizer, kept on an accelerator from step to step.
 //!
-//! The arithmetic is [`AdamW`]'s, an operation of Burn for each line of its loop. An accelerator's division and root need not round
-//! as a CPU's do, and its compiler may contract a product and a sum, so the last bits differ from the loop's; on one device
-//! they are the same each time.
+//! The arithmetic is that of [`AdamW`], one Burn operation for each line of its loop. An accelerator may round
+//! divisions and roots differently from a CPU, and its compiler may fuse a product and a sum. So the last bits differ
+//! from the loop's; on one device they are the same each time.
 
 use burn::tensor::{Device, Tensor, TensorData};
 
@@ -17,14 +17,13 @@ pub struct Resident {
     average: Option<Tensor<1>>,
 }
 
-/// The same on the host. Moments may be empty, of parameters that nobody trains.
+/// The same buffers on the host. Moments may be empty for parameters that are not trained.
 #[derive(Debug)]
 pub struct Host<'a> {
-    /// Parameters.
     pub params: &'a mut [f32],
-    /// First moments.
+    /// First moments of the parameters.
     pub m: &'a mut [f32],
-    /// Second moments.
+    /// Second moments of the parameters.
     pub v: &'a mut [f32],
     /// Moving average of the parameters, if one is kept.
     pub average: Option<&'a mut [f32]>,
@@ -40,10 +39,10 @@ fn fetch(from: &Tensor<1>, to: &mut [f32]) {
 }
 
 impl Resident {
-    /// Sends everything to `device`.
+    /// Copies everything to `device`.
     pub fn send(host: &Host<'_>, device: &Device) -> Self {
         let device = &device.clone().inner();
-        // No device keeps a tensor without elements: parameters that nobody trains have one moment that nobody reads.
+        // A device keeps no tensor without elements, so missing moments are one unused element.
         let moments =
             |values: &[f32]| if values.is_empty() { Tensor::zeros([1], device) } else { send(values, device) };
         Self {
@@ -57,7 +56,7 @@ impl Resident {
     /// Copies everything to the host.
     ///
     /// # Panics
-    /// If its buffers are not as long as those that were sent.
+    /// If a buffer has another length than the one sent.
     pub fn fetch(&self, host: Host<'_>) {
         fetch(&self.params, host.params);
         if !host.m.is_empty() {
@@ -69,17 +68,17 @@ impl Resident {
         }
     }
 
-    /// The parameters.
+    /// The current parameters [N].
     pub fn params(&self) -> &Tensor<1> {
         &self.params
     }
 
-    /// Their moving average, if one is kept.
+    /// The moving average of the parameters, if one is kept.
     pub fn average(&self) -> Option<&Tensor<1>> {
         self.average.as_ref()
     }
 
-    /// Update number `t`, counted from 1, with rate `lr` and `factor` times the gradient, as [`AdamW::step`].
+    /// Makes update number `t`, counted from 1, with rate `lr` and `factor` times the gradient, as [`AdamW::step`].
     ///
     /// # Panics
     /// If the gradient has another length than the parameters, or `t` is 0.

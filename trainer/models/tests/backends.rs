@@ -1,5 +1,6 @@
-//! One training step of the VAE and of the denoiser on another backend, whose kernels are composed of Burn's operations, agrees
-//! with the same step on flex and its fused kernels: loss, gradients, and the weights after it. `ndarray` is in every test build.
+//! One training step of the VAE and of the denoiser on another backend agrees with the same step on flex: loss,
+//! gradients, and updated weights. The other backend's kernels are composed of Burn's operations, flex has fused ones.
+//! `ndarray` is in every test build.
 #![cfg(all(feature = "flex", any(feature = "ndarray", feature = "wgpu", feature = "cuda")))]
 
 use burn::module::Module;
@@ -55,7 +56,7 @@ fn vae(device: &Device) -> Step {
     let features = wave([3, frames, skeleton.features], 0.37, device);
     let body = Body::new(skeleton, &vec![0.0; skeleton.features], &vec![0.1; skeleton.features], device);
 
-    // Dropout is on: its mask must be the same everywhere.
+    // Dropout is on: its mask must be the same on both backends.
     let mut dropout = Dropout::new(0.1, 5, 1, 0);
     let posterior = vae.encode(features.clone(), &lengths, &mut dropout);
     let decoded = vae.decode(posterior.sample(wave([3, 2, 8], 0.71, device)), &lengths, frames, &mut dropout);
@@ -110,7 +111,7 @@ fn agrees(backend: Backend) {
     }
 }
 
-/// A tape anywhere among a kernel's arguments is kept, also if it is the last of them alone that has one.
+/// A kernel keeps a tape on any of its arguments, also if only the last one has it.
 #[test]
 fn a_lone_bias_gets_its_gradient() {
     let flex = device::open(Backend::Flex, 0).expect("flex is built in");

@@ -1,7 +1,7 @@
 //! Transformer blocks, GRUs, convolutions and the small evaluators against PyTorch's layers (golden `nn`).
 //!
-//! Only layers that the published networks have: norm after the residual, exact GELU, one layer of GRU. The others are named and
-//! skipped, and so are causal masks.
+//! Only layers of the published networks are checked: norm after the residual, exact GELU, one layer of GRU. The others
+//! are named and skipped, and so are causal masks.
 
 mod common;
 
@@ -47,7 +47,7 @@ fn golden_nn() {
         }
         seen += 1;
         let (io, mut gates) = (Arrays::read(&file), Gates::default());
-        // On the tape and off it, the kernels take different ways.
+        // The kernels have separate paths with and without a tape.
         for device in [Device::flex(), Device::flex().autodiff()] {
             let block = block(&weights, heads(&info[layer]), decoder, &device);
             let check = if decoder { check_decoder } else { check_encoder };
@@ -58,14 +58,14 @@ fn golden_nn() {
     assert!(seen > 0, "no layer that exists here is stored");
 }
 
-/// Heads of a layer: as its description says, four where it says nothing.
+/// Heads of a layer by its description, or four if the description has none.
 fn heads(description: &Value) -> usize {
     let stated = description.as_str().and_then(|text| text.split("nhead=").nth(1));
     let digits = |text: &str| text.chars().take_while(char::is_ascii_digit).collect::<String>();
     stated.map_or(4, |text| digits(text).parse().expect("a number of heads"))
 }
 
-/// A block of the stored weights' sizes.
+/// A block with the sizes of the stored weights.
 fn block(weights: &Path, heads: usize, memory: bool, device: &Device) -> Block {
     let bytes = std::fs::read(weights).expect("readable weights");
     let linear1 = Arrays::read(weights).get("linear1.weight").shape.clone();
@@ -94,7 +94,7 @@ fn check_encoder(block: &Block, io: &Arrays, device: &Device, gates: &mut Gates)
     gates.tensor("encoder", "y_padded", block.forward(x, None, Some(&mask), off), io.get("y_padded"), GATE);
 }
 
-/// Memories are never padded here; each sequence sees its own, cut to its length.
+/// Memories are never padded; each sequence sees its own, cut to its length.
 fn check_decoder(block: &Block, io: &Arrays, device: &Device, gates: &mut Gates) {
     let (tgt, memory, y) = (io.get("tgt"), io.get("memory"), io.get("y"));
     for (b, keys) in lengths(io.get("mem_pad_mask")).into_iter().enumerate() {
@@ -128,7 +128,7 @@ fn loaded<M: burn::module::Module>(module: M, stored: &Arrays) -> M {
     names::load(module, &std::fs::read(&stored.file).expect("readable weights"), "").expect("weights that fit")
 }
 
-/// Sizes out of stored shapes; those that a layer does not have are 1.
+/// Sizes from stored shapes; sizes that a layer does not have are 1.
 fn sizes(stored: &Arrays) -> EvaluatorConfig {
     let dim = |name: &str, axis: usize| stored.find(name).map_or(1, |a| a.shape[axis]);
     EvaluatorConfig {
@@ -161,7 +161,7 @@ fn check_text(io: &Arrays, stored: &Arrays, device: &Device, gates: &mut Gates) 
     gates.tensor("text", "y", network.forward(words, classes, &io.get("cap_lens").usizes()), io.get("y"), GATE);
 }
 
-/// All lengths equal, and ragged: a stored state behind a sequence's end is zero, ours is not looked at.
+/// Checks equal and ragged lengths. Past a sequence's end the stored state is zero and ours is ignored.
 fn check_gru(io: &Arrays, stored: &Arrays, device: &Device, gates: &mut Gates) {
     let rows = stored.get("weight_ih_l0").shape.clone();
     let width = rows[0] / 3;
@@ -187,7 +187,7 @@ fn check_gru(io: &Arrays, stored: &Arrays, device: &Device, gates: &mut Gates) {
     }
 }
 
-/// Both convolutions; what stands between and behind them is computed here, in f64.
+/// Checks both convolutions; the layers between and after them are computed here in f64.
 fn check_convolutions(io: &Arrays, stored: &Arrays, device: &Device, gates: &mut Gates) {
     use models::networks::Conv;
     let x = io.get("x").tensor::<3>(device).swap_dims(1, 2);

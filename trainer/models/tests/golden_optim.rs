@@ -17,17 +17,17 @@ fn singles(value: &Value) -> Vec<f32> {
     numbers(value).into_iter().map(|v| v as f32).collect()
 }
 
-/// What a trajectory's name says: optimizer, schedule if it is ours, clip. The file stores neither weight decay nor
-/// second beta; 0.01 and 0.99 (plain Adam: 0 and 0.999) are the only round values that reproduce the weights to 1e-6.
+/// Settings in a trajectory's name: optimizer, schedule if it is ours, clip. The file stores neither weight decay nor
+/// second beta. 0.01 and 0.99 (plain Adam: 0 and 0.999) are the only round values that reproduce the weights to 1e-6.
 fn setting(name: &str, stored: &[f64]) -> (AdamW, Option<LrSchedule>, f64) {
     let adamw = AdamW { beta1: 0.9, beta2: 0.99, eps: 1e-8, weight_decay: 0.01 };
     let ours = |warmup, decay| Some(LrSchedule { peak: 0.01, warmup, steps: stored.len() as u64, decay });
     match name {
-        // Ends at a hundredth of the peak, which no recipe here does: the stored rates are used.
+        // Ends at a hundredth of the peak, unlike any recipe here: the stored rates are used.
         "adamw_cosine_annealing_T60_ema099" => (adamw, None, 0.0),
         "adamw_hf_cosine_warmup10_60_ema099" => (adamw, ours(10, Decay::Cosine), 0.0),
         "adamw_constant_clip0.5" => (adamw, ours(0, Decay::Constant), 0.5),
-        // Steps down twice: likewise.
+        // Steps down twice: the stored rates are used as well.
         "adam_multistep_20_40_g0.1" => (AdamW { beta2: 0.999, weight_decay: 0.0, ..adamw }, None, 0.0),
         other => panic!("trajectory `{other}`: what optimizer is this?"),
     }

@@ -65,7 +65,7 @@ fn golden_schedulers() {
     gates.close("golden/schedulers");
 }
 
-/// The published schedule of a network that predicts this.
+/// The published schedule for a network with this prediction.
 fn predicting(prediction: Prediction) -> Schedule {
     Schedule::new(&Diffusion { prediction, ..Diffusion::default() }, TIMESTEPS)
 }
@@ -89,7 +89,7 @@ fn ddim(word: &str, schedule: &Schedule, info: &serde_json::Value, steps: &Array
     }
 }
 
-/// Every `lcm_*` entry: the timesteps by our rules, then each step from the stored latent before it.
+/// Checks every `lcm_*` entry: the timesteps by our rules, then each step from the stored latent before it.
 fn lcm(info: &serde_json::Value, steps: &Arrays, gates: &mut Gates) {
     use models::diffusion::{Grid, LcmTimesteps, lcm_timesteps};
     let (device, schedule) = (common::device(), Schedule::published());

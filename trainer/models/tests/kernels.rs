@@ -21,7 +21,7 @@ fn values<const D: usize>(x: Tensor<D>) -> Vec<f32> {
     x.into_data().as_slice::<f32>().expect("f32").to_vec()
 }
 
-/// `out` against fixed weights, as a loss whose gradient reaches every element differently.
+/// A loss of `out` with fixed weights, whose gradient differs for every element.
 fn weighted<const D: usize>(out: Tensor<D>) -> Tensor<1> {
     let weights = tensor(out.dims(), 5, &out.device().inner());
     (out * weights).sum()
@@ -136,7 +136,7 @@ fn norms_are_the_stock_norms() {
                 };
                 let gradients = weighted(out.clone()).backward();
                 let mut all = vec![values(out)];
-                // Of a single column nothing but rounding errors reaches the input.
+                // With a single column the input's gradient is only rounding error.
                 if width > 1 {
                     all.push(values(x.grad(&gradients).unwrap()));
                     all.extend(residual.then(|| values(y.grad(&gradients).unwrap())));
@@ -183,7 +183,7 @@ fn padding_reaches_nothing() {
         x[3 * 24..6 * 24].fill(junk);
         let x = Tensor::<3>::from_data(TensorData::new(x, [2, 6, 24]), &Device::flex().autodiff()).require_grad();
         let y = kernels::self_attention(x.clone(), 2, Some(&mask), &mut Dropout::off());
-        // Rows of padding are no one's business; the loss leaves them out.
+        // Rows of padding are undefined; the loss leaves them out.
         let live = Tensor::cat(vec![y.clone().slice([0..1, 0..3, 0..8]), y.slice([1..2, 0..3, 0..8])], 0);
         let gradients = weighted(live.clone()).backward();
         (values(live), values(x.grad(&gradients).unwrap())[3 * 24..6 * 24].to_vec())
@@ -248,7 +248,7 @@ fn values_do_not_depend_on_the_tape() {
 
 #[test]
 fn constants_take_no_part() {
-    // A frozen network under a tape: its parameters get no gradient, what flows through them does.
+    // A frozen network under a tape: its parameters get no gradient, but its inputs do.
     let x = leaf([1, 4, 6], 1);
     let weight = tensor([6, 6], 2, &Device::flex());
     let y = kernels::linear(x.clone(), weight, None);

@@ -1,4 +1,4 @@
-//! Published tensor names, pinned: a renamed field is a file that nobody can read any more. And published sizes.
+//! Published tensor names and sizes, pinned: a renamed field would make published files unreadable.
 
 use std::collections::BTreeMap;
 
@@ -231,7 +231,7 @@ fn weights_that_do_not_fit_are_listed_from_both_sides() {
     let LoadError::Mismatch { missing, unused } = load(student, &save(&teacher), "").unwrap_err() else { panic!() };
     assert_eq!((missing, unused), (vec!["time_embedding.cond_proj.weight [10, 14]".to_owned()], vec![]));
 
-    // Another size: the name stands on both sides, with both shapes.
+    // Another size: the name appears on both sides, with both shapes.
     let mut entries = layout(&teacher);
     entries[0].shape = vec![4, 8];
     let other = to_bytes(&entries, &models::flat::read(&teacher));
@@ -242,7 +242,7 @@ fn weights_that_do_not_fit_are_listed_from_both_sides() {
     assert!(matches!(load(teacher, b"not weights", ""), Err(LoadError::Unreadable(_))));
 }
 
-/// The file is the `safetensors` crate's, and what is large in it is not copied.
+/// The file equals that of the `safetensors` crate, and its large parts are not copied.
 #[test]
 fn weights_are_written_from_where_they_lie() {
     let network = with(|init| Denoiser::new(&small_denoiser(None), init));
@@ -298,7 +298,7 @@ fn weights_are_read_tensor_by_tensor() {
     assert_eq!((broken.unwrap_err().as_str(), reads), ("the line is cut", 5));
 }
 
-/// In the place of the old ones, which need not be there any more.
+/// The values replace the old ones, which may already be gone.
 #[test]
 fn parameters_are_assigned_in_place() {
     for device in [Device::flex(), Device::flex().autodiff()] {

@@ -1,4 +1,4 @@
-//! What must hold of the networks whatever their weights are.
+//! Properties of the networks that hold for any weights.
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -140,7 +140,7 @@ fn a_fresh_student_ignores_its_guidance() {
     let student = Denoiser::new(&denoiser_config(Some(8)), &mut draws(&device));
     let (z, text) = (wave([2, 3, 6], 1, &device), wave([2, 1, 10], 2, &device));
     let off = &mut Dropout::off();
-    // The projection starts at zero and draws nothing, so both hold the same weights.
+    // The projection is initialised to zero and draws nothing, so both hold the same weights.
     let expected = host(teacher.forward(z.clone(), &[20, 900], text.clone(), None, off));
     for w in [0.0, 6.5, 14.0] {
         let w = guidance_embedding(&[w, w], 8, &device);

@@ -36,7 +36,7 @@ fn phases(grid: &Grid, count: usize, io: &Arrays, expected: &serde_json::Value, 
     assert_eq!(phases.edges, stored("edge_grid_index").usizes());
     let times: Vec<usize> = (0..count).map(|m| phases.edge_time(m)).collect();
     assert_eq!(times, stored("edge_timestep").usizes());
-    // The image repository blends with factors that, by construction, choose between point and network.
+    // The image repository blends with factors that always select either the point or the network.
     for i in 0..grid.steps {
         assert_eq!(stored("c_skip_online").values[i], 0.0, "the online network is never at an edge");
         assert_eq!(stored("c_out_online").values[i], 1.0);
@@ -68,7 +68,7 @@ fn phases(grid: &Grid, count: usize, io: &Arrays, expected: &serde_json::Value, 
     let (a, e) = jumps(&start, &prev);
     let z_prev = affine(z_t, guided, &a, &e);
     gates.tensor("solver", what("z_prev"), z_prev.clone(), stored("z_prev_f64"), GATE);
-    // At an edge prev is the end already, and the jump is the identity.
+    // At an edge prev is already the end, and the jump is the identity.
     let (a, e) = jumps(&prev, &end);
     let target = affine(z_prev, load("target_eps"), &a, &e);
     gates.tensor("target", what("target"), target.clone(), stored("target_f64"), GATE);
@@ -103,7 +103,7 @@ fn hinge(io: &Arrays, expected: &serde_json::Value, gates: &mut Gates) {
     gates.check("hinge", "g", relative(g, expected["hinge/g_loss"].as_f64().expect("a loss")), 1e-5);
 }
 
-/// Scores [B, ...] as [B, N, 1].
+/// Converts scores [B, ...] to [B, N, 1].
 fn scores(array: &common::Array, device: &Device) -> Tensor<3> {
     let flat = common::Array { shape: vec![array.shape[0], array.values.len() / array.shape[0], 1], ..array.clone() };
     flat.tensor(device)

@@ -7,25 +7,25 @@ use burn::tensor::Tensor;
 
 use super::{Schedule, TIMESTEPS, affine_one};
 
-/// Data deviation in the boundary condition.
+/// Standard deviation of the data in the boundary condition.
 const SIGMA_DATA: f64 = 0.5;
-/// Timesteps are stretched by this in the boundary condition.
+/// Factor on timesteps in the boundary condition.
 const TIMESTEP_SCALING: f64 = 10.0;
 
-/// The teacher's solver grid: `steps = 1000 / skip` timesteps `skip` apart, the last of which is 999.
+/// The teacher's solver grid: `steps = 1000 / skip` timesteps, `skip` apart; the last is 999.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Grid {
-    /// S, points of the grid.
+    /// S, the number of grid points.
     pub steps: usize,
-    /// k, timesteps between neighbours.
+    /// k, the timesteps between neighbours.
     pub skip: usize,
 }
 
 impl Grid {
-    /// The grid with stride `skip`: 20 in MotionLCM v1, 100 in v2 and MotionPCM.
+    /// Creates the grid with stride `skip`: 20 in MotionLCM v1, 100 in v2 and MotionPCM.
     ///
     /// # Panics
-    /// If `skip` is not a divisor of 1000; a caller that has it from a user checks that first.
+    /// If `skip` is not a divisor of 1000. A caller that takes it from a user checks it first.
     pub fn new(skip: usize) -> Self {
         assert!(skip > 0 && TIMESTEPS.is_multiple_of(skip), "the solver's skip must divide 1000, not {skip}");
         Self { steps: TIMESTEPS / skip, skip }
@@ -36,7 +36,7 @@ impl Grid {
         (i + 1) * self.skip - 1
     }
 
-    /// Where one solver step from grid point i lands: `tau_{i-1}`, and 0 from i = 0.
+    /// The timestep after one solver step from grid point i: `tau_{i-1}`, or 0 from i = 0.
     pub fn prev(&self, i: usize) -> usize {
         i * self.skip - usize::from(i > 0)
     }
@@ -56,7 +56,7 @@ pub fn consistency(schedule: &Schedule, t: usize) -> (f64, f64) {
     (skip + out * a, out * e)
 }
 
-/// Which timesteps the multi-step sampler visits.
+/// Rule for the timesteps of the multi-step sampler.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LcmTimesteps {
     /// v1: grid points spread evenly from 999 downwards.
@@ -83,10 +83,11 @@ pub fn lcm_timesteps(rule: LcmTimesteps, steps: usize) -> Vec<usize> {
     }
 }
 
-/// Denoises `z` [B, N, d] in `timesteps.len()` calls of `out`, the network's output, adding `step_noise[j]` after every call but the last.
+/// Denoises `z` [B, N, d] in `timesteps.len()` calls of `out`, the network's output. Adds `step_noise[j]` after every
+/// call but the last.
 ///
 /// # Panics
-/// If there is not one noise tensor for each step but the last.
+/// If the number of noise tensors is not the number of steps minus one.
 pub fn lcm_sample(
     schedule: &Schedule,
     timesteps: &[usize],

@@ -1,14 +1,14 @@
-//! DDIM with classifier-free guidance: the teacher's sampler.
+//! DDIM with classifier-free guidance, the teacher's sampler.
 //!
 //! Source: Song, Meng, Ermon, arXiv:2010.02502, eq. 12 with eta = 0. Timesteps have "leading" spacing with offset 1
-//! (981, 961, ..., 1 for 50 steps), and the last move lands on `ab_0`, not on 1, as MLD has it.
+//! (981, 961, ..., 1 for 50 steps). As in MLD, the last move ends at `ab_0` and not at 1.
 
 use burn::tensor::Tensor;
 
 pub use super::timesteps::{ddim_previous, ddim_timesteps};
 use super::{Schedule, affine_one};
 
-/// Moves `z` [B, N, d] from pure noise to a clean latent in `steps` calls of `out`. Along a flow these are Euler's steps.
+/// Moves `z` [B, N, d] from pure noise to a clean latent in `steps` calls of `out`. For a flow these are Euler steps.
 ///
 /// `out(z, t)` is the network's output, already guided.
 pub fn ddim_sample(
@@ -24,7 +24,7 @@ pub fn ddim_sample(
     z
 }
 
-/// Timesteps with "leading" spacing and no offset, noisiest first: 900, 800, ..., 0 for 10 of 1000. As StableMoFusion has it.
+/// Timesteps with "leading" spacing and no offset, noisiest first: 900, 800, ..., 0 for 10 of 1000 (StableMoFusion).
 ///
 /// # Panics
 /// If `steps` is not in `1..=schedule.steps()`.
@@ -34,7 +34,8 @@ pub fn leading_timesteps(schedule: &Schedule, steps: usize) -> Vec<usize> {
     (0..steps).rev().map(|i| i * (all / steps)).collect()
 }
 
-/// As [`ddim_sample`] along `timesteps`, and from the last of them to the sample itself, without the noise of timestep 0.
+/// Samples along `timesteps` like [`ddim_sample`]; the last move ends at the sample itself, without noise of timestep
+/// 0.
 pub fn ddim_sample_to_data(
     schedule: &Schedule,
     timesteps: &[usize],

@@ -1,13 +1,14 @@
-//! Ancestral sampling: every move draws from the posterior of a cleaner level, given the sample and what it is taken for.
+//! Ancestral sampling: every move draws from the posterior of a cleaner level, given the sample and its clean estimate.
 //!
-//! Source: Ho et al., arXiv:2006.11239, eq. 6 and 7, with the posterior's variance ("fixed small") as MDM has it; Nichol and Dhariwal,
-//! arXiv:2102.09672, for moves over several timesteps. The last move gives what the sample is taken for, without noise. Nothing is clipped.
+//! Source: Ho et al., arXiv:2006.11239, eq. 6 and 7, with MDM's posterior variance ("fixed small"). Moves over several
+//! timesteps follow Nichol and Dhariwal, arXiv:2102.09672. The last move returns the clean estimate without noise.
+//! Nothing is clipped.
 
 use burn::tensor::Tensor;
 
 use super::{Schedule, affine_one};
 
-/// Timesteps of a sampler with `steps` of the schedule's, noisiest first: evenly spaced from the last one to 0.
+/// Selects `steps` of the schedule's timesteps, noisiest first, evenly spaced from the last one to 0.
 ///
 /// # Panics
 /// If `steps` is not in `1..=schedule.steps()`.
@@ -21,7 +22,7 @@ pub fn ddpm_timesteps(schedule: &Schedule, steps: usize) -> Vec<usize> {
     (0..steps).rev().map(|i| (stride * i as f64).round_ties_even() as usize).collect()
 }
 
-/// `z_s = A z_t + C z_0 + D noise` for s before t.
+/// The factors (A, C, D) of `z_s = A z_t + C z_0 + D noise` for s before t.
 pub fn posterior(schedule: &Schedule, t: usize, s: usize) -> (f64, f64, f64) {
     let (bar_t, bar_s) = (schedule.alpha_bar(t), schedule.alpha_bar(s));
     let ratio = bar_t / bar_s;
@@ -30,8 +31,8 @@ pub fn posterior(schedule: &Schedule, t: usize, s: usize) -> (f64, f64, f64) {
     (a / (1.0 - bar_t), c / (1.0 - bar_t), variance.sqrt())
 }
 
-/// Moves `z` [B, T, F] from pure noise to a clean sample along `timesteps`. `out(z, t)` is the network's output, already guided;
-/// `step_noise(j)` is asked for noise of the same shape in every move j but the last.
+/// Moves `z` [B, T, F] from pure noise to a clean sample along `timesteps`. `out(z, t)` is the network's output,
+/// already guided. `step_noise(j)` returns noise of the same shape for every move j but the last.
 pub fn ddpm_sample(
     schedule: &Schedule,
     timesteps: &[usize],
@@ -79,7 +80,7 @@ mod tests {
 
     #[test]
     fn a_posterior_of_true_samples_has_the_moments_of_its_level() {
-        // z_t = alpha_t z_0 + sigma_t eps: then z_s has mean alpha_s z_0 and variance sigma_s^2.
+        // Given z_t = alpha_t z_0 + sigma_t eps, z_s has mean alpha_s z_0 and variance sigma_s^2.
         for (schedule, t, s) in [(cosine(50), 40, 3), (cosine(1000), 999, 500), (Schedule::published(), 700, 20)] {
             let (a, c, d) = posterior(&schedule, t, s);
             assert!((a * schedule.alpha(t) + c - schedule.alpha(s)).abs() < 1e-9);

@@ -1,23 +1,24 @@
-//! DPM-Solver, DPM-Solver++ and the stochastic DPM-Solver++: multistep, of order two, midpoint.
+//! DPM-Solver, DPM-Solver++ and the stochastic DPM-Solver++: multistep, second order, midpoint.
 //!
-//! Source: Lu et al., arXiv:2206.00927 (noise) and arXiv:2211.01095 (data and its stochastic form), in the settings that published motion models
-//! draw with. StableMoFusion takes the stochastic one on the noise levels of Karras et al., arXiv:2206.00364 (rho 7), where the network is
-//! asked at the timestep nearest to a level. Its library was not pinned: up to one version the last level stood twice, so that the last move
-//! changes nothing; from the next on the last level is 0, and the last move gives what the sample is taken for. [`Last`] says which.
+//! Source: Lu et al., arXiv:2206.00927 (noise) and arXiv:2211.01095 (data and its stochastic form), with the settings
+//! of published motion models. StableMoFusion uses the stochastic form on the noise levels of Karras et al.,
+//! arXiv:2206.00364 (rho 7), and calls the network at the timestep nearest to a level. Its code did not pin the
+//! library. Up to one version the library repeats the last level, so that the last move changes nothing. Later versions
+//! end at level 0, so that the last move returns the clean estimate. [`Last`] selects between the two.
 //!
-//! Notation: `lambda = ln(alpha / sigma)`; a move from t to s has `h = lambda_s - lambda_t`. The first move is of order one. So is the last
-//! one of fewer than 15, and any move to level 0.
+//! Notation: `lambda = ln(alpha / sigma)`; a move from t to s has `h = lambda_s - lambda_t`. The first move is first
+//! order. The last move is first order too if there are fewer than 15, and so is any move to level 0.
 
 use burn::tensor::Tensor;
 
 use super::{Schedule, affine_one};
 
-/// From this many moves on, the last one may be of order two.
+/// The last move may be second order from this many moves on.
 const MANY: usize = 15;
-/// Spacing of the levels of Karras et al.
+/// Exponent of the level spacing of Karras et al.
 const RHO: f64 = 7.0;
 
-/// What a solver integrates exactly, and whether it adds noise.
+/// The quantity that the solver integrates exactly, and the noise it adds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Form {
     /// The predicted noise: DPM-Solver.
@@ -28,12 +29,12 @@ pub enum Form {
     StochasticData,
 }
 
-/// Where the last move ends.
+/// End of the last move.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Last {
-    /// At no noise.
+    /// Level 0, without noise.
     Zero,
-    /// Where the move before it ended: it changes nothing.
+    /// The level of the move before, so that the last move changes nothing.
     Repeated,
 }
 
@@ -46,7 +47,7 @@ struct Level {
 }
 
 impl Level {
-    /// Of a ratio `sigma / alpha`, with `alpha^2 + sigma^2 = 1`.
+    /// The level with the ratio `sigma / alpha`, where `alpha^2 + sigma^2 = 1`.
     fn of_ratio(t: usize, ratio: f64) -> Self {
         let alpha = 1.0 / (ratio * ratio + 1.0).sqrt();
         Self { t, alpha, sigma: ratio * alpha }
@@ -57,7 +58,7 @@ impl Level {
     }
 }
 
-/// The levels that a solver visits; its moves lead from one to the next.
+/// The levels that a solver visits; each move leads from one to the next.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DpmPath {
     levels: Vec<Level>,
@@ -68,7 +69,7 @@ fn ratio(schedule: &Schedule, t: usize) -> f64 {
     schedule.sigma(t) / schedule.alpha(t)
 }
 
-/// The timestep whose level is nearest in the logarithm.
+/// The timestep whose level is nearest to `log` in the logarithm.
 fn nearest(logs: &[f64], log: f64) -> usize {
     let low = logs.iter().filter(|known| **known <= log).count().clamp(1, logs.len() - 1) - 1;
     let share = ((logs[low] - log) / (logs[low] - logs[low + 1])).clamp(0.0, 1.0);
@@ -76,7 +77,7 @@ fn nearest(logs: &[f64], log: f64) -> usize {
 }
 
 impl DpmPath {
-    /// `steps` moves over evenly spaced timesteps, from the last one; they end at the level of timestep 0.
+    /// `steps` moves over evenly spaced timesteps, from the last timestep to timestep 0.
     ///
     /// # Panics
     /// If `steps` is not in `1..schedule.steps()`.
@@ -91,7 +92,8 @@ impl DpmPath {
         Self { levels: (0..=steps).rev().map(level).collect() }
     }
 
-    /// `steps` levels spaced as Karras et al. have them between the extreme levels of the schedule, and where `last` says.
+    /// `steps` levels between the extreme levels of the schedule, spaced as in Karras et al., then the end that `last`
+    /// selects.
     ///
     /// # Panics
     /// If `steps` is not in `1..=schedule.steps()`.
@@ -114,12 +116,12 @@ impl DpmPath {
         Self { levels }
     }
 
-    /// Moves.
+    /// Number of moves, one less than the number of levels.
     pub fn steps(&self) -> usize {
         self.levels.len() - 1
     }
 
-    /// The timesteps at which the network is asked, noisiest first.
+    /// The timesteps of the network's calls, noisiest first.
     pub fn timesteps(&self) -> Vec<usize> {
         self.levels[..self.steps()].iter().map(|level| level.t).collect()
     }
@@ -129,11 +131,11 @@ impl DpmPath {
         self.levels.iter().map(|level| level.sigma / level.alpha).collect()
     }
 
-    /// Factors of move `j`.
+    /// The factors of move `j`.
     fn step(&self, form: Form, j: usize) -> Move {
         let (from, to) = (self.levels[j], self.levels[j + 1]);
         if to.sigma == 0.0 {
-            // The limit of all three forms, whose own formulas divide by the level.
+            // The limit of all three forms at level 0; their own formulas divide by the level.
             let noise = if form == Form::Noise { -from.sigma / from.alpha } else { 0.0 };
             let (keep, take) = if form == Form::Noise { (1.0 / from.alpha, noise) } else { (0.0, 1.0) };
             return Move { keep, take, lean: 0.0, fresh: 0.0 };
@@ -153,7 +155,8 @@ impl DpmPath {
     }
 }
 
-/// `z_s = keep z_t + take p + lean (p - p_before) + fresh noise`, with p what the form integrates.
+/// Factors of `z_s = keep z_t + take p + lean (p - p_before) + fresh noise`, with p the quantity that the form
+/// integrates.
 struct Move {
     keep: f64,
     take: f64,
@@ -161,8 +164,8 @@ struct Move {
     fresh: f64,
 }
 
-/// Moves `z` [B, T, F] from pure noise along `path`. `out(z, t)` is the network's output, already guided; `step_noise(j)` is asked for noise
-/// of the same shape in every move j of the stochastic form that adds any.
+/// Moves `z` [B, T, F] from pure noise along `path`. `out(z, t)` is the network's output, already guided.
+/// `step_noise(j)` returns noise of the same shape for every move j of the stochastic form that adds noise.
 pub fn dpm_sample(
     schedule: &Schedule,
     path: &DpmPath,
@@ -218,7 +221,7 @@ mod tests {
         assert!((ratios[0] - 157.4).abs() < 0.1 && (ratios[9] - 0.0100).abs() < 1e-4 && ratios[9] == ratios[10]);
     }
 
-    /// The network of one known sample: every form must find it, whatever the steps.
+    /// The exact network for one known sample: every form must reach the sample for any number of steps.
     #[test]
     fn a_network_that_knows_the_sample_is_followed_to_it() {
         let (schedule, device) = (Schedule::published(), Device::flex());

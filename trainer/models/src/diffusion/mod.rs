@@ -1,12 +1,14 @@
-//! The noise schedule, what moves a sample along it, and the samplers.
+//! The noise schedule, its forward and reverse moves, and the samplers.
 //!
-//! Every rule here is affine in the latent and the network's output, whatever it predicts, so each module gives plain coefficients, one
-//! pair per sample, and [`affine`] applies them. Coefficients are computed in f64 (see [`Schedule`]).
+//! Every rule here is affine in the latent and the network's output, for every kind of prediction. So each module
+//! returns plain coefficients, one pair per sample, and [`affine`] applies them. Coefficients are computed in f64 (see
+//! [`Schedule`]).
 //!
-//! Notation: `alpha_t` and `sigma_t` are the factors of signal and noise; of a diffusion `alpha_t = sqrt(ab_t)`, `sigma_t = sqrt(1 - ab_t)` with
-//! `ab_t` the cumulative alpha. Timesteps are integers 0..=999. Latents are [B, N, d]. Nothing here draws random numbers: noise is an argument.
+//! Notation: `alpha_t` and `sigma_t` are the factors of signal and noise. For a diffusion `alpha_t = sqrt(ab_t)` and
+//! `sigma_t = sqrt(1 - ab_t)` with `ab_t` the cumulative alpha. Timesteps are integers 0..=999. Latents are [B, N, d].
+//! Nothing here draws random numbers; noise is an argument.
 //!
-//! Not its job: networks, losses, what the timestep and the guidance scale of a training example are.
+//! Not its job: networks, losses, and the choice of timesteps and guidance scales for training examples.
 
 pub mod consistency;
 pub mod ddim;
@@ -25,18 +27,18 @@ pub use schedule::{Schedule, TIMESTEPS, flow};
 
 use burn::tensor::{Tensor, TensorData};
 
-/// A column [B, 1, 1] of per-sample factors, on the device of `like`.
+/// Reshapes per-sample factors into a column [B, 1, 1] on the device of `like`.
 pub fn column(values: &[f32], like: &Tensor<3>) -> Tensor<3> {
     Tensor::from_data(TensorData::new(values.to_vec(), [values.len(), 1, 1]), &like.device())
 }
 
-/// `a_b z_b + e_b eps_b` for every sample b; `z`, `eps` [B, N, d], `a`, `e` [B].
+/// Computes `a_b z_b + e_b eps_b` for every sample b; `z`, `eps` [B, N, d], `a`, `e` [B].
 pub fn affine(z: Tensor<3>, eps: Tensor<3>, a: &[f32], e: &[f32]) -> Tensor<3> {
     let (a, e) = (column(a, &z), column(e, &z));
     z * a + eps * e
 }
 
-/// The same with one pair for the whole batch.
+/// Like [`affine`], with one pair of factors for the whole batch.
 pub fn affine_one(z: Tensor<3>, eps: Tensor<3>, (a, e): (f64, f64)) -> Tensor<3> {
     z * (a as f32) + eps * (e as f32)
 }

@@ -1,17 +1,17 @@
 //! Phased consistency: the grid cut into M phases, and the sampler that makes one deterministic jump per phase.
 //!
-//! Source: MotionPCM, arXiv:2501.19083; the rule for the edges is that of the phased consistency model for images
-//! (arXiv:2405.18407): edge j is grid index `floor(j S / M)`. Departs from the image recipe: adversarial noise levels
-//! end at the true next edge, since 10 grid points give phases of unequal length.
+//! Source: MotionPCM, arXiv:2501.19083. The edges follow the phased consistency model for images (arXiv:2405.18407):
+//! edge j is grid index `floor(j S / M)`. Departs from the image recipe: adversarial noise levels end at the true next
+//! edge, since 10 grid points give phases of unequal length.
 //!
-//! M is the number of sampling steps, and the edges of training and sampling are the same table: a network trained for
-//! one M serves no other.
+//! M is the number of sampling steps. Training and sampling use the same edges, so a network trained for one M cannot
+//! be sampled with another.
 
 use burn::tensor::Tensor;
 
 use super::{Grid, Schedule, TIMESTEPS, affine_one};
 
-/// The edges `s_0 < s_1 < ... < s_{M-1}` between the phases. Phase m holds grid indices from its edge's on.
+/// The edges `s_0 < s_1 < ... < s_{M-1}` between the phases. Phase m holds the grid indices from its edge on.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Phases {
     /// Grid index of each edge; the first is 0.
@@ -23,18 +23,19 @@ impl Phases {
     /// Cuts `grid` into `phases` phases.
     ///
     /// # Panics
-    /// If there are no phases, or more than grid points; a caller that has the number from a user checks that first.
+    /// If there are no phases, or more than grid points. A caller that takes the number from a user checks it first.
     pub fn new(grid: &Grid, phases: usize) -> Self {
         assert!((1..=grid.steps).contains(&phases), "1 to {} phases fit the grid, not {phases}", grid.steps);
         Self { edges: (0..phases).map(|j| j * grid.steps / phases).collect(), grid: *grid }
     }
 
-    /// The phase of grid index i. A timestep that equals an edge belongs to the phase below it, whose index i is in.
+    /// The phase of grid index i. A timestep equal to an edge belongs to the phase below the edge, which holds index i.
     pub fn phase_of(&self, i: usize) -> usize {
         self.edges.partition_point(|edge| *edge <= i) - 1
     }
 
-    /// Whether one solver step from grid index i lands on the edge of its phase, where the target is that point itself.
+    /// Returns true if one solver step from grid index i ends on the edge of its phase. The target is then that point
+    /// itself.
     pub fn is_edge(&self, i: usize) -> bool {
         self.edges.contains(&i)
     }
@@ -44,7 +45,7 @@ impl Phases {
         self.grid.prev(self.edges[m])
     }
 
-    /// The timestep below which phase m's adversarial noise levels lie: `s_{m+1}`, and 1000 for the last phase.
+    /// Upper bound of phase m's adversarial noise levels: `s_{m+1}`, and 1000 for the last phase.
     pub fn next_edge_time(&self, m: usize) -> usize {
         if m + 1 < self.edges.len() { self.edge_time(m + 1) } else { TIMESTEPS }
     }
@@ -56,7 +57,7 @@ impl Phases {
     }
 }
 
-/// Jumps `z` [B, N, d] through all phases, one call of `out`, the network's output, each; no noise is added on the way.
+/// Moves `z` [B, N, d] through all phases with one call of `out`, the network's output, each; adds no noise.
 pub fn pcm_sample(
     schedule: &Schedule,
     phases: &Phases,
@@ -116,7 +117,7 @@ mod tests {
     #[test]
     fn an_edge_timestep_belongs_to_the_phase_below() {
         let phases = Phases::new(&Grid::new(100), 2);
-        // tau_4 = 499 = s_1, but index 4 lies in phase 0.
+        // tau_4 = 499 = s_1, but index 4 is in phase 0.
         assert_eq!((phases.phase_of(4), phases.phase_of(5), phases.phase_of(9)), (0, 1, 1));
         assert!(phases.is_edge(0) && phases.is_edge(5) && !phases.is_edge(4));
         assert_eq!((phases.next_edge_time(0), phases.next_edge_time(1)), (499, 1000));

@@ -1,13 +1,15 @@
-//! How a sample becomes noise, and how a network's output is read along the way.
+//! Noise schedules, and the interpretation of a network's output along them.
 //!
-//! At timestep t a noised sample is `z_t = alpha_t z_0 + sigma_t eps`. Schedules differ in the two factors, predictions in what of this the
-//! network gives; both come down to plain coefficients, so that samplers and losses know neither. Wherever a function here speaks of
-//! `out`, it is the network's output, guided or not: every reading is affine in it.
+//! A noised sample at timestep t is `z_t = alpha_t z_0 + sigma_t eps`. Schedules differ in the two factors; predictions
+//! differ in the quantity that the network returns. Both reduce to plain coefficients, so that samplers and losses
+//! depend on neither. In this module `out` is the network's output, guided or not: every interpretation is affine in
+//! it.
 //!
-//! Sources: Rombach et al., arXiv:2112.10752 (`scaled_linear`, as MLD and MotionLCM use it); Ho et al., arXiv:2006.11239 (`linear`); Nichol
-//! and Dhariwal, arXiv:2102.09672 (`cosine`); Salimans and Ho, arXiv:2202.00512 (velocity); Liu et al., arXiv:2209.03003 (`flow`). The
-//! weights that are published for the first two were trained with tables in f32, and near t = 0 that rounding is visible in
-//! `1 - ab_t`; so those tables are rounded likewise and only then widened. The cosine's are f64, as its authors have them.
+//! Sources: Rombach et al., arXiv:2112.10752 (`scaled_linear`, as in MLD and MotionLCM); Ho et al., arXiv:2006.11239
+//! (`linear`); Nichol and Dhariwal, arXiv:2102.09672 (`cosine`); Salimans and Ho, arXiv:2202.00512 (velocity); Liu et
+//! al., arXiv:2209.03003 (`flow`). The published weights for the first two were trained with f32 tables, whose rounding
+//! is visible in `1 - ab_t` near t = 0. So those tables are rounded to f32 and then widened. The cosine table is f64,
+//! as its authors have it.
 
 use burn::tensor::Tensor;
 use protocol::stage::{Diffusion, NoiseSchedule, Prediction};
@@ -16,24 +18,24 @@ pub use super::timesteps::TIMESTEPS;
 use super::timesteps::{ddim_previous, ddim_timesteps};
 use super::{affine, unzip};
 
-/// A noise schedule, and what the network predicts along it.
+/// A noise schedule, and the quantity that the network predicts along it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Schedule {
-    /// `beta_t`; a flow has none.
+    /// `beta_t`; empty for a flow.
     betas: Vec<f64>,
-    /// `ab_t`; a flow has none.
+    /// `ab_t`; empty for a flow.
     alpha_bar: Vec<f64>,
-    /// (alpha_t, sigma_t).
+    /// Pairs (alpha_t, sigma_t) by timestep.
     factors: Vec<(f64, f64)>,
     prediction: Prediction,
 }
 
-/// (alpha, sigma) of a rectified flow at the share `s` of noise: a straight line.
+/// Factors (alpha, sigma) of a rectified flow, a straight line, at the share `s` of noise.
 pub fn flow(s: f64) -> (f64, f64) {
     (1.0 - s, s)
 }
 
-/// `steps` equidistant numbers in f32, rounded as PyTorch does it: from the nearer end.
+/// Returns `steps` equidistant numbers in f32, computed from the nearer end as in PyTorch.
 fn line(first: f32, last: f32, steps: usize) -> impl Iterator<Item = f32> {
     let step = (last - first) / (steps - 1).max(1) as f32;
     (0..steps).map(move |t| {
@@ -64,13 +66,13 @@ impl Default for Schedule {
 }
 
 impl Schedule {
-    /// The schedule of MLD, MotionLCM and MotionPCM: `scaled_linear` .00085 -> .012, noise predicted. Terminal signal is not zero:
-    /// `ab_999` = .00466.
+    /// The schedule of MLD, MotionLCM and MotionPCM: `scaled_linear` .00085 -> .012, noise predicted. The terminal
+    /// signal is not zero: `ab_999` = .00466.
     pub fn published() -> Self {
         Self::new(&Diffusion::default(), TIMESTEPS)
     }
 
-    /// A schedule over timesteps `0..steps`.
+    /// Creates a schedule over timesteps `0..steps`.
     pub fn new(settings: &Diffusion, steps: usize) -> Self {
         let betas = betas(settings, steps);
         let rounded = settings.schedule != NoiseSchedule::Cosine;
@@ -93,7 +95,7 @@ impl Schedule {
         Self { betas, alpha_bar, factors, prediction: settings.prediction }
     }
 
-    /// Timesteps.
+    /// Number of timesteps.
     pub fn steps(&self) -> usize {
         self.factors.len()
     }
@@ -105,34 +107,35 @@ impl Schedule {
     /// `beta_t`, the share of the variance that becomes noise at t.
     ///
     /// # Panics
-    /// If `t` is not a timestep; so do all functions of a timestep. And for a flow, which has none.
+    /// If `t` is not a timestep, like all functions of a timestep. Also for a flow, which has no `beta_t`.
     pub fn beta(&self, t: usize) -> f64 {
         self.betas[t]
     }
 
-    /// `ab_t`, the share of signal in the variance.
+    /// `ab_t`, the signal's share of the variance.
     pub fn alpha_bar(&self, t: usize) -> f64 {
         let (alpha, sigma) = self.factors[t];
         self.alpha_bar.get(t).copied().unwrap_or_else(|| alpha * alpha / (alpha * alpha + sigma * sigma))
     }
 
-    /// The factor of the signal.
+    /// `alpha_t`, the factor of the signal.
     pub fn alpha(&self, t: usize) -> f64 {
         self.factors[t].0
     }
 
-    /// The factor of the noise.
+    /// `sigma_t`, the factor of the noise.
     pub fn sigma(&self, t: usize) -> f64 {
         self.factors[t].1
     }
 
-    /// `z_t = A z_0 + E noise`: (alpha_t, sigma_t).
+    /// Factors (alpha_t, sigma_t) of `z_t = A z_0 + E noise`.
     pub fn add_noise(&self, t: usize) -> (f64, f64) {
         self.factors[t]
     }
 
-    /// What the network should give for samples `clean` and their `noise` at `timesteps`: the noise, the sample, or the velocity. That of a
-    /// flow is `noise - clean`, its slope towards noise; otherwise it is `alpha noise - sigma clean`.
+    /// The network's target for samples `clean` and their `noise` at `timesteps`: the noise, the sample, or the
+    /// velocity. The velocity of a flow is `noise - clean`, its slope towards noise; otherwise it is `alpha noise -
+    /// sigma clean`.
     pub fn target(&self, clean: Tensor<3>, noise: Tensor<3>, timesteps: &[usize]) -> Tensor<3> {
         match self.prediction {
             Prediction::Noise => noise,
@@ -145,17 +148,17 @@ impl Schedule {
         }
     }
 
-    /// `z_0 = A z_t + E out`: the clean sample that an output implies.
+    /// Factors of `z_0 = A z_t + E out`, the clean sample that an output implies.
     pub fn clean(&self, t: usize) -> (f64, f64) {
         self.readings_at(self.factors[t]).0
     }
 
-    /// `eps = A z_t + E out`: the noise that an output implies.
+    /// Factors of `eps = A z_t + E out`, the noise that an output implies.
     pub fn noise(&self, t: usize) -> (f64, f64) {
         self.readings_at(self.factors[t]).1
     }
 
-    /// The clean sample and the noise that an output implies at a level (alpha, sigma), which may lie between timesteps.
+    /// Factors of the implied clean sample and noise at a level (alpha, sigma), which may lie between timesteps.
     pub fn readings_at(&self, (alpha, sigma): (f64, f64)) -> ((f64, f64), (f64, f64)) {
         match self.prediction {
             Prediction::Noise => ((1.0 / alpha, -sigma / alpha), (0.0, 1.0)),
@@ -165,8 +168,8 @@ impl Schedule {
         }
     }
 
-    /// `z_s = A z_t + E out`, the deterministic move from `t` to `s`: the clean sample that the output implies, with its noise at level s. Along
-    /// a flow it is Euler's step. `jump(t, t)` is exactly the identity.
+    /// Factors of `z_s = A z_t + E out`, the deterministic move from `t` to `s`: the implied clean sample, with its
+    /// noise at level s. For a flow it is an Euler step. `jump(t, t)` is exactly the identity.
     ///
     /// Source: Song, Meng, Ermon, arXiv:2010.02502, eq. 12 with eta = 0.
     pub fn jump(&self, t: usize, s: usize) -> (f64, f64) {
@@ -182,7 +185,7 @@ impl Schedule {
         (alpha * clean.0 + sigma * noise.0, alpha * clean.1 + sigma * noise.1)
     }
 
-    /// `z_s = A z_m + E noise`, the noising from level `m` to a noisier level `s >= m`.
+    /// Factors of `z_s = A z_m + E noise`, the noising from level `m` to a noisier level `s >= m`.
     pub fn transition(&self, m: usize, s: usize) -> (f64, f64) {
         if self.is_flow() {
             let a = self.alpha(s) / self.alpha(m);
@@ -192,8 +195,8 @@ impl Schedule {
         (ratio.sqrt(), (1.0 - ratio).max(0.0).sqrt())
     }
 
-    /// The moves (from, to) of a sampler of `steps` steps, noisiest first. A diffusion is spaced as MLD has it (see [`super::ddim`]); a flow begins
-    /// at pure noise and ends at the sample, in steps of one length.
+    /// The moves (from, to) of a sampler with `steps` steps, noisiest first. A diffusion is spaced as in MLD (see
+    /// [`super::ddim`]). A flow starts at pure noise and ends at the sample, in steps of equal length.
     ///
     /// # Panics
     /// If `steps` is not in `1..self.steps()`.
@@ -265,7 +268,7 @@ mod tests {
         }
     }
 
-    /// Every schedule with every prediction that it allows.
+    /// Every schedule with every prediction that it supports.
     fn all(steps: usize) -> Vec<(Diffusion, Schedule)> {
         let mut all = Vec::new();
         for schedule in [NoiseSchedule::ScaledLinear, NoiseSchedule::Linear, NoiseSchedule::Cosine, NoiseSchedule::Flow]
@@ -280,7 +283,7 @@ mod tests {
         all
     }
 
-    /// One example in numbers: what is read from the true output is the truth, at every timestep.
+    /// A numeric example: the true output implies the true sample and noise, at every timestep.
     #[test]
     fn the_true_output_gives_back_sample_noise_and_every_level() {
         let device = burn::tensor::Device::flex();
@@ -293,7 +296,7 @@ mod tests {
                 let out = schedule.target(tensor(clean), tensor(noise), &[t]).into_scalar::<f32>();
                 let read = |(a, e): (f64, f64)| a * z + e * f64::from(out);
                 let close = |found: f64, expected: f64, what: &str| {
-                    // Near one end the coefficients of a reading are large.
+                    // Coefficients are large near one end.
                     let bound = 1e-5 * (1.0 + schedule.clean(t).0.abs() + schedule.noise(t).0.abs());
                     assert!((found - expected).abs() < bound, "{settings:?}, t {t}, {what}: {found}, not {expected}");
                 };
@@ -329,7 +332,7 @@ mod tests {
         assert_eq!(schedule.path(1), [(999, 0)]);
         assert_eq!(schedule.path(4), [(999, 749), (749, 500), (500, 250), (250, 0)]);
         assert_eq!(schedule.path(999).len(), 999);
-        // Euler's step.
+        // A jump along a flow is an Euler step.
         near(schedule.jump(750, 250), (1.0, (250.0 - 750.0) / 999.0));
         assert_eq!(Schedule::published().path(50)[..2], [(981, 961), (961, 941)]);
     }

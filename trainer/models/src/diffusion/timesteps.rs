@@ -1,9 +1,9 @@
 //! The timesteps that samplers visit. Source: Song, Meng, Ermon, arXiv:2010.02502, with "leading" spacing and offset 1.
 
-/// Timesteps of the published latent models.
+/// Number of timesteps of the published latent models.
 pub const TIMESTEPS: usize = 1000;
 
-/// Timesteps of the sampler, noisiest first.
+/// Timesteps of the sampler for `steps` steps, noisiest first.
 ///
 /// # Panics
 /// If `steps` is not in 1..=999.
@@ -13,7 +13,7 @@ pub fn ddim_timesteps(steps: usize) -> Vec<usize> {
     (0..steps).rev().map(|i| i * stride + 1).collect()
 }
 
-/// Where the step at `t` lands: `t - 1000 / steps`, or 0 below that.
+/// The timestep after a step from `t`: `t - 1000 / steps`, or 0 if that is negative.
 pub fn ddim_previous(steps: usize, t: usize) -> usize {
     t.saturating_sub(TIMESTEPS / steps)
 }

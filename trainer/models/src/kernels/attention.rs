@@ -1,8 +1,8 @@
-//! Scaled dot-product attention with a key mask (Vaswani et al., arXiv:1706.03762), heads packed as published checkpoints
-//! have them: one projection gives q, k and v side by side, head after head.
+//! Scaled dot-product attention with a key mask (Vaswani et al., arXiv:1706.03762). Heads are packed as in published
+//! checkpoints: one projection returns q, k and v side by side, head after head.
 //!
-//! The fused path never splits heads in memory: matrix products run on strided views of the packed projections, over the
-//! valid keys only, and the whole is one node of the tape.
+//! The fused path never splits heads in memory: matrix products run on strided views of the packed projections, over
+//! the valid keys only. The whole computation is one node of the tape.
 
 use burn::tensor::activation::softmax;
 use burn::tensor::{Tensor, TensorData};
@@ -23,17 +23,17 @@ use burn::backend::autodiff::{
 #[cfg(feature = "flex")]
 use burn::backend::flex::FlexTensor;
 
-/// How many leading keys of each sequence are valid; the rest is padding.
+/// Number of leading valid keys of each sequence; the rest is padding.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct KeyMask {
     valid: Vec<usize>,
 }
 
 impl KeyMask {
-    /// `lengths[b]` valid items after `prefix` items that always are.
+    /// Creates a mask with `lengths[b]` valid items after `prefix` items that are always valid.
     ///
     /// # Panics
-    /// If a sequence has no valid key at all: its attention would be undefined.
+    /// If a sequence has no valid key: its attention would be undefined.
     pub fn new(lengths: &[usize], prefix: usize) -> Self {
         let valid: Vec<_> = lengths.iter().map(|l| l + prefix).collect();
         assert!(valid.iter().all(|v| *v > 0), "a sequence without a valid key");
@@ -126,7 +126,7 @@ fn stock(
     let split = |x: Tensor<3>, len: usize| x.reshape([batch, len, heads, width / heads]).swap_dims(1, 2);
     let mut scores = split(q, queries).matmul(split(k, keys).swap_dims(2, 3)) * sizes.scale();
     if let Some(mask) = mask {
-        // Far below any score, and finite, so that a gradient through it is 0 and not undefined.
+        // Far below any score, but finite, so that a gradient through it is 0 and not undefined.
         let bias =
             (0..batch).flat_map(|b| (0..keys).map(move |j| if j < mask.of(b) { 0.0 } else { -1e9_f32 })).collect();
         scores = scores + Tensor::from_data(TensorData::new(bias, [batch, 1, 1, keys]), &device);
@@ -303,8 +303,8 @@ mod fused {
         (out, weights)
     }
 
-    /// Gradients with the layout of the packed inputs: `dq` into a buffer with rows of `q_row`, `dk` and `dv` into one with
-    /// rows of `kv_row`; the two are the same buffer for self-attention, hence the closure-free plain code.
+    /// The inputs of the backward pass: the packed projections, the softmax weights, the gradient of the output, and
+    /// the mask and dropout of the forward pass.
     struct Backprop<'a> {
         packed: Packed<'a>,
         weights: &'a [f32],
@@ -315,7 +315,7 @@ mod fused {
     }
 
     impl Backprop<'_> {
-        /// Calls `write` for each head with the gradient of its scores (already scaled) and its dropped-out weights.
+        /// Calls `write` for each head with the gradient of its scores (already scaled) and its weights after dropout.
         fn each_head(&self, mut write: impl FnMut(usize, usize, usize, &[f32], &[f32])) {
             let s = self.s;
             let mut scores = vec![0.0; s.queries * s.keys];

@@ -1,9 +1,9 @@
-//! Stateless dropout: whether an element is kept is a hash of (seed, step, slice, layer, element), so a step that is
-//! computed again, by another worker or after a crash, drops the same elements. No generator, no lock, no state to save.
+//! Stateless dropout: an element is kept or dropped by a hash of (seed, step, slice, layer, element). A recomputed
+//! step, on another worker or after a crash, drops the same elements. There is no generator, lock or state to save.
 
 use burn::tensor::{Tensor, TensorData};
 
-/// Where in the run dropout happens, and with which probability.
+/// Position in the run, and the dropout probability there.
 #[derive(Debug, Clone)]
 pub struct Dropout {
     key: u64,
@@ -12,12 +12,12 @@ pub struct Dropout {
 }
 
 impl Dropout {
-    /// No dropout: evaluation, or a frozen network.
+    /// Disables dropout, for evaluation or a frozen network.
     pub fn off() -> Self {
         Self { key: 0, layer: 0, probability: 0.0 }
     }
 
-    /// Dropout of one slice of one step. Each use inside the network counts a layer further.
+    /// Dropout of one slice of one step. Each use inside the network advances the layer by one.
     pub fn new(probability: f64, seed: u64, step: u64, slice: u64) -> Self {
         Self { key: mix(mix(mix(seed) ^ step) ^ slice), layer: 0, probability }
     }
@@ -36,7 +36,7 @@ impl Dropout {
         Some(mix(self.key ^ self.layer))
     }
 
-    /// What kept elements are multiplied by; dropped ones become 0.
+    /// Factor of an element: `1 / (1 - p)` if it is kept, 0 if it is dropped.
     pub(super) fn mask(&self, key: u64, index: usize) -> f32 {
         #[expect(clippy::cast_precision_loss, reason = "53 bits are drawn")]
         let uniform = (mix(key ^ index as u64) >> 11) as f64 / (1_u64 << 53) as f64;

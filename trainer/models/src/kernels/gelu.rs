@@ -32,8 +32,8 @@ pub fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
         }
         Place::Other => {}
     }
-    // Composed, because the gradient of Burn's own GELU is that of the tanh approximation on backends that do not
-    // bring another: measured on ndarray, gradients of a denoiser off by 2e-4 of the largest.
+    // Composed, because on some backends Burn's GELU has the gradient of the tanh approximation. Measured on ndarray:
+    // gradients of a denoiser differ by 2e-4 of the largest.
     let cdf = (x.clone() * std::f32::consts::FRAC_1_SQRT_2).erf() + 1.0;
     x * cdf * 0.5
 }

@@ -1,10 +1,12 @@
-//! One direction of a layer of gated recurrent units over ragged sequences (Cho et al., arXiv:1406.1078, in PyTorch's form).
+//! One direction of a layer of gated recurrent units over ragged sequences (Cho et al., arXiv:1406.1078, in PyTorch's
+//! form).
 //!
-//! `r = s(a_r + u_r)`, `z = s(a_z + u_z)`, `n = tanh(a_n + r u_n)`, `h' = (1 - z) n + z h`, with `a` the gates' part of the input and
-//! `u = h U^T + c` that of the state. A token behind a sequence's end leaves the state alone, so that the forward direction
-//! stops at a sequence's own last token and the backward direction starts there.
+//! `r = s(a_r + u_r)`, `z = s(a_z + u_z)`, `n = tanh(a_n + r u_n)`, `h' = (1 - z) n + z h`. `a` is the input's part of
+//! the gates and `u = h U^T + c` the state's part. A token past a sequence's end leaves the state unchanged. So the
+//! forward direction stops at a sequence's own last token and the backward direction starts there.
 //!
-//! Fused: a whole direction is one node of the tape; the gates are kept, and the gradient of U is one product over all tokens.
+//! Fused: a whole direction is one node of the tape. The gates are kept, and the gradient of U is one product over all
+//! tokens.
 
 use burn::tensor::{Tensor, TensorData, activation::sigmoid};
 
@@ -23,8 +25,9 @@ use burn::backend::autodiff::{
 #[cfg(feature = "flex")]
 use burn::backend::flex::FlexTensor;
 
-/// States [B, T, g] after each token: `input` [B, T, 3g] are the inputs' gates, `start` [B, g] the first states, `weight` [3g, g] and
-/// `bias` [3g] make the states' gates. Of sequence b the first `lengths[b]` tokens count. `reverse` runs from the last to the first.
+/// Returns the states [B, T, g] after each token. `input` [B, T, 3g] holds the input's part of the gates and `start`
+/// [B, g] the first states. `weight` [3g, g] and `bias` [3g] compute the state's part. The first `lengths[b]` tokens of
+/// sequence b are valid. `reverse` runs from the last token to the first.
 pub fn gru(
     input: Tensor<3>,
     start: Tensor<2>,
@@ -81,7 +84,7 @@ fn composed(
         let next = n.clone() - z.clone() * n + z * state.clone();
         let live: Vec<f32> = lengths.iter().map(|l| if t < *l { 1.0 } else { 0.0 }).collect();
         let live = Tensor::<2>::from_data(TensorData::new(live, [batch, 1]), &device);
-        // 0 and 1 make this a choice, not a mixture.
+        // A mask of 0 and 1 makes this a selection, not a mixture.
         state = next * live.clone() + state * (-live + 1.0);
         states[t] = state.clone();
     }
@@ -100,12 +103,12 @@ struct Shape {
 
 #[cfg(feature = "flex")]
 impl Shape {
-    /// Token of turn `i`.
+    /// The token that turn `i` processes.
     fn token(&self, i: usize) -> usize {
         if self.reverse { self.tokens - 1 - i } else { i }
     }
 
-    /// States [turn, B, g] as [B, T, g].
+    /// Reorders states from [turn, B, g] to [B, T, g].
     fn by_sequence(&self, states: &[f32]) -> Vec<f32> {
         let (size, width) = (self.batch * self.width, self.width);
         let mut out = vec![0.0; states.len()];
@@ -119,7 +122,7 @@ impl Shape {
     }
 }
 
-/// What a forward pass leaves, all by turn: states after it [turn, B, g], and r, z, n, u_n [turn, B, 4g].
+/// The results of a forward pass by turn: states after it [turn, B, g], and r, z, n, u_n [turn, B, 4g].
 #[cfg(feature = "flex")]
 #[derive(Debug, Clone)]
 struct Run {
@@ -171,7 +174,7 @@ fn tanh(x: f32) -> f32 {
 
 #[cfg(feature = "flex")]
 multiversion! {
-    /// One token of one sequence.
+    /// Computes one token of one sequence.
     fn unit(a: &[f32], u: &[f32], old: &[f32], gates: &mut [f32], new: &mut [f32]) {
         let g = old.len();
         let (a_r, a_z, a_n) = (&a[..g], &a[g..2 * g], &a[2 * g..3 * g]);
@@ -195,7 +198,8 @@ multiversion! {
 
 #[cfg(feature = "flex")]
 multiversion! {
-    /// Its gradient: `dh` of the state after it in, of the part of the state before it that goes round the gates out.
+    /// The backward pass of [`unit`]. `dh` enters as the gradient of the state after the token. It leaves as the direct
+    /// part of the gradient of the state before it, without the part through the gates.
     fn unit_back(gates: &[f32], old: &[f32], dh: &mut [f32], da: &mut [f32], du: &mut [f32]) {
         let g = old.len();
         let (gate_r, gate_z) = (&gates[..g], &gates[g..2 * g]);
@@ -239,7 +243,7 @@ impl Backward<Flex, 4> for GruOp {
         let mut dh = vec![0.0; size];
         let mut da = vec![0.0; 3 * size * tokens];
         let mut du = vec![0.0; 3 * size * tokens];
-        // States before each turn.
+        // The states before each turn.
         let mut olds = Vec::with_capacity(size * tokens);
         olds.extend_from_slice(start);
         olds.extend_from_slice(&run.states[..size * tokens.saturating_sub(1)]);

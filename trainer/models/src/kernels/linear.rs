@@ -110,7 +110,7 @@ fn tracked<const D: usize>(x: Tensor<D>, weight: Tensor<2>, bias: Option<Tensor<
     let (shape, [out, inner]) = (x.dims(), weight.dims());
     assert_eq!(shape[D - 1], inner, "linear: input width against weight");
     let biased = bias.is_some();
-    // Without a bias the third parent is a constant that takes part in nothing.
+    // Without a bias the third parent is an unused constant.
     let bias = bias.unwrap_or_else(|| Tensor::zeros([1], &device));
     let x = raw::track(x);
     let w = raw::track(weight);

@@ -1,7 +1,8 @@
 //! Mish: `x tanh(ln(1 + e^x))` (Misra, arXiv:1908.08681).
 //!
-//! `tanh(ln(1 + u)) = u (u + 2) / (u (u + 2) + 2)`, so one exponential is enough. The fused path takes that of `-|x|` and divides both sides by
-//! `e^(2x)` where x is positive; the composed one takes that of x up to 20, from where on the quotient rounds to 1.
+//! `tanh(ln(1 + u)) = u (u + 2) / (u (u + 2) + 2)` with `u = e^x`, so one exponential is enough. The fused path
+//! computes `e^(-|x|)` and divides both sides by `e^(2x)` for positive x. The composed path caps x at 20, above which
+//! the quotient rounds to 1.
 
 use burn::tensor::Tensor;
 
@@ -20,7 +21,7 @@ use burn::backend::autodiff::{
 #[cfg(feature = "flex")]
 use burn::backend::flex::FlexTensor;
 
-/// Where the argument of the composed path's exponential ends.
+/// Upper limit of the exponent in the composed path.
 const CAP: f32 = 20.0;
 
 /// Mish of every element.

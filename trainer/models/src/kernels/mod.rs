@@ -1,13 +1,13 @@
-//! Fused CPU kernels with hand-written backward passes, and the stock operations they replace elsewhere.
+//! Fused CPU kernels with hand-written backward passes, and the stock operations that replace them on other backends.
 //!
-//! Each public function takes and returns Burn tensors. On the `flex` backend, with or without autodiff, one call is one
-//! node of the tape and one or two passes over memory; on any other backend the same function is composed of Burn's
-//! operations. Both compute the same mathematics; `tests/kernels.rs` compares them, `benches/steps.rs` times them.
+//! Each public function takes and returns Burn tensors. On the `flex` backend, with or without autodiff, one call is
+//! one node of the tape and one or two passes over memory. On any other backend the same function is composed of Burn's
+//! operations. Both compute the same mathematics; `tests/kernels.rs` compares them and `benches/steps.rs` times them.
 //!
-//! Bits: a kernel's result depends on its inputs alone. Sums run in a fixed order, matrix products run on the calling
-//! thread, and dropout masks are a hash of where they are used, not of a generator.
+//! Determinism: a kernel's result depends on its inputs alone. Sums run in a fixed order, and matrix products run on
+//! the calling thread. Dropout masks are hashes of their position, without a generator.
 //!
-//! Not its job: parameters, shapes of networks.
+//! Not its job: parameters, and the shapes of networks.
 
 mod attention;
 mod dropout;
@@ -27,7 +27,7 @@ pub use linear::linear;
 pub use mish::mish;
 pub use norm::{add_layer_norm, layer_norm};
 
-/// Runs `body` with Burn's operations in place of the fused kernels, on this thread: what the kernels are measured against.
+/// Runs `body` with Burn's operations instead of the fused kernels on this thread, as the reference for comparisons.
 pub fn stock<T>(body: impl FnOnce() -> T) -> T {
     #[cfg(feature = "flex")]
     {

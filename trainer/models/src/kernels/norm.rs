@@ -75,7 +75,7 @@ multiversion! {
     }
 }
 
-/// Sums in 16 lanes, then the lanes in order: vectorises, and one order for all widths.
+/// Sums in 16 lanes, then adds the lanes in order. It vectorises and has one order for all widths.
 #[cfg(feature = "flex")]
 #[inline(always)]
 fn lanes(mut items: impl FnMut(usize) -> f32, width: usize) -> f32 {
@@ -202,7 +202,7 @@ fn tracked<const D: usize>(
 ) -> Tensor<D> {
     let shape = x.dims();
     let residual = y.is_some();
-    // Without a residual its slot holds a constant that takes part in nothing.
+    // Without a residual its parent is an unused constant.
     let y = y.unwrap_or_else(|| Tensor::zeros([1; D], &x.device()));
     let (x, y, gamma, beta) = (raw::track(x), raw::track(y), raw::track(gamma), raw::track(beta));
     let nodes = [x.node(), y.node(), gamma.node(), beta.node()];

@@ -1,4 +1,4 @@
-//! The way from Burn tensors to slices and back, and matrix products on slices.
+//! Conversion between Burn tensors and slices, and matrix products on slices.
 
 use burn::tensor::{Tensor, TensorData};
 
@@ -23,17 +23,17 @@ mod flex {
     /// A tensor on the tape.
     pub(in crate::kernels) type OnTape = <Tracked as BackendTypes>::FloatTensorPrimitive;
 
-    /// Where a tensor lives.
+    /// Backend and tape of a tensor.
     pub(in crate::kernels) enum Place {
         /// On flex, on the tape.
         Tracked,
         /// On flex, without a tape.
         Plain,
-        /// Anywhere else.
+        /// On any other backend.
         Other,
     }
 
-    /// Whether `x` has a tape.
+    /// Returns true if `x` has a tape.
     pub(in crate::kernels) fn on_tape<const D: usize>(x: &Tensor<D>) -> bool {
         x.clone().try_into_primitive::<Tracked>().is_ok()
     }
@@ -42,7 +42,7 @@ mod flex {
         static STOCK: Cell<bool> = const { Cell::new(false) };
     }
 
-    /// Runs `body` with every tensor of this thread counted as living elsewhere.
+    /// Runs `body` with every tensor of this thread treated as [`Place::Other`].
     pub(in crate::kernels) fn stock<T>(body: impl FnOnce() -> T) -> T {
         struct Restore(bool);
         impl Drop for Restore {
@@ -54,7 +54,7 @@ mod flex {
         body()
     }
 
-    /// Where `x` lives, and with it the others of a call: on the tape if any of them is (`taped`).
+    /// The place of a call's tensors, from the backend of `x`; they are on the tape if any of them is (`taped`).
     pub(in crate::kernels) fn place<const D: usize>(x: &Tensor<D>, taped: bool) -> Place {
         if STOCK.get() {
             Place::Other
@@ -93,7 +93,7 @@ mod flex {
         x.as_slice::<f32>().expect("made contiguous, f32 throughout")
     }
 
-    /// A tensor of `values`.
+    /// Makes a tensor of `values` in `shape`.
     pub(in crate::kernels) fn make(values: Vec<f32>, shape: &[usize]) -> FlexTensor {
         FlexTensor::from_data(TensorData::new(values, shape.to_vec()))
     }
@@ -104,7 +104,7 @@ mod flex {
     }
 }
 
-/// A matrix inside a slice: element (i, j) lies at `offset + i * row + j * col`.
+/// A matrix inside a slice: element (i, j) is at `offset + i * row + j * col`.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct View {
     pub(super) offset: usize,
@@ -118,7 +118,7 @@ impl View {
         Self { offset: 0, row: width, col: 1 }
     }
 
-    /// The transpose.
+    /// The transpose, as a view with row and column strides swapped.
     pub(super) fn t(self) -> Self {
         Self { offset: self.offset, row: self.col, col: self.row }
     }

@@ -1,7 +1,8 @@
-//! Loops compiled for several instruction sets; the best one that the processor has is taken at run time.
+//! Loops compiled for several instruction sets; the best one of the processor is selected at run time.
 //!
-//! The bodies are plain loops that the compiler vectorises. On one machine the choice never changes, so bits do not either;
-//! another instruction set may contract multiply-adds differently, which is why a gang is made of one (`crate::instruction_set`).
+//! The bodies are plain loops that the compiler vectorises. The choice never changes on one machine, and neither do the
+//! bits. Another instruction set may contract multiply-adds differently, so all workers of a gang must have the same
+//! one (`crate::instruction_set`).
 
 /// Defines `fn name(args)` that runs `body` compiled for AVX-512, AVX2 or the baseline.
 macro_rules! multiversion {
@@ -38,7 +39,7 @@ macro_rules! multiversion {
 }
 pub(super) use multiversion;
 
-/// Whether the AVX-512 version may run.
+/// Returns true if the processor supports the AVX-512 version.
 #[cfg(target_arch = "x86_64")]
 pub(crate) fn has_wide() -> bool {
     is_x86_feature_detected!("avx512f")
@@ -48,7 +49,7 @@ pub(crate) fn has_wide() -> bool {
         && has_middle()
 }
 
-/// Whether the AVX2 version may run.
+/// Returns true if the processor supports the AVX2 version.
 #[cfg(target_arch = "x86_64")]
 pub(crate) fn has_middle() -> bool {
     is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma")

@@ -1,4 +1,4 @@
-//! Attention whose queries, keys and values are projected apart, as GPT-style code bases publish them, and attention with an additive bias.
+//! Attention with separate projections of queries, keys and values (as in GPT-style code), and with an additive bias.
 
 use burn::module::{Module, Param};
 use burn::tensor::activation::softmax;
@@ -8,15 +8,15 @@ use super::conv::{GAP, Gap};
 use super::{Init, Linear, Norm};
 use crate::kernels::{self, Dropout, KeyMask};
 
-/// Deviation of GPT-style first weights.
+/// Standard deviation of GPT-style initial weights.
 pub(super) const DEVIATION: f64 = 0.02;
 /// Added to variances in layer norms.
 const EPS: f64 = 1e-5;
-/// Far below any score, and finite, so that a gradient through it is 0 and not undefined.
+/// Far below any score, but finite, so that a gradient through it is 0 and not undefined.
 const HIDDEN: f32 = -1e9;
 
-/// Softmax attention with `bias` added to the scores; it has a size of the batch or 1, of the heads or 1, of the queries or 1, and of the
-/// keys. `q_bqh` [B, Q, H], `k_bkh` and `v_bkh` [B, K, H] -> [B, Q, H].
+/// Softmax attention with `bias` added to the scores. The bias has shape [B or 1, heads or 1, Q or 1, K]. `q_bqh` [B,
+/// Q, H], `k_bkh` and `v_bkh` [B, K, H] -> [B, Q, H].
 pub(super) fn attend(
     q_bqh: Tensor<3>,
     k_bkh: Tensor<3>,
@@ -29,7 +29,7 @@ pub(super) fn attend(
     attend_at(scale, q_bqh, k_bkh, v_bkh, heads, bias, dropout)
 }
 
-/// The same with another scale of the scores.
+/// Like [`attend`], with another scale of the scores.
 pub(super) fn attend_at(
     scale: f32,
     q_bqh: Tensor<3>,
@@ -49,7 +49,7 @@ pub(super) fn attend_at(
     weights.matmul(split(v_bkh, keys)).swap_dims(1, 2).reshape([batch, queries, width])
 }
 
-/// A bias [1, 1, len, len] that hides what comes after a position.
+/// A bias [1, 1, len, len] that hides the positions after a query's own.
 pub(super) fn causal(len: usize, device: &Device) -> Tensor<4> {
     let values = (0..len).flat_map(|q| (0..len).map(move |k| if k > q { HIDDEN } else { 0.0 })).collect();
     Tensor::from_data(TensorData::new(values, [1, 1, len, len]), device)
@@ -61,35 +61,35 @@ pub(super) fn hiding(visible: &[bool], batch: usize, device: &Device) -> Tensor<
     Tensor::from_data(TensorData::new(values, [batch, 1, 1, visible.len() / batch]), device)
 }
 
-/// What a block's attention may look at.
+/// The keys that a block's attention may see.
 #[derive(Debug, Clone)]
 pub(super) enum Sight {
-    /// Everything, but for keys behind a sequence's end.
+    /// All keys up to the end of the sequence.
     Keys(Option<KeyMask>),
-    /// As a bias on the scores says.
+    /// The keys that a bias on the scores leaves visible.
     Bias(Box<Tensor<4>>),
 }
 
-/// Rows of a table by id.
+/// A table with one row per id.
 #[derive(Module, Debug)]
 pub struct Embedding {
-    /// [rows, width].
+    /// Weights of shape [rows, width].
     pub weight: Param<Tensor<2>>,
 }
 
 impl Embedding {
-    /// Normal with deviation 0.02.
+    /// Initialises the table from a normal distribution with deviation 0.02.
     pub(super) fn new(init: &mut Init<'_>, rows: usize, width: usize) -> Self {
         Self { weight: init.scaled_normal(DEVIATION, [rows, width]) }
     }
 
-    /// Ids [B T] -> [B, T, width].
+    /// Looks up ids [B T] -> [B, T, width].
     pub(super) fn rows(&self, ids: &[usize], batch: usize) -> Tensor<3> {
         rows_of(self.weight.val(), ids, batch)
     }
 }
 
-/// Rows [B, n / B, width] of `table` [rows, width].
+/// Looks up rows [B, n / B, width] in `table` [rows, width].
 pub(super) fn rows_of(table: Tensor<2>, ids: &[usize], batch: usize) -> Tensor<3> {
     let width = table.dims()[1];
     let values: Vec<i64> = ids.iter().map(|id| *id as i64).collect();
@@ -103,8 +103,8 @@ pub(super) fn linear(init: &mut Init<'_>, inner: usize, out: usize) -> Linear {
     Linear { weight: init.scaled_normal(DEVIATION, [out, inner]), bias: Some(init.constant(0.0, [out])) }
 }
 
-/// Sines and cosines in turn, [1, len, width]: `sin(p f_i), cos(p f_i)` with `f_i = 10000^(-2i / width)`. In f32 from the frequencies on, as
-/// the tables that upstream stores.
+/// Alternating sines and cosines [1, len, width]: `sin(p f_i), cos(p f_i)` with `f_i = 10000^(-2i / width)`. Computed
+/// in f32 from the frequencies on, like the tables that upstream stores.
 pub(super) fn sinusoids(len: usize, width: usize, device: &Device) -> Tensor<3> {
     let step = -(10_000_f64.ln()) / width as f64;
     let frequency = |i: usize| (((2 * (i / 2)) as f32) * step as f32).exp();
@@ -116,7 +116,7 @@ pub(super) fn sinusoids(len: usize, width: usize, device: &Device) -> Tensor<3> 
     Tensor::from_data(TensorData::new(values, [1, len, width]), device)
 }
 
-/// Multi-head attention with a projection each.
+/// Multi-head attention with separate projections of keys, queries and values.
 #[derive(Module, Debug)]
 pub struct SplitAttention {
     /// H -> H.
@@ -160,7 +160,7 @@ impl SplitAttention {
     }
 }
 
-/// Linear, GELU, Linear, dropout.
+/// Linear, GELU, Linear, dropout, as upstream's sequence numbers them.
 pub(super) type Mlp = (Linear, Gap, Linear);
 
 pub(super) fn mlp(init: &mut Init<'_>, width: usize, rate: usize) -> Mlp {
@@ -174,13 +174,11 @@ pub(super) fn through((first, _, second): &Mlp, x_bth: Tensor<3>, dropout: &mut 
 /// A pre-norm block: `x += Attn(LN1 x)`, `x += MLP(LN2 x)`.
 #[derive(Module, Debug)]
 pub struct GptBlock {
-    /// Before the attention.
+    /// Norm before the attention.
     pub ln1: Norm,
-    /// Before the feed-forward.
+    /// Norm before the feed-forward.
     pub ln2: Norm,
-    /// Attention.
     pub attn: SplitAttention,
-    /// Feed-forward.
     pub mlp: Mlp,
 }
 
@@ -201,12 +199,11 @@ impl GptBlock {
     }
 }
 
-/// Blocks, a norm and the logits of classes.
+/// Blocks, a final norm and the logits of classes.
 #[derive(Module, Debug)]
 pub struct GptHead {
-    /// Blocks.
     pub blocks: Vec<GptBlock>,
-    /// After them.
+    /// Norm after the blocks.
     pub ln_f: Norm,
     /// H -> classes, no bias.
     pub head: Linear,
@@ -232,18 +229,17 @@ impl GptHead {
     }
 }
 
-/// `x += Attn(LN1 x, LN3 w)`, `x += MLP(LN2 x)`: words looked at, no tokens among each other.
+/// `x += Attn(LN1 x, LN3 w)`, `x += MLP(LN2 x)`: tokens attend to words, not to each other.
 #[derive(Module, Debug)]
 pub struct CrossBlock {
-    /// Before the attention.
+    /// Norm before the attention.
     pub ln1: Norm,
-    /// Before the feed-forward.
+    /// Norm before the feed-forward.
     pub ln2: Norm,
-    /// On the words.
+    /// Norm on the words.
     pub ln3: Norm,
     /// Attention to the words.
     pub attn: SplitAttention,
-    /// Feed-forward.
     pub mlp: Mlp,
 }
 

@@ -1,8 +1,9 @@
-//! CLIP's text tower. Source: Radford et al., arXiv:2103.00020; tensor names are those of Hugging Face's `CLIPModel`, whose other tower is not
-//! read. Weights under OpenAI's names are renamed by [`renamed_from_openai`].
+//! CLIP's text tower. Source: Radford et al., arXiv:2103.00020. Tensor names are those of Hugging Face's `CLIPModel`,
+//! whose image tower is not read. [`renamed_from_openai`] renames weights under OpenAI's names.
 //!
-//! Token and position embeddings, causal pre-norm blocks, a norm. A caption's vector is the state at the end token, which has the largest
-//! id of all, or its projection. What pads does not matter up to the end token; states behind it depend on it.
+//! Token and position embeddings, causal pre-norm blocks, a norm. A caption's vector is the state at the end token,
+//! which has the largest id, or the projection of that state. Padding does not affect the states up to the end token;
+//! the states after it depend on it.
 
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -13,45 +14,43 @@ use super::attend::{DEVIATION, Embedding, attend, causal, hiding, linear};
 use super::{Init, Linear, Norm};
 use crate::kernels::{self, Dropout};
 
-/// The end token's id in published settings, where it stands for "the largest id".
+/// The end token's id in published settings; it means "the largest id of the caption".
 const LEGACY_END: usize = 2;
 
-/// What is between the feed-forward's layers.
+/// Activation between the layers of the feed-forward.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ClipActivation {
-    /// `x sigmoid(1.702 x)`: the published towers.
+    /// `x sigmoid(1.702 x)`, as in the published towers.
     QuickGelu,
-    /// With the error function.
+    /// GELU with the error function.
     Gelu,
 }
 
-/// Size of the tower, as `text_config` of a published `config.json` has it.
+/// Size of the tower, as in `text_config` of a published `config.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ClipTextConfig {
     /// Rows of the token table.
     pub vocab_size: usize,
-    /// Width H.
     pub hidden_size: usize,
-    /// Feed-forward width.
     pub intermediate_size: usize,
-    /// Blocks.
+    /// Number of blocks.
     pub num_hidden_layers: usize,
-    /// Heads.
+    /// Number of attention heads.
     pub num_attention_heads: usize,
-    /// Positions.
+    /// Largest number of tokens.
     pub max_position_embeddings: usize,
     /// Width C of a projected caption.
     pub projection_dim: usize,
-    /// In the feed-forward.
+    /// Activation in the feed-forward.
     pub hidden_act: ClipActivation,
     /// Added to variances in layer norms.
     pub layer_norm_eps: f64,
-    /// The end token; 2 stands for the largest id of a caption.
+    /// The end token; 2 means the largest id of a caption.
     pub eos_token_id: usize,
 }
 
-/// Tables.
+/// Tables of tokens and positions.
 #[derive(Module, Debug)]
 pub struct ClipEmbeddings {
     /// Token -> H.
@@ -60,7 +59,7 @@ pub struct ClipEmbeddings {
     pub position_embedding: Embedding,
 }
 
-/// Attention with a projection each.
+/// Attention with separate projections.
 #[derive(Module, Debug)]
 pub struct ClipAttention {
     /// H -> H.
@@ -73,50 +72,46 @@ pub struct ClipAttention {
     pub out_proj: Linear,
 }
 
-/// Two layers.
+/// The feed-forward of two layers.
 #[derive(Module, Debug)]
 pub struct ClipMlp {
     /// H -> feed-forward width.
     pub fc1: Linear,
-    /// And back.
+    /// Feed-forward width -> H.
     pub fc2: Linear,
 }
 
-/// `x += Attn(LN1 x)`, `x += MLP(LN2 x)`.
+/// A pre-norm block: `x += Attn(LN1 x)`, `x += MLP(LN2 x)`.
 #[derive(Module, Debug)]
 pub struct ClipBlock {
-    /// Attention.
     pub self_attn: ClipAttention,
-    /// Before it.
+    /// Norm before the attention.
     pub layer_norm1: Norm,
-    /// Feed-forward.
     pub mlp: ClipMlp,
-    /// Before it.
+    /// Norm before the feed-forward.
     pub layer_norm2: Norm,
 }
 
-/// The blocks.
+/// The stack of blocks.
 #[derive(Module, Debug)]
 pub struct ClipEncoder {
-    /// In order.
+    /// Blocks, first to last.
     pub layers: Vec<ClipBlock>,
 }
 
 /// The tower without its projection.
 #[derive(Module, Debug)]
 pub struct ClipTextModel {
-    /// Tables.
     pub embeddings: ClipEmbeddings,
-    /// Blocks.
     pub encoder: ClipEncoder,
-    /// After them.
+    /// Norm after the blocks.
     pub final_layer_norm: Norm,
 }
 
-/// The tower.
+/// The tower with its projection.
 #[derive(Module, Debug)]
 pub struct ClipText {
-    /// Without the projection.
+    /// The tower without the projection.
     pub text_model: ClipTextModel,
     /// H -> C, no bias.
     pub text_projection: Linear,
@@ -124,19 +119,19 @@ pub struct ClipText {
     config: ClipTextConfig,
 }
 
-/// What captions become.
+/// The outputs of the tower for a batch of captions.
 #[derive(Debug)]
 pub struct ClipStates {
     /// The state of every token, after the last norm: [B, T, H].
     pub tokens_bth: Tensor<3>,
-    /// That of the end token: [B, H].
+    /// The state of the end token: [B, H].
     pub pooled_bh: Tensor<2>,
-    /// Its projection, not normalised: [B, C].
+    /// The projection of `pooled_bh`, not normalised: [B, C].
     pub projected_bc: Tensor<2>,
 }
 
 impl ClipText {
-    /// One with weights that mean nothing yet.
+    /// Creates a tower with untrained weights.
     pub fn new(config: &ClipTextConfig, init: &mut Init<'_>) -> Self {
         let (width, inner) = (config.hidden_size, config.intermediate_size);
         let mut block = || {
@@ -167,7 +162,8 @@ impl ClipText {
         }
     }
 
-    /// `ids` [B T]. `visible` [B T] hides keys; the users of published models give none, so that what pads is looked at from behind the end.
+    /// Encodes `ids` [B T]. `visible` [B T] hides keys. Users of the published models pass `None`, so positions after
+    /// the end see the padding.
     ///
     /// # Panics
     /// If there are more tokens than positions, or an id is not in the table.
@@ -211,7 +207,7 @@ impl ClipText {
         x + block.mlp.fc2.forward(inner)
     }
 
-    /// Where a caption ends: at the first end token, or the first of the largest id.
+    /// The position of a caption's end: its first end token, or the first of its largest ids.
     fn end(&self, ids: &[usize]) -> usize {
         let end = match self.config.eos_token_id {
             LEGACY_END => ids.iter().copied().max().unwrap_or_default(),
@@ -221,7 +217,8 @@ impl ClipText {
     }
 }
 
-/// A tensor under OpenAI's name as tensors under Hugging Face's; none of what the text tower does not have. `shape` must be that of the values.
+/// Converts a tensor under OpenAI's name into tensors under Hugging Face's names. Returns none for tensors that the
+/// text tower lacks. `shape` must be the shape of the values.
 pub fn renamed_from_openai(name: &str, shape: &[usize], values: Vec<f32>) -> Vec<(String, Vec<usize>, Vec<f32>)> {
     let same = |name: &str, values: Vec<f32>| vec![(name.to_owned(), shape.to_vec(), values)];
     match name {
@@ -230,7 +227,7 @@ pub fn renamed_from_openai(name: &str, shape: &[usize], values: Vec<f32>) -> Vec
         "ln_final.weight" => same("text_model.final_layer_norm.weight", values),
         "ln_final.bias" => same("text_model.final_layer_norm.bias", values),
         "text_projection" => {
-            // There [H, C], here [C, H].
+            // OpenAI's shape is [H, C]; Hugging Face's is [C, H].
             let &[width, out] = shape else { return Vec::new() };
             let turned = (0..out).flat_map(|c| (0..width).map(move |h| h * out + c)).map(|at| values[at]).collect();
             vec![("text_projection.weight".to_owned(), vec![out, width], turned)]

@@ -1,4 +1,5 @@
-//! What a ControlNet does to its condition before that is added to the noised latent. Source: as for [`Control`](super::Control).
+//! The layers that a ControlNet applies to its condition before adding it to the noised latent. Source: as for
+//! [`Control`](super::Control).
 
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -6,16 +7,17 @@ use burn::tensor::activation::silu;
 
 use super::{Init, Linear};
 
-/// The Linears that a condition goes through. Their numbers are upstream's places in a sequence that v2 has activations in.
+/// The condition's Linears. Their numbers are upstream's places in a sequence, which has activations between them in
+/// v2.
 #[derive(Module, Debug)]
 pub struct ConditionEmbedding {
     /// d -> E.
     pub at_0: Linear,
     /// E -> E (v1).
     pub at_1: Option<Linear>,
-    /// v1: E -> d, zero at first. v2: E -> E.
+    /// v1: E -> d, initialised to zero. v2: E -> E.
     pub at_2: Linear,
-    /// E -> d, zero at first (v2).
+    /// E -> d, initialised to zero (v2).
     pub at_4: Option<Linear>,
 }
 
@@ -33,7 +35,7 @@ impl ConditionEmbedding {
         }
     }
 
-    /// [B, N, d] -> [B, N, d].
+    /// Maps [B, N, d] to [B, N, d].
     pub fn forward(&self, condition_bnd: Tensor<3>) -> Tensor<3> {
         let x = self.at_0.forward(condition_bnd);
         match (&self.at_1, &self.at_4) {

@@ -1,10 +1,11 @@
-//! The ControlNet of a latent denoiser: a trainable copy that tells the frozen one, block by block, where joints should be. Source: MotionLCM
-//! (Dai et al., ECCV 2024; v2 of late 2024), after Zhang et al., arXiv:2302.05543.
+//! The ControlNet of a latent denoiser: a trainable copy that adds joint targets to the frozen denoiser, block by
+//! block. Source: MotionLCM (Dai et al., ECCV 2024; v2 of late 2024), after Zhang et al., arXiv:2302.05543.
 //!
-//! Tokens of the [trajectory encoder](super::TrajectoryEncoder) go through three Linears, the last of which is zero at first, and are added to the
-//! noised latent; v2 has SiLU between them. The copy's block outputs, each through a Linear that is zero at first, are added to those of the same
-//! blocks of the frozen denoiser, before these are kept for its skip connections. So at the start nothing changes, and only the zero
-//! layers get a gradient. The copy has no norm at its end; its `latent_post` is copied and has no use.
+//! Tokens of the [trajectory encoder](super::TrajectoryEncoder) pass three Linears, with SiLU between them in v2, and
+//! are added to the noised latent. The last Linear is initialised to zero. Each block output of the copy passes a
+//! Linear that is initialised to zero. It is added to the output of the same block of the frozen denoiser, before that
+//! output is kept for the skip connections. So nothing changes at the start, and only the zero layers get a gradient.
+//! The copy has no norm at its end; its `latent_post` is copied but unused.
 
 use burn::tensor::Tensor;
 
@@ -12,17 +13,18 @@ use super::{ConditionEmbedding, Denoiser, DenoiserConfig, Init, Linear};
 use crate::flat;
 use crate::kernels::Dropout;
 
-/// What a ControlNet adds.
+/// The contribution of a ControlNet to its denoiser.
 #[derive(Debug, Clone, Copy)]
 pub struct Control<'a> {
-    /// For each block [B, N + 1 + L, H].
+    /// Residuals of each block, [B, N + 1 + L, H].
     pub residuals: &'a [Tensor<3>],
-    /// What they are multiplied by; 1 as trained.
+    /// Factor on the residuals; 1 as trained.
     pub scale: f64,
 }
 
 impl Denoiser {
-    /// A ControlNet for denoisers of `config`'s size, whose condition embedding has width `embed` and, in v2, activations.
+    /// Creates a ControlNet for denoisers of `config`'s size. Its condition embedding has width `embed` and, in v2,
+    /// activations.
     pub fn controlnet(config: &DenoiserConfig, embed: usize, activated: bool, init: &mut Init<'_>) -> Self {
         let mut network = Self::new(config, init);
         network.encoder.norm = None;
@@ -35,8 +37,8 @@ impl Denoiser {
         network
     }
 
-    /// What a ControlNet adds to the output of each block of its denoiser, [B, N + 1 + L, H] each. `condition_bnd` [B, N, d] are the trajectory
-    /// encoder's tokens; the rest is what the denoiser is given.
+    /// Computes the residuals for the blocks of the denoiser, [B, N + 1 + L, H] each. `condition_bnd` [B, N, d] are the
+    /// trajectory encoder's tokens; the other arguments are the denoiser's.
     ///
     /// # Panics
     /// If this is no ControlNet.
@@ -59,7 +61,7 @@ impl Denoiser {
         residuals
     }
 
-    /// As [`forward`](Self::forward), with what a ControlNet adds to the blocks' outputs.
+    /// Like [`forward`](Self::forward), with a ControlNet's residuals added to the blocks' outputs.
     pub fn forward_controlled(
         &self,
         latent_bnd: Tensor<3>,
@@ -81,7 +83,8 @@ impl Denoiser {
     }
 }
 
-/// `control` with every parameter that `base` has too taken from there; the condition embedding and the zero layers keep their own.
+/// Copies every parameter that `base` and `control` share from `base`; the condition embedding and the zero layers keep
+/// their own values.
 pub fn copied_from(base: &Denoiser, control: Denoiser) -> Denoiser {
     let (entries, values) = (flat::layout(base), flat::read(base));
     let mut at = 0;

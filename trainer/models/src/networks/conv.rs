@@ -1,7 +1,7 @@
-//! Convolutions over time on [B, T, C], as matrix products over windows, and the parts of upstream's sequences.
+//! Convolutions over time on [B, T, C] as matrix products over windows, and the parts of upstream's sequences.
 //!
-//! Rows of a window are gathered tap after tap, so that a convolution of any stride and dilation is one [`kernels::linear`]: its weights are
-//! published as [out, in, taps], and the fused product runs on the calling thread.
+//! The rows of a window are gathered tap after tap. So a convolution of any stride and dilation is one
+//! [`kernels::linear`]: weights are published as [out, in, taps], and the fused product runs on the calling thread.
 
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
@@ -9,7 +9,7 @@ use burn::tensor::Tensor;
 use super::Init;
 use crate::kernels;
 
-/// An entry of a sequence that has no parameters: an activation, a reshaping. Its number counts, it does not.
+/// An entry of a sequence without parameters, such as an activation or a reshape; it only takes up a number.
 pub(super) type Gap = bool;
 /// The one value of a [`Gap`].
 pub(super) const GAP: Gap = false;
@@ -17,29 +17,30 @@ pub(super) const GAP: Gap = false;
 /// A convolution over time.
 #[derive(Module, Debug)]
 pub struct Conv1d {
-    /// [out, in, taps].
+    /// Weights of shape [out, in, taps].
     pub weight: Param<Tensor<3>>,
-    /// [out].
+    /// Bias of shape [out].
     pub bias: Option<Param<Tensor<1>>>,
     stride: usize,
     dilation: usize,
     padding: usize,
-    /// Edges are repeated instead of zero.
+    /// Pads with repeated edges instead of zeros.
     replicate: bool,
 }
 
 impl Conv1d {
-    /// An odd number of taps, stride 1, as many frames out as in; weight and bias in PyTorch's default range.
+    /// Creates a layer with stride 1 and an odd number of taps, which keeps the number of frames. Weight and bias are
+    /// initialised in PyTorch's default range.
     pub fn same(init: &mut Init<'_>, inner: usize, out: usize, taps: usize) -> Self {
         Self::dilated(init, inner, out, taps, 1)
     }
 
-    /// The same with `dilation` frames from tap to tap.
+    /// Like [`same`](Self::same), with `dilation` frames between taps.
     pub fn dilated(init: &mut Init<'_>, inner: usize, out: usize, taps: usize, dilation: usize) -> Self {
         Self { padding: dilation * (taps / 2), dilation, ..Self::strided(init, inner, out, taps, 1, 0) }
     }
 
-    /// Every `stride`-th window, with `padding` frames of zeros on either side.
+    /// Creates a layer on every `stride`-th window, with `padding` frames of zeros on either side.
     pub fn strided(init: &mut Init<'_>, inner: usize, out: usize, taps: usize, stride: usize, padding: usize) -> Self {
         let fan = inner * taps;
         Self {
@@ -52,19 +53,19 @@ impl Conv1d {
         }
     }
 
-    /// The layer without a bias.
+    /// Removes the bias.
     #[must_use]
     pub fn without_bias(self) -> Self {
         Self { bias: None, ..self }
     }
 
-    /// The layer with its edges repeated where others have zeros.
+    /// Pads with repeated edges instead of zeros.
     #[must_use]
     pub fn replicating(self) -> Self {
         Self { replicate: true, ..self }
     }
 
-    /// [B, T, in] -> [B, T', out] with `T' = (T + 2 padding - dilation (taps - 1) - 1) / stride + 1`.
+    /// Maps [B, T, in] to [B, T', out] with `T' = (T + 2 padding - dilation (taps - 1) - 1) / stride + 1`.
     ///
     /// # Panics
     /// If the padded sequence is shorter than a window.
@@ -76,7 +77,7 @@ impl Conv1d {
         kernels::linear(self.windows(x_btc, taps), weight, self.bias.as_ref().map(Param::val))
     }
 
-    /// [B, T, in] -> [B, T', taps in].
+    /// Gathers windows: [B, T, in] -> [B, T', taps in].
     fn windows(&self, x_btc: Tensor<3>, taps: usize) -> Tensor<3> {
         if taps == 1 && self.stride == 1 && self.padding == 0 {
             return x_btc;
@@ -85,7 +86,7 @@ impl Conv1d {
         let reach = self.dilation * (taps - 1);
         assert!(frames + 2 * self.padding > reach, "{frames} frames are shorter than a window of {}", reach + 1);
         let count = (frames + 2 * self.padding - reach - 1) / self.stride + 1;
-        // In blocks of `stride` rows every tap is a column of blocks.
+        // Viewed in blocks of `stride` rows, every tap is a column of blocks.
         let rows = self.stride * (reach / self.stride + count);
         let blocks = self.padded(x_btc, rows).reshape([batch, rows / self.stride, self.stride * inner]);
         let tap = |k: usize| {
@@ -95,7 +96,7 @@ impl Conv1d {
         Tensor::cat((0..taps).map(tap).collect(), 2)
     }
 
-    /// `rows` rows, of which the first are the padding on the left.
+    /// Pads to `rows` rows, including the padding on the left.
     fn padded(&self, x_btc: Tensor<3>, rows: usize) -> Tensor<3> {
         let [batch, frames, inner] = x_btc.dims();
         let edge = |at: usize, count: usize| {
@@ -109,7 +110,7 @@ impl Conv1d {
         if self.padding > 0 {
             parts.push(edge(0, self.padding));
         }
-        // What no window reaches is cut off.
+        // Frames beyond the last window are cut off.
         let kept = frames.min(rows - self.padding);
         parts.push(x_btc.clone().slice([0..batch, 0..kept, 0..inner]));
         let missing = rows - self.padding - kept;
@@ -120,22 +121,22 @@ impl Conv1d {
     }
 }
 
-/// A transposed convolution of two taps and stride 2: twice as many frames, none of which overlap.
+/// A transposed convolution of two taps and stride 2: it doubles the frames, and windows do not overlap.
 #[derive(Module, Debug)]
 pub struct Doubling {
-    /// [in, out, 2].
+    /// Weights of shape [in, out, 2].
     pub weight: Param<Tensor<3>>,
-    /// [out].
+    /// Bias of shape [out].
     pub bias: Param<Tensor<1>>,
 }
 
 impl Doubling {
-    /// Weight and bias in PyTorch's default range, which counts outputs here.
+    /// Initialises weight and bias in PyTorch's default range, which counts outputs for this layer.
     pub fn new(init: &mut Init<'_>, inner: usize, out: usize) -> Self {
         Self { weight: init.fan_in(2 * out, [inner, out, 2]), bias: init.fan_in(2 * out, [out]) }
     }
 
-    /// [B, T, in] -> [B, 2 T, out].
+    /// Maps [B, T, in] to [B, 2 T, out].
     pub fn forward(&self, x_btc: Tensor<3>) -> Tensor<3> {
         let [batch, frames, _] = x_btc.dims();
         let [inner, out, taps] = self.weight.dims();
@@ -146,7 +147,7 @@ impl Doubling {
     }
 }
 
-/// Every frame `times` times in a row: nearest-neighbour up-sampling. [B, T, C] -> [B, times T, C].
+/// Repeats every frame `times` times (nearest-neighbour up-sampling). [B, T, C] -> [B, times T, C].
 pub(super) fn repeat(x_btc: Tensor<3>, times: usize) -> Tensor<3> {
     let [batch, frames, width] = x_btc.dims();
     let x = x_btc.reshape([batch, frames, 1, width]).expand([batch, frames, times, width]);

@@ -1,8 +1,9 @@
-//! The latent denoiser: predicts the noise in a latent from the latent, a timestep and a caption embedding. Source: MLD (v1: ReLU on
-//! the text, d = H), MotionLCM v2 (no ReLU, projections), and LCM's guidance embedding (Luo et al., arXiv:2310.04378).
+//! The latent denoiser: predicts the noise in a latent from the latent, a timestep and a caption embedding. Source: MLD
+//! (v1: ReLU on the text, d = H), MotionLCM v2 (no ReLU, projections), and LCM's guidance embedding (Luo et al.,
+//! arXiv:2310.04378).
 //!
-//! One sequence: N latent tokens, one time token, the text tokens; learned positions; skip encoder; the first N outputs. The length of
-//! the motion is no input: it enters through the VAE's decoder alone.
+//! The sequence is N latent tokens, one time token and the text tokens, with learned positions. A skip encoder follows,
+//! and its first N outputs are the prediction. The motion's length is no input here; only the VAE's decoder uses it.
 
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -22,21 +23,20 @@ pub struct DenoiserConfig {
     pub dim: usize,
     /// Width H of the transformer.
     pub width: usize,
-    /// Blocks.
+    /// Number of blocks.
     pub layers: usize,
-    /// Heads.
+    /// Number of attention heads.
     pub heads: usize,
-    /// Feed-forward width.
     pub feed_forward: usize,
     /// Width of a caption embedding.
     pub text_dim: usize,
     /// Width of the time sinusoid.
     pub time_dim: usize,
-    /// ReLU on the text (v1).
+    /// Applies ReLU to the text (v1).
     pub text_relu: bool,
-    /// Linear layers d -> H and back (v2); without them d is H (v1).
+    /// Adds linear layers d -> H and back (v2); without them d is H (v1).
     pub projection: bool,
-    /// Width of the guidance embedding of a student.
+    /// Width of a student's guidance embedding.
     pub guidance_dim: Option<usize>,
     /// Added to variances in layer norms.
     pub norm_eps: f64,
@@ -47,30 +47,29 @@ pub struct DenoiserConfig {
 pub struct TimeEmbedding {
     /// time_dim -> H.
     pub linear_1: Linear,
-    /// guidance_dim -> time_dim, no bias, zero at first.
+    /// guidance_dim -> time_dim, no bias, initialised to zero.
     pub cond_proj: Option<Linear>,
     /// H -> H.
     pub linear_2: Linear,
 }
 
-/// The denoiser.
+/// The denoiser's layers under their published names.
 #[derive(Module, Debug)]
 pub struct Denoiser {
     /// d -> H (v2).
     pub latent_pre: Option<Linear>,
     /// H -> d (v2).
     pub latent_post: Option<Linear>,
-    /// Time token.
+    /// Layers of the time token.
     pub time_embedding: TimeEmbedding,
     /// text_dim -> H; published as `emb_proj.1`.
     pub emb_proj: Linear,
     /// Positions of all tokens.
     pub query_pos: Positions,
-    /// The transformer.
     pub encoder: SkipStack,
-    /// What a ControlNet's condition goes through.
+    /// Layers for a ControlNet's condition.
     pub controlnet_cond_embedding: Option<ConditionEmbedding>,
-    /// What a ControlNet's block outputs go through; a denoiser has none.
+    /// Layers for a ControlNet's block outputs; empty in a denoiser.
     pub controlnet_down_mid_blocks: Vec<Linear>,
     tokens: usize,
     time_dim: usize,
@@ -78,7 +77,7 @@ pub struct Denoiser {
 }
 
 impl Denoiser {
-    /// A fresh denoiser.
+    /// Creates a denoiser with initial weights.
     pub fn new(config: &DenoiserConfig, init: &mut Init<'_>) -> Self {
         let DenoiserConfig { tokens, dim, width, text_dim, time_dim, .. } = *config;
         let stack = StackConfig {
@@ -108,10 +107,10 @@ impl Denoiser {
         }
     }
 
-    /// The time token [B, H] before positions.
+    /// The time token [B, H] before positions are added.
     ///
     /// # Panics
-    /// If a guidance embedding is given to a network without a place for it.
+    /// If a guidance embedding is given to a network without a layer for it.
     pub fn time_token(
         &self,
         timesteps: &[usize],
@@ -126,8 +125,8 @@ impl Denoiser {
         self.time_embedding.linear_2.forward(silu(self.time_embedding.linear_1.forward(sinusoid)))
     }
 
-    /// Predicted noise [B, N, d]. `latent_bnd` [B, N, d]; one timestep a sample; `text_blc` [B, L, text_dim]; `guidance_bg`
-    /// [B, guidance_dim] for a student.
+    /// Predicts the noise [B, N, d]. `latent_bnd` [B, N, d]; one timestep per sample; `text_blc` [B, L, text_dim];
+    /// `guidance_bg` [B, guidance_dim] for a student.
     pub fn forward(
         &self,
         latent_bnd: Tensor<3>,
@@ -143,7 +142,7 @@ impl Denoiser {
         }
     }
 
-    /// The outputs of every block on the N latent tokens, [B, N, H] each: what a discriminator looks at.
+    /// The outputs of every block on the N latent tokens, [B, N, H] each, for a discriminator.
     pub fn features(
         &self,
         latent_bnd: Tensor<3>,
@@ -160,7 +159,7 @@ impl Denoiser {
         seen
     }
 
-    /// The first N outputs of the transformer [B, N, H], with the output of every block replaced by what `pass` makes of it.
+    /// The first N outputs of the transformer [B, N, H]; `pass` replaces the output of every block.
     pub(super) fn tokens_through(
         &self,
         latent_bnd: Tensor<3>,

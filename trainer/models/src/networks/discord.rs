@@ -1,11 +1,12 @@
-//! The vector field of a rectified flow that turns frozen tokens into motion: a U-Net over time. Source: DisCoRD (Cho et al.,
-//! arXiv:2411.19527), after the one-dimensional U-Net of Ho et al., arXiv:2006.11239.
+//! The vector field of a rectified flow that converts frozen tokens into motion: a U-Net over time. Source: DisCoRD
+//! (Cho et al., arXiv:2411.19527), after the one-dimensional U-Net of Ho et al., arXiv:2006.11239.
 //!
-//! The noisy motion and the projected tokens are joined per frame. A level is residual blocks with the time's scale and shift, and a
-//! convolution that halves the frames (not on the last level); the way up mirrors it, each residual block with its counterpart's output
-//! appended. Norms are root mean square over channels. Time runs from noise at 0 to data at 1 and enters unscaled.
+//! The noisy motion and the projected tokens are joined per frame. A level is residual blocks with the time's scale and
+//! shift, and a convolution that halves the frames (not on the last level). The way up mirrors it: the output of the
+//! matching residual block is appended. Norms are root mean square over channels. Time is 0 at noise and 1 at data, and
+//! enters unscaled.
 //!
-//! Departs: batch norms of the projection named `Upsample` use their stored statistics, in training too.
+//! Departs: the batch norms of the projection `Upsample` use their stored statistics in training too.
 
 use burn::module::{Module, Param};
 use burn::tensor::activation::{leaky_relu, silu, softmax};
@@ -16,20 +17,20 @@ use super::conv::{Conv1d, Doubling, GAP, Gap, repeat};
 use super::{Init, Linear};
 use crate::kernels::{Dropout, dropout, gelu};
 
-/// Frames that one token stands for.
+/// Frames per token.
 const UNIT: usize = 4;
-/// Heads of the linear attentions, and their width.
+/// Number of heads of the linear attentions, and the width of each.
 const LINEAR_HEADS: (usize, usize) = (4, 32);
-/// The least norm that is divided by.
+/// Lower limit of a norm used as a divisor.
 const LEAST: f32 = 1e-12;
 /// Added to variances in batch norms.
 const BATCH_EPS: f64 = 1e-5;
 
-/// How tokens become a condition on each frame.
+/// Conversion of tokens into a condition on each frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Projection {
-    /// Repeat, stack four frames, a linear layer, unstack, another: as published.
+    /// Repeat, stack four frames, a linear layer, unstack, a second linear layer, as published.
     Stack,
     /// Repeat and a linear layer; nearest-neighbour up-sampling is the same.
     Repeat,
@@ -39,15 +40,15 @@ pub enum Projection {
     Upsample,
 }
 
-/// How the time enters.
+/// Encoding of the time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TimeFeatures {
     /// Sines and cosines of fixed frequencies.
     Sinusoid,
-    /// The time, sines and cosines of trained frequencies, so many in all.
+    /// The time itself, then sines and cosines of trained frequencies; the number counts all of them.
     Learned(usize),
-    /// The same with frequencies drawn once.
+    /// Like [`Learned`](Self::Learned), with frequencies drawn once and not trained.
     Random(usize),
 }
 
@@ -58,30 +59,30 @@ pub struct UnetConfig {
     pub features: usize,
     /// Width of the first level.
     pub width: usize,
-    /// Widths of what the levels give, over the first.
+    /// Output widths of the levels as multiples of `width`.
     pub multiples: Vec<usize>,
     /// Width of a token.
     pub token_dim: usize,
     /// Width of the condition on a frame.
     pub condition_dim: usize,
-    /// Residual blocks of a level.
+    /// Residual blocks per level.
     pub blocks: usize,
-    /// Tokens to condition.
+    /// Conversion of tokens into the condition.
     pub projection: Projection,
-    /// Attention on each level and in the middle: heads and their width in the middle; those of the levels are fixed.
+    /// Attention on each level and in the middle, as heads and their width in the middle. The levels' are fixed.
     pub attention: Option<(usize, usize)>,
-    /// Time to features.
+    /// Encoding of the time.
     pub time: TimeFeatures,
     /// Base of the sinusoid's frequencies.
     pub theta: f64,
-    /// Twice the features come out: upstream's option of a learned variance.
+    /// Doubles the output features: upstream's option of a learned variance.
     pub learned_variance: bool,
 }
 
 /// Scales rows to a root mean square of 1, then by a learned gain.
 #[derive(Module, Debug)]
 pub struct RmsNorm {
-    /// [1, C, 1].
+    /// Gain of shape [1, C, 1].
     pub g: Param<Tensor<3>>,
 }
 
@@ -100,9 +101,9 @@ impl RmsNorm {
 /// Convolution, norm, SiLU.
 #[derive(Module, Debug)]
 pub struct ConvBlock {
-    /// Three taps.
+    /// Convolution with three taps.
     pub proj: Conv1d,
-    /// After it.
+    /// Norm after the convolution.
     pub norm: RmsNorm,
 }
 
@@ -119,13 +120,13 @@ impl ConvBlock {
 /// Two convolutions with the time's scale and shift between them.
 #[derive(Module, Debug)]
 pub struct TimedBlock {
-    /// After SiLU: time -> scale and shift.
+    /// Time -> scale and shift, after a SiLU.
     pub mlp: (Gap, Linear),
     /// In -> out.
     pub block1: ConvBlock,
     /// Out -> out.
     pub block2: ConvBlock,
-    /// In -> out around them, if the widths differ.
+    /// In -> out on the residual path, if the widths differ.
     pub res_conv: Option<Conv1d>,
 }
 
@@ -153,7 +154,7 @@ impl TimedBlock {
     }
 }
 
-/// Attention that is linear in the frames: queries over the width of a head, keys over the frames.
+/// Attention linear in the frames: softmax of queries over a head's width, and of keys over the frames.
 #[derive(Module, Debug)]
 pub struct LinearAttention {
     /// C -> queries, keys, values; no bias.
@@ -223,17 +224,16 @@ fn joined(x: Tensor<4>) -> Tensor<3> {
     x.swap_dims(1, 2).reshape([batch, frames, heads * head])
 }
 
-/// A norm and what comes after it.
+/// A layer with a norm before it.
 #[derive(Module, Debug)]
 pub struct Normed<M: Module> {
-    /// Attention.
+    /// The layer after the norm, an attention.
     #[allow(clippy::struct_field_names, reason = "published name")]
     pub r#fn: M,
-    /// Before it.
     pub norm: RmsNorm,
 }
 
-/// `x + F(norm x)`.
+/// A residual connection: `x + F(norm x)`.
 #[derive(Module, Debug)]
 pub struct Residual<M: Module> {
     /// The norm and the attention.
@@ -245,7 +245,7 @@ impl<M: Module> Residual<M> {
         Self { r#fn: Normed { r#fn: inner, norm: RmsNorm::new(init, width) } }
     }
 
-    /// `2 x + F(norm x)`: the network adds what is a residual already to its input once more.
+    /// Computes `2 x + F(norm x)`: the network adds the input a second time to a residual output.
     fn twice(&self, x_btc: Tensor<3>, inner: impl FnOnce(&M, Tensor<3>) -> Tensor<3>) -> Tensor<3> {
         let normed = self.r#fn.norm.forward(x_btc.clone());
         x_btc * 2.0 + inner(&self.r#fn.r#fn, normed)
@@ -256,26 +256,26 @@ impl<M: Module> Residual<M> {
 #[derive(Module, Debug)]
 #[expect(clippy::large_enum_variant, reason = "a network has a dozen, and a box is no module")]
 pub enum LevelPart {
-    /// Convolutions.
+    /// Two convolutions with the time's scale and shift.
     Block(TimedBlock),
-    /// Attention.
+    /// Linear attention with a residual.
     Attention(Residual<LinearAttention>),
-    /// To the next level, without or with halving the frames.
+    /// Convolution to the next level; it halves the frames or keeps them.
     Conv(Conv1d),
-    /// Doubles the frames first.
+    /// Doubling of the frames, then a convolution.
     Up((Gap, Conv1d)),
 }
 
-/// Scale and shift by stored statistics.
+/// Scale and shift with stored statistics.
 #[derive(Module, Debug)]
 pub struct BatchNorm {
-    /// [C].
+    /// Gain of shape [C].
     pub weight: Param<Tensor<1>>,
-    /// [C].
+    /// Bias of shape [C].
     pub bias: Param<Tensor<1>>,
-    /// [C]; not trained.
+    /// Mean of shape [C]; not trained.
     pub running_mean: Param<Tensor<1>>,
-    /// [C]; not trained.
+    /// Variance of shape [C]; not trained.
     pub running_var: Param<Tensor<1>>,
 }
 
@@ -294,68 +294,68 @@ impl BatchNorm {
     }
 }
 
-/// An entry of the condition's projection.
+/// An entry of the projection from tokens to the condition.
 #[derive(Module, Debug)]
 #[expect(clippy::large_enum_variant, reason = "a network has a handful, and a box is no module")]
 pub enum ProjectionPart {
-    /// Without parameters.
+    /// An activation or a reshape.
     Gap(Gap),
-    /// One tap.
+    /// A linear layer, as a convolution of one tap.
     Linear(Conv1d),
-    /// Twice the frames.
+    /// A transposed convolution that doubles the frames.
     Doubling(Doubling),
     /// Five taps with repeated edges, leaky ReLU, batch norm.
     Normed((Conv1d, Gap, BatchNorm)),
 }
 
-/// An entry of the time's layers.
+/// An entry of the layers that encode the time.
 #[derive(Module, Debug)]
 pub enum TimePart {
     /// Fixed frequencies, or GELU.
     Gap(Gap),
-    /// Frequencies of its own.
+    /// Learned or drawn frequencies.
     Frequencies(Frequencies),
-    /// Linear.
+    /// A linear layer.
     Linear(Linear),
 }
 
 /// Frequencies of the time's sines and cosines.
 #[derive(Module, Debug)]
 pub struct Frequencies {
-    /// [n / 2].
+    /// Frequencies of shape [n / 2].
     pub weights: Param<Tensor<1>>,
     random: bool,
 }
 
-/// The network's parts; the published names begin with `net`.
+/// The network's parts. All published names have the prefix `net`.
 #[derive(Module, Debug)]
 pub struct UnetParts {
     /// Motion and condition -> the first width.
     pub init_proj: Conv1d,
-    /// Time -> features of it.
+    /// Layers from the time to its features.
     pub time_mlp: Vec<TimePart>,
     /// Tokens -> condition.
     pub condition_projection: Vec<ProjectionPart>,
-    /// The way down.
+    /// Levels of the way down.
     pub downs: Vec<Vec<LevelPart>>,
-    /// In the middle.
+    /// First block in the middle.
     pub mid_block1: TimedBlock,
-    /// Between them.
+    /// Attention between the two middle blocks.
     pub mid_attn: Option<Residual<FullAttention>>,
-    /// In the middle.
+    /// Second block in the middle.
     pub mid_block2: TimedBlock,
-    /// The way up.
+    /// Levels of the way up.
     pub ups: Vec<Vec<LevelPart>>,
-    /// With the first layer's output appended.
+    /// The last block; its input has the first layer's output appended.
     pub final_res_block: TimedBlock,
-    /// To features.
+    /// Last width -> features.
     pub final_conv: Conv1d,
 }
 
 /// The vector field.
 #[derive(Module, Debug)]
 pub struct FlowUnet {
-    /// All of it.
+    /// The whole network, under the prefix of the published names.
     pub net: UnetParts,
     width: usize,
     levels: usize,
@@ -364,7 +364,7 @@ pub struct FlowUnet {
 }
 
 impl FlowUnet {
-    /// A fresh one, in PyTorch's default ranges.
+    /// Creates a network initialised in PyTorch's default ranges.
     pub fn new(config: &UnetConfig, init: &mut Init<'_>) -> Self {
         let &UnetConfig { features, width, condition_dim, .. } = config;
         let time = 4 * width;
@@ -418,12 +418,12 @@ impl FlowUnet {
         }
     }
 
-    /// What frames must be a multiple of: of a token's, and of what the levels halve.
+    /// The number of frames must be a multiple of this: a token's frames, and the halvings of the levels.
     pub fn multiple(&self) -> usize {
         UNIT.max(1 << (self.levels - 1))
     }
 
-    /// The condition on each frame, [B, n, token] -> [B, 4 n, condition].
+    /// Computes the condition on each frame, [B, n, token] -> [B, 4 n, condition].
     pub fn condition(&self, tokens_bnc: Tensor<3>) -> Tensor<3> {
         let [batch, tokens, dim] = tokens_bnc.dims();
         let mut x = tokens_bnc;
@@ -433,7 +433,7 @@ impl FlowUnet {
                 ProjectionPart::Gap(_) => x,
                 ProjectionPart::Linear(conv) if self.stack && linears == 0 => {
                     linears += 1;
-                    // Four equal frames side by side, each with a part of what comes out.
+                    // Four equal frames are stacked; each gets its own part of the output.
                     let stacked = Tensor::cat(vec![x; UNIT], 2);
                     conv.forward(stacked).reshape([batch, UNIT * tokens, dim])
                 }
@@ -446,7 +446,7 @@ impl FlowUnet {
         x
     }
 
-    /// Features of the time, [B, 4 width].
+    /// Encodes the time as features [B, 4 width].
     pub fn time(&self, times: &[f32], device: &Device) -> Tensor<2> {
         let at = |values: Vec<f32>| Tensor::<2>::from_data(TensorData::new(values, [times.len(), 1]), device);
         let mut x = sines(times, self.width, self.theta, device);
@@ -471,10 +471,11 @@ impl FlowUnet {
         x
     }
 
-    /// Velocity [B, T, F] of the noisy motion `x_btf` [B, T, F] at `times` (noise 0, data 1) under `tokens_bnc` [B, T / 4, token].
+    /// The velocity [B, T, F] of the noisy motion `x_btf` [B, T, F] at `times` (noise 0, data 1) given `tokens_bnc` [B,
+    /// T / 4, token].
     ///
     /// # Panics
-    /// If T is no multiple of [`multiple`](Self::multiple), or there is not a token for every four frames.
+    /// If T is not a multiple of [`multiple`](Self::multiple), or there is not one token for every four frames.
     pub fn forward(&self, x_btf: Tensor<3>, times: &[f32], tokens_bnc: Tensor<3>, drop: &mut Dropout) -> Tensor<3> {
         let frames = x_btf.dims()[1];
         let multiple = self.multiple();
@@ -495,7 +496,7 @@ impl FlowUnet {
                     other => {
                         let out = aside(other, x);
                         if matches!(other, LevelPart::Attention(_)) {
-                            // What is appended on the way up is what the attention made of it.
+                            // The way up appends the output after the attention, not before it.
                             kept.pop();
                             kept.push(out.clone());
                         }
@@ -525,7 +526,7 @@ impl FlowUnet {
     }
 }
 
-/// An entry that is no residual block.
+/// Applies an entry that is not a residual block.
 fn aside(part: &LevelPart, x_btc: Tensor<3>) -> Tensor<3> {
     match part {
         LevelPart::Attention(attention) => attention.twice(x_btc, LinearAttention::forward),

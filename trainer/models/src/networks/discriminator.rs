@@ -1,8 +1,10 @@
-//! MotionPCM's discriminator: small heads on the block features of the frozen teacher. Source: MotionPCM (arXiv:2501.19083), which says
-//! "linear layers, layer norm, activation, residual" and gives no sizes, and the image repository it follows.
+//! MotionPCM's discriminator: small heads on the block features of the frozen teacher. Source: MotionPCM
+//! (arXiv:2501.19083), which says "linear layers, layer norm, activation, residual" and gives no sizes, and the image
+//! repository that it follows.
 //!
-//! A head is `h1 = a(LN(W1 f))`, `h2 = h1 + a(LN(W2 h1))`, `score = W3 h2` for each latent token, with `a` a leaky ReLU of slope 0.01. One head per
-//! block. Our choice: width of the blocks, LayerNorm (the image heads have GroupNorm), a score per token.
+//! A head is `h1 = a(LN(W1 f))`, `h2 = h1 + a(LN(W2 h1))`, `score = W3 h2` for each latent token, with `a` a leaky ReLU
+//! of slope 0.01. There is one head per block. Our choice: width of the blocks, LayerNorm (the image heads have
+//! GroupNorm), a score per token.
 
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -10,16 +12,14 @@ use burn::tensor::activation::leaky_relu;
 
 use super::{Init, Linear, Norm};
 
-/// One head.
+/// The scoring layers of one teacher block.
 #[derive(Module, Debug)]
 pub struct Head {
     /// H -> H.
     pub linear1: Linear,
-    /// After `linear1`.
     pub norm1: Norm,
     /// H -> H.
     pub linear2: Linear,
-    /// After `linear2`.
     pub norm2: Norm,
     /// H -> 1.
     pub score: Linear,
@@ -28,12 +28,12 @@ pub struct Head {
 /// Heads, one per block of the teacher.
 #[derive(Module, Debug)]
 pub struct Discriminator {
-    /// In block order.
+    /// Heads in the order of the blocks.
     pub heads: Vec<Head>,
 }
 
 impl Discriminator {
-    /// Heads for a teacher of `layers` blocks of `width`.
+    /// Creates heads for a teacher of `layers` blocks of `width`.
     pub fn new(layers: usize, width: usize, init: &mut Init<'_>) -> Self {
         let head = |_| Head {
             linear1: Linear::new(init, width, width),

@@ -1,8 +1,9 @@
-//! The other vector field of DisCoRD's code base, which no released configuration uses: a transformer with adaptive norms. Source: DisCoRD
-//! (Cho et al., arXiv:2411.19527), after DiT (Peebles and Xie, arXiv:2212.09748) and ALiBi (Press et al., arXiv:2108.12409).
+//! The second vector field of DisCoRD's code, a transformer with adaptive norms; no released configuration uses it.
+//! Source: DisCoRD (Cho et al., arXiv:2411.19527), after DiT (Peebles and Xie, arXiv:2212.09748) and ALiBi (Press et
+//! al., arXiv:2108.12409).
 //!
-//! Departs: the published state holds a norm that nothing reads and, with sinusoidal positions, their constant table; here they are not
-//! parameters.
+//! Departs: the published state holds an unused norm and, with sinusoidal positions, their constant table; here they
+//! are not parameters.
 
 #![allow(non_snake_case, reason = "published names")]
 
@@ -16,9 +17,9 @@ use super::conv::{GAP, Gap};
 use super::{Init, Linear, time_sinusoid_f32};
 use crate::kernels::{self, Dropout};
 
-/// Frames that one token stands for.
+/// Frames per token.
 const UNIT: usize = 4;
-/// Added to variances.
+/// Added to variances in norms.
 const EPS: f64 = 1e-6;
 /// Width of the time's sinusoid.
 const FREQUENCIES: usize = 256;
@@ -30,55 +31,52 @@ pub const ATTENTION_DROPOUT: f64 = 0.1;
 pub struct DitConfig {
     /// Features per frame.
     pub features: usize,
-    /// Width H.
     pub width: usize,
     /// Width of a token.
     pub token_dim: usize,
     /// Width of the condition on a frame.
     pub condition_dim: usize,
-    /// Heads.
+    /// Number of attention heads.
     pub heads: usize,
-    /// Feed-forward width over H.
+    /// Feed-forward width as a multiple of H.
     pub rate: usize,
-    /// Blocks.
+    /// Number of blocks.
     pub layers: usize,
-    /// Fixed positions are added.
+    /// Adds fixed positions.
     pub positions: bool,
-    /// Scores fall with the distance between frames.
+    /// Lowers scores with the distance between frames (ALiBi).
     pub alibi: bool,
-    /// Width of a caption embedding that is added to the time's.
+    /// Width of a caption embedding that is added to the time's embedding.
     pub text_dim: Option<usize>,
 }
 
-/// Packed attention.
+/// Attention with one packed projection for queries, keys and values.
 #[derive(Module, Debug)]
 pub struct DitAttention {
-    /// [3H, H].
+    /// Weights of shape [3H, H].
     pub in_proj_weight: Param<Tensor<2>>,
-    /// [3H].
+    /// Bias of shape [3H].
     pub in_proj_bias: Param<Tensor<1>>,
     /// H -> H.
     pub out_proj: Linear,
     heads: usize,
 }
 
-/// Two layers.
+/// The feed-forward of two layers.
 #[derive(Module, Debug)]
 pub struct DitMlp {
-    /// H -> wider.
+    /// H -> feed-forward width.
     pub fc1: Linear,
-    /// Back.
+    /// Feed-forward width -> H.
     pub fc2: Linear,
 }
 
-/// A block whose norms, and what it adds, are scaled and shifted by the time.
+/// A block whose norms and residual outputs are scaled and shifted by the time.
 #[derive(Module, Debug)]
 pub struct DitBlock {
-    /// Attention.
     pub attn: DitAttention,
-    /// Feed-forward.
     pub mlp: DitMlp,
-    /// After SiLU: time -> shift, scale, gate of both.
+    /// Time -> shift, scale and gate of both layers, after a SiLU.
     pub adaLN_modulation: (Gap, Linear),
 }
 
@@ -144,53 +142,52 @@ impl DitBlock {
     }
 }
 
-/// Xavier-uniform and a bias of zeros.
+/// A Linear with Xavier-uniform weights and a bias of zeros.
 fn still(init: &mut Init<'_>, inner: usize, out: usize) -> Linear {
     Linear { weight: init.xavier(out, inner), bias: Some(init.constant(0.0, [out])) }
 }
 
-/// All zeros: at the start a block adds nothing.
+/// A Linear of zeros: a block adds nothing at the start.
 fn zero(init: &Init<'_>, inner: usize, out: usize) -> Linear {
     Linear { weight: init.constant(0.0, [out, inner]), bias: Some(init.constant(0.0, [out])) }
 }
 
-/// Linear, SiLU, Linear.
+/// Linear, SiLU, Linear on the time's sinusoid.
 #[derive(Module, Debug)]
 pub struct TimeEmbedder {
-    /// The layers.
+    /// Linear, SiLU, Linear under upstream's numbers.
     pub mlp: (Linear, Gap, Linear),
 }
 
-/// To features.
+/// The output layer, with an adaptive norm.
 #[derive(Module, Debug)]
 pub struct DitOut {
     /// H -> features.
     pub linear: Linear,
-    /// After SiLU: time -> shift, scale.
+    /// Time -> shift and scale, after a SiLU.
     pub adaLN_modulation: (Gap, Linear),
 }
 
-/// The network's parts; the published names begin with `net`.
+/// The network's parts. All published names have the prefix `net`.
 #[derive(Module, Debug)]
 pub struct DitParts {
     /// Motion and condition -> H.
     pub in_proj: Linear,
-    /// Tokens, four times and stacked, -> condition.
+    /// Tokens, repeated four times and stacked, -> condition.
     pub cin_proj: (Gap, Linear, Gap, Linear),
     /// Time -> H.
     pub t_embedder: TimeEmbedder,
     /// Caption -> H.
     pub text_embed: Option<Linear>,
-    /// Blocks.
     pub blocks: Vec<DitBlock>,
-    /// To features.
+    /// H -> features.
     pub out_proj: DitOut,
 }
 
 /// The vector field.
 #[derive(Module, Debug)]
 pub struct FlowDit {
-    /// All of it.
+    /// The whole network, under the prefix of the published names.
     pub net: DitParts,
     heads: usize,
     positions: bool,
@@ -198,7 +195,7 @@ pub struct FlowDit {
 }
 
 impl FlowDit {
-    /// A fresh one: Xavier-uniform, with zeros where the time modulates and at the end.
+    /// Creates a network: Xavier-uniform, with zeros in the modulation by time and in the last layer.
     pub fn new(config: &DitConfig, init: &mut Init<'_>) -> Self {
         let DitConfig { features, width, token_dim, condition_dim, .. } = *config;
         let mut time = |inner: usize| Linear {
@@ -229,24 +226,26 @@ impl FlowDit {
         }
     }
 
-    /// The condition on each frame, [B, n, token] -> [B, 4 n, condition].
+    /// Computes the condition on each frame, [B, n, token] -> [B, 4 n, condition].
     pub fn condition(&self, tokens_bnc: Tensor<3>) -> Tensor<3> {
         let [batch, tokens, dim] = tokens_bnc.dims();
         let stacked = self.net.cin_proj.1.forward(Tensor::cat(vec![tokens_bnc; UNIT], 2));
         self.net.cin_proj.3.forward(stacked.reshape([batch, UNIT * tokens, dim]))
     }
 
-    /// Features of the time, [B, H], without a caption's.
+    /// Encodes the time as [B, H], without a caption's embedding.
     pub fn time(&self, times: &[f32], device: &Device) -> Tensor<2> {
         let (first, _, second) = &self.net.t_embedder.mlp;
         second.forward(silu(first.forward(time_sinusoid_f32(times, FREQUENCIES, device))))
     }
 
-    /// Velocity [B, T, F] of `x_btf` [B, T, F] at `times` under `tokens_bnc` [B, T / 4, token], and a caption `text_bc` [B, C] if the network
-    /// takes one. Of clip b frames behind `lengths[b]` are not looked at, but computed.
+    /// The velocity [B, T, F] of `x_btf` [B, T, F] at `times` given `tokens_bnc` [B, T / 4, token], and a caption
+    /// `text_bc` [B, C] if the network has a layer for it. Frames of clip b past `lengths[b]` are computed but not
+    /// attended to.
     ///
     /// # Panics
-    /// If there is not a token for every four frames, or a caption for a network without a place for it, or none for one with.
+    /// If there is not one token for every four frames, or the caption does not match the network: given without a
+    /// layer for it, or missing with one.
     pub fn forward(
         &self,
         x_btf: Tensor<3>,
@@ -297,8 +296,8 @@ pub fn falling(heads: usize, len: usize, device: &Device) -> Tensor<4> {
     Tensor::from_data(TensorData::new(values.collect(), [1, heads, len, len]), device)
 }
 
-/// Slopes of ALiBi: a geometric sequence that ends at 2^-8 for a power of two; otherwise that of the power below, and then every other slope
-/// of the power above.
+/// Slopes of ALiBi: a geometric sequence that ends at 2^-8 for a power of two. Other numbers of heads take the slopes
+/// of the power below, then every second slope of the power above.
 fn slopes(heads: usize) -> Vec<f32> {
     let sequence = |n: usize| (1..=n).map(move |i| 2.0_f64.powf(-8.0 * i as f64 / n as f64) as f32);
     if heads.is_power_of_two() {

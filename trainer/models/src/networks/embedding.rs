@@ -1,8 +1,8 @@
-//! Sinusoids of timesteps and guidance scales. Source: diffusers' `Timesteps` (cosines first) as MLD configures it, and the LCM
-//! script's guidance embedding (sines first, other denominator, argument times 1000).
+//! Sinusoids of timesteps and guidance scales. Source: diffusers' `Timesteps` (cosines first) as MLD configures it, and
+//! the LCM script's guidance embedding (sines first, other denominator, argument times 1000).
 //!
-//! Both run in f32 from the frequencies on, as the originals do: with arguments up to 15,000 the rounding is part of what a
-//! network was trained with.
+//! Both are computed in f32 from the frequencies on, like the originals. Arguments reach 15,000, and networks were
+//! trained with the rounding that follows.
 
 use burn::tensor::{Device, Tensor, TensorData};
 
@@ -13,7 +13,7 @@ pub fn time_sinusoid(timesteps: &[usize], width: usize, device: &Device) -> Tens
     time_sinusoid_f32(&times, width, device)
 }
 
-/// The same for times that are no integers.
+/// Like [`time_sinusoid`], for fractional times.
 pub fn time_sinusoid_f32(times: &[f32], width: usize, device: &Device) -> Tensor<2> {
     let half = width / 2;
     #[expect(clippy::cast_precision_loss, clippy::cast_possible_truncation, reason = "f32 by definition")]
@@ -42,8 +42,8 @@ pub fn guidance_embedding(guidance: &[f32], width: usize, device: &Device) -> Te
     Tensor::from_data(TensorData::new(rows.collect(), [guidance.len(), 2 * half]), device)
 }
 
-/// [positions, width]: `sin(p f_i)` and `cos(p f_i)` in turns, with `f_i = 10000^(-2i / width)`: the table of Vaswani et al.,
-/// arXiv:1706.03762, as MDM and StableMoFusion have it for frames and for timesteps.
+/// Alternating `sin(p f_i)` and `cos(p f_i)` [positions, width] with `f_i = 10000^(-2i / width)`. It is the table of
+/// Vaswani et al., arXiv:1706.03762, that MDM and StableMoFusion use for frames and for timesteps.
 pub fn position_sinusoid(positions: impl ExactSizeIterator<Item = usize>, width: usize, device: &Device) -> Tensor<2> {
     #[expect(clippy::cast_precision_loss, clippy::cast_possible_truncation, reason = "f32 by definition")]
     let step = -(10_000_f64.ln() / width as f64) as f32;

@@ -1,7 +1,7 @@
 //! A plain stack of post-norm transformer blocks: PyTorch's `TransformerEncoder`, without a norm at its end.
 //!
-//! First values are that class's: Xavier for the packed projection, the Linear default for the other weights, zero for the biases of
-//! attention. Departs: blocks are drawn apart, upstream they start equal.
+//! Initial values are those of PyTorch's class: Xavier for the packed projection, the Linear default for the other
+//! weights, zero for the biases of attention. Departs: blocks are drawn separately; upstream copies one block.
 
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -12,12 +12,12 @@ use crate::kernels::{Dropout, KeyMask};
 /// Blocks, one after the other.
 #[derive(Module, Debug)]
 pub struct Layers {
-    /// The blocks.
+    /// Blocks, first to last.
     pub layers: Vec<Block>,
 }
 
 impl Layers {
-    /// Blocks of `config`'s size, without memory.
+    /// Creates blocks of `config`'s size, without memory.
     pub fn new(init: &mut Init<'_>, config: &StackConfig) -> Self {
         let StackConfig { width, feed_forward, layers, .. } = *config;
         let mut block = || {

@@ -1,10 +1,13 @@
-//! The text-motion evaluator: three networks that put captions and motions into one space, where the metrics are taken.
+//! The text-motion evaluator: three networks that map captions and motions into one space, in which metrics are
+//! computed.
 //!
-//! Source: text-to-motion (Guo et al., CVPR 2022). Movements are a token per four frames, by two strided convolutions; a bidirectional GRU over the
-//! movements gives a motion's embedding, another over the words a caption's. Sequences are ragged: the forward GRU stops at a
-//! sequence's own last token and the backward GRU starts there, whatever stands behind it. Notation: c channels in, g width of a GRU.
+//! Source: text-to-motion (Guo et al., CVPR 2022). Two strided convolutions make one movement of every four frames. A
+//! bidirectional GRU over the movements returns a motion's embedding, another over the words a caption's. Sequences are
+//! ragged: the forward GRU stops at a sequence's own last token and the backward GRU starts there, so padding has no
+//! effect. Notation: c channels in, g width of a GRU.
 //!
-//! [`MovementDecoder`] belongs to the first phase of the training alone: encoder and decoder make an autoencoder.
+//! [`MovementDecoder`] belongs only to the first phase of the training, in which encoder and decoder form an
+//! autoencoder.
 
 use burn::module::{Module, Param};
 use burn::tensor::activation::leaky_relu;
@@ -18,13 +21,13 @@ use crate::kernels::{self, Dropout, dropout, gru};
 const SLOPE: f64 = 0.2;
 /// Added to variances in layer norms.
 const EPS: f64 = 1e-5;
-/// Frames that one movement stands for.
+/// Frames per movement.
 pub(crate) const UNIT: usize = 4;
 
-/// Sizes. The published evaluator: 512, 512, 1024, 300, 15, 512, 512.
+/// Sizes of the networks. The published evaluator: 512, 512, 1024, 300, 15, 512, 512.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct EvaluatorConfig {
-    /// Features of a frame that movements are made of: all but the four foot contacts.
+    /// Features of a frame without the four foot contacts.
     pub features: usize,
     /// Width between the two convolutions.
     pub movement_hidden: usize,
@@ -34,7 +37,7 @@ pub struct EvaluatorConfig {
     pub motion_hidden: usize,
     /// Width of a word vector.
     pub word: usize,
-    /// Classes of words.
+    /// Number of word classes.
     pub classes: usize,
     /// Width of the text GRU.
     pub text_hidden: usize,
@@ -42,12 +45,12 @@ pub struct EvaluatorConfig {
     pub embedding: usize,
 }
 
-/// A convolution over time of four frames, every second one, one frame of zeros on either side.
+/// A convolution over four frames with stride 2 and one frame of zeros on either side.
 #[derive(Module, Debug)]
 pub struct Conv {
-    /// [out, in, 4].
+    /// Weights of shape [out, in, 4].
     pub weight: Param<Tensor<3>>,
-    /// [out].
+    /// Bias of shape [out].
     pub bias: Param<Tensor<1>>,
 }
 
@@ -56,14 +59,14 @@ impl Conv {
         Self { weight: init.xavier_normal((inner + out) * UNIT, [out, inner, UNIT]), bias: init.constant(0.0, [out]) }
     }
 
-    /// A layer with these weights.
+    /// Creates a layer with these weights.
     pub fn from_weights(weight: Tensor<3>, bias: Tensor<1>) -> Self {
         Self { weight: Param::from_tensor(weight), bias: Param::from_tensor(bias) }
     }
 
-    /// [B, T, in] -> [B, T / 2, out].
+    /// Maps [B, T, in] to [B, T / 2, out].
     ///
-    /// A window is two neighbouring pairs of padded frames, so that the convolution is a Linear over windows.
+    /// A window is two neighbouring pairs of padded frames, so the convolution is a Linear over windows.
     pub fn forward(&self, x_btc: Tensor<3>) -> Tensor<3> {
         let [batch, frames, inner] = x_btc.dims();
         let [out, _, taps] = self.weight.dims();
@@ -78,12 +81,12 @@ impl Conv {
     }
 }
 
-/// The transpose of such a convolution: twice as many frames.
+/// The transpose of [`Conv`], which doubles the frames.
 #[derive(Module, Debug)]
 pub struct Deconv {
-    /// [in, out, 4].
+    /// Weights of shape [in, out, 4].
     pub weight: Param<Tensor<3>>,
-    /// [out].
+    /// Bias of shape [out].
     pub bias: Param<Tensor<1>>,
 }
 
@@ -92,14 +95,14 @@ impl Deconv {
         Self { weight: init.xavier_normal((inner + out) * UNIT, [inner, out, UNIT]), bias: init.constant(0.0, [out]) }
     }
 
-    /// A layer with these weights.
+    /// Creates a layer with these weights.
     pub fn from_weights(weight: Tensor<3>, bias: Tensor<1>) -> Self {
         Self { weight: Param::from_tensor(weight), bias: Param::from_tensor(bias) }
     }
 
-    /// [B, T, in] -> [B, 2 T, out].
+    /// Maps [B, T, in] to [B, 2 T, out].
     ///
-    /// Frame 2m has taps 3 and 1 on inputs m-1 and m, frame 2m+1 taps 2 and 0 on inputs m and m+1.
+    /// Frame 2m applies taps 3 and 1 to inputs m-1 and m. Frame 2m+1 applies taps 2 and 0 to inputs m and m+1.
     pub fn forward(&self, x_btc: Tensor<3>) -> Tensor<3> {
         let [batch, frames, inner] = x_btc.dims();
         let out = self.weight.dims()[1];
@@ -122,7 +125,7 @@ fn linear(init: &mut Init<'_>, inner: usize, out: usize) -> Linear {
     Linear { weight: init.xavier_normal(inner + out, [out, inner]), bias: Some(init.constant(0.0, [out])) }
 }
 
-/// Features to movements.
+/// Encoder from features to movements.
 #[derive(Module, Debug)]
 pub struct MovementEncoder {
     /// Features -> hidden.
@@ -134,7 +137,7 @@ pub struct MovementEncoder {
 }
 
 impl MovementEncoder {
-    /// A fresh one.
+    /// Creates an encoder with initial weights.
     pub fn new(config: &EvaluatorConfig, init: &mut Init<'_>) -> Self {
         Self {
             main_0: Conv::new(init, config.features, config.movement_hidden),
@@ -151,7 +154,7 @@ impl MovementEncoder {
     }
 }
 
-/// Movements to features, contacts included.
+/// Decoder from movements to features, contacts included.
 #[derive(Module, Debug)]
 pub struct MovementDecoder {
     /// Movement -> hidden.
@@ -163,7 +166,7 @@ pub struct MovementDecoder {
 }
 
 impl MovementDecoder {
-    /// A fresh one; `features` counts the contacts too.
+    /// Creates a decoder with initial weights; `features` counts the contacts too.
     pub fn new(config: &EvaluatorConfig, features: usize, init: &mut Init<'_>) -> Self {
         Self {
             main_0: Deconv::new(init, config.movement, config.movement_hidden),
@@ -182,26 +185,26 @@ impl MovementDecoder {
 /// One bidirectional layer of gated recurrent units. Rows of the weights are the gates r, z, n.
 #[derive(Module, Debug)]
 pub struct BiGru {
-    /// [3g, in].
+    /// Forward in time; shape [3g, in].
     pub weight_ih_l0: Param<Tensor<2>>,
-    /// [3g, g].
+    /// Forward in time; shape [3g, g].
     pub weight_hh_l0: Param<Tensor<2>>,
-    /// [3g].
+    /// Forward in time; shape [3g].
     pub bias_ih_l0: Param<Tensor<1>>,
-    /// [3g].
+    /// Forward in time; shape [3g].
     pub bias_hh_l0: Param<Tensor<1>>,
-    /// Backward in time; [3g, in].
+    /// Backward in time; shape [3g, in].
     pub weight_ih_l0_reverse: Param<Tensor<2>>,
-    /// [3g, g].
+    /// Backward in time; shape [3g, g].
     pub weight_hh_l0_reverse: Param<Tensor<2>>,
-    /// [3g].
+    /// Backward in time; shape [3g].
     pub bias_ih_l0_reverse: Param<Tensor<1>>,
-    /// [3g].
+    /// Backward in time; shape [3g].
     pub bias_hh_l0_reverse: Param<Tensor<1>>,
 }
 
 impl BiGru {
-    /// PyTorch's default: uniform within `±1 / sqrt(g)`.
+    /// Initialises all weights uniformly within `±1 / sqrt(g)`, PyTorch's default.
     pub fn new(init: &mut Init<'_>, inner: usize, width: usize) -> Self {
         let rows = 3 * width;
         Self {
@@ -216,8 +219,9 @@ impl BiGru {
         }
     }
 
-    /// The states after each token of `x_btc` [B, T, in] of which the first `lengths[b]` count, in either direction, from the
-    /// states `start` [B, g]. A state behind a sequence's end is the last one before it (forward) or the first (backward).
+    /// The states after each token of `x_btc` [B, T, in] in either direction, from the states `start` [B, g]. The first
+    /// `lengths[b]` tokens are valid. Past the end, a forward state repeats the last one before it, and a backward
+    /// state is its start.
     pub fn forward(&self, x_btc: Tensor<3>, lengths: &[usize], start: [Tensor<2>; 2]) -> [Tensor<3>; 2] {
         let [forward, backward] = start;
         let gates = |w: &Param<Tensor<2>>, b: &Param<Tensor<1>>| kernels::linear(x_btc.clone(), w.val(), Some(b.val()));
@@ -228,7 +232,7 @@ impl BiGru {
         [ahead, back]
     }
 
-    /// The last state of either direction, side by side [B, 2g], from learned first states `hidden` [2, 1, g].
+    /// The last state of either direction, side by side [B, 2g], from learned initial states `hidden` [2, 1, g].
     fn last(&self, x_btc: Tensor<3>, lengths: &[usize], hidden: &Param<Tensor<3>>) -> Tensor<2> {
         let [batch, tokens, _] = x_btc.dims();
         let width = hidden.dims()[2];
@@ -240,25 +244,24 @@ impl BiGru {
     }
 }
 
-/// Movements to the embedding of a motion.
+/// Encoder from movements to the embedding of a motion.
 #[derive(Module, Debug)]
 pub struct MotionEncoder {
     /// Movement -> g.
     pub input_emb: Linear,
-    /// Over the movements.
+    /// GRU over the movements.
     pub gru: BiGru,
     /// 2g -> g.
     pub output_net_0: Linear,
-    /// After it.
     pub output_net_1: Norm,
     /// g -> embedding.
     pub output_net_3: Linear,
-    /// First states [2, 1, g].
+    /// Initial states [2, 1, g].
     pub hidden: Param<Tensor<3>>,
 }
 
 impl MotionEncoder {
-    /// A fresh one.
+    /// Creates an encoder with initial weights.
     pub fn new(config: &EvaluatorConfig, init: &mut Init<'_>) -> Self {
         let width = config.motion_hidden;
         Self {
@@ -271,7 +274,7 @@ impl MotionEncoder {
         }
     }
 
-    /// Movements [B, N, movement], of which the first `lengths[b]` count, to [B, embedding].
+    /// Maps movements [B, N, movement] to embeddings [B, embedding]; the first `lengths[b]` movements are valid.
     pub fn forward(&self, movements_bnc: Tensor<3>, lengths: &[usize]) -> Tensor<2> {
         let last = self.gru.last(self.input_emb.forward(movements_bnc), lengths, &self.hidden);
         let x = leaky_relu(self.output_net_1.forward(self.output_net_0.forward(last), EPS), SLOPE);
@@ -279,27 +282,26 @@ impl MotionEncoder {
     }
 }
 
-/// Words to the embedding of a caption.
+/// Encoder from words to the embedding of a caption.
 #[derive(Module, Debug)]
 pub struct TextEncoder {
     /// Word classes -> word vector.
     pub pos_emb: Linear,
     /// Word vector -> g.
     pub input_emb: Linear,
-    /// Over the words.
+    /// GRU over the words.
     pub gru: BiGru,
     /// 2g -> g.
     pub output_net_0: Linear,
-    /// After it.
     pub output_net_1: Norm,
     /// g -> embedding.
     pub output_net_3: Linear,
-    /// First states [2, 1, g].
+    /// Initial states [2, 1, g].
     pub hidden: Param<Tensor<3>>,
 }
 
 impl TextEncoder {
-    /// A fresh one.
+    /// Creates an encoder with initial weights.
     pub fn new(config: &EvaluatorConfig, init: &mut Init<'_>) -> Self {
         let width = config.text_hidden;
         Self {
@@ -313,7 +315,8 @@ impl TextEncoder {
         }
     }
 
-    /// Word vectors [B, W, word] and one-hot classes [B, W, classes], of which the first `lengths[b]` count, to [B, embedding].
+    /// Maps word vectors [B, W, word] and one-hot classes [B, W, classes] to [B, embedding]; the first `lengths[b]` are
+    /// valid.
     pub fn forward(&self, words_bwc: Tensor<3>, classes_bwc: Tensor<3>, lengths: &[usize]) -> Tensor<2> {
         let words = words_bwc + self.pos_emb.forward(classes_bwc);
         let last = self.gru.last(self.input_emb.forward(words), lengths, &self.hidden);
@@ -322,19 +325,16 @@ impl TextEncoder {
     }
 }
 
-/// All three, as the published file has them.
+/// All three networks, as in the published file.
 #[derive(Module, Debug)]
 pub struct Evaluator {
-    /// Captions.
     pub text_encoder: TextEncoder,
-    /// Motions.
     pub motion_encoder: MotionEncoder,
-    /// Movements.
     pub movement_encoder: MovementEncoder,
 }
 
 impl Evaluator {
-    /// A fresh one.
+    /// Creates networks with initial weights.
     pub fn new(config: &EvaluatorConfig, init: &mut Init<'_>) -> Self {
         Self {
             text_encoder: TextEncoder::new(config, init),
@@ -343,8 +343,8 @@ impl Evaluator {
         }
     }
 
-    /// Embeddings [B, embedding] of motions [B, T, features + contacts], normalised, of which the first `frames[b]` count. A length
-    /// is rounded down to whole movements.
+    /// Embeddings [B, embedding] of normalised motions [B, T, features + contacts]. The first `frames[b]` frames are
+    /// valid; the length is rounded down to whole movements.
     pub fn motion(&self, motion_btf: Tensor<3>, frames: &[usize]) -> Tensor<2> {
         let [batch, all, _] = motion_btf.dims();
         let features = self.movement_encoder.main_0.weight.dims()[1];
@@ -354,7 +354,7 @@ impl Evaluator {
         self.motion_encoder.forward(movements, &lengths)
     }
 
-    /// Where its parameters live.
+    /// The device of the parameters.
     pub fn device(&self) -> Device {
         self.text_encoder.hidden.val().device()
     }

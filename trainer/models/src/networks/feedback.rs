@@ -1,8 +1,9 @@
-//! The feedback network: how a latent should change, given where its motion is and how far that is from where it should be. Source: iterative error
-//! feedback (Carreira et al., CVPR 2016) and learned descent (Song et al., ECCV 2020), which fit poses to images so; ours for motions.
+//! The feedback network: predicts a change of a latent from its decoded motion and the distance of that from the
+//! target. Source: iterative error feedback (Carreira et al., CVPR 2016) and learned descent (Song et al., ECCV 2020),
+//! which fit poses to images this way; ours fits motions.
 //!
-//! A transformer over the N tokens of the latent and the frames of its motion; the first N outputs, through a Linear that is zero at first, are the
-//! change. So a fresh one changes nothing.
+//! It is a transformer over the N tokens of the latent and the frames of its motion. The first N outputs pass a Linear
+//! that is initialised to zero and are the change. So a fresh network changes nothing.
 
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
@@ -16,11 +17,11 @@ use crate::kernels::{Dropout, KeyMask};
 pub struct FeedbackConfig {
     /// N tokens of a latent.
     pub tokens: usize,
-    /// Their width d.
+    /// Width d of a latent token.
     pub dim: usize,
-    /// Numbers that it is told of a frame.
+    /// Inputs per frame.
     pub inputs: usize,
-    /// The transformer.
+    /// Size of the transformer.
     pub stack: StackConfig,
 }
 
@@ -31,18 +32,17 @@ pub struct Feedback {
     pub latent_token: Param<Tensor<2>>,
     /// d -> H.
     pub latent_embedding: Linear,
-    /// What is told of a frame -> H.
+    /// Inputs of a frame -> H.
     pub frame_embedding: Linear,
     /// Positions of tokens and frames.
     pub position_encoder: Positions,
-    /// The transformer.
     pub encoder: SkipStack,
     /// H -> d.
     pub change: Linear,
 }
 
 impl Feedback {
-    /// A fresh one.
+    /// Creates a network with initial weights.
     pub fn new(config: &FeedbackConfig, init: &mut Init<'_>) -> Self {
         let FeedbackConfig { tokens, dim, inputs, stack } = config;
         Self {
@@ -55,7 +55,8 @@ impl Feedback {
         }
     }
 
-    /// The change [B, N, d] of latents [B, N, d], of whose motions `frames_btf` [B, T, inputs] are told; motion b has `lengths[b]` frames.
+    /// The change [B, N, d] of latents [B, N, d]. `frames_btf` [B, T, inputs] describes their motions; motion b has
+    /// `lengths[b]` frames.
     ///
     /// # Panics
     /// If a motion is longer than there are positions.

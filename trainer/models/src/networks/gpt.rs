@@ -1,10 +1,11 @@
 //! The autoregressive token generator. Source: T2M-GPT (Zhang et al., CVPR 2023).
 //!
-//! One sequence: a token for the caption, then the tokens of the motion so far; fixed positions on all of them; causal pre-norm blocks, whose
-//! first half is called base and whose second head. Classes are the codes and the end; a further id pads.
+//! The sequence is a token for the caption, then the tokens of the motion so far, with fixed positions on all of them.
+//! Causal pre-norm blocks follow; their first half is called base and their second half head. Classes are the codes and
+//! the end; one further id pads.
 //!
-//! Departs: the published state holds a learned position table that nothing reads, its fixed table and its causal masks; here they are not
-//! parameters.
+//! Departs: the published state holds an unused learned position table, its fixed table and its causal masks; here they
+//! are not parameters.
 
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -17,19 +18,18 @@ use crate::kernels::Dropout;
 /// Size of the generator.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GptConfig {
-    /// Codes K.
+    /// Number of codes K.
     pub codes: usize,
-    /// Width H.
     pub width: usize,
-    /// Heads.
+    /// Number of attention heads.
     pub heads: usize,
     /// Blocks of each half.
     pub layers: usize,
-    /// Positions, the caption's counted.
+    /// Number of positions, the caption's included.
     pub block: usize,
     /// Width of a caption embedding.
     pub text_dim: usize,
-    /// Feed-forward width over H.
+    /// Feed-forward width as a multiple of H.
     pub rate: usize,
 }
 
@@ -39,35 +39,34 @@ impl GptConfig {
         self.codes
     }
 
-    /// The id behind the end.
+    /// The id that pads after the end.
     pub fn pad(&self) -> usize {
         self.codes + 1
     }
 }
 
-/// The first half.
+/// The embeddings and the first half of the blocks.
 #[derive(Module, Debug)]
 pub struct GptBase {
     /// Codes, end, pad -> H.
     pub tok_emb: Embedding,
     /// Caption -> H.
     pub cond_emb: Linear,
-    /// Blocks.
     pub blocks: Vec<GptBlock>,
 }
 
-/// The generator.
+/// The token generator of T2M-GPT.
 #[derive(Module, Debug)]
 pub struct Gpt {
     /// Embeddings and the first blocks.
     pub trans_base: GptBase,
-    /// The other blocks and the logits.
+    /// The second half of the blocks, and the logits.
     pub trans_head: GptHead,
     block: usize,
 }
 
 impl Gpt {
-    /// A fresh one: weights normal with deviation 0.02, biases 0.
+    /// Creates a generator: weights normal with deviation 0.02, biases 0.
     pub fn new(config: &GptConfig, init: &mut Init<'_>) -> Self {
         let GptConfig { codes, width, heads, layers, rate, .. } = *config;
         Self {

@@ -1,5 +1,5 @@
-//! First values of parameters, drawn on the host from a keyed stream in declaration order: never from a backend's global
-//! generator, whose state cannot be saved and differs between backends.
+//! Initial values of parameters, drawn on the host from a keyed stream in declaration order. A backend's global
+//! generator is never used: its state cannot be saved and differs between backends.
 
 use burn::module::{Param, ParamId};
 use burn::tensor::{Device, Tensor, TensorData};
@@ -7,7 +7,7 @@ use motion::random::Stream;
 use protocol::Seed;
 use protocol::stage::Positions;
 
-/// Draws parameters.
+/// Draws initial values of parameters.
 #[derive(Debug)]
 pub struct Init<'a> {
     stream: Stream,
@@ -16,34 +16,34 @@ pub struct Init<'a> {
     draws: Draws,
 }
 
-/// What parameters begin with.
+/// Source of the initial values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Draws {
-    /// Their draws.
+    /// Values from the keyed stream.
     Made,
-    /// Zeros.
+    /// Zeros in place of the values from the stream.
     Left,
-    /// Nothing, until they are asked for.
+    /// No values; the parameters stay uninitialised.
     Never,
 }
 
 impl<'a> Init<'a> {
-    /// All parameters of one network of one stage. `purpose` keeps two networks of one stage apart.
+    /// Draws all parameters of one network of one stage. `purpose` separates two networks of one stage.
     pub fn new(seed: Seed, purpose: &str, positions: Positions, device: &'a Device) -> Self {
         Self { stream: Stream::new(seed, purpose, 0, 0), device, positions, draws: Draws::Made }
     }
 
-    /// Zeros in place of all draws: of a network whose weights are read right after, for draws of a large one take longer than that.
+    /// Fills all parameters with zeros, for a network whose weights are loaded next. Draws of a large one take longer.
     pub fn blank(device: &'a Device) -> Self {
         Self { draws: Draws::Left, ..Self::new(Seed(0), "blank", Positions::Uniform, device) }
     }
 
-    /// No values at all: of a network whose [layout](crate::flat::layout) alone is wanted. However large it is, it takes no memory.
+    /// Makes no values, for reading a network's [layout](crate::flat::layout). A network of any size takes no memory.
     pub fn shapes(device: &'a Device) -> Self {
         Self { draws: Draws::Never, ..Self::blank(device) }
     }
 
-    /// Where parameters are made.
+    /// The device of the parameters.
     pub fn device(&self) -> &Device {
         self.device
     }
@@ -66,7 +66,7 @@ impl<'a> Init<'a> {
         self.param(|| values, shape)
     }
 
-    /// Every element `value`.
+    /// A parameter whose elements are all `value`.
     pub fn constant<const D: usize>(&self, value: f32, shape: [usize; D]) -> Param<Tensor<D>> {
         self.param(|| vec![value; shape.iter().product()], shape)
     }
@@ -96,12 +96,12 @@ impl<'a> Init<'a> {
         self.draw(-bound, bound, shape)
     }
 
-    /// Standard normal.
+    /// Draws from the standard normal distribution.
     pub fn normal<const D: usize>(&mut self, shape: [usize; D]) -> Param<Tensor<D>> {
         self.normal_times(1.0, shape)
     }
 
-    /// Normal with this deviation.
+    /// Draws from a normal distribution with this deviation.
     pub fn scaled_normal<const D: usize>(&mut self, deviation: f64, shape: [usize; D]) -> Param<Tensor<D>> {
         self.normal_times(deviation as f32, shape)
     }

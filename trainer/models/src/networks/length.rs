@@ -1,7 +1,8 @@
-//! The length estimator: how long the motion of a caption is. Source: MoMask (Guo et al., CVPR 2024), `LengthEstimator`.
+//! The length estimator: predicts the length of a caption's motion. Source: MoMask (Guo et al., CVPR 2024),
+//! `LengthEstimator`.
 //!
-//! A caption's embedding goes through three hidden layers (Linear, layer norm, leaky ReLU) to the logits of classes; class c is a motion of
-//! c movements of four frames. Dropout stands before the second and the third linear layer.
+//! A caption's embedding passes three hidden layers (Linear, layer norm, leaky ReLU) to the logits of classes. Class c
+//! is a motion of c movements of four frames. Dropout precedes the second and the third linear layer.
 
 use burn::module::{Module, Param};
 use burn::tensor::activation::{leaky_relu, log_softmax};
@@ -18,35 +19,32 @@ const SLOPE: f64 = 0.2;
 const EPS: f64 = 1e-5;
 /// Widths of the hidden layers.
 const HIDDEN: [usize; 3] = [512, 256, 128];
-/// Deviation of the first weights.
+/// Standard deviation of the initial weights.
 const DEVIATION: f64 = 0.02;
 
-/// Caption embedding to the logits of lengths.
+/// Estimator from a caption embedding to the logits of lengths.
 #[derive(Module, Debug)]
 pub struct LengthEstimator {
     /// Text -> 512.
     pub output_0: Linear,
-    /// After it.
     pub output_1: Norm,
     /// 512 -> 256.
     pub output_4: Linear,
-    /// After it.
     pub output_5: Norm,
     /// 256 -> 128.
     pub output_8: Linear,
-    /// After it.
     pub output_9: Norm,
     /// 128 -> classes.
     pub output_11: Linear,
 }
 
 impl LengthEstimator {
-    /// Frames that one class is longer than the one before it.
+    /// Frames by which a class is longer than the class before it.
     pub const UNIT: usize = UNIT;
-    /// Classes as published: up to 49 movements, 196 frames.
+    /// Number of classes as published: up to 49 movements, 196 frames.
     pub const CLASSES: usize = 50;
 
-    /// A fresh one: weights normal with deviation 0.02, biases 0.
+    /// Creates an estimator: weights normal with deviation 0.02, biases 0.
     pub fn new(text: usize, classes: usize, init: &mut Init<'_>) -> Self {
         let [a, b, c] = HIDDEN;
         Self {
@@ -75,12 +73,12 @@ impl LengthEstimator {
         self.output_11.forward(x)
     }
 
-    /// The class of a motion of so many frames.
+    /// The class of a motion of `frames` frames.
     pub fn class(frames: usize, classes: usize) -> usize {
         (frames / UNIT).min(classes - 1)
     }
 
-    /// Cross-entropy of the logits [B, classes] against a class each, summed over the batch.
+    /// Cross-entropy of the logits [B, classes] against one class per row, summed over the batch.
     pub fn loss(logits_bc: Tensor<2>, classes: &[usize]) -> Tensor<1> {
         let [batch, count] = logits_bc.dims();
         let mut own = vec![0.0_f32; batch * count];
@@ -89,23 +87,23 @@ impl LengthEstimator {
         (log_softmax(logits_bc, 1) * own).sum().neg()
     }
 
-    /// Draws a class for each row of host-side logits: the largest of `p / e` with exponential `e`, that is a draw from the softmax.
-    /// `exponential` gives the next one.
+    /// Draws a class from the softmax of host-side logits: the largest of `p / e` with exponential `e`. `exponential`
+    /// returns the next `e`.
     pub fn draw(logits: &[f32], exponential: impl FnMut() -> f64) -> usize {
         let mut exponential = exponential;
-        // Comparing logarithms, so that nothing overflows.
+        // Logarithms are compared, so that nothing overflows.
         let scores = logits.iter().map(|logit| f64::from(*logit) - exponential().ln());
         scores.enumerate().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(0, |(class, _)| class)
     }
 
-    /// A length in frames for host-side logits, at least one movement.
+    /// Draws a length in frames from host-side logits, at least one movement.
     pub fn sample(logits: &[f32], stream: &mut Stream) -> usize {
         Self::draw(logits, || -(1.0 - stream.uniform()).ln()).max(1) * UNIT
     }
 }
 
 fn linear(init: &mut Init<'_>, inner: usize, out: usize) -> Linear {
-    // Through the host, so that the parameter is a leaf.
+    // A copy through the host makes the parameter a leaf of the tape.
     let scaled = (init.normal([out, inner]).val().detach() * DEVIATION).into_data();
     let weight = Param::from_tensor(Tensor::from_data(scaled, init.device()));
     Linear { weight, bias: Some(init.constant(0.0, [out])) }

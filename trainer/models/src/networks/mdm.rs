@@ -1,8 +1,10 @@
-//! MDM: the clean motion predicted from a noised one, a timestep and a caption's vector. Source: Tevet et al., arXiv:2209.14916 (`trans_enc`).
+//! MDM: predicts the clean motion from a noised motion, a timestep and a caption's vector. Source: Tevet et al.,
+//! arXiv:2209.14916 (`trans_enc`).
 //!
-//! One sequence: a condition token, which is time plus text, and the frames; sinusoidal positions; post-norm encoder; all outputs but the first.
-//! A caption is left out by a zero vector before its projection, so that the projection's bias remains. The published model attends to
-//! frames of padding; its authors call the key mask over them a fix, and have it in their model of 50 steps.
+//! The sequence is a condition token (time plus text) and the frames, with sinusoidal positions. A post-norm encoder
+//! follows, and all outputs but the first are used. A caption is dropped by zeroing its vector before the projection,
+//! so that the projection's bias remains. The published model attends to frames of padding; its authors call the key
+//! mask over them a fix, and use it in their model of 50 steps.
 
 #![expect(non_snake_case, reason = "fields have the published names")]
 
@@ -21,11 +23,10 @@ pub struct MdmConfig {
     pub features: usize,
     /// Width H of the transformer.
     pub width: usize,
-    /// Blocks.
+    /// Number of blocks.
     pub layers: usize,
-    /// Heads.
+    /// Number of attention heads.
     pub heads: usize,
-    /// Feed-forward width.
     pub feed_forward: usize,
     /// Width of a caption's vector.
     pub text_dim: usize,
@@ -36,14 +37,14 @@ pub struct MdmConfig {
 /// Features -> H.
 #[derive(Module, Debug)]
 pub struct InputProcess {
-    /// For every frame.
+    /// Linear applied to every frame.
     pub poseEmbedding: Linear,
 }
 
 /// H -> features.
 #[derive(Module, Debug)]
 pub struct OutputProcess {
-    /// For every frame.
+    /// Linear applied to every frame.
     pub poseFinal: Linear,
 }
 
@@ -56,12 +57,11 @@ pub struct TimestepEmbedder {
     pub time_embed_2: Linear,
 }
 
-/// The network.
+/// MDM's layers under their published names.
 #[derive(Module, Debug)]
 pub struct Mdm {
     /// Features -> H.
     pub input_process: InputProcess,
-    /// The transformer.
     pub seqTransEncoder: Layers,
     /// Timestep -> H.
     pub embed_timestep: TimestepEmbedder,
@@ -72,7 +72,7 @@ pub struct Mdm {
 }
 
 impl Mdm {
-    /// A fresh one.
+    /// Creates a network with initial weights.
     pub fn new(config: &MdmConfig, init: &mut Init<'_>) -> Self {
         let MdmConfig { features, width, layers, heads, feed_forward, text_dim, norm_eps } = *config;
         let stack = StackConfig { width, layers, heads, feed_forward, norm_eps, memory: false };
@@ -88,8 +88,8 @@ impl Mdm {
         }
     }
 
-    /// The clean motion [B, T, F], normalised, that `x_btf` [B, T, F] at `timesteps` is taken for. `text_bc` [B, text_dim] has zeros where the
-    /// caption is left out. With `lengths`, frames past them are attended by nobody.
+    /// Predicts the clean motion [B, T, F], normalised, from `x_btf` [B, T, F] at `timesteps`. `text_bc` [B, text_dim]
+    /// is zero for a dropped caption. With `lengths`, frames past them are not attended to.
     pub fn forward(
         &self,
         x_btf: Tensor<3>,

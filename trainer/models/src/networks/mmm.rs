@@ -1,11 +1,12 @@
 //! The masked token generator of MMM (Pinyoanuntapong et al., CVPR 2024).
 //!
-//! A token is its frozen code, or a learned row for end, pad and mask, through one Linear. Positions are added, the words of the caption are
-//! looked at (cross blocks; published without a mask on the words), the caption as a whole is put in front, positions are added again from its place on, so
-//! that a token carries two neighbouring rows of the table; then pre-norm blocks without a causal mask. Classes are the codes.
+//! A token is its frozen code, or a learned row for end, pad and mask, through one Linear. Positions are added. Cross
+//! blocks attend to the words of the caption (published without a mask on the words). Then the caption's embedding is
+//! put in front and positions are added again, starting at its place. So a token carries two neighbouring rows of the
+//! table. Pre-norm blocks without a causal mask follow. Classes are the codes.
 //!
-//! Departs: the published state holds the frozen tokenizer, a learned position table that nothing reads, and masks; here the codes are an
-//! argument and the others are not parameters.
+//! Departs: the published state holds the frozen tokenizer, an unused learned position table, and masks. Here the codes
+//! are an argument and the others are not parameters.
 
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -18,23 +19,22 @@ use crate::kernels::{Dropout, KeyMask};
 /// Size of the generator.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MmmConfig {
-    /// Codes K.
+    /// Number of codes K.
     pub codes: usize,
     /// Width of a code.
     pub dim: usize,
-    /// Width H.
     pub width: usize,
-    /// Heads.
+    /// Number of attention heads.
     pub heads: usize,
-    /// Blocks of the head; the base has as many, cross blocks counted.
+    /// Blocks of the head; the base has the same number, including cross blocks.
     pub layers: usize,
-    /// Cross blocks.
+    /// Number of cross blocks in the base.
     pub local: usize,
-    /// Positions, the caption's and the end's counted.
+    /// Number of positions, those of the caption and the end included.
     pub block: usize,
     /// Width of the embeddings of captions and words.
     pub text_dim: usize,
-    /// Feed-forward width over H.
+    /// Feed-forward width as a multiple of H.
     pub rate: usize,
 }
 
@@ -44,23 +44,23 @@ impl MmmConfig {
         self.codes
     }
 
-    /// The id behind the end.
+    /// The id that pads after the end.
     pub fn pad(&self) -> usize {
         self.codes + 1
     }
 
-    /// The id of a token to be filled in.
+    /// The id of a token to be generated.
     pub fn mask(&self) -> usize {
         self.codes + 2
     }
 
-    /// Positions of tokens and the end.
+    /// Number of positions of tokens and the end.
     pub fn positions(&self) -> usize {
         self.block - 1
     }
 }
 
-/// The first half.
+/// The embeddings and the first half of the blocks.
 #[derive(Module, Debug)]
 pub struct MmmBase {
     /// End, pad, mask -> code width.
@@ -71,22 +71,22 @@ pub struct MmmBase {
     pub cond_emb: Linear,
     /// Word -> H.
     pub word_emb: Linear,
-    /// Blocks that look at the words.
+    /// Blocks that attend to the words.
     pub cross_att: Vec<CrossBlock>,
-    /// Blocks.
+    /// Blocks after the cross blocks.
     pub blocks: Vec<GptBlock>,
 }
 
-/// The generator.
+/// The token generator of MMM.
 #[derive(Module, Debug)]
 pub struct Mmm {
     /// Embeddings and the first blocks.
     pub trans_base: MmmBase,
-    /// The other blocks and the logits.
+    /// The second half of the blocks, and the logits.
     pub trans_head: GptHead,
 }
 
-/// What the network looks at besides the ids.
+/// The inputs of the network besides the ids.
 #[derive(Debug, Clone)]
 pub struct MmmCondition {
     /// The tokenizer's codes [K, d].
@@ -95,12 +95,13 @@ pub struct MmmCondition {
     pub text_bc: Tensor<2>,
     /// Words [B, W, C].
     pub words_bnc: Tensor<3>,
-    /// Words of each caption, behind which nothing is looked at; `None` if all W count, as published, where W is always 77.
+    /// Number of words of each caption; later words are masked. `None` counts all W, as published, where W is always
+    /// 77.
     pub words: Option<Vec<usize>>,
 }
 
 impl Mmm {
-    /// A fresh one: weights normal with deviation 0.02, biases 0.
+    /// Creates a generator: weights normal with deviation 0.02, biases 0.
     ///
     /// # Panics
     /// If there are more cross blocks than blocks.
@@ -120,10 +121,10 @@ impl Mmm {
         }
     }
 
-    /// Logits [B, 1 + P, K] of the caption's place, which means nothing, and of each position of `ids` [B P].
+    /// Logits [B, 1 + P, K] of the caption's place, which are unused, and of each position of `ids` [B P].
     ///
-    /// Of sequence b the first `visible[b]` positions are looked at, all without; where `text_visible` is
-    /// false the caption's place is not.
+    /// The first `visible[b]` positions of sequence b are attended to; all of them if it is `None`. The caption's place
+    /// is hidden where `text_visible` is false.
     pub fn forward(
         &self,
         ids: &[usize],

@@ -1,4 +1,4 @@
-//! The published networks. Field names are the published tensor names, so that paths of parameters are too.
+//! The published networks. Field names are the published tensor names, so paths of parameters are the published paths.
 //!
 //! Notation in tensor names: b batch, t frames or tokens, h width, n latent tokens, d latent width, f features.
 
@@ -54,5 +54,5 @@ pub use trajectory::{Hints, TrajectoryConfig, TrajectoryEncoder};
 pub use transformer::{Attention, Block, Linear, Norm, SkipStack, StackConfig};
 pub use vae::{Posterior, Vae, VaeConfig};
 
-/// Rows of a learned position table, which bound the length of a sequence.
+/// Rows of a learned position table; they limit the length of a sequence.
 pub const POSITIONS: usize = 500;

@@ -1,10 +1,12 @@
-//! The two token generators of MoMask (Guo et al., CVPR 2024): one fills in the first layer's tokens, one adds those of the layers above.
+//! The two token generators of MoMask (Guo et al., CVPR 2024): one generates the first layer's tokens, the other those
+//! of the layers above.
 //!
-//! Both are post-norm blocks over [caption, tokens], or [caption, layer, tokens]: positions stand on the tokens alone, the leading ones are
-//! dropped at the end. The null condition is a caption embedding of zeros before its Linear, whose bias stays.
+//! Both are post-norm blocks over [caption, tokens], or [caption, layer, tokens]. Only the tokens have positions, and
+//! the outputs of the leading entries are dropped. The null condition is a caption embedding of zeros before its
+//! Linear, whose bias stays.
 //!
-//! Departs: the constant position table is not a parameter. Without shared weights upstream doubles the logits before adding the bias; so
-//! does this, for such weights alone, and its bias table has a row too many there.
+//! Departs: the constant position table is not a parameter. As upstream, weights that are not shared double the logits
+//! before the bias is added, and their bias table has an extra row.
 
 #![allow(non_snake_case, reason = "published names")]
 
@@ -24,36 +26,34 @@ const HEAD_EPS: f64 = 1e-12;
 /// Size of a generator.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MomaskConfig {
-    /// Codes K of a layer.
+    /// Number of codes K of a layer.
     pub codes: usize,
-    /// Layers Q of codes.
+    /// Number of layers Q of codes.
     pub quantizers: usize,
     /// Width of a token's embedding.
     pub dim: usize,
-    /// Width H.
     pub width: usize,
-    /// Blocks.
+    /// Number of blocks.
     pub layers: usize,
-    /// Heads.
+    /// Number of attention heads.
     pub heads: usize,
-    /// Feed-forward width.
     pub feed_forward: usize,
     /// Width of a caption embedding.
     pub text_dim: usize,
 }
 
 impl MomaskConfig {
-    /// The id of a token to be filled in, of the masked generator.
+    /// The masked generator's id of a token to be generated.
     pub fn mask(&self) -> usize {
         self.codes
     }
 
-    /// The id behind the end, of the masked generator.
+    /// The masked generator's id that pads after the end.
     pub fn pad(&self) -> usize {
         self.codes + 1
     }
 
-    /// The id behind the end, of the residual generator, which may also draw it.
+    /// The residual generator's id that pads after the end, which it may also draw.
     pub fn residual_pad(&self) -> usize {
         self.codes
     }
@@ -73,14 +73,14 @@ impl MomaskConfig {
 /// Embedding -> H.
 #[derive(Module, Debug)]
 pub struct InputProcess {
-    /// The one layer.
+    /// Linear applied to every token.
     pub poseEmbedding: Linear,
 }
 
-/// Blocks.
+/// The stack of post-norm blocks.
 #[derive(Module, Debug)]
 pub struct Blocks {
-    /// In order.
+    /// Blocks, first to last.
     pub layers: Vec<Block>,
 }
 
@@ -94,7 +94,8 @@ impl Blocks {
     }
 }
 
-/// As published: all weights normal with deviation 0.02, all biases 0, but for the packed projection, which stays Xavier-uniform.
+/// Creates a block as published: weights normal with deviation 0.02 and biases 0. Only the packed projection is
+/// Xavier-uniform.
 fn block(config: &MomaskConfig, init: &mut Init<'_>) -> Block {
     let mut block = Block::new(init, &config.stack());
     block.self_attn.out_proj = linear(init, config.width, config.width);
@@ -103,12 +104,12 @@ fn block(config: &MomaskConfig, init: &mut Init<'_>) -> Block {
     block
 }
 
-/// H -> classes, or -> the width of embeddings.
+/// H -> classes, or H -> the width of embeddings.
 #[derive(Module, Debug)]
 pub struct OutputProcess {
     /// H -> H.
     pub dense: Linear,
-    /// After GELU.
+    /// Norm after the GELU.
     pub LayerNorm: Norm,
     /// H -> out.
     pub poseFinal: Linear,
@@ -129,7 +130,8 @@ impl OutputProcess {
     }
 }
 
-/// `leading` tokens, then `tokens` through a Linear with positions; the blocks; the outputs of the latter.
+/// Applies the blocks to `leading` tokens followed by `tokens` through a Linear with positions. Returns the outputs of
+/// the latter.
 fn trunk(
     (input, blocks): (&InputProcess, &Blocks),
     leading: Vec<Tensor<3>>,
@@ -147,12 +149,11 @@ fn trunk(
     out.slice([0..batch, count..count + len, 0..width])
 }
 
-/// Fills in masked tokens of the first layer.
+/// Generator of the masked tokens of the first layer.
 #[derive(Module, Debug)]
 pub struct MaskedTransformer {
     /// Embedding -> H.
     pub input_process: InputProcess,
-    /// Blocks.
     pub seqTransEncoder: Blocks,
     /// Caption -> H.
     pub cond_emb: Linear,
@@ -163,7 +164,7 @@ pub struct MaskedTransformer {
 }
 
 impl MaskedTransformer {
-    /// A fresh one.
+    /// Creates a generator with initial weights.
     pub fn new(config: &MomaskConfig, init: &mut Init<'_>) -> Self {
         Self {
             input_process: InputProcess { poseEmbedding: linear(init, config.dim, config.width) },
@@ -174,7 +175,8 @@ impl MaskedTransformer {
         }
     }
 
-    /// Logits [B, n, K] of each position of `ids` [B n], of which `lengths[b]` count. `text_bc` [B, C]; zeros for the null condition.
+    /// Logits [B, n, K] of each position of `ids` [B n]; the first `lengths[b]` are valid. `text_bc` [B, C] is zero for
+    /// the null condition.
     pub fn forward(&self, ids: &[usize], text_bc: Tensor<2>, lengths: &[usize], drop: &mut Dropout) -> Tensor<3> {
         let batch = lengths.len();
         let condition = leading(&self.cond_emb, text_bc);
@@ -184,14 +186,14 @@ impl MaskedTransformer {
     }
 }
 
-/// [B, C] -> [B, 1, H].
+/// Maps [B, C] to [B, 1, H].
 fn leading(layer: &Linear, x_bc: Tensor<2>) -> Tensor<3> {
     let out = layer.forward(x_bc);
     let [batch, width] = out.dims();
     out.reshape([batch, 1, width])
 }
 
-/// Adds the tokens of layer j from those of the layers below it.
+/// Generator of the tokens of layer j, given those of the layers below it.
 #[derive(Module, Debug)]
 pub struct ResidualTransformer {
     /// Shared: the tables between the first input and the last output, [Q - 2, K + 1, d]. The output of layer k is the input of layer k.
@@ -208,9 +210,8 @@ pub struct ResidualTransformer {
     pub token_embed_weight: Option<Param<Tensor<3>>>,
     /// Embedding -> H.
     pub input_process: InputProcess,
-    /// Blocks.
     pub seqTransEncoder: Blocks,
-    /// Which layer, one-hot -> H.
+    /// One-hot layer -> H.
     pub quant_emb: Linear,
     /// Caption -> H.
     pub cond_emb: Linear,
@@ -220,10 +221,10 @@ pub struct ResidualTransformer {
 }
 
 impl ResidualTransformer {
-    /// A fresh one; `shared` as published.
+    /// Creates a generator with initial weights; `shared` selects shared tables, as published.
     ///
     /// # Panics
-    /// If there are fewer than three layers of codes: upstream's shared tables begin with the third.
+    /// If there are fewer than three layers of codes: upstream's shared tables start at the third.
     pub fn new(config: &MomaskConfig, shared: bool, init: &mut Init<'_>) -> Self {
         let MomaskConfig { codes, quantizers, dim, width, .. } = *config;
         assert!(quantizers > 2, "a residual generator has at least three layers of codes");
@@ -247,10 +248,10 @@ impl ResidualTransformer {
         }
     }
 
-    /// Table `row` of two or one, [K + 1, d].
+    /// Selects table `row` [K + 1, d] of the concatenated tables.
     ///
     /// # Panics
-    /// If neither the shared nor the own tables are there, which [`new`](Self::new) rules out.
+    /// If neither the shared nor the unshared tables are present, which [`new`](Self::new) rules out.
     fn table(parts: [&Option<Param<Tensor<3>>>; 3], row: usize) -> Tensor<2> {
         let mut row = row;
         for part in parts.into_iter().flatten() {
@@ -263,14 +264,14 @@ impl ResidualTransformer {
         panic!("a residual generator has tables for all of its layers")
     }
 
-    /// Embeddings of the tokens of layer `layer` (0 to Q - 2), [B n] ids -> [B, n, d].
+    /// Embeds the tokens of layer `layer` (0 to Q - 2), [B n] ids -> [B, n, d].
     pub fn embed(&self, ids: &[usize], layer: usize, batch: usize) -> Tensor<3> {
         let parts = [&self.token_embed_weight_, &self.embed_proj_shared_weight, &self.token_embed_weight];
         rows_of(Self::table(parts, layer), ids, batch)
     }
 
-    /// What the network makes of the sum of embeddings `sum_bnd` [B, n, d] before the classes, [B, n, d]. `layers[b]` (1 to Q - 1) is asked
-    /// for.
+    /// The network's output before the classes, [B, n, d], for the sum of embeddings `sum_bnd` [B, n, d]. `layers[b]`
+    /// (1 to Q - 1) is the layer to generate.
     pub fn features(
         &self,
         sum_bnd: Tensor<3>,

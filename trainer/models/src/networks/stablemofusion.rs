@@ -1,14 +1,17 @@
-//! StableMoFusion: a 1-D U-Net over frames with cross-attention to the tokens of a caption. Source: Huang et al., arXiv:2405.05691 (`T2MUnet`).
+//! StableMoFusion: a 1-D U-Net over frames with cross-attention to the tokens of a caption. Source: Huang et al.,
+//! arXiv:2405.05691 (`T2MUnet`).
 //!
-//! A level is two conditioned blocks and a convolution that halves the frames, the last level too; two blocks in the middle; on the way up
-//! the frames are doubled and the level's output is appended. A block is a residual pair of convolutions, scaled and shifted by the timestep,
-//! and residual cross-attention. The group norms are over the channels of one frame each, not over time. Frames are filled up with zeros to a
-//! multiple of 16. A caption that is left out skips every cross-attention; there is no null embedding.
+//! A level is two conditioned blocks and a convolution that halves the frames, on the last level too. The middle has
+//! two blocks. On the way up the frames are doubled and the level's output is appended. A block is a residual pair of
+//! convolutions, scaled and shifted by the timestep, and residual cross-attention. Group norms run over the channels of
+//! one frame each, not over time. Frames are padded with zeros to a multiple of 16. A dropped caption skips every
+//! cross-attention; there is no null embedding.
 //!
-//! Attention is linear by default: queries are normalised over a head's channels, keys over the tokens, and keys times values
-//! are a small matrix a head, on which dropout acts. `full_attention` is the usual one. Neither has an output projection.
+//! Attention is linear by default: queries are normalised over a head's channels and keys over the tokens. Keys times
+//! values are a small matrix per head, on which dropout acts. `full_attention` selects softmax attention. Neither has
+//! an output projection.
 //!
-//! Departs: upstream's captions all have 77 tokens and no mask. Ours may have `lengths`, and then tokens past them take no part.
+//! Departs: upstream's captions all have 77 tokens and no mask. Ours may have `lengths`; tokens past them are ignored.
 //!
 //! Notation: c channels, n tokens, k heads.
 
@@ -32,20 +35,21 @@ const HEADS: usize = 8;
 /// Added to variances in all norms.
 const EPS: f64 = 1e-5;
 
-/// Size of a StableMoFusion network. Published: width 512, multipliers 2, 2, 2, 2, time 512, text 256 with 4 layers, 4 heads and 2048.
+/// Size of a StableMoFusion network. Published: width 512, multipliers 2, 2, 2, 2, time 512, text 256 with 4 layers, 4
+/// heads and 2048.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StableMoFusionConfig {
     /// Features per frame.
     pub features: usize,
-    /// Channels that the multipliers count in.
+    /// Number of channels that the multipliers scale.
     pub width: usize,
-    /// A level each.
+    /// Channels of each level as a multiple of `width`.
     pub multipliers: Vec<usize>,
     /// Width of the timestep's embedding.
     pub time_dim: usize,
-    /// Width of a token as the text encoder gives it.
+    /// Width of a token from the text encoder.
     pub text_dim: usize,
-    /// Width of a token inside.
+    /// Width of a token inside the network.
     pub text_width: usize,
     /// Feed-forward width of the text transformer.
     pub text_feed_forward: usize,
@@ -53,18 +57,18 @@ pub struct StableMoFusionConfig {
     pub text_heads: usize,
     /// Blocks of the text transformer.
     pub text_layers: usize,
-    /// The usual cross-attention in place of the linear one.
+    /// Uses softmax cross-attention instead of the linear one.
     pub full_attention: bool,
 }
 
-/// What a batch is conditioned on.
+/// The captions of a batch.
 #[derive(Debug, Clone)]
 pub struct TokenCondition {
     /// Encoded tokens [B, N, text width].
     pub text_bnc: Tensor<3>,
-    /// How many tokens of each caption count; all without.
+    /// Number of valid tokens of each caption; `None` if all are valid.
     pub lengths: Option<Vec<usize>>,
-    /// Whether each sample has its caption, or goes without.
+    /// True for a sample with its caption, false for a sample without.
     pub kept: Vec<bool>,
 }
 
@@ -73,38 +77,38 @@ pub struct TokenCondition {
 pub struct ScaledConv {
     /// in -> out.
     pub block: Conv1d,
-    /// The norm's scale and shift.
+    /// Scale and shift of the norm.
     pub group_norm: Norm,
 }
 
-/// The same without scale and shift by the timestep.
+/// Like [`ScaledConv`], without scale and shift by the timestep.
 #[derive(Module, Debug)]
 pub struct PlainConv {
-    /// out -> out, zero at first.
+    /// out -> out, initialised to zero.
     pub block: Conv1d,
-    /// The norm's scale and shift.
+    /// Scale and shift of the norm.
     pub norm: Norm,
 }
 
-/// Two convolutions beside a skip.
+/// Two convolutions with a residual connection.
 #[derive(Module, Debug)]
 pub struct ResidualConv {
-    /// The first.
+    /// First convolution, scaled and shifted by the timestep.
     pub blocks_0: ScaledConv,
-    /// The second.
+    /// Second convolution.
     pub blocks_1: PlainConv,
-    /// Time -> scale and shift of the first, zero at first.
+    /// Time -> scale and shift of the first convolution, initialised to zero.
     pub time_mlp_1: Linear,
-    /// in -> out where they differ.
+    /// in -> out on the residual path, if the widths differ.
     pub residual_conv: Option<Conv1d>,
 }
 
 /// Attention of frames to tokens.
 #[derive(Module, Debug)]
 pub struct TextAttention {
-    /// On the frames.
+    /// Norm on the frames.
     pub norm: Norm,
-    /// On the tokens.
+    /// Norm on the tokens.
     pub text_norm: Norm,
     /// c -> c.
     pub query: Linear,
@@ -115,19 +119,18 @@ pub struct TextAttention {
     full: bool,
 }
 
-/// Residual cross-attention.
+/// Cross-attention with a residual connection.
 #[derive(Module, Debug)]
 pub struct CrossAttention {
-    /// The attention.
     pub cross_attention: TextAttention,
 }
 
-/// A conditioned block.
+/// A block conditioned on timestep and text.
 #[derive(Module, Debug)]
 pub struct ConditionedBlock {
-    /// On the timestep.
+    /// Convolutions conditioned on the timestep.
     pub conv1d: ResidualConv,
-    /// On the text.
+    /// Cross-attention to the text.
     pub cross_attn: CrossAttention,
 }
 
@@ -148,31 +151,28 @@ pub struct Doubling {
 /// A level on the way down.
 #[derive(Module, Debug)]
 pub struct Down {
-    /// First block.
     pub at_0: ConditionedBlock,
-    /// Second block.
     pub at_1: ConditionedBlock,
-    /// To the next level.
+    /// Convolution to the next level.
     pub at_2: Halving,
 }
 
 /// A level on the way up.
 #[derive(Module, Debug)]
 pub struct Up {
-    /// From the level below.
+    /// Convolution from the level below.
     pub at_0: Doubling,
     /// First block, on the doubled frames and the level's output on the way down.
     pub at_1: ConditionedBlock,
-    /// Second block.
     pub at_2: ConditionedBlock,
 }
 
-/// The U-Net.
+/// The U-Net's layers under their published names.
 #[derive(Module, Debug)]
 pub struct Unet {
-    /// Position sinusoid of the timestep -> 4 times as wide.
+    /// Position sinusoid of the timestep -> 4 times its width.
     pub time_mlp_1: Linear,
-    /// And back, after Mish.
+    /// 4 times the width -> the width, after Mish.
     pub time_mlp_3: Linear,
     /// Levels, from the finest.
     pub downs: Vec<Down>,
@@ -182,7 +182,7 @@ pub struct Unet {
     pub mid_block1: ConditionedBlock,
     /// Second block in the middle.
     pub mid_block2: ConditionedBlock,
-    /// To features, zero at first.
+    /// Last width -> features, initialised to zero.
     pub final_conv: Conv1d,
 }
 
@@ -191,15 +191,15 @@ pub struct Unet {
 pub struct StableMoFusion {
     /// Tokens of the text encoder -> text width.
     pub embed_text: Linear,
-    /// Over the tokens.
+    /// Transformer over the tokens.
     pub textTransEncoder: Layers,
-    /// After it.
+    /// Norm after the transformer.
     pub text_ln: Norm,
-    /// Over the frames.
+    /// U-Net over the frames.
     pub unet: Unet,
 }
 
-/// [B, T, c] with mean 0 and variance 1 in each group of a frame's channels.
+/// Standardises [B, T, c] to mean 0 and variance 1 in each group of a frame's channels.
 fn standardised(x_btc: Tensor<3>) -> Tensor<3> {
     let [batch, frames, channels] = x_btc.dims();
     let width = channels / GROUPS;
@@ -208,7 +208,7 @@ fn standardised(x_btc: Tensor<3>) -> Tensor<3> {
     layer_norm(x_btc.reshape([batch, frames, GROUPS, width]), ones, zeros, EPS).reshape([batch, frames, channels])
 }
 
-/// A convolution whose first values are all zero.
+/// A convolution initialised to zero.
 fn zero(init: &mut Init<'_>, inner: usize, out: usize, taps: usize) -> Conv1d {
     let mut conv = Conv1d::same(init, inner, out, taps);
     conv.weight = init.constant(0.0, [out, inner, taps]);
@@ -216,13 +216,13 @@ fn zero(init: &mut Init<'_>, inner: usize, out: usize, taps: usize) -> Conv1d {
     conv
 }
 
-/// A transposed convolution that doubles the frames, with PyTorch's first values.
+/// A transposed convolution that doubles the frames, with PyTorch's initial values.
 fn doubling(init: &mut Init<'_>, inner: usize, out: usize) -> Deconv {
     const TAPS: usize = 4;
     Deconv { weight: init.fan_in(out * TAPS, [inner, out, TAPS]), bias: init.fan_in(out * TAPS, [out]) }
 }
 
-/// What of a block comes from the settings.
+/// The settings of a block.
 #[derive(Clone, Copy)]
 struct Sizes {
     time: usize,
@@ -255,7 +255,7 @@ impl ResidualConv {
         let pair = self.time_mlp_1.forward(time_bh).reshape([batch, 1, 2 * channels]);
         let scale = pair.clone().slice([0..batch, 0..1, 0..channels]) + 1.0;
         let shift = pair.slice([0..batch, 0..1, channels..2 * channels]);
-        // The norm's own scale and shift come first; together they are one of each.
+        // The norm's own scale and shift come first; both pairs combine to one.
         let norm = &self.blocks_0.group_norm;
         let first = mish(first * (scale.clone() * row(&norm.weight)) + (scale * row(&norm.bias) + shift));
 
@@ -299,7 +299,7 @@ impl TextAttention {
         let mut value_bknc = split(value, tokens);
         if let Some(lengths) = &condition.lengths {
             let live = live_tokens(lengths, tokens, &key_bknc);
-            // Far below any key, and finite, so that a gradient through it is 0 and not undefined.
+            // Far below any key, but finite, so that a gradient through it is 0 and not undefined.
             key_bknc = key_bknc + (live.clone() - 1.0) * 1e9;
             value_bknc = value_bknc * live;
         }
@@ -309,7 +309,7 @@ impl TextAttention {
     }
 }
 
-/// [B, 1, N, 1] with 1 for a token that counts and 0 for one that does not, on the device of `like`.
+/// A mask [B, 1, N, 1] with 1 for a valid token and 0 for the others, on the device of `like`.
 fn live_tokens(lengths: &[usize], tokens: usize, like: &Tensor<4>) -> Tensor<4> {
     let live = lengths.iter().flat_map(|l| (0..tokens).map(move |n| if n < *l { 1.0_f32 } else { 0.0 })).collect();
     Tensor::from_data(TensorData::new(live, [lengths.len(), 1, tokens, 1]), &like.device())
@@ -334,11 +334,11 @@ impl ConditionedBlock {
     }
 }
 
-/// What every block of a pass is given.
+/// The inputs of every block of a pass.
 struct Given<'a> {
     time_bh: Tensor<2>,
     condition: Option<&'a TokenCondition>,
-    /// 1 where the sample has its caption and 0 where it goes without, unless all have theirs.
+    /// 1 for a sample with its caption and 0 without; `None` if all samples have theirs.
     kept_b11: Option<Tensor<3>>,
 }
 
@@ -394,10 +394,10 @@ impl Unet {
 }
 
 impl StableMoFusion {
-    /// Frames are filled up to a multiple of this, which bounds the number of levels to 4.
+    /// Frames are padded to a multiple of this; it limits the number of levels to 4.
     pub const MULTIPLE: usize = 16;
 
-    /// A fresh network.
+    /// Creates a network with initial weights.
     pub fn new(config: &StableMoFusionConfig, init: &mut Init<'_>) -> Self {
         let stack = StackConfig {
             width: config.text_width,
@@ -415,7 +415,7 @@ impl StableMoFusion {
         }
     }
 
-    /// Encoded tokens [B, N, text width] of the text encoder's [B, N, text_dim], of which the first `lengths[b]` count.
+    /// Encodes the text encoder's tokens [B, N, text_dim] as [B, N, text width]; the first `lengths[b]` are valid.
     pub fn encode_text(&self, tokens_bnc: Tensor<3>, lengths: Option<&[usize]>, drop: &mut Dropout) -> Tensor<3> {
         let mask = lengths.map(|lengths| KeyMask::new(lengths, 0));
         let x = self.textTransEncoder.forward(self.embed_text.forward(tokens_bnc), mask.as_ref(), drop);
@@ -429,8 +429,8 @@ impl StableMoFusion {
         self.unet.time_mlp_3.forward(mish(self.unet.time_mlp_1.forward(sinusoid)))
     }
 
-    /// What `x_btf` [B, T, F], normalised, at `timesteps` is taken for, [B, T, F]: the clean motion as published. Without a condition, no sample
-    /// has its caption.
+    /// The network's prediction [B, T, F] for normalised `x_btf` [B, T, F] at `timesteps`: as published, the clean
+    /// motion. Without a condition, no sample has its caption.
     pub fn forward(
         &self,
         x_btf: Tensor<3>,
@@ -513,7 +513,8 @@ mod tests {
             assert!(off(cut.clone(), masked.clone()) < 1e-5);
             assert!(off(cut.clone(), run(tokens.clone(), None, [true; 2])) > 1e-3, "the tokens matter");
 
-            // A sample without its caption is what it is in a batch without captions; the other one stays.
+            // A sample without its caption equals the same sample in a batch without captions; the other sample keeps
+            // its caption.
             let mixed = run(tokens, Some(vec![3, 3]), [true, false]);
             let none = network.forward(x.clone(), &[3, 700], None, &mut Dropout::off());
             let row = |x: &Tensor<3>, b: usize| x.clone().slice([b..b + 1, 0..20, 0..10]);

@@ -1,8 +1,10 @@
-//! T5's encoder, and what Sentence-T5 adds to it. Sources: Raffel et al., arXiv:1910.10683; Ni et al., arXiv:2108.08877. Tensor names are those
-//! of Hugging Face's `T5EncoderModel` and of sentence-transformers' dense layer.
+//! T5's encoder, and the pooling and dense layer of Sentence-T5. Sources: Raffel et al., arXiv:1910.10683; Ni et al.,
+//! arXiv:2108.08877. Tensor names are those of Hugging Face's `T5EncoderModel` and of sentence-transformers' dense
+//! layer.
 //!
-//! Pre-norm blocks with root-mean-square norms; attention without biases whose scores are not divided by the root of the head's width, but get
-//! a bias by the distance of the positions, in buckets, from a table that the first block has and all blocks use.
+//! Pre-norm blocks with root-mean-square norms. Attention has no biases, and its scores are not divided by the root of
+//! the head's width. A bias by the distance of the positions, in buckets, is added to them. Its table is in the first
+//! block, and all blocks use it.
 
 #![expect(non_snake_case, reason = "fields have the published names")]
 
@@ -15,24 +17,22 @@ use super::attend::{DEVIATION, Embedding, attend_at, hiding, rows_of};
 use super::{Init, Linear};
 use crate::kernels::Dropout;
 
-/// Size of the encoder, as a published `config.json` has it.
+/// Size of the encoder, as in a published `config.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct T5Config {
     /// Rows of the token table.
     pub vocab_size: usize,
-    /// Width H.
     pub d_model: usize,
-    /// Width of a head; times the heads it need not be H.
+    /// Width of a head; heads times this width may differ from H.
     pub d_kv: usize,
-    /// Feed-forward width.
     pub d_ff: usize,
-    /// Blocks.
+    /// Number of blocks.
     pub num_layers: usize,
-    /// Heads.
+    /// Number of attention heads.
     pub num_heads: usize,
-    /// Buckets of distances, both directions together.
+    /// Number of buckets of distances, both directions together.
     pub relative_attention_num_buckets: usize,
-    /// Distances from here on share a bucket.
+    /// Distances from this one on share a bucket.
     pub relative_attention_max_distance: usize,
     /// Added to mean squares in norms.
     pub layer_norm_epsilon: f64,
@@ -40,20 +40,20 @@ pub struct T5Config {
     pub feed_forward_proj: T5FeedForward,
 }
 
-/// What is between the feed-forward's layers.
+/// Activation between the feed-forward's layers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum T5FeedForward {
-    /// T5, Sentence-T5.
+    /// ReLU, as in T5 and Sentence-T5.
     Relu,
-    /// A GELU by tanh times a second layer.
+    /// GELU with the tanh approximation, times a second layer (T5 1.1).
     GatedGelu,
 }
 
 /// `x / sqrt(mean(x^2) + eps)` times a scale.
 #[derive(Module, Debug)]
 pub struct RootMeanSquareNorm {
-    /// [H].
+    /// Scale of shape [H].
     pub weight: Param<Tensor<1>>,
 }
 
@@ -64,81 +64,77 @@ impl RootMeanSquareNorm {
     }
 }
 
-/// Attention.
+/// Attention with separate projections without biases.
 #[derive(Module, Debug)]
 pub struct T5SelfAttention {
     /// H -> heads times their width.
     pub q: Linear,
-    /// The same.
+    /// H -> heads times their width.
     pub k: Linear,
-    /// The same.
+    /// H -> heads times their width.
     pub v: Linear,
-    /// And back.
+    /// Heads times their width -> H.
     pub o: Linear,
-    /// Buckets -> heads; of the first block.
+    /// Buckets -> heads; only in the first block.
     pub relative_attention_bias: Option<Embedding>,
 }
 
-/// `x += Attn(norm x)`.
+/// The attention sublayer: `x += Attn(norm x)`.
 #[derive(Module, Debug)]
 pub struct T5AttentionLayer {
-    /// Attention.
     pub SelfAttention: T5SelfAttention,
-    /// Before it.
+    /// Norm before the attention.
     pub layer_norm: RootMeanSquareNorm,
 }
 
-/// Two layers, or three with a gate.
+/// The feed-forward: two layers, or three with a gate.
 #[derive(Module, Debug)]
 pub struct T5Dense {
-    /// Without a gate.
+    /// H -> feed-forward width, without a gate.
     pub wi: Option<Linear>,
-    /// With one: what goes through the GELU.
+    /// H -> feed-forward width; the input of the GELU of a gated layer.
     pub wi_0: Option<Linear>,
-    /// With one: what it is multiplied by.
+    /// H -> feed-forward width; the factor of a gated layer.
     pub wi_1: Option<Linear>,
-    /// Back to H.
+    /// Feed-forward width -> H.
     pub wo: Linear,
 }
 
-/// `x += FF(norm x)`.
+/// The feed-forward sublayer: `x += FF(norm x)`.
 #[derive(Module, Debug)]
 pub struct T5FeedForwardLayer {
-    /// Feed-forward.
     pub DenseReluDense: T5Dense,
-    /// Before it.
+    /// Norm before the feed-forward.
     pub layer_norm: RootMeanSquareNorm,
 }
 
-/// A block.
+/// An attention and a feed-forward sublayer.
 #[derive(Module, Debug)]
 pub struct T5Block {
     /// Attention, then feed-forward.
     pub layer: (T5AttentionLayer, T5FeedForwardLayer),
 }
 
-/// Blocks and a norm.
+/// The blocks and the final norm.
 #[derive(Module, Debug)]
 pub struct T5Stack {
-    /// In order.
+    /// Blocks, first to last.
     pub block: Vec<T5Block>,
-    /// After them.
     pub final_layer_norm: RootMeanSquareNorm,
 }
 
-/// The encoder.
+/// T5's encoder under its published names.
 #[derive(Module, Debug)]
 pub struct T5Encoder {
     /// Token -> H.
     pub shared: Embedding,
-    /// Blocks.
     pub encoder: T5Stack,
     #[module(skip)]
     config: T5Config,
 }
 
 impl T5Encoder {
-    /// One with weights that mean nothing yet.
+    /// Creates an encoder with untrained weights.
     pub fn new(config: &T5Config, init: &mut Init<'_>) -> Self {
         let (width, inner) = (config.d_model, config.num_heads * config.d_kv);
         let mut block = |first: bool| {
@@ -172,7 +168,8 @@ impl T5Encoder {
         }
     }
 
-    /// States [B, T, H] of `ids` [B T], of which each row's first `lengths` count; those of what pads mean nothing.
+    /// States [B, T, H] of `ids` [B T]. The first `lengths` ids of each row are valid; the states of padding are
+    /// undefined.
     ///
     /// # Panics
     /// If an id is not in the table.
@@ -187,7 +184,7 @@ impl T5Encoder {
         self.encoder.final_layer_norm.forward(x, self.config.layer_norm_epsilon)
     }
 
-    /// What is added to the scores of `len` positions: [1, heads, queries, keys].
+    /// The bias on the scores of `len` positions: [1, heads, queries, keys].
     ///
     /// # Panics
     /// If there is no block.
@@ -218,8 +215,9 @@ impl T5Encoder {
     }
 }
 
-/// The bucket of a key that comes `distance` after its query, or before it if that is below 0: half of the buckets for each direction, half of
-/// those for each of the nearest distances, the others for logarithmically growing spans up to `most`. In f32, as published.
+/// The bucket of a key `distance` positions after its query (before it, if negative). Each direction has half of the
+/// buckets. Half of those hold one near distance each; the others hold logarithmically growing ranges up to `most`.
+/// Computed in f32, as published.
 pub fn distance_bucket(distance: i64, buckets: usize, most: usize) -> usize {
     let each = buckets / 2;
     let exact = each / 2;

@@ -1,9 +1,9 @@
-//! Convolutional encoder and decoder around a codebook, the same in T2M-GPT (Zhang et al., CVPR 2023), MoMask (Guo et al., CVPR 2024) and
-//! MMM (Pinyoanuntapong et al., CVPR 2024), after OpenAI's Jukebox.
+//! Convolutional encoder and decoder around a codebook, after OpenAI's Jukebox. They are the same in T2M-GPT (Zhang et
+//! al., CVPR 2023), MoMask (Guo et al., CVPR 2024) and MMM (Pinyoanuntapong et al., CVPR 2024).
 //!
-//! Encoder: convolution, then per level a strided convolution and a stack of dilated residual blocks, then a convolution to codes.
-//! Decoder: the mirror image, with nearest-neighbour up-sampling. Dilations of a stack fall, 9, 3, 1, on both sides. The codebooks are no
-//! parameters: see [`crate::quantizer`].
+//! Encoder: a convolution, then per level a strided convolution and a stack of dilated residual blocks, then a
+//! convolution to codes. Decoder: the mirror image, with nearest-neighbour up-sampling. Dilations of a stack decrease,
+//! 9, 3, 1, on both sides. The codebooks are no parameters: see [`crate::quantizer`].
 
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -23,29 +23,29 @@ pub struct TokenizerConfig {
     pub dim: usize,
     /// Width between the convolutions.
     pub width: usize,
-    /// Levels, each of which makes sequences shorter by `stride`.
+    /// Number of levels; each shortens sequences by `stride`.
     pub levels: usize,
-    /// What a level shortens by.
+    /// Factor by which a level shortens sequences.
     pub stride: usize,
-    /// Residual blocks of a level.
+    /// Residual blocks per level.
     pub depth: usize,
-    /// What dilations grow by from block to block.
+    /// Factor between the dilations of neighbouring blocks.
     pub growth: usize,
 }
 
 impl TokenizerConfig {
-    /// Frames that one token stands for.
+    /// Frames per token.
     pub fn unit(&self) -> usize {
         (0..self.levels).map(|_| self.stride).product()
     }
 }
 
-/// `x + D(C1(relu(C3(relu(x)))))`.
+/// A residual block, `x + D(C1(relu(C3(relu(x)))))` with dropout D.
 #[derive(Module, Debug)]
 pub struct ResidualBlock {
-    /// Three taps, dilated.
+    /// Dilated convolution with three taps.
     pub conv1: Conv1d,
-    /// One tap.
+    /// Convolution with one tap.
     pub conv2: Conv1d,
 }
 
@@ -56,10 +56,10 @@ impl ResidualBlock {
     }
 }
 
-/// Residual blocks with falling dilation.
+/// Residual blocks with decreasing dilation.
 #[derive(Module, Debug)]
 pub struct ResidualStack {
-    /// The widest reach first.
+    /// Blocks, the largest dilation first.
     pub model: Vec<ResidualBlock>,
 }
 
@@ -84,33 +84,33 @@ impl ResidualStack {
 /// An entry of the encoder's sequence.
 #[derive(Module, Debug)]
 pub enum EncoderPart {
-    /// First and last.
+    /// The first and the last convolution.
     Conv(Conv1d),
-    /// ReLU.
+    /// The ReLU after the first convolution.
     Activation(Gap),
-    /// A level.
+    /// A strided convolution and its residual blocks.
     Level((Conv1d, ResidualStack)),
 }
 
-/// Motion to rows of codes' width.
+/// Encoder from motion to rows of a code's width.
 #[derive(Module, Debug)]
 pub struct TokenEncoder {
-    /// Convolution, ReLU, levels, convolution.
+    /// Convolution, ReLU, levels, convolution, in this order.
     pub model: Vec<EncoderPart>,
 }
 
 /// An entry of the decoder's sequence.
 #[derive(Module, Debug)]
 pub enum DecoderPart {
-    /// The first and the last two.
+    /// The first and the last two convolutions.
     Conv(Conv1d),
-    /// ReLU.
+    /// The ReLUs around the levels.
     Activation(Gap),
-    /// A level.
+    /// Residual blocks, up-sampling and a convolution.
     Level((ResidualStack, Gap, Conv1d)),
 }
 
-/// Sums of codes to motion.
+/// Decoder from sums of codes to motion.
 #[derive(Module, Debug)]
 pub struct TokenDecoder {
     /// Convolution, ReLU, levels, convolution, ReLU, convolution.
@@ -120,15 +120,15 @@ pub struct TokenDecoder {
 /// Encoder and decoder of a tokenizer.
 #[derive(Module, Debug)]
 pub struct Tokenizer {
-    /// Motion to rows.
+    /// Encoder from motion to rows.
     pub encoder: TokenEncoder,
-    /// Rows to motion.
+    /// Decoder from rows to motion.
     pub decoder: TokenDecoder,
     stride: usize,
 }
 
 impl Tokenizer {
-    /// A fresh one, in PyTorch's default range.
+    /// Creates a tokenizer initialised in PyTorch's default range.
     pub fn new(config: &TokenizerConfig, init: &mut Init<'_>) -> Self {
         let TokenizerConfig { features, dim, width, levels, stride, .. } = *config;
         let mut encoder = vec![EncoderPart::Conv(Conv1d::same(init, features, width, 3)), EncoderPart::Activation(GAP)];
@@ -148,7 +148,8 @@ impl Tokenizer {
         Self { encoder: TokenEncoder { model: encoder }, decoder: TokenDecoder { model: decoder }, stride }
     }
 
-    /// Normalised features [B, T, F] -> rows [B, T / unit, d]; a rest of T that makes no whole token is not looked at by a token of its own.
+    /// Encodes normalised features [B, T, F] as rows [B, T / unit, d]. Frames at the end that do not fill a token get
+    /// no token of their own.
     pub fn encode(&self, features_btf: Tensor<3>, drop: &mut Dropout) -> Tensor<3> {
         self.encoder.model.iter().fold(features_btf, |x, part| match part {
             EncoderPart::Conv(conv) => conv.forward(x),
@@ -157,7 +158,7 @@ impl Tokenizer {
         })
     }
 
-    /// Sums of codes [B, n, d] -> normalised features [B, unit n, F].
+    /// Decodes sums of codes [B, n, d] into normalised features [B, unit n, F].
     pub fn decode(&self, codes_bnd: Tensor<3>, drop: &mut Dropout) -> Tensor<3> {
         self.decoder.model.iter().fold(codes_bnd, |x, part| match part {
             DecoderPart::Conv(conv) => conv.forward(x),

@@ -1,7 +1,9 @@
-//! The trajectory encoder: a few tokens out of the frames at which joints are given. Source: MotionLCM (Dai et al., ECCV 2024; v2 of late 2024).
+//! The trajectory encoder: computes a few tokens from the frames with joint targets. Source: MotionLCM (Dai et al.,
+//! ECCV 2024; v2 of late 2024).
 //!
-//! N learned tokens stand before the frames, each of which is the hint's joints at it; the first N outputs are taken, in v2 through a Linear. Frames
-//! without a given joint are attended by nobody, so they are left out altogether: a frame's place is in its position alone.
+//! The sequence is N learned tokens, then one entry per frame with the hint's joints there. The first N outputs are
+//! used, in v2 after a Linear. Frames without a target would be masked, so they are left out: only the position encodes
+//! a frame's place.
 
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Int, Tensor, TensorData};
@@ -11,45 +13,46 @@ use super::vae::Positions;
 use super::{Init, Linear, POSITIONS, SkipStack, StackConfig};
 use crate::kernels::{Dropout, KeyMask};
 
-/// Coordinates of a joint.
+/// Number of coordinates of a joint.
 const AXES: usize = 3;
 
 /// Size of a trajectory encoder.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TrajectoryConfig {
-    /// Joints of the skeleton.
+    /// Number of joints of the skeleton.
     pub joints: usize,
-    /// N tokens.
+    /// Number of tokens N.
     pub tokens: usize,
     /// Width d of a token.
     pub dim: usize,
     /// Width H of the transformer.
     pub width: usize,
-    /// Blocks.
+    /// Number of blocks.
     pub layers: usize,
-    /// Heads.
+    /// Number of attention heads.
     pub heads: usize,
-    /// Feed-forward width.
     pub feed_forward: usize,
-    /// A Linear H -> d at the end (v2); without it d is H (v1).
+    /// Adds a Linear H -> d at the end (v2); without it d is H (v1).
     pub projection: bool,
     /// Added to variances in layer norms.
     pub norm_eps: f64,
 }
 
-/// Where which joints should be: for a batch, the frames at which any is given.
+/// Joint targets of a batch, for the frames that have any.
 #[derive(Debug, Clone)]
 pub struct Hints {
-    /// Normalised coordinates [B, M, joints x 3] of those frames, zero for joints that are not given, one after the other and then padding.
+    /// Normalised coordinates [B, M, joints x 3] of those frames, then padding. Coordinates of joints without a target
+    /// are zero.
     rows_bmj: Tensor<3>,
-    /// Their numbers in the motion, 0 for padding; B x M.
+    /// Indices of those frames in the motion, 0 for padding; B x M.
     frames: Vec<usize>,
-    /// How many there are of each motion.
+    /// Number of those frames in each motion.
     counts: Vec<usize>,
 }
 
 impl Hints {
-    /// Of `values` [B, T, joints, 3], normalised, and `given` of the same shape, which says which coordinates count.
+    /// Selects the frames of normalised `values` [B, T, joints, 3] with any true entry in `given`, which has the same
+    /// shape.
     ///
     /// # Panics
     /// If the two differ in length, or are not B x T x joints x 3.
@@ -64,7 +67,7 @@ impl Hints {
         let row = |b: usize, t: usize| (b * frames + t) * width..(b * frames + t + 1) * width;
         let live: Vec<Vec<usize>> =
             (0..batch).map(|b| (0..frames).filter(|t| given[row(b, *t)].contains(&true)).collect()).collect();
-        // One row of padding where nothing is given at all.
+        // One row of padding if no motion has a target.
         let most = live.iter().map(Vec::len).max().unwrap_or_default().max(1);
         let (mut rows, mut numbers) = (vec![0.0; batch * most * width], vec![0; batch * most]);
         for (b, kept) in live.iter().enumerate() {
@@ -95,14 +98,13 @@ pub struct TrajectoryEncoder {
     pub skel_embedding: Linear,
     /// Positions of tokens and frames.
     pub query_pos_encoder: Positions,
-    /// The transformer.
     pub encoder: SkipStack,
     /// H -> d (v2).
     pub latent_proj: Option<Linear>,
 }
 
 impl TrajectoryEncoder {
-    /// A fresh one.
+    /// Creates an encoder with initial weights.
     pub fn new(config: &TrajectoryConfig, init: &mut Init<'_>) -> Self {
         let TrajectoryConfig { joints, tokens, dim, width, layers, heads, feed_forward, norm_eps, .. } = *config;
         let stack = StackConfig { width, layers, heads, feed_forward, norm_eps, memory: false };
@@ -115,10 +117,10 @@ impl TrajectoryEncoder {
         }
     }
 
-    /// Tokens [B, N, d], shaped as a latent is.
+    /// Encodes hints as tokens [B, N, d], the shape of a latent.
     ///
     /// # Panics
-    /// If a hint stands at a frame for which there is no position.
+    /// If the frame of a hint has no position.
     pub fn forward(&self, hints: &Hints, dropout: &mut Dropout) -> Tensor<3> {
         let [batch, most, _] = hints.rows_bmj.dims();
         let [tokens, width] = self.global_motion_token.dims();

@@ -1,10 +1,10 @@
 //! Post-norm transformer blocks and the skip stack of MLD (Chen et al., arXiv:2212.04048, after DETR and U-ViT).
 //!
-//! A block is `x <- LN(x + Attention(x))`, with memory also `x <- LN(x + CrossAttention(x, memory))`, then
-//! `x <- LN(x + W2 GELU(W1 x))`. In a stack of 2k + 1 blocks the outputs of the first k are kept; before each of the last k the
-//! newest one is appended, `[x, skip]`, and brought back to width by a Linear. A LayerNorm ends the stack.
+//! A block is `x <- LN(x + Attention(x))`, with memory also `x <- LN(x + CrossAttention(x, memory))`, then `x <- LN(x +
+//! W2 GELU(W1 x))`. A stack of 2k + 1 blocks keeps the outputs of the first k. Before each of the last k the newest
+//! kept output is appended, `[x, skip]`, and a Linear restores the width. A LayerNorm ends the stack.
 //!
-//! Departs: biases of cloned layers are drawn apart, upstream they start equal.
+//! Departs: biases of cloned layers are drawn separately; upstream copies one layer.
 
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
@@ -15,46 +15,44 @@ use crate::kernels::{self, Dropout, KeyMask};
 /// Size of a stack.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StackConfig {
-    /// Width H.
     pub width: usize,
-    /// Blocks; odd.
+    /// Number of blocks; odd for a skip stack.
     pub layers: usize,
-    /// Heads.
+    /// Number of attention heads.
     pub heads: usize,
-    /// Feed-forward width.
     pub feed_forward: usize,
-    /// Added to variances.
+    /// Added to variances in layer norms.
     pub norm_eps: f64,
-    /// Whether blocks attend to a memory.
+    /// Adds attention to a memory to every block.
     pub memory: bool,
 }
 
 /// `y = x W^T + b`; `weight` [out, in] as published.
 #[derive(Module, Debug)]
 pub struct Linear {
-    /// [out, in].
+    /// Weights of shape [out, in].
     pub weight: Param<Tensor<2>>,
-    /// [out].
+    /// Bias of shape [out].
     pub bias: Option<Param<Tensor<1>>>,
 }
 
 impl Linear {
-    /// PyTorch's default initialisation.
+    /// Initialises in PyTorch's default range.
     pub fn new(init: &mut Init<'_>, inner: usize, out: usize) -> Self {
         Self { weight: init.fan_in(inner, [out, inner]), bias: Some(init.fan_in(inner, [out])) }
     }
 
-    /// Xavier-uniform weight, default bias: as inside skip stacks.
+    /// Initialises the weight Xavier-uniform and the bias by default, as inside skip stacks.
     pub fn xavier(init: &mut Init<'_>, inner: usize, out: usize) -> Self {
         Self { weight: init.xavier(out, inner), bias: Some(init.fan_in(inner, [out])) }
     }
 
-    /// All zeros and no bias.
+    /// Initialises to zero, without a bias.
     pub fn zero(init: &Init<'_>, inner: usize, out: usize) -> Self {
         Self { weight: init.constant(0.0, [out, inner]), bias: None }
     }
 
-    /// [..., in] -> [..., out].
+    /// Maps [..., in] to [..., out].
     pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
         kernels::linear(x, self.weight.val(), self.bias.as_ref().map(Param::val))
     }
@@ -63,24 +61,24 @@ impl Linear {
 /// Layer norm's scale and shift.
 #[derive(Module, Debug)]
 pub struct Norm {
-    /// [width].
+    /// Scale of shape [width].
     pub weight: Param<Tensor<1>>,
-    /// [width].
+    /// Shift of shape [width].
     pub bias: Param<Tensor<1>>,
 }
 
 impl Norm {
-    /// Ones and zeros.
+    /// Initialises the scale to ones and the shift to zeros.
     pub fn new(init: &Init<'_>, width: usize) -> Self {
         Self { weight: init.constant(1.0, [width]), bias: init.constant(0.0, [width]) }
     }
 
-    /// `LN(x)`.
+    /// Computes `LN(x)` over the last axis.
     pub fn forward<const D: usize>(&self, x: Tensor<D>, eps: f64) -> Tensor<D> {
         kernels::layer_norm(x, self.weight.val(), self.bias.val(), eps)
     }
 
-    /// `LN(x + y)`.
+    /// Computes `LN(x + y)` in one pass.
     pub fn after<const D: usize>(&self, x: Tensor<D>, y: Tensor<D>, eps: f64) -> Tensor<D> {
         kernels::add_layer_norm(x, y, self.weight.val(), self.bias.val(), eps)
     }
@@ -91,7 +89,7 @@ impl Norm {
 pub struct Attention {
     /// [3H, H]: queries, keys, values.
     pub in_proj_weight: Param<Tensor<2>>,
-    /// [3H].
+    /// Bias of shape [3H].
     pub in_proj_bias: Param<Tensor<1>>,
     /// H -> H.
     pub out_proj: Linear,
@@ -123,7 +121,7 @@ impl Attention {
     }
 }
 
-/// One block; with `multihead_attn` and `norm3` it is a decoder layer.
+/// A transformer block; with `multihead_attn` and `norm3` it is a decoder layer.
 #[derive(Module, Debug)]
 pub struct Block {
     /// Attention among the tokens.
@@ -134,17 +132,17 @@ pub struct Block {
     pub linear1: Linear,
     /// Feed-forward -> H.
     pub linear2: Linear,
-    /// After self-attention.
+    /// Norm after self-attention.
     pub norm1: Norm,
-    /// After the feed-forward, or after cross-attention if there is one.
+    /// Norm after the feed-forward, or after cross-attention if the block has it.
     pub norm2: Norm,
-    /// After the feed-forward, if there is cross-attention.
+    /// Norm after the feed-forward, if the block has cross-attention.
     pub norm3: Option<Norm>,
     eps: f64,
 }
 
 impl Block {
-    /// A block of `config`'s size.
+    /// Creates a block of `config`'s size.
     pub fn new(init: &mut Init<'_>, config: &StackConfig) -> Self {
         let StackConfig { width, heads, feed_forward, memory, norm_eps, .. } = *config;
         Self {
@@ -181,27 +179,27 @@ impl Block {
     }
 }
 
-/// Blocks with skip connections, and the norm that ends them.
+/// Blocks with skip connections, and the final norm.
 #[derive(Module, Debug)]
 pub struct SkipStack {
-    /// The first half.
+    /// Blocks of the first half.
     pub input_blocks: Vec<Block>,
-    /// Between the halves.
+    /// Block between the halves.
     pub middle_block: Block,
-    /// The second half.
+    /// Blocks of the second half.
     pub output_blocks: Vec<Block>,
     /// [x, skip] -> H before each block of the second half.
     pub linear_blocks: Vec<Linear>,
-    /// After the last block; a ControlNet has none.
+    /// Norm after the last block; a ControlNet has none.
     pub norm: Option<Norm>,
     eps: f64,
 }
 
 impl SkipStack {
-    /// A stack of `config`'s size.
+    /// Creates a stack of `config`'s size.
     ///
     /// # Panics
-    /// If the number of layers is even; the pipeline reader refuses that before.
+    /// If the number of layers is even; the pipeline reader refuses that earlier.
     pub fn new(init: &mut Init<'_>, config: &StackConfig) -> Self {
         assert!(config.layers % 2 == 1, "a skip stack has an odd number of layers");
         let half = config.layers / 2;
@@ -226,7 +224,8 @@ impl SkipStack {
         self.forward_blocks(x_bth, memory_bnh, mask, dropout, |_, x| x)
     }
 
-    /// As [`forward`](Self::forward), with the output of every block, in order, replaced by what `pass` makes of it; it is told the block's number.
+    /// Like [`forward`](Self::forward), but `pass` replaces the output of every block, in order; it also receives the
+    /// block's number.
     pub fn forward_blocks(
         &self,
         mut x_bth: Tensor<3>,

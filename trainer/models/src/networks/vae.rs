@@ -1,8 +1,8 @@
-//! The motion VAE. Source: MLD (Chen et al., arXiv:2212.04048) with one 256-wide latent token, and MotionLCM v2 with 16 tokens of 32
-//! and a projection on either side of the bottleneck.
+//! The motion VAE. Source: MLD (Chen et al., arXiv:2212.04048) with one 256-wide latent token, and MotionLCM v2 with 16
+//! tokens of 32 and a projection on either side of the bottleneck.
 //!
-//! 2N learned tokens stand before the frames; after the encoder the first N of them are means and the next N log-variances. The
-//! decoder's queries are positions alone; the N latent tokens are its memory, without positions of their own.
+//! 2N learned tokens precede the frames. After the encoder the first N of them are means and the next N log-variances.
+//! The decoder's queries are positions alone; its memory is the N latent tokens, without positions of their own.
 
 use burn::module::{Module, Param};
 use burn::tensor::{Tensor, TensorData};
@@ -16,19 +16,18 @@ use crate::kernels::{Dropout, KeyMask};
 pub struct VaeConfig {
     /// Features per frame: 263 or 251.
     pub features: usize,
-    /// N latent tokens.
+    /// Number of latent tokens N.
     pub tokens: usize,
     /// Width d of a latent token.
     pub dim: usize,
     /// Width H of the transformers.
     pub width: usize,
-    /// Blocks in each of encoder and decoder.
+    /// Number of blocks in each of encoder and decoder.
     pub layers: usize,
-    /// Heads.
+    /// Number of attention heads.
     pub heads: usize,
-    /// Feed-forward width.
     pub feed_forward: usize,
-    /// Linear layers around the bottleneck (v2); without them d is H (v1).
+    /// Adds linear layers around the bottleneck (v2); without them d is H (v1).
     pub projection: bool,
     /// Added to variances in layer norms.
     pub norm_eps: f64,
@@ -44,7 +43,7 @@ pub struct Posterior {
 }
 
 impl Posterior {
-    /// `mu + exp(logvar / 2) noise`, with `noise` standard normal [B, N, d].
+    /// Computes `mu + exp(logvar / 2) noise`, with `noise` standard normal [B, N, d].
     pub fn sample(&self, noise_bnd: Tensor<3>) -> Tensor<3> {
         self.mu_bnd.clone() + self.sigma() * noise_bnd
     }
@@ -58,7 +57,7 @@ impl Posterior {
 /// A learned position table.
 #[derive(Module, Debug)]
 pub struct Positions {
-    /// [rows, 1, H].
+    /// Table of shape [rows, 1, H].
     pub pe: Param<Tensor<3>>,
 }
 
@@ -75,7 +74,7 @@ impl Positions {
     }
 }
 
-/// The motion VAE.
+/// The VAE's layers under their published names.
 #[derive(Module, Debug)]
 pub struct Vae {
     /// Learned tokens [2N, H].
@@ -86,9 +85,7 @@ pub struct Vae {
     pub query_pos_encoder: Positions,
     /// Positions of the queries.
     pub query_pos_decoder: Positions,
-    /// Encoder.
     pub encoder: SkipStack,
-    /// Decoder.
     pub decoder: SkipStack,
     /// H -> d (v2).
     pub latent_pre: Option<Linear>,
@@ -100,7 +97,7 @@ pub struct Vae {
 }
 
 impl Vae {
-    /// A fresh VAE.
+    /// Creates a VAE with initial weights.
     pub fn new(config: &VaeConfig, init: &mut Init<'_>) -> Self {
         let VaeConfig { features, tokens, dim, width, .. } = *config;
         let stack = |memory| StackConfig {
@@ -125,7 +122,7 @@ impl Vae {
         }
     }
 
-    /// `features_btf` [B, T, F], normalised; of clip b the first `lengths[b]` frames count.
+    /// Encodes normalised `features_btf` [B, T, F]; the first `lengths[b]` frames of clip b are valid.
     pub fn encode(&self, features_btf: Tensor<3>, lengths: &[usize], dropout: &mut Dropout) -> Posterior {
         let [batch, frames, _] = features_btf.dims();
         let [count, width] = self.global_motion_token.dims();
@@ -145,7 +142,7 @@ impl Vae {
         }
     }
 
-    /// `latent_bnd` [B, N, d] -> normalised features [B, frames, F]; frames past `lengths[b]` are exactly 0.
+    /// Decodes `latent_bnd` [B, N, d] into normalised features [B, frames, F]; frames past `lengths[b]` are exactly 0.
     pub fn decode(&self, latent_bnd: Tensor<3>, lengths: &[usize], frames: usize, dropout: &mut Dropout) -> Tensor<3> {
         let batch = latent_bnd.dims()[0];
         let device = latent_bnd.device();

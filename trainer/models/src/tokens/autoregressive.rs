@@ -1,4 +1,4 @@
-//! Drawing from [`Gpt`] and its training examples. Source: T2M-GPT (Zhang et al., CVPR 2023).
+//! Sampling from [`Gpt`], and its training examples. Source: T2M-GPT (Zhang et al., CVPR 2023).
 
 use burn::tensor::Tensor;
 
@@ -7,11 +7,12 @@ use crate::kernels::Dropout;
 use crate::networks::{Gpt, GptConfig};
 use crate::quantizer::first_largest;
 
-/// How the next id is taken from its logits.
+/// Choice of the next id from its logits.
 pub enum Draw<'a> {
-    /// The largest.
+    /// The id with the largest logit.
     Greedy,
-    /// From the softmax: the largest of `p / e` with an exponential `e` for each class, which the function fills: step, example.
+    /// A draw from the softmax: the largest of `p / e`. The function fills one exponential `e` per class for a step and
+    /// example.
     Categorical(&'a mut dyn FnMut(usize, usize, &mut [f64])),
 }
 
@@ -24,10 +25,11 @@ impl std::fmt::Debug for Draw<'_> {
     }
 }
 
-/// Ids of each example until its end, which is not among them; none where the end comes first.
+/// The ids of each example before its end; empty if the end comes first.
 ///
-/// `text_bc` [B, C]. Examples that have ended go on being computed with the others, whose logits do not depend on them. As upstream an example
-/// that reaches the last position has one id less than there are positions: what is drawn there is dropped.
+/// `text_bc` [B, C]. Finished examples are still computed with the others, whose logits do not depend on them. As
+/// upstream, an example that reaches the last position has one id less than there are positions: the last draw is
+/// dropped.
 pub fn sample(network: &Gpt, config: &GptConfig, text_bc: Tensor<2>, mut draw: Draw<'_>) -> Vec<Vec<usize>> {
     let batch = text_bc.dims()[0];
     let (end, classes) = (config.end(), config.codes + 1);
@@ -66,29 +68,29 @@ pub fn sample(network: &Gpt, config: &GptConfig, text_bc: Tensor<2>, mut draw: D
     ids.into_iter().zip(lengths).map(cut).collect()
 }
 
-/// The class with the largest `p / e`; compared as logarithms, so that nothing overflows.
+/// The class with the largest `p / e`; logarithms are compared, so that nothing overflows.
 fn drawn(logits: &[f32], exponentials: &[f64]) -> usize {
     let scores = logits.iter().zip(exponentials).map(|(logit, e)| f64::from(*logit) - e.ln());
     scores.enumerate().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(0, |(class, _)| class)
 }
 
-/// One clip as the generator is trained on it.
+/// A training example of one clip.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Example {
-    /// What the network sees: `block - 1` ids, some replaced.
+    /// The network's input: `block - 1` ids, some replaced.
     pub input: Vec<usize>,
-    /// What it should say at each of the `block` places.
+    /// The expected ids at each of the `block` places.
     pub target: Vec<usize>,
-    /// Tokens.
+    /// Number of tokens, without the end.
     pub len: usize,
 }
 
 impl Example {
-    /// `tokens`, the end and padding. Where `keep` says no the network sees `random` instead, at any place, ends and padding too; both have
-    /// `block - 1` values.
+    /// Lays out `tokens`, the end and padding. The input has `random` instead wherever `keep` is false, at ends and
+    /// padding too; both have `block - 1` values.
     ///
     /// # Panics
-    /// If the tokens and the end are more than the network has places for.
+    /// If the tokens and the end exceed the network's places.
     pub fn new(config: &GptConfig, tokens: &[usize], keep: &[bool], random: &[usize]) -> Self {
         assert!(tokens.len() < config.block, "{} tokens for {} places", tokens.len(), config.block);
         let mut target = tokens.to_vec();

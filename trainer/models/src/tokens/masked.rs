@@ -1,4 +1,5 @@
-//! Filling in the first layer of codes with MoMask's masked transformer (Guo et al., CVPR 2024), and its training examples.
+//! Sampling the first layer of codes with MoMask's masked transformer (Guo et al., CVPR 2024), and its training
+//! examples.
 
 use burn::tensor::Tensor;
 
@@ -10,40 +11,40 @@ use crate::quantizer::NO_CODE;
 /// Score of a token that is never masked again.
 const KEPT: f32 = 1e5;
 
-/// How tokens are drawn.
+/// Settings of the iterative sampling.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sampling {
-    /// Iterations.
+    /// Number of iterations.
     pub steps: usize,
     /// Scale of classifier-free guidance; 1 for none.
     pub guidance: f32,
-    /// What logits are divided by.
+    /// Divisor of the logits.
     pub temperature: f32,
-    /// Share of the classes that cannot be drawn.
+    /// Share of the classes that are excluded, the least likely first.
     pub threshold: f64,
 }
 
-/// A clip to be filled in.
+/// A clip with known and open tokens.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Canvas {
-    /// A known id, or `None` where one is to be drawn.
+    /// A known id, or `None` for one to be drawn.
     pub tokens: Vec<Option<usize>>,
 }
 
 impl Canvas {
-    /// Nothing known.
+    /// A clip of `len` open tokens.
     pub fn empty(len: usize) -> Self {
         Self { tokens: vec![None; len] }
     }
 }
 
-/// Ids [B n] of the first layer, [`NO_CODE`] behind the end of each clip; n is the longest clip's length.
+/// Ids [B n] of the first layer, with [`NO_CODE`] past the end of each clip; n is the longest clip's length.
 ///
-/// Iteration k of T masks the `round(cos(pi t / 2) open)` open tokens of the lowest scores, at least one, with `t = k / (T - 1)`, and draws
-/// them all at once; the score of a drawn token is its share in the softmax. Tokens that an iteration keeps are kept for good. Known tokens
-/// are never masked, and counts are relative to the others.
+/// Iteration k of T masks the `round(cos(pi t / 2) open)` open tokens with the lowest scores, at least one, with `t = k
+/// / (T - 1)`. It draws them all at once; the score of a drawn token is its share in the softmax. Tokens that an
+/// iteration keeps are final. Known tokens are never masked, and counts are relative to the others.
 ///
-/// `see` gets the ids that the network sees in each iteration.
+/// `see` receives the network's input ids of each iteration.
 pub fn generate(
     network: &MaskedTransformer,
     config: &MomaskConfig,
@@ -94,38 +95,39 @@ pub fn generate(
     ids.into_iter().enumerate().map(id).collect()
 }
 
-/// The draws for one clip in training; all but the first have as many values as there are positions.
+/// The draws for one clip in training; every list has one value per position.
 #[derive(Debug, Clone, Copy)]
 pub struct Corruption<'a> {
-    /// Uniform: gives the share that is chosen, `cos(pi u / 2)` of the positions, padding counted.
+    /// Uniform: sets the share of chosen positions to `cos(pi u / 2)`, padding counted.
     pub share: f32,
-    /// Uniform: the smallest are chosen.
+    /// Uniform: the positions with the smallest values are chosen.
     pub order: &'a [f32],
-    /// Uniform: a tenth of the chosen tokens becomes `random`.
+    /// Uniform: a tenth of the chosen tokens is replaced by `random`.
     pub replace: &'a [f32],
-    /// Uniform: 88 of 100 of the others become the mask.
+    /// Uniform: 88 of 100 of the other chosen tokens are masked.
     pub hide: &'a [f32],
-    /// Codes.
+    /// Codes that replace tokens.
     pub random: &'a [usize],
 }
 
-/// One clip as the generator is trained on it.
+/// A training example of one clip.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Example {
-    /// What the network sees.
+    /// The network's input ids.
     pub input: Vec<usize>,
-    /// Which positions it is asked for.
+    /// True for positions that the loss counts.
     pub asked: Vec<bool>,
 }
 
 impl Example {
-    /// `tokens`, padding behind `len` of them.
+    /// Masks and replaces `tokens`; positions from `len` on are padding.
     pub fn new(config: &MomaskConfig, tokens: &[usize], len: usize, draws: &Corruption<'_>) -> Self {
         let n = tokens.len();
         let count = (n as f32 * cosine(draws.share)).round_ties_even().max(1.0) as usize;
         let mut order: Vec<usize> = (0..n).collect();
         order.sort_by(|a, b| draws.order[*a].total_cmp(&draws.order[*b]));
-        // Upstream compares the order itself with the count, not ranks: as many positions, another draw of the same kind.
+        // Upstream compares the sort order itself with the count, not ranks. It selects the same number, by another
+        // draw.
         let asked: Vec<bool> = order.iter().enumerate().map(|(p, at)| *at < count && p < len).collect();
         let input = (0..n).map(|p| match (p < len, asked[p]) {
             (false, _) => config.pad(),

@@ -1,4 +1,4 @@
-//! Drawing from [`Mmm`] and its training examples. Source: MMM (Pinyoanuntapong et al., CVPR 2024).
+//! Sampling from [`Mmm`], and its training examples. Source: MMM (Pinyoanuntapong et al., CVPR 2024).
 
 use burn::tensor::Tensor;
 
@@ -6,58 +6,59 @@ use super::{Uniforms, cosine, gumbel_draw, host, probability};
 use crate::kernels::Dropout;
 use crate::networks::{Mmm, MmmCondition, MmmConfig};
 
-/// Tokens of the longest clip, to which numbers of steps refer.
+/// Tokens of the longest clip; numbers of steps refer to it.
 const LONGEST: f64 = 49.0;
 
-/// How tokens are drawn.
+/// Settings of the stepwise sampling.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Sampling {
     /// Steps of the longest clip; shorter ones reach their last count in fewer.
     pub steps: usize,
-    /// The largest logit instead of a draw.
+    /// Uses the largest logit instead of a draw.
     pub greedy: bool,
-    /// What the counts of masked tokens refer to.
+    /// The base of the counts of masked tokens.
     pub counts: Counts,
-    /// Of a batch of one upstream ends before the step that would draw a single token, by a slip of precedence; larger batches always run all steps.
+    /// Ends a batch of one before the step that would draw a single token. Upstream does so because of an operator
+    /// precedence error; larger batches always run all steps.
     pub stops_alone: bool,
 }
 
-/// What the counts of masked tokens refer to.
+/// The base of the counts of masked tokens.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Counts {
     /// The tokens that are not given.
     Open,
-    /// The whole clip, whatever is given: a gap shorter than the count is drawn anew as a whole.
+    /// The whole clip, with given tokens: a gap shorter than the count is drawn again as a whole.
     Whole,
 }
 
-/// One step as it was taken.
+/// The inputs and results of one step.
 #[derive(Debug)]
 pub struct Step<'a> {
-    /// What the network saw, [B P].
+    /// The network's input ids, [B P].
     pub seen: &'a [usize],
     /// Logits [B P K].
     pub logits: &'a [f32],
-    /// What was drawn where something was masked.
+    /// The drawn id of each masked position.
     pub drawn: &'a [Option<usize>],
-    /// How many tokens of each clip were to be masked.
+    /// Number of tokens of each clip to be masked.
     pub counts: &'a [usize],
-    /// One less the share of what was drawn; 0 where nothing was.
+    /// One minus the softmax share of the drawn id; 0 for positions without a draw.
     pub scores: &'a [f32],
 }
 
-/// How many of `tokens` steps of `sampling` count for a clip, in f32 as upstream.
+/// The number of steps of a clip of `tokens` tokens, in f32 as upstream.
 fn own_steps(sampling: &Sampling, tokens: usize) -> f32 {
     ((sampling.steps as f64 / LONGEST) as f32 * tokens as f32).round_ties_even() + 1e-8
 }
 
-/// Ids [B P] with end and padding. `given[b]` are the clip's tokens, `None` where one is to be drawn.
+/// Ids [B P] with end and padding. `given[b]` holds the clip's tokens, `None` for one to be drawn.
 ///
-/// Step k masks those of the last drawn tokens that were the least likely, `max(1, floor(n cos(pi t / 2)))` of them with `t = min(1, k / s)` and
-/// `s = round(steps tokens / 49)`, and draws them all at once. What a step keeps is kept for good.
+/// Step k masks the least likely of the drawn tokens and draws them again, all at once. Their number is `max(1, floor(n
+/// cos(pi t / 2)))` with `t = min(1, k / s)` and `s = round(steps tokens / 49)`. Tokens that a step keeps are final.
 ///
 /// # Panics
-/// If a clip and its end are more than the network has positions for.
+/// If a clip and its end exceed the network's positions.
 pub fn sample(
     network: &Mmm,
     config: &MmmConfig,
@@ -118,7 +119,7 @@ pub fn sample(
     ids
 }
 
-/// Known tokens, masks, the end, padding.
+/// Lays out known tokens, masks, the end and padding.
 fn laid_out(config: &MmmConfig, tokens: &[Option<usize>]) -> Vec<usize> {
     let mut ids: Vec<usize> = tokens.iter().map(|token| token.unwrap_or(config.mask())).collect();
     ids.push(config.end());
@@ -139,37 +140,38 @@ pub fn logits(
     out.slice([0..batch, 1..len, 0..classes])
 }
 
-/// The draws for one clip in training; all but the first have as many values as there are positions.
+/// The draws for one clip in training; every list has one value per position.
 #[derive(Debug, Clone, Copy)]
 pub struct Corruption<'a> {
-    /// Uniform: the share that is masked is `0.5 + u / 2`.
+    /// Uniform: the share of masked tokens is `0.5 + u / 2`.
     pub share: f32,
-    /// Whether a token stays itself before masking.
+    /// True if a token keeps its id before masking.
     pub keep: &'a [bool],
-    /// Codes instead of those that do not.
+    /// Codes for the tokens that do not keep theirs.
     pub random: &'a [usize],
-    /// Uniform: decides which positions are masked.
+    /// Uniform: decides the masked positions.
     pub order: &'a [f32],
 }
 
-/// One clip as the generator is trained on it.
+/// A training example of one clip.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Example {
-    /// What the network sees: `positions` ids.
+    /// The network's input: `positions` ids.
     pub input: Vec<usize>,
-    /// What it should say.
+    /// The expected ids.
     pub target: Vec<usize>,
-    /// Tokens; the end behind them is seen, and not asked for.
+    /// Number of tokens; the end after them is an input, but the loss does not count it.
     pub len: usize,
 }
 
 impl Example {
-    /// `tokens`, the end and padding.
+    /// Lays out `tokens`, the end and padding.
     ///
-    /// Which positions are masked follows the published script, which compares the order of `u - valid` itself with the count, not ranks.
+    /// The masked positions follow the published script, which compares the sort order of `u - valid` itself with the
+    /// count, not ranks.
     ///
     /// # Panics
-    /// If the tokens and the end are more than the network has positions for.
+    /// If the tokens and the end exceed the network's positions.
     pub fn new(config: &MmmConfig, tokens: &[usize], draws: &Corruption<'_>) -> Self {
         let (len, positions) = (tokens.len(), config.positions());
         assert!(len < positions, "{len} tokens for {positions} positions");

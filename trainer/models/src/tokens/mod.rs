@@ -1,9 +1,10 @@
-//! Drawing token ids from the published generators, and the losses that those are trained with.
+//! Sampling token ids from the published generators, and their training losses.
 //!
-//! Everything but the networks runs on the host: ids are integers, and what is masked next follows from comparisons. Draws are arguments, so
-//! that a caller keys them and a test stores them.
+//! Everything but the networks runs on the host: ids are integers, and masking is decided by comparisons. Draws are
+//! arguments, so that a caller keys them and a test stores them.
 //!
-//! Losses are sums over the examples in a form that adds up over slices: weights are given by a caller that knows the whole batch.
+//! Losses are sums over the examples, in a form that adds up over slices. The weights come from a caller that has the
+//! whole batch.
 
 pub mod autoregressive;
 pub mod masked;
@@ -15,10 +16,10 @@ use burn::tensor::{Tensor, TensorData};
 
 use crate::quantizer::{first_largest, gumbel};
 
-/// Fills uniform draws in [0, 1), one for each class: step, example, position.
+/// Fills uniform draws in [0, 1), one per class: step, example, position.
 pub type Uniforms<'a> = &'a mut dyn FnMut(usize, usize, usize, &mut [f32]);
 
-/// The least temperature, at which draws are the largest logit.
+/// The lowest temperature, at which draws are the largest logit.
 const COLDEST: f32 = 1e-10;
 
 /// Draws a class: the largest of `logit / temperature + gumbel`.
@@ -29,7 +30,7 @@ pub fn gumbel_draw(logits: &[f32], temperature: f32, uniforms: &[f32]) -> usize 
 
 /// Keeps the `ceil((1 - threshold) n)` largest of n logits; the others become minus infinity.
 ///
-/// In floating point as upstream: of 20 logits a threshold of 0.9 keeps 2.
+/// Computed in floating point as upstream: a threshold of 0.9 keeps 2 of 20 logits.
 pub fn keep_top(logits: &mut [f32], threshold: f64) {
     let kept = ((1.0 - threshold) * logits.len() as f64).ceil() as usize;
     let mut order: Vec<usize> = (0..logits.len()).collect();
@@ -37,19 +38,21 @@ pub fn keep_top(logits: &mut [f32], threshold: f64) {
     order.into_iter().skip(kept).for_each(|i| logits[i] = f32::NEG_INFINITY);
 }
 
-/// Share of a class in the softmax of `logits`.
+/// The share of a class in the softmax of `logits`.
 pub fn probability(logits: &[f32], class: usize) -> f32 {
     let top = logits.iter().fold(f32::NEG_INFINITY, |top, l| top.max(*l));
     let all: f32 = logits.iter().map(|l| (l - top).exp()).sum();
     (logits[class] - top).exp() / all
 }
 
-/// Share of tokens that are masked at `t` from 0 (all) to 1 (none): `cos(pi t / 2)`, in f32 as upstream, whose rounding decides counts.
+/// Share of tokens that are masked at `t` from 0 (all) to 1 (none): `cos(pi t / 2)`. Computed in f32 as upstream, since
+/// the rounding decides counts.
 pub fn cosine(t: f32) -> f32 {
     (t * std::f32::consts::PI * 0.5).cos()
 }
 
-/// Point `k` of `count` equally far ones from 0 to 1, in f32 as `torch.linspace` counts: the second half from the end.
+/// Point `k` of `count` equidistant points from 0 to 1, computed in f32 as by `torch.linspace`: the second half from
+/// the end.
 pub fn grid(k: usize, count: usize) -> f32 {
     if count < 2 {
         return 0.0;
@@ -58,8 +61,8 @@ pub fn grid(k: usize, count: usize) -> f32 {
     if k < count / 2 { step * k as f32 } else { 1.0 - step * (count - 1 - k) as f32 }
 }
 
-/// Cross-entropy of logits [B, n, classes] against `targets` [B n], weighted by `weights` [B n] and summed. A target of weight 0 need be no
-/// class.
+/// Cross-entropy of logits [B, n, classes] against `targets` [B n], weighted by `weights` [B n] and summed. A target of
+/// weight 0 need not be a class.
 pub fn cross_entropy(logits_bnc: Tensor<3>, targets: &[usize], weights: &[f32]) -> Tensor<1> {
     let [batch, len, classes] = logits_bnc.dims();
     let mut own = vec![0.0_f32; batch * len * classes];
@@ -72,12 +75,12 @@ pub fn cross_entropy(logits_bnc: Tensor<3>, targets: &[usize], weights: &[f32]) 
     (log_softmax(logits_bnc, 2) * own).sum().neg()
 }
 
-/// The values of a tensor on the host.
+/// Copies the values of a tensor to the host.
 fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
     tensor.into_data().as_slice::<f32>().expect("f32 throughout").to_vec()
 }
 
-/// Logits with classifier-free guidance, `null + scale (conditional - null)`; the null pass is left out at scale 1.
+/// Logits with classifier-free guidance, `null + scale (conditional - null)`; scale 1 skips the null pass.
 fn guided<const D: usize>(scale: f32, mut pass: impl FnMut(bool) -> Tensor<D>) -> Tensor<D> {
     let conditional = pass(true);
     if scale == 1.0 {

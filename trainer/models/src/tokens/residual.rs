@@ -1,4 +1,4 @@
-//! Adding the layers of codes above the first with MoMask's residual transformer (Guo et al., CVPR 2024).
+//! Sampling the layers of codes above the first with MoMask's residual transformer (Guo et al., CVPR 2024).
 
 use burn::tensor::Tensor;
 
@@ -8,14 +8,15 @@ use crate::networks::{MomaskConfig, ResidualTransformer};
 use crate::quantizer::NO_CODE;
 use crate::tokens::masked::Sampling;
 
-/// The layer that the others are added to.
+/// The first layer, to which the others are added.
 #[derive(Clone, Copy)]
 pub struct First<'a> {
-    /// Its ids [B n], [`NO_CODE`] behind the end of each clip.
+    /// Ids of the layer [B n], with [`NO_CODE`] past the end of each clip.
     pub ids: &'a [i64],
-    /// Tokens of each clip.
+    /// Number of tokens of each clip.
     pub lengths: &'a [usize],
-    /// Codes that are known, by layer from 1 on and place in [B n]: they are not drawn, and the layers above see them. As published there are none.
+    /// Known codes by layer from 1 on and place in [B n]. They are not drawn, and the layers above see them. The
+    /// published sampler has none.
     pub known: &'a dyn Fn(usize, usize) -> Option<usize>,
 }
 
@@ -25,8 +26,9 @@ impl std::fmt::Debug for First<'_> {
     }
 }
 
-/// All ids [B n Q] for those of the first layer [B n], which are [`NO_CODE`] behind the end of each clip. A pad that is drawn inside a clip is
-/// [`NO_CODE`] too: that layer adds nothing there. The layers are drawn one after the other; `sampling.steps` does not matter.
+/// All ids [B n Q] for the ids of the first layer [B n], which are [`NO_CODE`] past the end of each clip. A pad drawn
+/// inside a clip is [`NO_CODE`] too: that layer adds nothing there. The layers are drawn one after the other;
+/// `sampling.steps` is not used.
 pub fn generate(
     network: &ResidualTransformer,
     config: &MomaskConfig,
@@ -66,7 +68,7 @@ pub fn generate(
     (0..first.len()).flat_map(|at| layers.iter().map(move |layer| id(at, layer))).collect()
 }
 
-/// The layer that a clip is trained on, from 1 to Q - 1, for a uniform draw: the lower ones more often.
+/// Selects a clip's training layer, from 1 to Q - 1, by a uniform draw; lower layers are more likely.
 pub fn trained_layer(uniform: f32, quantizers: usize) -> usize {
     let top = (quantizers - 2) as f32;
     1 + ((1.0 - super::cosine(uniform)) * top).round_ties_even() as usize

@@ -1,4 +1,4 @@
-//! Where the fixtures are, and how they are read and compared.
+//! Finds, reads and compares the fixtures.
 #![allow(dead_code, unreachable_pub, reason = "each test binary compiles its own copy and uses a part of it")]
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -9,7 +9,7 @@ use protocol::stage::Backend;
 use safetensors::{Dtype, SafeTensors};
 use serde_json::Value;
 
-/// The folder of fixtures, or `None`, said loudly, where this checkout has none.
+/// The folder of fixtures, or `None` with a notice if this checkout has none.
 pub fn shared(part: &str) -> Option<PathBuf> {
     let root = std::env::var_os("STRIDE_SHARED")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"), PathBuf::from);
@@ -21,7 +21,7 @@ pub fn shared(part: &str) -> Option<PathBuf> {
     None
 }
 
-/// The backend that the tests compute on: `STRIDE_TEST_BACKEND`, or flex.
+/// The backend of the tests: `STRIDE_TEST_BACKEND`, or flex.
 fn backend() -> Backend {
     let name = std::env::var("STRIDE_TEST_BACKEND").unwrap_or_else(|_| "flex".to_owned());
     serde_json::from_value(Value::String(name)).expect("STRIDE_TEST_BACKEND is flex, ndarray, wgpu or cuda")
@@ -32,13 +32,13 @@ pub fn device() -> Device {
     models::device::open(backend(), 0).unwrap_or_else(|e| panic!("{e}"))
 }
 
-/// The same with autodiff.
+/// The first device of that backend, with autodiff.
 pub fn tracked() -> Device {
     device().autodiff()
 }
 
-/// What gates are multiplied by: they hold for flex, and the README of the fixtures allows other summation orders at
-/// least five times as much.
+/// Factor on gates. They hold for flex; the README of the fixtures allows at least five times as much for other
+/// summation orders.
 fn slack() -> f64 {
     if backend() == Backend::Flex { 1.0 } else { 5.0 }
 }
@@ -120,7 +120,7 @@ impl Arrays {
         self.arrays.keys().map(String::as_str)
     }
 
-    /// The first parts of the names `case/...`.
+    /// The first parts of array names `case/...`.
     pub fn cases(&self) -> BTreeSet<String> {
         self.names().filter_map(|n| n.split_once('/')).map(|(case, _)| case.to_owned()).collect()
     }
@@ -139,7 +139,7 @@ fn numbers(dtype: Dtype, data: &[u8], name: &str) -> Vec<f64> {
     }
 }
 
-/// A float16's value.
+/// The value of a float16's bits.
 fn half(bits: u16) -> f64 {
     let (sign, exponent, fraction) = (bits >> 15, i32::from(bits >> 10 & 31), f64::from(bits & 1023) / 1024.0);
     let size = match exponent {
@@ -185,7 +185,7 @@ pub struct Gates {
 }
 
 impl Gates {
-    /// Records `error` of what `what` names, of a kind that has the gate `gate`.
+    /// Records the `error` of `what`, of a kind with the gate `gate`.
     pub fn check(&mut self, kind: &'static str, what: impl Into<String>, error: f64, gate: f64) {
         let (what, gate) = (what.into(), gate * slack());
         self.checks += 1;
@@ -212,7 +212,7 @@ impl Gates {
         self.check(kind, what, error(&values(found), &expected.values), gate);
     }
 
-    /// Prints one line and fails if any gate was missed, or if nothing was checked.
+    /// Prints one line, and fails if any gate was missed or nothing was checked.
     pub fn close(self, fixture: &str) {
         let worst: Vec<String> =
             self.worst.iter().map(|(kind, (e, what))| format!("{kind} {e:.1e} ({what})")).collect();

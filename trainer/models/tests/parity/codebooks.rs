@@ -1,4 +1,5 @@
-//! Codebooks over several updates in a row (fixture `05_rvq_ema`): a layer alone, tiled, MMM's rule, and the residual stack with its gradient.
+//! Codebooks over several updates in a row (fixture `05_rvq_ema`): a single layer, repeated rows, MMM's rule, and the
+//! residual stack with its gradient.
 
 use std::borrow::Cow;
 
@@ -11,7 +12,7 @@ use crate::common::{Array, Arrays, Gates, device, error, folders, json, name, re
 use crate::networks::scalar;
 use crate::tokenizer::{EMA, ids, number, size};
 
-/// Whole gradients.
+/// Gate of whole gradients.
 const GRADIENT: f64 = 1e-4;
 
 #[test]
@@ -33,12 +34,12 @@ fn parity_codebooks() {
     }
 }
 
-/// [B, d, T] as rows [B T, d].
+/// Rows [B T, d] of an array [B, d, T].
 fn as_rows(x: &Array) -> Vec<f32> {
     values(x.tensor::<3>(&device()).swap_dims(1, 2))
 }
 
-/// Rows [B T, d] as [B, d, T].
+/// An array [B, d, T] of rows [B T, d].
 fn as_channels(rows: Vec<f32>, like: &Array) -> Tensor<3> {
     let [batch, dim, len] = [like.shape[0], like.shape[1], like.shape[2]];
     Tensor::<3>::from_data(TensorData::new(rows, [batch, len, dim]), &device()).swap_dims(1, 2)
@@ -60,7 +61,7 @@ impl State {
     }
 }
 
-/// Rows that codes are replaced by: the first ones, or those that a stored permutation puts first.
+/// Replacement rows for codes: the first ones, or the first in a stored permutation.
 fn replacements(io: &Arrays, case: &str, step: usize, rows: &[f32], count: usize, dim: usize) -> Vec<f32> {
     let picked = match io.find(&format!("{case}/permutation")) {
         None => rows.to_vec(),

@@ -1,5 +1,5 @@
-//! Control: trajectory encoder, residuals, the controlled prediction, its losses and gradients, copy-initialisation, a step of two groups, and
-//! controlled sampling (fixtures `02_control*`).
+//! Control: trajectory encoder, residuals, the controlled prediction with its losses and gradients,
+//! copy-initialisation, a step of two groups, and controlled sampling (fixtures `02_control*`).
 
 use std::path::Path;
 
@@ -25,7 +25,7 @@ use crate::{FORWARD, LOSS};
 const TRAJECTORY: f64 = 1e-5;
 const CHANGE: f64 = 1e-3;
 
-/// Everything of a fixture.
+/// The contents of a fixture.
 struct Fixture {
     config: Value,
     expected: Value,
@@ -111,7 +111,7 @@ impl Fixture {
         self.io.cases().into_iter().filter(has).collect()
     }
 
-    /// The batch's noised latents and what the controlled network makes of them.
+    /// The batch's noised latents and the controlled network's output for them.
     fn forward(&self, case: &str, control: &Denoiser, trajectory: &TrajectoryEncoder) -> Forward {
         let off = &mut Dropout::off();
         let key = |part: &str| format!("{case}/{part}");
@@ -159,7 +159,7 @@ impl Fixture {
         let metres = settings["use_3d"].as_bool().expect("a flag");
         let shape = (forward.lengths.len(), frames, joints);
         let target = ControlTarget::new(&hint.f32s(), &given, shape, (&mean, &std), metres, &device());
-        // What a sample's sum is divided by, over the batch as the variant has it.
+        // The divisor of a sample's sum, over the batch according to the variant.
         let entries = target.entries();
         let all: usize = entries.iter().sum();
         let weights: Vec<f32> = entries
@@ -181,7 +181,7 @@ impl Fixture {
         (latent, control, features)
     }
 
-    /// Names and lengths of all that is trained, and its gradient of `loss`.
+    /// Names and lengths of all trained parameters, and their gradient of `loss`.
     fn gradients(&self, loss: Tensor<1>) -> (Vec<Entry>, Vec<f32>) {
         let named = |prefix: &str, entries: Vec<Entry>| -> Vec<Entry> {
             entries.into_iter().map(|e| Entry { name: format!("{prefix}{}", e.name), shape: e.shape }).collect()
@@ -207,7 +207,7 @@ struct Forward {
     lengths: Vec<usize>,
 }
 
-/// The variants of the loss: by name, or the one of all cases.
+/// The variants of the loss: by name, or the single one of all cases.
 fn variants(config: &Value) -> Vec<(String, Value)> {
     match config["loss_variants"].as_object() {
         Some(all) => all.iter().map(|(name, settings)| (format!("/{name}"), settings.clone())).collect(),
@@ -222,7 +222,7 @@ fn parity_control() {
         let mut gates = Gates::default();
         let fixture = Fixture::read(&folder, &tracked());
         for case in fixture.cases() {
-            // Built by another network in the fixture; `parity_control_initialisation` has it.
+            // Another network in the fixture made it; `parity_control_initialisation` checks it.
             if case != "init" {
                 training(&fixture, &case, &mut gates);
             }
@@ -248,11 +248,11 @@ fn training(f: &Fixture, case: &str, gates: &mut Gates) {
             gates.tensor("forward", what(part), found.clone(), stored, FORWARD);
         }
     }
-    // At the noisiest timesteps the clean sample is many times an output's rounding.
+    // At the noisiest timesteps the clean sample magnifies an output's rounding many times.
     gates.tensor("sample", case, forward.predicted.clone(), f.io.get(&what("sample_pred")), 3.0 * FORWARD);
     for (i, residual) in forward.residuals.iter().enumerate() {
         if let Some(stored) = f.io.find(&what(&format!("controlnet_residual/{i}"))) {
-            // Stored with the tokens first.
+            // Stored with the token axis first.
             gates.tensor("residual", what(&i.to_string()), residual.clone().swap_dims(0, 1), stored, FORWARD);
         }
     }
@@ -294,7 +294,7 @@ fn training(f: &Fixture, case: &str, gates: &mut Gates) {
     }
 }
 
-/// Clip over both groups together, and AdamW.
+/// Clips over both groups together, and applies AdamW.
 fn step(f: &Fixture, case: &str, loss: Tensor<1>, gates: &mut Gates) {
     let settings = &f.config["optimizer"];
     let number = |value: &Value| value.as_f64().expect("a number");
@@ -326,13 +326,13 @@ fn step(f: &Fixture, case: &str, loss: Tensor<1>, gates: &mut Gates) {
     }
 }
 
-/// Text, hint and noise to latents: LCM steps, or DDIM with guidance.
+/// Samples latents from text, hint and noise: LCM steps, or DDIM with guidance.
 fn sampling(f: &Fixture, case: &str, gates: &mut Gates) {
     let off = &mut Dropout::off();
     let schedule = Schedule::published();
     let stored = &f.expected[case];
     let times: Vec<usize> = serde_json::from_value(stored["timesteps"].clone()).expect("timesteps");
-    // Some fixtures sample with the text and the hint of a training case, which they name.
+    // Some fixtures sample with the text and the hint of a training case that they name.
     let from = if f.io.find(&format!("{case}/text")).is_some() { case } else { "ragged" };
     let text = f.tensor::<3>(&format!("{from}/text"));
     let tokens = f.tensor::<3>(&format!("{from}/traj_embedding"));
@@ -403,12 +403,12 @@ fn parity_control_initialisation() {
             (list("copied_from_denoiser"), list("kept_own_initialisation"), list("zero_at_start"));
         for (entry, values) in split(&flat::layout(&fresh), &flat::read(&fresh)) {
             let same = base.get(&entry.name).is_some_and(|own| own == values);
-            // Upstream's lists may name the norm at the end, which a ControlNet has no use for.
+            // Upstream's lists may contain the norm at the end, which a ControlNet does not use.
             assert_eq!(copied.contains(&entry.name), same, "{} is copied", entry.name);
             assert_eq!(kept.contains(&entry.name), !same, "{} keeps its own", entry.name);
             assert_eq!(zero.contains(&entry.name), values.iter().all(|v| *v == 0.0), "{} is zero", entry.name);
         }
-        // The two inner layers of the condition embedding are the fixture's.
+        // The two inner layers of the condition embedding come from the fixture.
         let weights = Arrays::read(&folder.join("weights.safetensors"));
         let mut values = flat::read(&fresh);
         let mut at = 0;

@@ -9,8 +9,8 @@ use crate::FORWARD;
 use crate::common::{Arrays, Gates, device, folders, json, name, shared, tracked, values};
 use crate::networks::{denoiser, repeated, timesteps};
 
-/// Arguments up to 1000 multiply what the last bit of a frequency is rounded to. Ours is the nearest f32; the stored ones
-/// come from an exponential that is off by a bit here and there.
+/// Gate of the time embedding. Arguments up to 1000 magnify the rounding of a frequency. Ours is the nearest f32; some
+/// of the stored ones come from an exponential that is off by a bit.
 const TIME: f64 = 1e-4;
 const GUIDANCE: f64 = 2e-3;
 
@@ -22,7 +22,7 @@ fn parity_denoiser() {
         let io = Arrays::read(&folder.join("io.safetensors"));
         let mut gates = Gates::default();
         let weights = folder.join("weights.safetensors");
-        // With and without autodiff: the kernels have a path for each.
+        // The kernels have separate paths with and without autodiff.
         for device in [device(), tracked()] {
             let network = denoiser(&config["constructor"], &weights, "", &device);
             for case in io.cases() {
@@ -37,7 +37,7 @@ fn parity_denoiser() {
     }
 }
 
-/// The stored guidance embedding, once ours is found to be near it.
+/// The stored guidance embedding, after a check that ours is close to it.
 fn guidance(case: &str, io: &Arrays, device: &Device, gates: &mut Gates) -> Option<Tensor<2>> {
     let stored = io.find(&format!("{case}/w_embedding"))?;
     let ours = guidance_embedding(&io.get(&format!("{case}/w")).f32s(), stored.shape[1], device);
@@ -88,7 +88,7 @@ fn pair(case: &str, network: &Denoiser, io: &Arrays, device: &Device, gates: &mu
     let double = Tensor::cat(vec![sample.clone(), sample], 0);
     let output = network.forward(double, &times, text, guidance, &mut Dropout::off());
     gates.tensor("output", format!("{case}/pair"), output.clone(), stored("output_pair"), FORWARD);
-    // Guidance multiplies what two passes differ by in rounding by 2g - 1, so it starts from the stored passes.
+    // Guidance magnifies the rounding differences of two passes by 2g - 1, so it starts from the stored passes.
     let output = stored("output_pair").tensor::<3>(device);
     let half = |b: std::ops::Range<usize>| output.clone().slice([b, 0..tokens, 0..dim]);
     for g in io.names().filter_map(|n| n.strip_prefix(&format!("{case}/guided_"))) {

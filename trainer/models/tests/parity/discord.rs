@@ -1,5 +1,5 @@
-//! The vector fields of DisCoRD: projections, times, velocities, losses with gradients, steps in a row and whole trajectories (fixtures
-//! `06_discord_*`).
+//! The vector fields of DisCoRD: projections, times, velocities, losses with gradients, steps in a row and whole
+//! trajectories (fixtures `06_discord_*`).
 
 use burn::tensor::{Device, Tensor, TensorData};
 use models::flat::{self, Entry};
@@ -17,11 +17,11 @@ use crate::networks::{check_gradients, gradients, scalar, split};
 use crate::tokenizer::{draws, filled, ids, number, size};
 use crate::{FORWARD, LOSS};
 
-/// Whole trajectories, averages after steps.
+/// Gate of whole trajectories, and of averages after steps.
 const TRAJECTORY: f64 = 1e-5;
-/// Norm of a parameter's change in one update.
+/// Gate of the norm of a parameter's change in one update.
 const CHANGE: f64 = 1e-3;
-/// In the published state, and no parameters here.
+/// Names in the published state that are no parameters here.
 const NOT_OURS: [&str; 4] = ["quantizer.", "num_batches_tracked", "post_norm", "postional_encoding"];
 
 fn unet_config(constructor: &Value) -> UnetConfig {
@@ -53,7 +53,7 @@ fn unet_config(constructor: &Value) -> UnetConfig {
     }
 }
 
-/// Parameters that are trained: statistics of batch norms are not.
+/// The trained parameters, without statistics of batch norms.
 fn trained<'a>(entries: &'a [Entry], values: &'a [f32]) -> (Vec<Entry>, Vec<f32>) {
     let kept = split(entries, values).filter(|(entry, _)| !entry.name.contains("running_"));
     let (entries, values): (Vec<Entry>, Vec<Vec<f32>>) = kept.map(|(e, v)| (e.clone(), v.to_vec())).unzip();
@@ -101,7 +101,7 @@ fn forward(network: &FlowUnet, case: &str, io: &Arrays, gates: &mut Gates) {
     gates.tensor("velocity", case, found, stored("v"), FORWARD);
 }
 
-/// All that a fixture samples, from tokens or from their ids.
+/// Samples all trajectories of a fixture, from tokens or from their ids.
 fn trajectories(network: &FlowUnet, case: &str, books: &[Vec<f32>], io: &Arrays, gates: &mut Gates) {
     let find = |part: &str| io.find(&format!("{case}/{part}"));
     let noise = find("noise").expect("noise").tensor::<3>(&device());
@@ -161,7 +161,7 @@ fn loss(network: &FlowUnet, case: &str, expected: &Value, io: &Arrays, gates: &m
     if let Some(wanted) = find("v_pred") {
         gates.tensor("velocity", case, found.clone(), wanted, FORWARD);
     }
-    // Of a padded batch the mean over valid frames, whichever clip they are of.
+    // The mean over the valid frames of a padded batch, over all clips together.
     let squares = (found - (data - noise)).square().mean_dim(2);
     let loss = match find("lengths") {
         None => squares.mean(),
@@ -195,7 +195,7 @@ fn steps(mut network: FlowUnet, config: &Value, expected: &Value, io: &Arrays, g
         let x = between(data.clone(), noise.clone(), &times);
         gates.tensor("between", &*what, x.clone(), stored("x_t"), FORWARD);
         let found = network.forward(x, &times, stored("z").tensor(&device), &mut Dropout::off());
-        // From the second step on, what Adam's first left is in it.
+        // From the second step on, the weights carry the rounding of Adam's first update, which is nearly a sign.
         let gate = if step == 0 { FORWARD } else { CHANGE };
         gates.tensor("velocity", &*what, found.clone(), stored("prediction"), gate);
         let target = data - noise;

@@ -1,8 +1,8 @@
-//! One step of latent consistency distillation: every intermediate, loss, gradients, and clip, AdamW and moving average
-//! after it (fixtures `03_distill*`).
+//! One step of latent consistency distillation (fixtures `03_distill*`): every intermediate, loss and gradients, and
+//! the clip, AdamW and moving average after it.
 //!
-//! Intermediates are computed from stored inputs, so that each line has an error of its own; loss, gradients and update
-//! come out of the whole chain.
+//! Intermediates are computed from stored inputs, so that each line has an error of its own. Loss, gradients and update
+//! are results of the whole chain.
 
 use std::ops::Deref;
 use std::path::Path;
@@ -20,9 +20,9 @@ use crate::common::{Arrays, Gates, device, error, folders, json, name, relative,
 use crate::networks::{check_gradients, denoiser, gradients, repeated, scalar, split};
 use crate::{FORWARD, LOSS};
 
-/// Parameters after one update.
+/// Gate of parameters after one update.
 const WEIGHTS: f64 = 1e-5;
-/// Norm of a parameter's change in the first update, which is nearly the sign of its gradient.
+/// Gate of the norm of a parameter's change in the first update, which is nearly the sign of its gradient.
 const CHANGE: f64 = 1e-3;
 
 struct Step<'a> {
@@ -35,7 +35,7 @@ struct Step<'a> {
 /// The networks of a distillation, and the grid of its solver.
 pub(crate) struct Networks {
     pub(crate) teacher: Denoiser,
-    /// On a device that tracks gradients.
+    /// The student, on a device that tracks gradients.
     pub(crate) student: Denoiser,
     pub(crate) target: Denoiser,
     pub(crate) grid: Grid,
@@ -43,7 +43,7 @@ pub(crate) struct Networks {
 }
 
 impl Networks {
-    /// Of a teacher's and a student's config, their weights, and the number of grid points.
+    /// Reads the networks from a teacher's and a student's config, their weights, and the number of grid points.
     pub(crate) fn read(teacher: &Value, student: &Value, weights: &Path, points: &Value) -> Self {
         let (plain, tracked) = (device(), tracked());
         Self {
@@ -56,7 +56,7 @@ impl Networks {
     }
 }
 
-/// Of an optimizer's config; and its learning rate.
+/// The optimizer of a config, and its learning rate.
 pub(crate) fn adam(settings: &Value) -> (AdamW, f64) {
     let number = |value: &Value| value.as_f64().expect("a number");
     let adam = AdamW {
@@ -114,7 +114,7 @@ impl Step<'_> {
         gates.check("table", "solver, before", error(&before, &stored("ddim_alpha_cumprods_prev_f64").values), 0.0);
     }
 
-    /// Start and end of the solver step of every example.
+    /// Start and end of every example's solver step.
     fn times(&self, case: &str) -> (Vec<usize>, Vec<usize>) {
         let index = self.io.get(&format!("{case}/grid_index")).usizes();
         (index.iter().map(|i| self.grid.tau(*i)).collect(), index.iter().map(|i| self.grid.prev(*i)).collect())
@@ -124,7 +124,7 @@ impl Step<'_> {
         self.io.get(&format!("{case}/{part}")).tensor(device)
     }
 
-    /// The stored embedding: arguments up to 15,000 make ours differ from it by their rounding alone.
+    /// The stored embedding: with arguments up to 15,000 ours differs from it by rounding.
     fn guidance(&self, case: &str, device: &Device) -> Tensor<2> {
         self.io.get(&format!("{case}/w_embedding")).tensor(device)
     }
@@ -176,7 +176,7 @@ impl Step<'_> {
         gates.tensor("guidance sinusoid", case, ours, stored("w_embedding"), 2e-3);
     }
 
-    /// Student and target predictions, by the whole chain.
+    /// Predictions of student and target, by the whole chain.
     fn chain(&self, case: &str, gates: &mut Gates) -> (Tensor<3>, Tensor<3>) {
         let (plain, tracked) = (device(), tracked());
         let (start, end) = self.times(case);

@@ -55,7 +55,7 @@ fn one(case: &str, network: &Evaluator, config: &EvaluatorConfig, io: &Arrays, g
     let text = network.text_encoder.forward(words, classes, &stored("cap_lens").usizes());
     gates.tensor("text", what("input order"), text.clone(), stored("text_embedding_input_order"), FORWARD);
 
-    // The published wrapper sorts motions by length and captions with them; distances are in that order.
+    // The published wrapper sorts motions by length, and captions likewise; distances are in that order.
     let order = stored("align_idx").usizes();
     let sorted = |all: &[f32]| -> Vec<f32> {
         let width = config.embedding;
@@ -74,7 +74,8 @@ fn one(case: &str, network: &Evaluator, config: &EvaluatorConfig, io: &Arrays, g
         .collect();
     gates.check("distance", what("matrix"), error(&distances, &expected.values), FORWARD);
 
-    // A sequence by itself, cut to its length plus what the convolutions see behind it, has the embedding that it has in a batch.
+    // A sequence alone has the same embedding as in a batch. It is cut to its length plus the frames that the
+    // convolutions read after it.
     for (b, length) in lengths.iter().enumerate() {
         let alone: Array = row(stored("motions"), b);
         let one = alone.tensor::<2>(&device).unsqueeze::<3>();

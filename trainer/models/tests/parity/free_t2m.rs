@@ -1,8 +1,9 @@
-//! Free-T2M's losses: the low-pass filter, both hosts' terms and totals, and the gradient that upstream's semantic term does not have
-//! (fixtures `07_free_t2m*`).
+//! Free-T2M's losses: the low-pass filter, both hosts' terms and totals, and the gradient that upstream's semantic term
+//! lacks (fixtures `07_free_t2m*`).
 //!
-//! The hosts differ in how terms are averaged. MDM's has one low-frequency mean over the whole batch, which it multiplies by each sample's stage;
-//! StableMoFusion's averages over the samples in a stage. Both transform all frames, padding included.
+//! The hosts average terms differently. MDM's host computes one low-frequency mean over the whole batch and multiplies
+//! it by each sample's stage. StableMoFusion's averages over the samples in a stage. Both transform all frames, padding
+//! included.
 
 use std::path::Path;
 
@@ -24,9 +25,9 @@ use crate::raw_diffusion::{
 };
 use crate::{FORWARD, LOSS};
 
-/// Whole gradients with respect to predictions.
+/// Gate of whole gradients with respect to predictions.
 const GRADIENT: f64 = 1e-4;
-/// Norms of gradients, relative.
+/// Gate of norms of gradients, relative.
 const NORM: f64 = 1e-4;
 
 #[test]
@@ -89,7 +90,7 @@ fn filtered(host: &str, expected: &Value, io: &Arrays, gates: &mut Gates) {
     }
 }
 
-/// StableMoFusion's total of stored predictions and embeddings: K is 1 and the threshold 300.
+/// Checks StableMoFusion's total of stored predictions and embeddings: K is 1 and the threshold 300.
 fn totals(expected: &Value, io: &Arrays, gates: &mut Gates) {
     let device = device();
     let (found, target) = (io.get("smf/prediction").tensor(&device), io.get("smf/target").tensor(&device));
@@ -114,14 +115,14 @@ fn smf_stages() -> [Stage; 2] {
     [Stage::of_shares(0.0, 0.3, 1000), Stage::new(301..=999)]
 }
 
-/// Each sample of the stage has an equal part of its mean.
+/// Equal weights of the samples in a stage, which sum to 1.
 fn shares(stage: &Stage, times: &[usize]) -> Vec<f32> {
     let mask = stage.mask(times);
     let count = mask.iter().sum::<f32>().max(1.0);
     mask.iter().map(|m| m / count).collect()
 }
 
-/// Its two terms; embeddings of all samples.
+/// The two terms of StableMoFusion; embeddings are those of all samples.
 fn smf_terms(
     times: &[usize],
     found: Tensor<3>,
@@ -131,13 +132,13 @@ fn smf_terms(
 ) -> (Tensor<1>, Tensor<1>) {
     let [low, high] = smf_stages();
     let weights = shares(&low, times);
-    // One sample alone loses its batch axis upstream, and then nothing is filtered.
+    // Upstream drops the batch axis of a single sample, and then nothing is filtered.
     let keep = if low.mask(times).iter().sum::<f32>() == 1.0 { frames } else { 1 };
     let slow = low_frequency(found, target, &vec![frames; times.len()], keep, Pointwise::L2, &weights);
     (slow, semantic(embeddings.0, embeddings.1, Agreement::Cosine, &shares(&high, times)))
 }
 
-/// The evaluator's half that reads motions.
+/// The evaluator's networks for motions.
 struct Encoder {
     movement: MovementEncoder,
     motion: MotionEncoder,
@@ -204,7 +205,7 @@ fn parity_free_t2m_in_mdm() {
         for case in config["cases"].as_object().expect("cases").keys() {
             let part = |part: &str| frames_first(io.get(&format!("{case}/{part}"))).tensor::<3>(&device);
             let times = io.get(&format!("{case}/t")).usizes();
-            // Absolute numbers upstream, whatever the number of steps.
+            // Upstream has absolute timesteps for any number of steps.
             let (low, high) = (Stage::new(30..=usize::MAX), Stage::new(0..=20));
             stages(case, &io, &low, &high, &times);
             let lengths = lengths(io.get(&format!("{case}/mask")));
@@ -212,7 +213,7 @@ fn parity_free_t2m_in_mdm() {
             let text = crate::common::row(io.get(&format!("{case}/text_embed")), 0).tensor(&device);
             let noisy = noised(&schedule, &x0, part("noise"), &times);
             let masked = host.1.then_some(&lengths[..]);
-            // A graph serves one backward pass.
+            // A graph supports one backward pass.
             let predict = || host.0.forward(noisy.clone(), &times, Tensor::clone(&text), masked, &mut Dropout::off());
             let predicted = predict();
             let stored = frames_first(io.get(&format!("{case}/prediction")));
@@ -220,7 +221,7 @@ fn parity_free_t2m_in_mdm() {
 
             let (batch, frames) = (times.len(), x0.dims()[1]);
             let mse = |p: &Tensor<3>| Tensor::cat(masked_errors(p, &x0, &lengths), 0).sum() / batch as f32;
-            // One mean over the batch, times the mean of the mask.
+            // One mean over the batch, multiplied by the mean of the mask.
             let slow = |p: &Tensor<3>| {
                 let share = low.mask(&times).iter().sum::<f32>() / batch as f32;
                 let weights = vec![share / batch as f32; batch];
@@ -294,7 +295,7 @@ fn parity_free_t2m_in_stablemofusion() {
             let noisy = noised(&linear(Prediction::Sample), &x0, part("noise").tensor(&device), &times);
             let kept: Vec<bool> = part("condition_dropped").values.iter().map(|dropped| *dropped == 0.0).collect();
             let tokens = batch_first(part("clip_states"), &device);
-            // A graph serves one backward pass.
+            // A graph supports one backward pass.
             let predict = || {
                 let off = &mut Dropout::off();
                 let text = host.encode_text(tokens.clone(), None, off);

@@ -1,4 +1,5 @@
-//! Logits, loss with gradients, greedy and drawn ids of the autoregressive generator (fixtures `05_t2mgpt_transformer`, `05_t2mgpt_sampling`).
+//! Logits, loss with gradients, greedy and drawn ids of the autoregressive generator (fixtures `05_t2mgpt_transformer`,
+//! `05_t2mgpt_sampling`).
 
 use burn::tensor::{Device, Tensor};
 use models::flat;
@@ -12,7 +13,7 @@ use crate::networks::{check_gradients, gradients, scalar};
 use crate::tokenizer::{draws, filled, number, size};
 use crate::{FORWARD, LOSS};
 
-/// In the published state, and no parameters here.
+/// Names in the published state that are no parameters here.
 const NOT_OURS: [&str; 3] = ["attn.mask", "pos_embed.embed", "pos_embedding"];
 
 fn network(config: &Value, weights: &Arrays, device: &Device) -> (Gpt, GptConfig) {
@@ -28,7 +29,7 @@ fn network(config: &Value, weights: &Arrays, device: &Device) -> (Gpt, GptConfig
     (filled(Gpt::new(&config, &mut draws(device)), weights, "", &NOT_OURS), config)
 }
 
-/// What is expected of gradients, without the parameters that the published state alone has.
+/// Expected gradients without the parameters that only the published state has.
 pub(crate) fn without(expected: &Value, names: &[&str]) -> Value {
     let mut expected = expected.clone();
     if let Some(unused) = expected["no_gradient"].as_array_mut() {
@@ -108,7 +109,7 @@ fn drawn(network: &Gpt, config: &GptConfig, case: &str, expected: &Value, io: &A
     let mut taken = 0;
     let mut fill = |step: usize, _: usize, out: &mut [f64]| {
         taken += 1;
-        // A case stores no more draws than it took.
+        // A case stores only the draws that it used.
         let at = step * classes;
         out.copy_from_slice(&exponentials.values[at..at + classes]);
     };

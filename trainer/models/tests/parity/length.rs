@@ -13,14 +13,14 @@ use crate::common::{Arrays, Gates, device, folders, json, name, relative, shared
 use crate::networks::{check_gradients, gradients, scalar, split};
 use crate::{FORWARD, LOSS};
 
-/// Norm of a parameter's change in one update.
+/// Gate of the norm of a parameter's change in one update.
 const CHANGE: f64 = 1e-3;
 
 fn network(config: &Value, folder: &std::path::Path, device: &Device) -> LengthEstimator {
     let size = |key: &str| config[key].as_u64().expect("a size") as usize;
     let mut init = Init::new(Seed(1), "parity", Positions::Uniform, device);
     let fresh = LengthEstimator::new(size("input"), size("output"), &mut init);
-    // Stored as float16 in one of them.
+    // One fixture stores float16.
     let weights = Arrays::read(&folder.join("weights.safetensors"));
     let entries = flat::layout(&fresh);
     assert_eq!(weights.names().count(), entries.len(), "as many parameters as stored");
@@ -59,7 +59,7 @@ fn parity_length_estimator() {
     }
 }
 
-/// Loss and gradients, then the steps that the fixture makes, each from what ours left.
+/// Checks loss and gradients, then the fixture's updates, each from our previous result.
 fn train(case: &str, mut network: LengthEstimator, config: &Value, expected: &Value, io: &Arrays, gates: &mut Gates) {
     let tracked = tracked();
     let stored = |part: &str| io.get(&format!("{case}/{part}"));
@@ -69,7 +69,7 @@ fn train(case: &str, mut network: LengthEstimator, config: &Value, expected: &Va
     let labels: Vec<usize> =
         stored("frames").usizes().into_iter().map(|frames| LengthEstimator::class(frames, classes)).collect();
     assert_eq!(labels, stored("labels").usizes(), "{case}: classes");
-    // Kept values are divided by 0.8; nothing is dropped where no masks are stored.
+    // Kept values are divided by 0.8; without stored masks nothing is dropped.
     let mask = |k: usize| {
         let array = io.find(&format!("{case}/keep_{k}"))?;
         let scaled = array.values.iter().map(|keep| (keep / 0.8) as f32).collect::<Vec<_>>();
@@ -123,7 +123,7 @@ fn train(case: &str, mut network: LengthEstimator, config: &Value, expected: &Va
     );
 }
 
-/// Draws with the stored exponentials.
+/// Checks draws with the stored exponentials.
 fn sample(network: &LengthEstimator, io: &Arrays, gates: &mut Gates) {
     let text = io.get("sample/text").tensor::<2>(&device());
     let logits = network.forward(text, &mut Dropout::off());

@@ -1,8 +1,8 @@
 //! Networks, losses, one distillation step and the samplers against the published PyTorch modules.
 //!
-//! Driven by what is there: every folder of the fixtures whose name starts with a known prefix, every case its arrays
-//! name, sizes out of its `config.json`. `06_sjpe` holds a metric, which the crate of the stages has.
-//! Gates are those of the fixtures' README, for CPU.
+//! The fixtures drive the tests: every folder with a known prefix, every case that its arrays name, with sizes from its
+//! `config.json`. `06_sjpe` holds a metric, which the crate `stages` checks. Gates are those of the fixtures' README,
+//! for CPU.
 
 mod codebooks;
 #[path = "../common/mod.rs"]
@@ -26,9 +26,9 @@ mod text;
 mod tokenizer;
 mod vae;
 
-/// One forward pass.
+/// Gate of one forward pass.
 const FORWARD: f64 = 3e-6;
-/// Scalar losses, relative.
+/// Gate of scalar losses, relative.
 const LOSS: f64 = 1e-5;
 
 #[test]

@@ -1,4 +1,5 @@
-//! Logits, the training script's draws, loss, gradients and step, and sampling step by step of MMM's generator (fixture `05_mmm`).
+//! MMM's generator (fixture `05_mmm`): logits, the training script's draws, loss, gradients and update, and sampling
+//! step by step.
 
 use burn::tensor::Device;
 use models::flat;
@@ -14,9 +15,9 @@ use crate::networks::{check_gradients, gradients, scalar, split};
 use crate::tokenizer::{draws, filled, number, size};
 use crate::{FORWARD, LOSS};
 
-/// In the published state, and no parameters here.
+/// Names in the published state that are no parameters here.
 const NOT_OURS: [&str; 4] = ["vqvae.", "attn.mask", "pos_embed.embed", "pos_embedding"];
-/// Norm of a parameter's change in one update.
+/// Gate of the norm of a parameter's change in one update.
 const CHANGE: f64 = 1e-3;
 
 struct Loaded {
@@ -138,7 +139,7 @@ fn train(loaded: &Loaded, case: &str, expected: &Value, io: &Arrays, gates: &mut
     }
 }
 
-/// Stored uniform draws [step, B, P, K]; of a greedy case one for all.
+/// Stored uniform draws [step, B, P, K]; a greedy case stores one value for all.
 fn uniforms(stored: &Array) -> impl FnMut(usize, usize, usize, &mut [f32]) + '_ {
     move |step: usize, b: usize, p: usize, out: &mut [f32]| {
         let [_, batch, len, classes] = stored.shape[..] else { panic!("draws by step, clip, position and class") };
@@ -184,7 +185,7 @@ fn stepwise(
         for (part, at) in [("logits_first", 0), ("logits_last", steps - 1)] {
             let wanted = stored(part);
             if at == taken {
-                // Behind the end of a clip in-painting's logits are not stored.
+                // In-painting stores no logits past the end of a clip.
                 gates.check("logits", &*what, error(&step.logits[..wanted.values.len()], &wanted.values), FORWARD);
             }
         }

@@ -67,7 +67,7 @@ fn parity_momask_transformers() {
     }
 }
 
-/// Logits [B, n, C] as upstream has them, [B, C, n].
+/// Converts logits [B, n, C] to upstream's [B, C, n].
 fn classes_second(logits: Tensor<3>) -> Tensor<3> {
     logits.swap_dims(1, 2)
 }
@@ -213,7 +213,7 @@ fn residual_training(
     let token = |b: usize, p: usize, q: usize| {
         if p < lengths[b] { all.values[(b * n + p) * config.quantizers + q] as usize } else { config.residual_pad() }
     };
-    // Embedded here, so that the tables take part in the gradient.
+    // Embedded here, so that the gradient reaches the tables.
     let clips: Vec<Tensor<3>> = (0..layers.len())
         .map(|b| {
             let ids = |q: usize| (0..n).map(|p| token(b, p, q)).collect::<Vec<_>>();

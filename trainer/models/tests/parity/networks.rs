@@ -1,4 +1,4 @@
-//! Networks built as a fixture's configuration says, and comparing their gradients.
+//! Networks built from a fixture's configuration, and comparison of their gradients.
 
 use std::path::Path;
 
@@ -14,11 +14,11 @@ use serde_json::Value;
 
 use crate::common::{Array, Arrays, Gates, error, relative};
 
-/// Whole gradients of single parameters.
+/// Gate of whole gradients of single parameters.
 const GRADIENT: f64 = 1e-4;
-/// Norm of all gradients, relative.
+/// Gate of the norm of all gradients, relative.
 const GLOBAL: f64 = 1e-4;
-/// Norm of one parameter's gradient, relative, after an allowance of `ALLOWANCE` times the global norm.
+/// Gate of the norm of one parameter's gradient, relative, after an allowance of `ALLOWANCE` times the global norm.
 const PARAMETER: f64 = 1e-3;
 const ALLOWANCE: f64 = 1e-7;
 
@@ -26,14 +26,14 @@ pub(crate) fn count(config: &Value, key: &str) -> usize {
     config[key].as_u64().unwrap_or_else(|| panic!("`{key}` is a number")) as usize
 }
 
-/// Refuses a configuration that asks for what our networks are not.
+/// Refuses a configuration with options that our networks do not have.
 pub(crate) fn only(config: &Value, fixed: &[(&str, Value)]) {
     for (key, value) in fixed {
         assert_eq!(&config[*key], value, "only this `{key}` exists here");
     }
 }
 
-/// (N, d, H, projection)
+/// Sizes of a VAE: (N, d, H, projection).
 fn sizes(config: &Value) -> (usize, usize, usize, bool) {
     let latent: Vec<usize> = serde_json::from_value(config["latent_dim"].clone()).expect("two sizes");
     let width = config["hidden_dim"].as_u64().map_or(latent[1], |w| w as usize);
@@ -45,12 +45,12 @@ pub(crate) fn draws(device: &Device) -> Init<'_> {
     Init::new(Seed(1), "parity", Positions::Uniform, device)
 }
 
-/// A VAE of the constructor arguments, with the fixture's weights.
+/// A VAE from the constructor arguments, with the fixture's weights.
 pub(crate) fn vae(config: &Value, weights: &Path, device: &Device) -> Vae {
     vae_at(config, weights, "", device)
 }
 
-/// The same with the weights under `prefix`.
+/// Like [`vae`], with the weights under `prefix`.
 pub(crate) fn vae_at(config: &Value, weights: &Path, prefix: &str, device: &Device) -> Vae {
     only(
         config,
@@ -78,12 +78,12 @@ pub(crate) fn vae_at(config: &Value, weights: &Path, prefix: &str, device: &Devi
     load(Vae::new(&config, &mut draws(device)), weights, prefix)
 }
 
-/// A denoiser of the constructor arguments, with the fixture's weights under `prefix`.
+/// A denoiser from the constructor arguments, with the fixture's weights under `prefix`.
 pub(crate) fn denoiser(config: &Value, weights: &Path, prefix: &str, device: &Device) -> Denoiser {
     load(Denoiser::new(&denoiser_config(config), &mut draws(device)), weights, prefix)
 }
 
-/// A denoiser's size out of its constructor arguments.
+/// A denoiser's size from its constructor arguments.
 pub(crate) fn denoiser_config(config: &Value) -> DenoiserConfig {
     only(
         config,
@@ -143,8 +143,8 @@ pub(crate) fn split<'a>(entries: &'a [Entry], flat: &'a [f32]) -> impl Iterator<
     })
 }
 
-/// Compares flat gradients with `{global_norm, per_parameter, no_gradient}`, the second of which some cases leave out, and with the whole gradients that `io` stores
-/// under `prefix/`.
+/// Compares flat gradients with `{global_norm, per_parameter, no_gradient}` and with the whole gradients that `io`
+/// stores under `prefix/`. Some cases leave out `per_parameter`.
 pub(crate) fn check_gradients(
     gates: &mut Gates,
     entries: &[Entry],
@@ -160,7 +160,7 @@ pub(crate) fn check_gradients(
             gates.check("whole grad", format!("{prefix} {}", entry.name), error(values, &whole.values), GRADIENT);
         }
     }
-    // The smaller cases of a fixture store no more than this.
+    // The smaller cases of a fixture store no norms per parameter.
     let Some(norms) = expected["per_parameter"].as_object() else { return };
     let unused: Vec<&str> =
         expected["no_gradient"].as_array().expect("names").iter().filter_map(Value::as_str).collect();
@@ -179,7 +179,7 @@ pub(crate) fn check_gradients(
     }
 }
 
-/// Timesteps of a batch: one each, or one for all.
+/// Timesteps of a batch: one per sample, or one for all.
 pub(crate) fn timesteps(array: &Array, batch: usize) -> Vec<usize> {
     let values = array.usizes();
     if values.len() == 1 { vec![values[0]; batch] } else { values }

@@ -1,8 +1,9 @@
-//! One whole iteration of phased consistency distillation with its discriminator, and the deterministic sampler (fixtures
-//! `11_pcm_step*`). They hold our reading of the paper, which nobody else has confirmed: see the fixtures' README.
+//! One whole iteration of phased consistency distillation with its discriminator, and the deterministic sampler
+//! (fixtures `11_pcm_step*`). The fixtures implement our reading of the paper, which has no independent confirmation:
+//! see their README.
 //!
-//! Intermediates are computed from stored inputs, so that each line has an error of its own; losses, gradients and updates come out of
-//! the whole chain.
+//! Intermediates are computed from stored inputs, so that each line has an error of its own. Losses, gradients and
+//! updates are results of the whole chain.
 
 use std::ops::Deref;
 use std::path::Path;
@@ -24,13 +25,13 @@ use crate::distillation::{Networks, adam};
 use crate::networks::{check_gradients, gradients, repeated, scalar, split};
 use crate::{FORWARD, LOSS};
 
-/// Jumps of the sampler, one after the other.
+/// Gate of the sampler's jumps, one after the other.
 const TRAJECTORY: f64 = 1e-5;
-/// Parameters after one update.
+/// Gate of parameters after one update.
 const WEIGHTS: f64 = 1e-5;
-/// Norm of a parameter's change in the first update, which is nearly the sign of its gradient.
+/// Gate of the norm of a parameter's change in the first update, which is nearly the sign of its gradient.
 const CHANGE: f64 = 1e-3;
-/// Gradients with respect to single tensors.
+/// Gate of gradients with respect to single tensors.
 const GRADIENT: f64 = 1e-4;
 
 struct Fixture<'a> {
@@ -156,7 +157,7 @@ fn denoiser_on(network: &Denoiser, device: &Device) -> Denoiser {
     network.clone().valid().to_device(device)
 }
 
-/// One case: what was drawn, and the times that follow from it.
+/// One case: its draws, and the times computed from them.
 struct Step<'a> {
     fixture: &'a Fixture<'a>,
     case: &'a str,
@@ -169,9 +170,9 @@ struct Step<'a> {
     levels: Vec<usize>,
 }
 
-/// What the chain gives, on the tape of the student.
+/// The results of the chain, on the tape of the student.
 struct Chain {
-    /// The student's noise.
+    /// The noise that the student predicts.
     eps: Tensor<3>,
     consistency: Tensor<1>,
     fake: Tensor<3>,
@@ -188,7 +189,7 @@ impl<'a> Step<'a> {
         let end = of(&|i| phases.edge_time(phases.phase_of(i)));
         let next = of(&|i| phases.next_edge_time(phases.phase_of(i)));
         let draws = fixture.io.get(&format!("{case}/level_u"));
-        // The product is f32's: .9 of 1000 is 900 there.
+        // The product is in f32: .9 of 1000 is 900 there.
         let level = |((u, end), next): ((f32, &usize), &usize)| end + (u * (next - end) as f32).floor() as usize;
         let levels = draws.f32s().into_iter().zip(&end).zip(&next).map(level).collect();
         Self { fixture, case, phases, index, start, prev, end, next, levels }
@@ -221,7 +222,7 @@ impl<'a> Step<'a> {
         }
     }
 
-    /// `a z + e eps` with the coefficients of a rule for each example.
+    /// Computes `a z + e eps` with a rule's coefficients for each example.
     fn map(&self, z: Tensor<3>, eps: Tensor<3>, pairs: impl Iterator<Item = (f64, f64)>) -> Tensor<3> {
         let (a, e) = unzip(pairs);
         affine(z, eps, &a, &e)
@@ -254,7 +255,7 @@ impl<'a> Step<'a> {
         self.map(self.load("z0", device), self.load("noise_real", device), pairs)
     }
 
-    /// Block features of the frozen teacher at the levels.
+    /// Block features of the frozen teacher at the noise levels.
     fn features(&self, z: Tensor<3>) -> Vec<Tensor<3>> {
         let text = self.load("text", &z.device());
         self.fixture.teacher.features(z, &self.levels, text, &mut Dropout::off())
@@ -291,7 +292,7 @@ impl<'a> Step<'a> {
         }
     }
 
-    /// The whole chain, each part from the one before. The student's noise is a leaf of its own if `leaf` says so.
+    /// Computes the whole chain, each part from the one before. With `leaf` the student's noise is a leaf of the tape.
     fn chain(&self, leaf: bool, gates: &mut Gates) -> Chain {
         let (fixture, plain, tracked, off) = (self.fixture, device(), tracked(), &mut Dropout::off());
         let onto = |x: Tensor<3>| Tensor::<3>::from_data(x.into_data(), &tracked);
@@ -374,7 +375,7 @@ impl<'a> Step<'a> {
         self.step(("discriminator", &named, flat::read(&fixture.heads), heads), None, gates);
     }
 
-    /// Gradients with respect to the student's noise, and to the fake alone.
+    /// Checks gradients with respect to the student's noise, and to the fake alone.
     fn inner_gradients(&self, weight: f32, gates: &mut Gates) {
         let chain = self.chain(true, gates);
         let total = chain.consistency + self.adversarial(chain.fake.clone()) * weight;
@@ -389,7 +390,7 @@ impl<'a> Step<'a> {
         }
     }
 
-    /// Clip and AdamW of one network, and the moving average of `average` if one is kept.
+    /// Clips and applies AdamW to one network, and moves the average of `average` if one is kept.
     fn step(
         &self,
         (network, entries, before, mut grads): (&'static str, &[Entry], Vec<f32>, Vec<f32>),
@@ -409,7 +410,7 @@ impl<'a> Step<'a> {
         adam.step(1, lr, &mut weights, &grads, &mut m, &mut v);
         let mut check = |which: &'static str, before: &[f32], after: &[f32]| {
             if let Some(stored) = expected[format!("{which}_change_norm")].as_object() {
-                // Key rows of an attention's bias have no gradient but rounding; the fixture leaves the tensor out.
+                // The gradient of key rows in an attention's bias is only rounding; the fixture leaves the tensor out.
                 let change: Vec<f32> = after.iter().zip(before).map(|(a, b)| a - b).collect();
                 let left_out = |entry: &Entry| entry.name.ends_with("in_proj_bias");
                 assert_eq!(stored.len(), entries.iter().filter(|entry| !left_out(entry)).count(), "{case} {which}");

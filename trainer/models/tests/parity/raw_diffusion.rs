@@ -1,4 +1,5 @@
-//! MDM and StableMoFusion: forward passes, losses, gradients, steps and whole trajectories (fixtures `07_mdm*`, `07_stablemofusion*`).
+//! MDM and StableMoFusion: forward passes, losses, gradients, steps and whole trajectories (fixtures `07_mdm*`,
+//! `07_stablemofusion*`).
 
 use std::path::Path;
 
@@ -19,16 +20,16 @@ use crate::common::{Array, Arrays, Gates, device, error, folders, json, name, re
 use crate::networks::{check_gradients, count, draws, gradients, load, only, scalar, split};
 use crate::{FORWARD, LOSS};
 
-/// Whole trajectories with guidance.
+/// Gate of whole trajectories with guidance.
 const TRAJECTORY: f64 = 1e-5;
-/// Half of a forward pass's entries, where a network tears others apart.
+/// Gate of the median error of a forward pass, for networks that magnify rounding in a few entries.
 const MEDIAN: f64 = 1e-4;
-/// Norm of a parameter's change in one update.
+/// Gate of the norm of a parameter's change in one update.
 const CHANGE: f64 = 1e-3;
-/// A moving average.
+/// Gate of a moving average.
 const AVERAGE: f64 = 1e-5;
 
-/// [B, F, 1, T] as [B, T, F], or [B, F, T].
+/// Converts [B, F, 1, T] or [B, F, T] to [B, T, F].
 pub(crate) fn frames_first(array: &Array) -> Array {
     let (batch, features, frames) = (array.shape[0], array.shape[1], array.shape[array.shape.len() - 1]);
     let at = |b: usize, t: usize, f: usize| array.values[(b * features + f) * frames + t];
@@ -37,7 +38,7 @@ pub(crate) fn frames_first(array: &Array) -> Array {
     Array { shape: vec![batch, frames, features], values }
 }
 
-/// How many frames of each row of a mask [B, ..., T] are set; they lead.
+/// Number of leading set frames in each row of a mask [B, ..., T].
 pub(crate) fn lengths(mask: &Array) -> Vec<usize> {
     let frames = mask.shape[mask.shape.len() - 1];
     let length = |row: &[f64]| {
@@ -48,12 +49,12 @@ pub(crate) fn lengths(mask: &Array) -> Vec<usize> {
     mask.values.chunks_exact(frames).map(length).collect()
 }
 
-/// [N, B, C] as [B, N, C].
+/// Converts [N, B, C] to [B, N, C].
 pub(crate) fn batch_first(array: &Array, device: &Device) -> Tensor<3> {
     array.tensor::<3>(device).swap_dims(0, 1)
 }
 
-/// An MDM of the constructor arguments, and whether frames of padding are masked.
+/// An MDM from the constructor arguments, and true if frames of padding are masked.
 pub(crate) fn mdm(config: &Value, weights: &Path, prefix: &str, device: &Device) -> (Mdm, bool) {
     only(config, &[("arch", "trans_enc".into()), ("nfeats", 1.into()), ("cond_mode", "text".into())]);
     let sizes = MdmConfig {
@@ -69,7 +70,7 @@ pub(crate) fn mdm(config: &Value, weights: &Path, prefix: &str, device: &Device)
     (load(Mdm::new(&sizes, &mut draws(device)), weights, prefix), masked)
 }
 
-/// A StableMoFusion network of the constructor arguments.
+/// A StableMoFusion network from the constructor arguments.
 pub(crate) fn stablemofusion(config: &Value, weights: &Path, prefix: &str, device: &Device) -> StableMoFusion {
     only(config, &[("adagn", true.into()), ("zero", true.into()), ("activation", "gelu".into())]);
     let sizes = StableMoFusionConfig {
@@ -276,7 +277,8 @@ fn parity_stablemofusion_forward() {
     }
 }
 
-/// Median absolute difference over the largest absolute expected value: blind to the few entries that rounding tears apart.
+/// Median absolute difference over the largest absolute expected value; a few entries with magnified rounding do not
+/// count.
 fn median_error(found: &Tensor<3>, expected: &Array) -> f64 {
     let scale = expected.values.iter().fold(0.0_f64, |m, v| m.max(v.abs()));
     let mut off: Vec<f64> =
@@ -285,13 +287,16 @@ fn median_error(found: &Tensor<3>, expected: &Array) -> f64 {
     off[off.len() / 2]
 }
 
-/// The gate of one forward pass, unless a last bit of the weights and of the input does far more to the output; then it is what they do.
+/// The gate of one forward pass. If a last bit of the weights and of the input changes the output far more than that,
+/// the gate is this change.
 ///
-/// A group norm of two channels gives little but a sign: channels that nearly agree are torn apart by the last bit of what came before, 300-fold,
-/// and again in the next block. The smallest networks here have such groups, and their stored guided passes disagree with their stored
-/// single passes by 5e-3 (by 2e-2 with full attention, in passes that attend to nothing). The same arithmetic written a second time, in f64, is
-/// up to 8e-2 away from what is stored, and in f32 up to 2e-1 from itself in f64, both in a few entries of one unconditional pass: half of
-/// the entries agree to 4e-5 everywhere, which [`MEDIAN`] holds. Mistakes are larger: the fixtures' README names 0.02 and more.
+/// A group norm of two channels returns little more than a sign. Rounding of its inputs separates channels that nearly
+/// agree, magnified 300-fold, and again in the next block. The smallest networks here have such groups. Their stored
+/// guided passes differ from their stored single passes by 5e-3 (by 2e-2 with full attention, in passes without a
+/// caption). A second implementation of the same arithmetic in f64 differs by up to 8e-2 from the stored values. In f32
+/// it differs by up to 2e-1 from itself in f64. Both occur in a few entries of one unconditional pass; half of the
+/// entries agree to 4e-5 everywhere, which [`MEDIAN`] checks. Mistakes are larger: the fixtures' README names 0.02 and
+/// more.
 fn conditioned_gate(
     network: &StableMoFusion,
     x: &Tensor<3>,
@@ -315,7 +320,7 @@ pub(crate) fn given(text_bnc: Tensor<3>, kept: Vec<bool>) -> TokenCondition {
     TokenCondition { text_bnc, lengths: None, kept }
 }
 
-/// What the loss of one case needs.
+/// Inputs of one case's loss.
 struct Batch {
     noisy: Tensor<3>,
     target: Tensor<3>,
@@ -405,7 +410,7 @@ fn train_case(
     check_listed(gates, network, &found, &expected[&prefix], io, &prefix);
 }
 
-/// As [`check_gradients`], where lists of norms leave out parameters whose gradients are rounding noise.
+/// Like [`check_gradients`], for lists of norms that leave out parameters whose gradients are rounding noise.
 pub(crate) fn check_listed<M: burn::module::Module>(
     gates: &mut Gates,
     network: &M,
@@ -420,14 +425,14 @@ pub(crate) fn check_listed<M: burn::module::Module>(
         for (entry, values) in split(&entries, found) {
             let left_out = entry.name.ends_with("cross_attention.key.bias");
             if left_out && !norms.contains_key(&entry.name) {
-                // Ours is noise too.
+                // Our gradient is rounding noise too.
                 let norm = global_norm(values);
                 assert!(norm < 1e-5 * expected["global_norm"].as_f64().expect("a norm"), "{}: {norm:e}", entry.name);
                 norms.insert(entry.name.clone(), norm.into());
             }
         }
     } else {
-        // Cases without norms say which parameters take no part.
+        // Cases without norms list the parameters without a gradient.
         for unused in expected["no_gradient"].as_array().into_iter().flatten().filter_map(Value::as_str) {
             let (_, values) =
                 split(&entries, found).find(|(entry, _)| entry.name == unused).expect("a parameter of that name");
@@ -437,7 +442,7 @@ pub(crate) fn check_listed<M: burn::module::Module>(
     check_gradients(gates, &entries, found, &all, io, prefix);
 }
 
-/// Updates in a row: clip, AdamW, moving average.
+/// Checks updates in a row: clip, AdamW, moving average.
 fn train_steps(
     cases: &[&String],
     config: &Value,
@@ -507,7 +512,7 @@ fn parity_stablemofusion_sampling() {
     for folder in folders(&root, &["07_stablemofusion_sampler"]) {
         let config = json(&folder.join("config.json"));
         let io = Arrays::read(&folder.join("io.safetensors"));
-        // The weights are another fixture's, whose name config gives as a path.
+        // The weights come from another fixture; the config has its path.
         let stored = config["weights"].as_str().expect("where the weights are");
         let weights = folder.join(stored.split_whitespace().next().expect("a path"));
         let network = stablemofusion(&config["constructor"], &weights, "", &device());
@@ -540,7 +545,7 @@ fn sample_case(case: &str, settings: &Value, config: &Value, network: &StableMoF
     };
     let last = if let Some(kind) = options["algorithm_type"].as_str() {
         assert_eq!((kind, &options["solver_order"]), ("sde-dpmsolver++", &Value::from(2)), "{case}");
-        // What the option is called since there is a choice; before, the last level stood twice.
+        // The option has this name since there is a choice; before that the last level was repeated.
         let end = match options["final_sigmas_type"].as_str() {
             Some("zero") => Last::Zero,
             None | Some("sigma_min") => Last::Repeated,
@@ -567,7 +572,8 @@ fn sample_case(case: &str, settings: &Value, config: &Value, network: &StableMoF
     }
 }
 
-/// Every move of DDPM by itself is what its two factors say: guards against a trajectory that agrees by cancelling.
+/// Every single move of DDPM is affine with its two factors. Without this a trajectory could agree because errors
+/// cancel.
 #[test]
 fn moves_of_the_ancestral_sampler_are_affine() {
     let (schedule, device) = (cosine(50), device());

@@ -14,7 +14,7 @@ use crate::common::{Array, Arrays, Gates, device, folders, json, name, relative,
 use crate::networks::{check_gradients, denoiser, gradients, repeated, scalar};
 use crate::{FORWARD, LOSS};
 
-/// Fifty steps with guidance.
+/// Gate of fifty steps with guidance.
 const TRAJECTORY: f64 = 1e-5;
 
 #[test]
@@ -46,7 +46,7 @@ fn steps(expected: &Value) -> Vec<usize> {
     serde_json::from_value(expected["timesteps"].clone()).expect("timesteps")
 }
 
-/// Latents after each step: the next step's input, and in the end the result.
+/// Compares latents after each step: the next step's input, and at the end the result.
 fn compare(gates: &mut Gates, case: &str, seen: &[Tensor<3>], last: Tensor<3>, stored: impl Fn(usize) -> Array) {
     for (j, latent) in seen.iter().skip(1).chain([&last]).enumerate() {
         gates.tensor("trajectory", format!("{case} step {j}"), latent.clone(), &stored(j), TRAJECTORY);

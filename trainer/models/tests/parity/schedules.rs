@@ -1,5 +1,5 @@
-//! Noising, targets and deterministic moves along the schedules of models whose networks are not here: the cosine of MDM, the linear one of
-//! StableMoFusion, the flow of DisCoRD (fixtures `07_*`, `06_discord_train`).
+//! Noising, targets and deterministic moves along the schedules of other models: the cosine of MDM, the linear schedule
+//! of StableMoFusion, the flow of DisCoRD (fixtures `07_*`, `06_discord_train`).
 
 use models::diffusion::{Schedule, affine, affine_one, flow, unzip};
 use protocol::stage::{Diffusion, NoiseSchedule, Prediction};
@@ -8,13 +8,13 @@ use serde_json::Value;
 use crate::FORWARD;
 use crate::common::{Array, Arrays, Gates, device, folders, json, name, shared};
 
-/// [B, ...] as [B, 1, n].
+/// Views [B, ...] as [B, 1, n].
 fn rows(array: &Array) -> Array {
     let batch = array.shape[0];
     Array { shape: vec![batch, 1, array.values.len() / batch], ..array.clone() }
 }
 
-/// `x_t` of every case that stores a sample, its noise, its timestep and the result.
+/// Checks `x_t` of every case that stores a sample, its noise, its timestep and the result.
 fn noised(schedule: &Schedule, io: &Arrays, gates: &mut Gates) {
     let device = device();
     let mut found = 0;
@@ -75,7 +75,7 @@ fn parity_sample_moves() {
         let latent = |j: usize| io.get(&format!("ddim10/latents_after_step/{j}"));
         for (j, t) in times.iter().enumerate().skip(1) {
             let out = io.get(&format!("ddim10/prediction/{j}")).tensor::<3>(&device);
-            // The last move lands on the sample itself.
+            // The last move ends at the sample itself.
             let rule = times.get(j + 1).map_or_else(|| schedule.clean(*t), |s| schedule.jump(*t, *s));
             let next = affine_one(latent(j - 1).tensor(&device), out, rule);
             gates.tensor("move", format!("t {t}"), next, latent(j), 1e-5);

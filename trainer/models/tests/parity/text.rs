@@ -1,5 +1,6 @@
-//! Text encoders (fixtures `09_text_clip`, `09_text_t5`): states, pooled and projected vectors of stored ids, under both namings of CLIP's
-//! weights, with and without masks; T5's position buckets and bias, its gated variant, and Sentence-T5's vector.
+//! Text encoders (fixtures `09_text_clip`, `09_text_t5`). CLIP: states, pooled and projected vectors of stored ids,
+//! under both namings of its weights, with and without masks. T5: position buckets and bias, its gated variant, and
+//! Sentence-T5's vector.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -17,10 +18,10 @@ use crate::FORWARD;
 use crate::common::{Array, Arrays, Gates, device, folders, json, name, row, shared};
 use crate::tokenizer::{draws, filled};
 
-/// In published folders, and not of the text tower.
+/// Names in published folders that are not part of the text tower.
 const NOT_OURS: [&str; 4] = ["vision_model.", "visual_projection.", "logit_scale", "position_ids"];
 
-/// The first rows of `found`, as many as are stored.
+/// The first rows of `found`, as many as the stored array has.
 fn first<const D: usize>(found: Tensor<D>, stored: &Array) -> Tensor<D> {
     found.narrow(0, 0, stored.shape[0])
 }
@@ -66,7 +67,7 @@ fn parity_text_clip() {
     }
 }
 
-/// `text_config`, with the width of the projection that stands above it.
+/// `text_config`, with the projection's width from the level above.
 fn with_projection(config: &Value) -> Value {
     let mut text = config["text_config"].clone();
     text["projection_dim"] = config["projection_dim"].clone();
@@ -127,7 +128,7 @@ fn parity_text_t5() {
             }
         }
 
-        // A padded batch: what pads is garbage on both sides.
+        // A padded batch: states of padding are undefined on both sides.
         let of = io.get("padded/rows").usizes();
         let expected = io.get("padded/states");
         let longest = expected.shape[1];

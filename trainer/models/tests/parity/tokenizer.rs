@@ -1,5 +1,5 @@
-//! Encoder, codes, decoder, losses with gradients and one training step of the tokenizers (fixtures `05_rvq_humanml`, `05_t2mgpt_vqvae`, and the
-//! tokenizer of `05_mmm`).
+//! Encoder, codes, decoder, losses with gradients and one training step of the tokenizers (fixtures `05_rvq_humanml`,
+//! `05_t2mgpt_vqvae`, and the tokenizer of `05_mmm`).
 
 use std::borrow::Cow;
 
@@ -19,10 +19,10 @@ use crate::common::{Array, Arrays, Gates, device, error, folders, json, name, re
 use crate::networks::{check_gradients, gradients, scalar};
 use crate::{FORWARD, LOSS};
 
-/// Codebooks, sums and counts after an update.
+/// Gate of codebooks, sums and counts after an update.
 pub(crate) const EMA: f64 = 1e-5;
 
-/// A module with the arrays whose names begin with `prefix`; those that contain one of `skipped` are no parameters of ours.
+/// Loads the arrays under `prefix` into a module. Names that contain one of `skipped` are no parameters of ours.
 pub(crate) fn filled<M: Module>(module: M, weights: &Arrays, prefix: &str, skipped: &[&str]) -> M {
     let entries = flat::layout(&module);
     let ours = |n: &&str| n.starts_with(prefix) && !skipped.iter().any(|part| n.contains(part));
@@ -53,7 +53,7 @@ pub(crate) fn ids(array: &Array) -> Vec<i64> {
     array.values.iter().map(|v| *v as i64).collect()
 }
 
-/// A tokenizer with its codebooks, one a layer.
+/// A tokenizer with one codebook per layer.
 struct Loaded {
     network: Tokenizer,
     books: Vec<Vec<f32>>,
@@ -83,7 +83,7 @@ fn load(config: &Value, weights: &Arrays, prefix: &str, device: &Device) -> Load
     Loaded { network, codes, books, dim: config.dim, format: format.expect("a format with these features") }
 }
 
-/// [B, d, n] of rows [B n, d].
+/// Converts rows [B n, d] to [B, d, n].
 fn channels_first(rows: Vec<f32>, batch: usize, dim: usize) -> Tensor<3> {
     let n = rows.len() / dim / batch;
     Tensor::<3>::from_data(TensorData::new(rows, [batch, n, dim]), &device()).swap_dims(1, 2)
@@ -180,19 +180,19 @@ fn forward(loaded: &Loaded, case: &str, expected: &Value, io: &Arrays, gates: &m
     }
 }
 
-/// Loss, gradients and the codebooks' update in training mode.
+/// Checks loss, gradients and the codebooks' update in training mode.
 fn train(loaded: &Loaded, prefix: &str, case: &str, expected: &Value, io: &Arrays, gates: &mut Gates) {
     let device = tracked();
     let find = |part: &str| io.find(&format!("{case}/{part}"));
     let motion = find("motion").unwrap_or_else(|| io.get("train/motion")).tensor::<3>(&device);
     let [batch, frames, _] = motion.dims();
     let (dim, codes, all_layers) = (loaded.dim, loaded.codes, loaded.books.len());
-    // A single layer has no number behind its name.
+    // The name of a single layer has no number at its end.
     let of = |part: &str, q: usize| find(&format!("{part}/{q}")).or_else(|| find(part).filter(|_| all_layers == 1));
     let rows = loaded.rows(motion.clone());
     let host = values(rows.clone());
     let given = of("before/code_count", 0).is_some();
-    // Where ids are stored, layers left out have none.
+    // Stored ids are negative for the layers that were left out.
     let active = find("indices")
         .map_or(all_layers, |indices| indices.values[..all_layers].iter().filter(|id| **id >= 0.0).count());
     let noise = |q: usize| find(&format!("tile_noise/{q}")).map(Array::f32s);
@@ -204,7 +204,7 @@ fn train(loaded: &Loaded, prefix: &str, case: &str, expected: &Value, io: &Array
     let drawn = of("gumbel_u", 0).is_some();
     let codebook = |layer: usize, rows: &[f32]| {
         if !given {
-            // Each layer takes noise for its start, then for its update.
+            // Each layer uses noise for its start, then for its update.
             books[layer] = candidates(rows, codes, dim, |_| noise(2 * layer).expect("noise on tiled rows"));
         }
         Cow::<[f32]>::Owned(books[layer].clone())

@@ -28,7 +28,7 @@ fn parity_vae() {
             other => panic!("{other:?} joints: no format has as many"),
         };
         let (mean, std) = (io.get("stats/mean").f32s(), io.get("stats/std").f32s());
-        // The fixtures keep the data's unit, also KIT-ML's.
+        // The fixtures keep the data's unit, also for KIT-ML.
         let mut body = Body::new(Skeleton::of(format), &mean, &std, &device);
         body.metres_per_unit = 1.0;
         for case in io.cases().into_iter().filter(|case| case != "stats") {
@@ -73,7 +73,7 @@ fn one(
 
     let entries = flat::layout(network);
     for (kind, settings) in config["loss"].as_object().expect("loss recipes") {
-        // Burn consumes the tape in a backward pass: every loss needs its own forward pass.
+        // Burn consumes the tape in a backward pass: every loss needs a forward pass of its own.
         let posterior = network.encode(features.clone(), &lengths, off);
         let decoded = network.decode(posterior.sample(stored("noise").tensor(device)), &lengths, frames, off);
         let terms = losses::vae(&recipe(settings), body, decoded, features.clone(), &posterior, &lengths);
