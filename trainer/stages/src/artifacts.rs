@@ -1,8 +1,8 @@
-//! Reading and writing artifacts through an [`AttemptContext`], and what the metas of our artifacts say.
+//! Reading and writing artifacts through an [`AttemptContext`], and the metas of our artifacts.
 //!
-//! An artifact is a manifest with files. The meta is all that a reader must know before it opens a file; the structs
-//! here are its schema, one per artifact kind, shared by the stage that writes it and those that read it. Tensors are
-//! safetensors in f32 or i64. Not its job: networks, and what a checkpoint holds.
+//! An artifact is a manifest with files. The meta holds everything that a reader needs before it opens a file. The
+//! structs here are its schema, one per artifact kind, shared by the stage that writes it and those that read it.
+//! Tensors are safetensors in f32 or i64. Not its job: networks, and the contents of a checkpoint.
 
 use std::cell::RefCell;
 use std::collections::{BTreeMap, HashMap};
@@ -24,27 +24,27 @@ use serde::{Deserialize, Serialize};
 
 use crate::context::{AttemptContext, ContextError, StageError};
 
-/// Where the weights of a VAE or a denoiser are.
+/// File of the weights of a VAE or a denoiser.
 pub const MODEL_FILE: &str = "model.safetensors";
-/// Where latents are: `mu` and `sigma` `[rows, N, d]`, `entry` `[rows]`.
+/// File of latents: `mu` and `sigma` `[rows, N, d]`, `entry` `[rows]`.
 pub const LATENTS_FILE: &str = "latents.safetensors";
-/// Where caption embeddings are: `captions` `[n, dim]` in the dataset's caption order, `null` `[dim]`.
+/// File of caption embeddings: `captions` `[n, dim]` in the dataset's caption order, `null` `[dim]`.
 pub const EMBEDDINGS_FILE: &str = "embeddings.safetensors";
 
 /// Meta of an artifact of kind `dataset`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DatasetMeta {
-    /// Which of the two formats.
+    /// The skeleton and feature layout.
     pub format: DataFormat,
-    /// Clips kept.
+    /// Number of clips kept.
     pub clips: usize,
-    /// Captions of all clips.
+    /// Number of captions of all clips.
     pub captions: usize,
-    /// Entries of the three splits together.
+    /// Number of entries of the three splits together.
     pub entries: usize,
-    /// Frames of all clips.
+    /// Number of frames of all clips.
     pub frames: usize,
-    /// Clips and captions left out; the file `report.txt` says which and why.
+    /// Number of clips and captions left out; the file `report.txt` lists them with reasons.
     pub skipped: usize,
 }
 
@@ -55,26 +55,26 @@ pub struct EmbeddingsMeta {
     pub text: Digest,
     /// Width of an embedding.
     pub dim: usize,
-    /// Captions embedded.
+    /// Number of captions embedded.
     pub captions: usize,
 }
 
 /// Meta of an artifact of kind `vae`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct VaeMeta {
-    /// The data it was trained on.
+    /// Format of the training data.
     pub format: DataFormat,
     /// Width of a feature vector.
     pub features: usize,
-    /// Latent shape.
     pub latent: LatentShape,
-    /// Size.
+    /// Size of encoder and decoder.
     pub network: Network,
     /// Mean of the training features, `[features]`.
     pub mean: Vec<f32>,
-    /// Their standard deviation, `[features]`.
+    /// Standard deviation of the training features, `[features]`.
     pub std: Vec<f32>,
-    /// Linears around the bottleneck. Where nothing is said there are some if it has another width than the transformer.
+    /// True if Linears surround the bottleneck. `None` means that they exist if its width differs from the
+    /// transformer's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub projection: Option<bool>,
 }
@@ -82,40 +82,39 @@ pub struct VaeMeta {
 /// Meta of an artifact of kind `latents`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LatentsMeta {
-    /// The data.
+    /// Format of the encoded data.
     pub format: DataFormat,
-    /// The VAE that encoded.
+    /// The VAE that encoded the data.
     pub vae: Digest,
-    /// Latent shape.
     pub latent: LatentShape,
     /// Crops per entry; row `e * crops + c` is crop `c` of entry `e`.
     pub crops: usize,
     /// Split of each entry.
     pub splits: Vec<Split>,
-    /// Captions of each entry, by number in the dataset and so by row in the embeddings.
+    /// Captions of each entry, as indices in the dataset and so as rows of the embeddings.
     pub captions: Vec<Vec<usize>>,
-    /// Frames of each row.
+    /// Number of frames of each row.
     pub lengths: Vec<usize>,
     /// First frame of each row in its entry.
     pub starts: Vec<usize>,
-    /// How paths of training crops were changed, if they were.
+    /// Changes to the paths of training crops, if there are any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub augmented: Option<Augmented>,
 }
 
-/// Other paths of crops; see [`motion::paths`].
+/// Changed paths of crops; see [`motion::paths`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Augmented {
-    /// What was asked for.
+    /// The settings of the changes.
     pub augment: Augment,
-    /// What the changes were drawn with.
+    /// Seed of the draws.
     pub seed: Seed,
-    /// The stage that drew them.
+    /// The stage that made the draws.
     pub stage: StageName,
 }
 
 impl LatentsMeta {
-    /// The feature rows `[length, D]`, not normalised, that `row` was encoded from.
+    /// The feature rows `[length, D]`, not normalised, of the crop that was encoded as `row`.
     ///
     /// # Panics
     /// If `dataset` is not the one that was encoded.
@@ -125,7 +124,7 @@ impl LatentsMeta {
     }
 }
 
-/// The feature rows `[length, D]`, not normalised, of crop `c` of `entry`, given its first frame and length.
+/// The feature rows `[length, D]`, not normalised, of crop `c` of `entry`, with its first frame and length.
 pub fn crop_rows(
     dataset: &Dataset,
     (entry, c): (usize, usize),
@@ -145,27 +144,28 @@ pub fn crop_rows(
 /// Meta of an artifact of kind `denoiser`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DenoiserMeta {
-    /// What it does.
+    /// Family of the model, which decides its samplers.
     #[serde(flatten)]
     pub family: Family,
-    /// Latent shape; that of its VAE.
+    /// Latent shape, equal to that of its VAE.
     pub latent: LatentShape,
-    /// Size.
+    /// Size of the transformer.
     pub network: Network,
     /// Noise schedule and prediction.
     pub diffusion: Diffusion,
-    /// A ReLU on the text embedding (v1).
+    /// True if a ReLU precedes the text projection (v1).
     pub text_relu: bool,
     /// Width of the guidance embedding; 0 for a teacher, which has none.
     pub guidance_dim: usize,
     /// Width of a caption embedding.
     pub text_dim: usize,
-    /// The parts that it was trained with: the VAE whose latents it makes, the text encoder.
+    /// The parts of its training: the VAE whose latents it generates, and the text encoder.
     pub fits: Parts,
-    /// Linears around the transformer. Where nothing is said there are some if it has another width than a latent token.
+    /// True if Linears surround the transformer. `None` means that they exist if its width differs from a latent
+    /// token's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub projection: Option<bool>,
-    /// Width of the time sinusoid, where it is not that of all published denoisers.
+    /// Width of the time sinusoid, if it differs from that of all published denoisers.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub time_dim: Option<usize>,
 }
@@ -176,12 +176,12 @@ pub fn meta<T: DeserializeOwned>(manifest: &Manifest, what: &str) -> Result<T, S
         .map_err(|e| StageError::Input(format!("{what}: its manifest is not one that this build writes: {e}")))
 }
 
-/// A meta as JSON.
+/// Serialises a meta as JSON.
 pub fn to_meta<T: Serialize>(meta: &T) -> serde_json::Value {
     serde_json::to_value(meta).expect("metas are plain data with string keys")
 }
 
-/// What a failed blob means for the stage.
+/// The stage's error for a failed blob.
 pub fn blob_error(error: BlobError) -> StageError {
     let text = error.to_string();
     StageError::Context(match error {
@@ -192,7 +192,7 @@ pub fn blob_error(error: BlobError) -> StageError {
     })
 }
 
-/// The digest and manifest of the input that the settings field `field` names; refused when it is of another kind.
+/// The digest and manifest of the input that settings field `field` names. Refuses an artifact of another kind.
 pub fn input(cx: &dyn AttemptContext, field: &str, kind: ArtifactKind) -> Result<(Digest, Manifest), StageError> {
     let digest = *cx
         .task()
@@ -219,22 +219,22 @@ fn entry<'a>(manifest: &'a Manifest, name: &str) -> Result<&'a FileEntry, StageE
     })
 }
 
-/// One file of an artifact.
+/// Reads one file of an artifact into memory.
 pub fn file(blobs: &dyn Blobs, manifest: &Manifest, name: &str) -> Result<Arc<[u8]>, StageError> {
     blobs.get(entry(manifest, name)?.digest).map_err(blob_error)
 }
 
-/// One file of an artifact, to be read where it is needed: for what is too large to lie in memory twice.
+/// Opens one file of an artifact for reading in pieces, for files too large to be in memory twice.
 pub fn open(blobs: &dyn Blobs, manifest: &Manifest, name: &str) -> Result<Box<dyn Blob>, StageError> {
     blobs.open(entry(manifest, name)?.digest).map_err(blob_error)
 }
 
-/// One file of an artifact, which stays where it is as far as it can: for what is read again and again.
+/// Maps one file of an artifact, which stays on disk if possible; for data that is read repeatedly.
 pub fn mapped(blobs: &dyn Blobs, manifest: &Manifest, name: &str) -> Result<Bytes, StageError> {
     blobs.map(entry(manifest, name)?.digest).map_err(blob_error)
 }
 
-/// All files of an artifact.
+/// Reads all files of an artifact into memory.
 pub fn files(blobs: &dyn Blobs, manifest: &Manifest) -> Result<BTreeMap<String, Arc<[u8]>>, StageError> {
     manifest
         .files
@@ -243,7 +243,7 @@ pub fn files(blobs: &dyn Blobs, manifest: &Manifest) -> Result<BTreeMap<String, 
         .collect()
 }
 
-/// An artifact in the making: files are uploaded one by one, so that only one is in memory at a time.
+/// An artifact in progress: files are uploaded one by one, so that only one is in memory at a time.
 #[derive(Debug)]
 pub struct Draft {
     manifest: Manifest,
@@ -251,7 +251,7 @@ pub struct Draft {
 }
 
 impl Draft {
-    /// An artifact without files.
+    /// Starts an artifact without files.
     pub fn new(cx: &dyn AttemptContext, kind: ArtifactKind, meta: serde_json::Value) -> Self {
         Self { manifest: Manifest::new(kind, meta), blobs: cx.blobs() }
     }
@@ -269,12 +269,12 @@ impl Draft {
         Ok(())
     }
 
-    /// The manifest, without uploading it: of what becomes a part.
+    /// Returns the manifest without uploading it, for an artifact that becomes a part.
     pub fn into_manifest(self) -> Manifest {
         self.manifest
     }
 
-    /// Adds another artifact as a part; its manifest must be uploaded.
+    /// Adds another artifact as a part; its manifest must already be uploaded.
     pub fn part(&mut self, role: &Role, part: &Manifest) -> Digest {
         model::add_part(&mut self.manifest, role, part)
     }
@@ -298,12 +298,12 @@ pub fn publish(
     draft.finish(cx)
 }
 
-/// The dataset of an artifact of kind `dataset`.
+/// Reads the dataset of an artifact of kind `dataset`.
 pub fn dataset(blobs: &dyn Blobs, manifest: &Manifest) -> Result<Dataset, StageError> {
     from_files(blobs, manifest, |fetch| Dataset::from_files(fetch))
 }
 
-/// Its captions alone.
+/// Reads only the captions of a dataset.
 pub fn captions(blobs: &dyn Blobs, manifest: &Manifest) -> Result<Vec<Caption>, StageError> {
     from_files(blobs, manifest, |fetch| Dataset::captions_from_files(fetch))
 }
@@ -315,7 +315,7 @@ fn from_files<T>(
     manifest: &Manifest,
     read: impl FnOnce(&Fetch<'_>) -> Result<T, PackError>,
 ) -> Result<T, StageError> {
-    // What the store said is kept, so that a lost connection is not taken for a broken dataset.
+    // The store's error is kept, so that a lost connection is not reported as a broken dataset.
     let refused = RefCell::new(None);
     let fetch = |name: &str| {
         mapped(blobs, manifest, name).map_err(|error| {
@@ -330,39 +330,38 @@ fn from_files<T>(
     })
 }
 
-/// A tensor on the host.
+/// A row-major tensor in host memory.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HostTensor<T: Pod> {
-    /// Its shape.
+    /// Sizes of the axes.
     pub shape: Vec<usize>,
-    /// Row-major values.
     pub values: Values<T>,
 }
 
 impl<T: Pod> HostTensor<T> {
-    /// Wraps values of a shape.
+    /// Wraps values with their shape.
     ///
     /// # Panics
-    /// If the counts differ.
+    /// If the number of values does not match the shape.
     pub fn new(shape: impl Into<Vec<usize>>, values: impl Into<Values<T>>) -> Self {
         let (shape, values) = (shape.into(), values.into());
         assert_eq!(shape.iter().product::<usize>(), values.len(), "values for shape {shape:?}");
         Self { shape, values }
     }
 
-    /// Values in one row, that is in everything but the first axis.
+    /// Number of values in one row, that is in all axes but the first.
     pub fn row_len(&self) -> usize {
         self.shape.iter().skip(1).product()
     }
 
-    /// Row `i`.
+    /// Row `i`, all values at that index of the first axis.
     pub fn row(&self, i: usize) -> &[T] {
         let n = self.row_len();
         &self.values[i * n..(i + 1) * n]
     }
 }
 
-/// Named tensors on their way into or out of a safetensors file.
+/// Named tensors to be written to or read from a safetensors file.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Tensors {
     floats: BTreeMap<String, HostTensor<f32>>,
@@ -384,7 +383,7 @@ impl Tensors {
         self
     }
 
-    /// The bytes of a safetensors file; the same tensors always give the same bytes.
+    /// Serialises a safetensors file; the same tensors always give the same bytes.
     pub fn to_bytes(&self) -> Result<Vec<u8>, StageError> {
         let mut raw: BTreeMap<&str, (Dtype, &[usize], Vec<u8>)> = BTreeMap::new();
         for (name, tensor) in &self.floats {
@@ -404,7 +403,7 @@ impl Tensors {
         safetensors::serialize(views, None::<HashMap<String, String>>).map_err(fault)
     }
 
-    /// Reads a safetensors file of f32 and i64 tensors, whose values stay where the bytes are; `what` names it in errors.
+    /// Reads a safetensors file of f32 and i64 tensors without copying their values; `what` names it in errors.
     pub fn from_bytes(bytes: Bytes, what: &str) -> Result<Self, StageError> {
         let bad = |text: String| StageError::Context(ContextError::Corrupt(format!("{what}: {text}")));
         let parsed = SafeTensors::deserialize(&bytes).map_err(|e| bad(e.to_string()))?;
@@ -457,11 +456,11 @@ impl Tensors {
 /// Caption embeddings with their meta.
 #[derive(Debug, Clone)]
 pub struct Embeddings {
-    /// What they are.
+    /// Meta of the artifact.
     pub meta: EmbeddingsMeta,
-    /// `[captions, dim]`.
+    /// Embeddings of shape `[captions, dim]`.
     pub captions: HostTensor<f32>,
-    /// The empty caption, `[dim]`.
+    /// Embedding of the empty caption, `[dim]`.
     pub null: Vec<f32>,
 }
 
@@ -488,7 +487,7 @@ impl Embeddings {
 /// VAE posteriors with their meta.
 #[derive(Debug, Clone)]
 pub struct Latents {
-    /// What they are.
+    /// Meta of the artifact.
     pub meta: LatentsMeta,
     /// Posterior means, `[rows, N, d]`.
     pub mu: HostTensor<f32>,
@@ -513,7 +512,7 @@ impl Latents {
         Ok(Self { meta, mu, sigma })
     }
 
-    /// Entries.
+    /// Number of dataset entries.
     pub fn entries(&self) -> usize {
         self.meta.splits.len()
     }

@@ -1,7 +1,7 @@
-//! What a stage may ask of the world.
+//! The interface of a stage to the world.
 //!
 //! `worker` implements it over HTTP and TCP; tests implement it in memory. A stage owns its thread and is synchronous:
-//! no clock, no environment, no network, no global generator of its own.
+//! it has no clock, environment, network or global generator of its own.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -11,10 +11,10 @@ use checkpoint::Blobs;
 use protocol::message::{FailureClass, StageTask};
 use protocol::{Digest, Manifest};
 
-/// Why the world said no.
+/// An error of the context.
 #[derive(Debug, thiserror::Error)]
 pub enum ContextError {
-    /// This attempt is over for us: another holds the grant, or the run was cancelled. Nothing more may be written.
+    /// This attempt has ended: another holds the grant, or the run was cancelled. Nothing more may be written.
     #[error("the grant of this attempt has ended: {0}")]
     GrantEnded(String),
     /// The store or the network failed after retries.
@@ -23,7 +23,7 @@ pub enum ContextError {
     /// The store is full or not writable.
     #[error("{0}")]
     Storage(String),
-    /// A stored object is whole and does not hold what it should.
+    /// A stored object is intact but has the wrong contents.
     #[error("{0}")]
     Corrupt(String),
     /// A stored object is damaged or missing.
@@ -31,10 +31,10 @@ pub enum ContextError {
     Damaged(String),
 }
 
-/// Why a stage failed. The message does not name the stage: its caller knows which one it was.
+/// An error of a stage. The message does not name the stage; the caller adds the name.
 #[derive(Debug, thiserror::Error)]
 pub enum StageError {
-    /// The user's data or settings; the message names file, line or field, what was expected and what to do.
+    /// The user's data or settings; the message names file, line or field, the expected value and the remedy.
     #[error("{0}")]
     Input(String),
     /// The loss or the gradient norm is not finite.
@@ -47,16 +47,16 @@ pub enum StageError {
         /// Global gradient norm before clipping.
         norm: f64,
     },
-    /// The world said no.
+    /// An error of the context.
     #[error(transparent)]
     Context(#[from] ContextError),
-    /// A fault of ours.
+    /// An internal fault.
     #[error("{0}")]
     Fault(String),
 }
 
 impl StageError {
-    /// What this says about trying again.
+    /// The failure class, which decides about retries.
     pub fn class(&self) -> FailureClass {
         match self {
             Self::Input(_) => FailureClass::Input,
@@ -70,62 +70,62 @@ impl StageError {
     }
 }
 
-/// How an attempt ended, short of an error.
+/// End of an attempt without an error.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Outcome {
     /// The output is uploaded.
     Finished {
-        /// Its manifest.
+        /// Manifest of the output.
         output: Digest,
-        /// Final values.
+        /// Final metrics by name.
         metrics: BTreeMap<String, f64>,
     },
     /// Stopped between steps with a checkpoint committed; the next attempt continues from `at`.
     Yielded {
-        /// Steps applied.
+        /// Number of steps applied.
         at: u64,
     },
 }
 
-/// What a member of a gang finds when it (re)joins.
+/// Position of a member that joins or rejoins a gang.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Rendezvous {
-    /// Nobody is ahead: go on from the state you have.
+    /// No peer is ahead; continue from your own state.
     Keep,
-    /// A peer is ahead, or you have just started: [`GangContext::adopt`] its state.
+    /// A peer is ahead, or you have just started; [`GangContext::adopt`] its state.
     Behind,
 }
 
-/// What became of taking over a peer's state.
+/// Result of adopting a peer's state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Adopted {
-    /// All of it is there.
+    /// The state is complete.
     Whole,
-    /// The members changed meanwhile: [`GangContext::rendezvous`] again. A member that came with a state of its own still has it; what
-    /// one that had only initialised itself has now is of no use.
+    /// The members changed during the transfer; call [`GangContext::rendezvous`] again. A member that had a state of
+    /// its own still has it. A member that had only initialised itself must not use its state.
     Cut,
 }
 
-/// What an exchange gave.
+/// Result of an exchange between members.
 #[derive(Debug)]
 pub enum Exchange {
     /// The sum over all slices of the step, along the fixed tree.
     Sum {
         /// Element-wise sum.
         sum: Vec<f32>,
-        /// The same for all members: stop after applying this step (save, then yield).
+        /// Equal for all members: stop after applying this step (save, then yield).
         drain: bool,
     },
-    /// The membership changed before the sum was complete. Call [`GangContext::rendezvous`], then compute what is yours and
-    /// was not computed yet.
+    /// The membership changed before the sum was complete. Call [`GangContext::rendezvous`], then compute those of your
+    /// slices that are not computed yet.
     Regroup,
 }
 
-/// What every stage may ask.
+/// The requests that every stage may make.
 pub trait AttemptContext {
-    /// What to do.
+    /// The settings and inputs of this task.
     fn task(&self) -> &StageTask;
-    /// Where to compute: the plain device. Training takes `.autodiff()` of it.
+    /// The device to compute on, without autodiff. Training uses its `.autodiff()`.
     fn device(&self) -> burn::tensor::Device;
     /// Reads and stages blobs; every blob read is verified against its digest.
     fn blobs(&self) -> Arc<dyn Blobs>;
@@ -133,49 +133,50 @@ pub trait AttemptContext {
     fn manifest(&self, digest: Digest) -> Result<Manifest, ContextError>;
     /// Uploads a manifest whose blobs are uploaded, and returns its digest.
     fn put_manifest(&mut self, manifest: &Manifest) -> Result<Digest, ContextError>;
-    /// Says how far the work is. Never fails, never blocks.
+    /// Reports progress. Never fails, never blocks.
     fn progress(&mut self, done: u64, total: u64, unit: &str, metrics: &[(&str, f64)]);
-    /// Records values of a step, exactly once whatever is retried. Never fails, never blocks. Rank 0 only writes.
+    /// Records values of a step, exactly once in spite of retries. Never fails, never blocks. Rank 0 only writes.
     fn record(&mut self, step: u64, metrics: &[(&str, f64)]);
-    /// A line for the user's log.
+    /// Writes a line to the user's log.
     fn log(&mut self, line: &str);
-    /// Whether the grant has ended or a stop was asked for; long loops without steps ask now and then.
+    /// Returns true if the grant has ended or a stop was requested. Long loops without steps check it regularly.
     fn interrupted(&self) -> bool;
 }
 
-/// What a gang stage may ask besides.
+/// The additional requests of a gang stage.
 pub trait GangContext: AttemptContext {
     /// The newest committed checkpoint of this task.
     fn latest_checkpoint(&self) -> Result<Option<Manifest>, ContextError>;
 
-    /// Meets the other members of the current generation. `applied` is the number of steps in the caller's state, `None`
-    /// when it has only initialised itself; `state` is its bytes, piece after piece, for a peer that needs them.
+    /// Meets the other members of the current generation. `applied` is the number of steps in the caller's state,
+    /// `None` if it has only initialised itself. `state` is its bytes, in pieces, for a peer that needs them.
     fn rendezvous(&mut self, applied: Option<u64>, state: &[&[u8]]) -> Result<Rendezvous, ContextError>;
 
-    /// After [`Rendezvous::Behind`]: fills `state`, cut as the caller likes, with the bytes of the peer that is ahead. Those of a member
-    /// that had only initialised itself arrive where they belong, so that a large state is in memory once.
+    /// Follows [`Rendezvous::Behind`]: fills `state`, cut as the caller likes, with the bytes of the peer that is
+    /// ahead. A member that had only initialised itself receives them in place, so that a large state is in memory
+    /// once.
     fn adopt(&mut self, state: &mut [&mut [u8]]) -> Result<Adopted, ContextError>;
 
-    /// The slices of the coming step that are this worker's: a contiguous range of `0..slices`. Changes only with
-    /// [`rendezvous`](Self::rendezvous).
+    /// This worker's slices of the coming step, a contiguous range of `0..slices`. Only
+    /// [`rendezvous`](Self::rendezvous) changes it.
     fn share(&self, slices: usize) -> Range<usize>;
 
-    /// Sums `parts` over all slices of `step`, no matter which member computed them, along the fixed binary tree over `0..slices`.
-    /// `parts` are this worker's slices in order: all vectors of one length.
+    /// Sums `parts` over all slices of `step` from all members, along the fixed binary tree over `0..slices`. `parts`
+    /// are this worker's slices in order: vectors of equal length.
     fn exchange(&mut self, step: u64, slices: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError>;
 
-    /// Whether this member is rank 0, which alone saves, records and reports.
+    /// Returns true for rank 0, the only member that saves, records and reports.
     fn leads(&self) -> bool;
 
-    /// Waits with the caller's state in memory while rank 0 saves and reports the last step. Returns once the members have changed:
-    /// then [`rendezvous`](Self::rendezvous), and if this member leads now, the last save is its own.
+    /// Waits with the caller's state in memory while rank 0 saves and reports the last step. Returns after a change of
+    /// the members. The caller then calls [`rendezvous`](Self::rendezvous); if it leads now, it makes the last save.
     ///
     /// # Errors
-    /// [`ContextError::GrantEnded`] once what rank 0 reported is acknowledged: nothing is left to do.
+    /// [`ContextError::GrantEnded`] once the report of rank 0 is acknowledged: the work is complete.
     fn hold(&mut self) -> Result<(), ContextError>;
 
-    /// Whether a checkpoint could be stored now. A member that keeps its state in memory loses nothing by saving later, so
-    /// training does not wait at a due checkpoint for a coordinator that is away.
+    /// Returns true if a checkpoint could be stored now. A member that keeps its state in memory loses nothing by
+    /// saving later. So training does not wait at a due checkpoint for a coordinator that is away.
     fn can_save(&self) -> bool {
         true
     }
@@ -189,19 +190,19 @@ pub trait GangContext: AttemptContext {
     ) -> Result<(), ContextError>;
 }
 
-/// What a map stage's shard or merge is.
+/// The part of a map stage that a task computes.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Part {
-    /// One shard.
+    /// One shard of the work.
     Shard {
-        /// Which.
+        /// Index of the shard, from 0.
         index: usize,
-        /// Of how many.
+        /// Number of shards.
         of: usize,
     },
-    /// All shards' artifacts, in order.
+    /// The merge of all shards' artifacts, in order.
     Merge {
-        /// Shard manifests.
+        /// Manifests of the shards.
         shards: Vec<Digest>,
     },
 }

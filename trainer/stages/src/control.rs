@@ -1,5 +1,5 @@
-//! The part of a model that makes its denoiser heed the positions that a motion is told to pass. Source: MotionLCM (Dai et al., ECCV 2024; v2 of
-//! late 2024). Its training is `train.control`; the positions are [`Hint`]s.
+//! The part of a model that steers its denoiser towards given joint positions. Source: MotionLCM (Dai et al., ECCV
+//! 2024; v2 of late 2024). Stage `train.control` trains it; the positions are [`Hint`]s.
 
 use burn::tensor::Device;
 use checkpoint::Blobs;
@@ -20,21 +20,21 @@ use crate::weights;
 
 /// Added to variances in layer norms.
 const NORM_EPS: f64 = 1e-5;
-/// What names of the ControlNet's weights begin with, as in MotionLCM's checkpoints.
+/// Prefix of the ControlNet's weights, as in MotionLCM's checkpoints.
 pub(crate) const CONTROLNET_PREFIX: &str = "controlnet.";
-/// What names of the trajectory encoder's weights begin with.
+/// Prefix of the trajectory encoder's weights.
 pub(crate) const TRAJECTORY_PREFIX: &str = "traj_encoder.";
-/// What names of the feedback network's weights begin with.
+/// Prefix of the feedback network's weights.
 pub(crate) const FEEDBACK_PREFIX: &str = "feedback.";
 
-/// How told positions are heeded.
+/// Strength of the steering towards given positions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Heed {
-    /// What the ControlNet's residuals, and what feedback changes, are multiplied by; 1 as trained, 0 not at all.
+    /// Factor on the ControlNet's residuals and on the changes by feedback; 1 as trained, 0 for none.
     pub scale: f64,
-    /// Rounds of feedback; `None` as many as the control part was trained with.
+    /// Rounds of feedback; `None` for the number used in training.
     pub feedback: Option<usize>,
-    /// Steps of descent that the drawn latents are refined by.
+    /// Steps of gradient descent that refine the drawn latents.
     pub refine: usize,
 }
 
@@ -47,9 +47,9 @@ impl Default for Heed {
 /// Meta of an artifact of kind `control`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ControlMeta {
-    /// The skeleton whose joints are told.
+    /// The skeleton whose joints have targets.
     pub format: DataFormat,
-    /// What was told in training.
+    /// The hints of the training.
     pub hints: ControlHints,
     /// Width of the layers between trajectory tokens and ControlNet.
     pub embedding: usize,
@@ -57,14 +57,15 @@ pub struct ControlMeta {
     pub network: Network,
     /// Mean of the joints' coordinates, `[joints x 3]` in metres.
     pub mean: Vec<f32>,
-    /// Their deviation.
+    /// Standard deviation of the joints' coordinates, `[joints x 3]` in metres.
     pub std: Vec<f32>,
-    /// The denoiser whose copy the ControlNet is; for another one it says nothing.
+    /// The denoiser that the ControlNet was copied from; it works for no other one.
     pub fits: Parts,
-    /// A Linear behind the trajectory encoder. Where nothing is said there is one if a latent token has another width than it.
+    /// True if a Linear follows the trajectory encoder. `None` means that it exists if the width of a latent token
+    /// differs from the encoder's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub projection: Option<bool>,
-    /// Rounds of feedback; 0 has no network for it.
+    /// Rounds of feedback; 0 means that there is no feedback network.
     #[serde(default, skip_serializing_if = "none")]
     pub feedback: usize,
 }
@@ -74,14 +75,14 @@ fn none(rounds: &usize) -> bool {
 }
 
 impl ControlMeta {
-    /// A fresh ControlNet for a denoiser; what the two have in common is not copied yet. In v2, whose latents are projected, its condition has
-    /// activations.
+    /// Creates a ControlNet for a denoiser, before the shared weights are copied. In v2, whose latents are projected,
+    /// its condition has activations.
     pub fn controlnet(&self, denoiser: &DenoiserMeta, init: &mut Init<'_>) -> Denoiser {
         let config = denoiser.config();
         Denoiser::controlnet(&config, self.embedding, config.projection, init)
     }
 
-    /// A fresh trajectory encoder, whose tokens are shaped as the denoiser's latents are.
+    /// Creates a trajectory encoder; its tokens have the shape of the denoiser's latents.
     pub fn trajectory(&self, denoiser: &DenoiserMeta, init: &mut Init<'_>) -> TrajectoryEncoder {
         let config = TrajectoryConfig {
             joints: self.mean.len() / AXES,
@@ -97,7 +98,7 @@ impl ControlMeta {
         TrajectoryEncoder::new(&config, init)
     }
 
-    /// A fresh feedback network, if there is one, for latents as the denoiser's.
+    /// Creates a feedback network for the denoiser's latents, if the part has one.
     pub fn feedback(&self, denoiser: &DenoiserMeta, init: &mut Init<'_>) -> Option<Feedback> {
         let Network { width, layers, heads, feed_forward, .. } = self.network;
         let config = FeedbackConfig {
@@ -121,7 +122,7 @@ pub struct TrainedControl {
 }
 
 impl TrainedControl {
-    /// Reads an artifact of kind `control`, made for a denoiser of this meta.
+    /// Reads an artifact of kind `control` for a denoiser with this meta.
     pub fn read(
         blobs: &dyn Blobs,
         manifest: &Manifest,
@@ -145,12 +146,13 @@ impl TrainedControl {
         Ok(Self { control, trajectory, feedback: feedback.transpose()?, meta, device })
     }
 
-    /// What it is.
+    /// Meta of the artifact.
     pub fn meta(&self) -> &ControlMeta {
         &self.meta
     }
 
-    /// Latents `[batch, N, d]` of motions of `lengths` frames after the rounds of feedback that are asked for, on how far their motions are from `hints`.
+    /// Corrects latents `[batch, N, d]` of motions of `lengths` frames by rounds of feedback on the distance of their
+    /// motions from `hints`.
     pub(crate) fn correct(
         &self,
         vae: &Autoencoder,
@@ -167,7 +169,7 @@ impl TrainedControl {
         }
     }
 
-    /// What steers a batch that is told `hints`, with residuals multiplied by `scale`.
+    /// The steering of a batch with `hints`, its residuals multiplied by `scale`.
     pub fn steer(&self, hints: &[Hint], scale: f64) -> Steering<'_> {
         let hints = NormalisedHints::of(hints, &self.meta.mean, &self.meta.std).on(&self.device);
         let tokens_bnd = self.trajectory.forward(&hints, &mut Dropout::off());

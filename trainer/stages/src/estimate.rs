@@ -1,11 +1,13 @@
-//! What a pipeline would cost on this machine: each stage is tried at its real size on a few made-up clips, and timed.
+//! Estimates the cost of a pipeline on this machine: each stage is run at its real size on a few made-up clips, and
+//! timed.
 //!
-//! Nothing is read but the pipeline, and nothing is kept, so a pipeline has an estimate before its data is there. A training stage makes a few
-//! updates of a slice of two examples; the time of an update is that of its batch at this pace. An evaluation draws a few motions. Both are paces of small
-//! batches, which a large one may beat, of clips of the mean length of HumanML3D, by one thread. Published text encoders are not tried: the built-in one
-//! stands in for them, with vectors of its own width. The teacher's samples that `match` compares with are left out.
+//! It reads only the pipeline and keeps nothing, so a pipeline has an estimate before its data exists. A training stage
+//! makes a few updates of a slice of two examples; the time of an update is that of its batch at this pace. An
+//! evaluation draws a few motions. Both are paces of small batches, which a large one may exceed, of clips with
+//! HumanML3D's mean length, on one thread. Published text encoders are not run: the built-in one replaces them, with
+//! vectors of its own width. The teacher's samples for `match` are left out.
 //!
-//! Not a stage: the clock is read.
+//! Not a stage: it reads the clock.
 
 mod stand_in;
 
@@ -30,30 +32,30 @@ use crate::context::{AttemptContext, Outcome, Part, StageError};
 use crate::kinds;
 use crate::solo::{Overlay, Solo};
 
-/// Updates that are tried; the first is not timed.
+/// Number of updates made; the first is not timed.
 pub const STEPS: u64 = 4;
-/// Examples of each.
+/// Number of examples in each update.
 pub const EXAMPLES: usize = 2;
-/// Samplers of more steps are timed with so many, and half of them.
+/// Samplers with more steps are timed with this many and with half of them.
 const SAMPLED: usize = 4;
 
-/// What a stage takes.
+/// The cost of one stage.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Estimate {
-    /// Parameters of what it trains.
+    /// Number of parameters that the stage trains.
     pub parameters: Option<u64>,
-    /// Seconds of one worker.
+    /// Duration on one worker, in seconds.
     pub seconds: Option<f64>,
 }
 
-/// Entries of a dataset by split.
+/// Number of entries of a dataset by split.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Entries {
-    /// Of `train.txt`.
+    /// Entries in `train.txt`.
     pub train: usize,
-    /// Of `val.txt`.
+    /// Entries in `val.txt`.
     pub val: usize,
-    /// Of `test.txt`.
+    /// Entries in `test.txt`.
     pub test: usize,
 }
 
@@ -68,7 +70,8 @@ impl Entries {
     }
 }
 
-/// An estimate for each stage that can be tried, until `budget` is spent; a sweep counts all its trials. `entries` are those of each dataset stage.
+/// Estimates each stage that can be run, until `budget` is spent; a sweep counts all its trials. `entries` are those of
+/// each dataset stage.
 pub fn estimate(
     pipeline: &Pipeline,
     entries: &BTreeMap<StageName, Entries>,
@@ -83,7 +86,7 @@ pub fn estimate(
         if begun.elapsed() > budget {
             break;
         }
-        // One that cannot be tried has no estimate, and neither have those that read it.
+        // A stage that cannot be run has no estimate, and neither have its readers.
         if let Ok(estimate) = tries.stage(stage) {
             found.insert(stage.name.clone(), estimate);
         }
@@ -96,7 +99,7 @@ struct Tries<'a> {
     entries: &'a BTreeMap<StageName, Entries>,
     device: Device,
     blobs: Arc<Overlay>,
-    /// What the stages gave that were tried.
+    /// Outputs of the stages that were run.
     outputs: BTreeMap<StageName, Digest>,
 }
 
@@ -113,7 +116,7 @@ impl Tries<'_> {
             StageSettings::ImportEvaluator(ImportEvaluator { format, .. }) => {
                 return self.stand_in(stage, |cx| stand_in::evaluator(cx, *format));
             }
-            // Published encoders take longer to be read than all else here.
+            // Reading published encoders takes longer than everything else here.
             StageSettings::TextEmbed(text) if text.encoder != TextEncoder::Hashed => {
                 let hashed = TextEmbed { dataset: text.dataset.clone(), ..TextEmbed::default() };
                 let tried = self.run(stage, hashed.into(), self.inputs(stage)?)?;
@@ -131,7 +134,7 @@ impl Tries<'_> {
             (tried.output, tried.pace.map(|pace| pace * share * steps * trainings(stage)))
         } else {
             match settings.sampler() {
-                // Longer samplers: their time is a straight line over the steps.
+                // The time of longer samplers is extrapolated linearly in the steps.
                 Some(sampler) if sampler.steps > SAMPLED && sampler.timesteps.is_empty() => {
                     let with = |steps| Sampler { steps, ..sampler.clone() };
                     let half = tried(reduced(settings, Some(&with(SAMPLED / 2)))?)?;
@@ -153,7 +156,7 @@ impl Tries<'_> {
         Ok(Estimate { parameters, seconds })
     }
 
-    /// What the stage reads, of what was tried before it; not the teacher that `match` asks.
+    /// The inputs of the stage, from stages that were run before; without the teacher of `match`.
     fn inputs(&self, stage: &PipelineStage) -> Result<BTreeMap<String, Digest>, StageError> {
         let measures = stage.settings.output().kind == ArtifactKind::Report;
         let read = stage.inputs.iter().filter(|input| !(measures && input.field == "teacher"));
@@ -205,7 +208,7 @@ impl Tries<'_> {
             Shape::Map => {
                 let shard = given(kinds::run_part(&mut cx, Part::Shard { index: 0, of: 1 })?)?;
                 match cx.task().settings.output().kind {
-                    // Nobody reads a report, and that of so few motions need not make sense.
+                    // The report is unused, and with so few motions it may be meaningless.
                     ArtifactKind::Report => shard,
                     _ => given(kinds::run_part(&mut cx, Part::Merge { shards: vec![shard] })?)?,
                 }
@@ -217,7 +220,7 @@ impl Tries<'_> {
         Ok(Tried { output, pace })
     }
 
-    /// How often a map stage does what was timed.
+    /// The number of times a map stage repeats the timed work.
     fn units(&self, settings: &StageSettings) -> f64 {
         let settings_json = serde_json::to_value(settings).unwrap_or_default();
         let of = |split: Split| -> f64 {
@@ -240,7 +243,7 @@ impl Tries<'_> {
         }
     }
 
-    /// Values of the weights of `output` that are not those of its inputs.
+    /// Number of values in the weight files of `output` that are not files of its inputs.
     fn parameters(&self, output: Digest, inputs: &BTreeMap<String, Digest>) -> Option<u64> {
         let manifest =
             |digest: Digest| -> Option<Manifest> { serde_json::from_slice(&self.blobs.get(digest).ok()?).ok() };
@@ -260,13 +263,13 @@ impl Tries<'_> {
     }
 }
 
-/// What a stage gave, and the seconds from one progress to the next.
+/// The output of a stage, and the seconds between progress reports.
 struct Tried {
     output: Digest,
     pace: Option<f64>,
 }
 
-/// How many trainings of the stage's length a sweep comes to.
+/// The number of trainings of the stage's length in a sweep.
 fn trainings(stage: &PipelineStage) -> f64 {
     let Some(sweep) = &stage.sweep else { return 1.0 };
     let (budget, trials) = (stage.settings.steps().map_or(1, |steps| steps.0.max(1)), sweep.trials());
@@ -281,7 +284,7 @@ fn trainings(stage: &PipelineStage) -> f64 {
     steps as f64 / budget as f64
 }
 
-/// The settings with one slice of few examples and few steps, and how many such slices a batch comes to.
+/// The settings with one slice of few examples and few steps, and the number of such slices in a batch.
 fn reduced_training(settings: &StageSettings) -> Result<(StageSettings, f64), StageError> {
     let Some(training) = settings.training() else { return Err(StageError::Fault("it does not train".into())) };
     let examples = training.batch.global.clamp(1, EXAMPLES);
@@ -290,7 +293,7 @@ fn reduced_training(settings: &StageSettings) -> Result<(StageSettings, f64), St
     json["steps"] = json!(STEPS);
     json["warmup"] = json!(0);
     json["batch"] = json!({"global": examples, "slices": 1});
-    // Phases have batches of their own.
+    // Phases have their own batches.
     for phase in ["windows", "movement"] {
         if let Some(batch) = json[phase]["batch"].as_u64().filter(|batch| *batch > 0) {
             json[phase]["batch"] = json!(((batch as f64 / share).round() as u64).max(1));
@@ -299,7 +302,7 @@ fn reduced_training(settings: &StageSettings) -> Result<(StageSettings, f64), St
     Ok((without_files(json)?, share))
 }
 
-/// The settings of a map or plain stage, over all of the few clips.
+/// The settings of a map or plain stage, applied to all of the few clips.
 fn reduced(settings: &StageSettings, sampler: Option<&Sampler>) -> Result<StageSettings, StageError> {
     let mut json = to_json(settings)?;
     let changes = [
@@ -329,7 +332,7 @@ fn to_json(settings: &StageSettings) -> Result<Value, StageError> {
     serde_json::to_value(settings).map_err(|e| StageError::Fault(e.to_string()))
 }
 
-/// Settings that read no folder.
+/// The settings without folders to read.
 fn without_files(mut json: Value) -> Result<StageSettings, StageError> {
     if json.get("words").is_some() {
         json["words"] = json!("");

@@ -1,8 +1,9 @@
-//! A trained evaluator out of its artifact: captions and motions in, embeddings out.
+//! A trained evaluator from its artifact: embeds captions and motions.
 //!
-//! Motions come in the data's own scale and are normalised with the evaluator's statistics, whatever the model was trained with. Padding
-//! is zero in that space, and a motion always has a movement of it behind its end, so that an embedding does not depend on the batch.
-//! Source: Guo et al.'s own loader, which pads to 196 frames. Departs: a motion of 196 frames, too, has padding behind it.
+//! Motions are in the data's own scale and are normalised with the evaluator's statistics, independently of the
+//! model's. Padding is zero after normalisation. Every motion has at least one movement of padding after its end, so an
+//! embedding does not depend on the batch. Source: Guo et al.'s own loader, which pads to 196 frames. Departs: a motion
+//! of 196 frames is padded too.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
@@ -21,23 +22,23 @@ use crate::kinds::word;
 use crate::weights;
 use crate::words::{CLASSES, WORD_WIDTH, WORDS, Words, WordsMeta};
 
-/// Frames of a movement.
+/// Number of frames of a movement.
 pub const UNIT: usize = 4;
 
 /// Meta of an artifact of kind `evaluator`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EvaluatorMeta {
-    /// The data it was trained on.
+    /// Format of the training data.
     pub format: DataFormat,
-    /// Sizes.
+    /// Sizes of the networks.
     pub config: EvaluatorConfig,
-    /// What it subtracts of features, `[features]`, contacts included.
+    /// Mean subtracted from features, `[features]`, contacts included.
     pub mean: Vec<f32>,
-    /// What it divides them by.
+    /// Deviation that divides features, `[features]`.
     pub std: Vec<f32>,
-    /// Which word vectors it reads.
+    /// Meta of its word vectors.
     pub words: WordsMeta,
-    /// `trained` or `imported`.
+    /// Origin of the weights, `trained` or `imported`.
     pub origin: String,
 }
 
@@ -68,7 +69,7 @@ pub fn publish(
     draft.finish(cx)
 }
 
-/// `(x - mean) / std` on rows.
+/// Computes `(x - mean) / std` on rows in place.
 pub fn normalise(rows: &mut [f32], mean: &[f32], std: &[f32]) {
     for row in rows.chunks_exact_mut(mean.len()) {
         for ((value, mean), std) in row.iter_mut().zip(mean).zip(std) {
@@ -97,7 +98,7 @@ impl TrainedEvaluator {
         Ok(Self { network, meta, words, device })
     }
 
-    /// What it is.
+    /// Meta of the artifact.
     pub fn meta(&self) -> &EvaluatorMeta {
         &self.meta
     }
@@ -107,12 +108,12 @@ impl TrainedEvaluator {
         self.meta.config.embedding
     }
 
-    /// Its weights, under the published names.
+    /// The weights under the published names.
     pub fn weights(&self) -> Vec<u8> {
         save(&self.network)
     }
 
-    /// Embeddings `[captions, width]`.
+    /// Embeds captions as `[captions, width]`.
     pub fn captions<'a>(&self, captions: impl IntoIterator<Item = &'a Caption>) -> Vec<f32> {
         let batch = self.words.batch(captions);
         let count = batch.lengths.len();
@@ -121,7 +122,7 @@ impl TrainedEvaluator {
         host(self.network.text_encoder.forward(words, classes, &batch.lengths))
     }
 
-    /// Embeddings `[motions, width]` of motions of features `[frames, features]` each, in the data's own scale.
+    /// Embeds motions as `[motions, width]`; each motion is `[frames, features]` in the data's own scale.
     pub fn motions(&self, motions: &[Vec<f32>]) -> Vec<f32> {
         let width = self.meta.mean.len();
         let lengths: Vec<usize> = motions.iter().map(|m| m.len() / width).collect();
@@ -136,8 +137,8 @@ impl TrainedEvaluator {
         host(self.network.motion(rows, &lengths))
     }
 
-    /// Embeddings [B, width] of motions [B, T, F] that were normalised with `mean` and `std`, of which the first `lengths[b]` frames count.
-    /// Gradients flow to the motions; the evaluator has none. As [`motions`](Self::motions) otherwise.
+    /// Embeds motions [B, T, F] normalised with `mean` and `std` as [B, width]; the first `lengths[b]` frames are
+    /// valid. Gradients flow to the motions, not to the evaluator. Otherwise as [`motions`](Self::motions).
     pub fn embed_normalised(&self, x_btf: Tensor<3>, lengths: &[usize], mean: &[f32], std: &[f32]) -> Tensor<2> {
         let [batch, have, width] = x_btf.dims();
         let device = x_btf.device();
@@ -157,10 +158,11 @@ impl TrainedEvaluator {
         self.network.motion(x * Tensor::<3>::from_data(TensorData::new(live, [batch, frames, 1]), &device), lengths)
     }
 
-    /// Refuses data that it was not made for: another skeleton, or features on another scale.
+    /// Refuses data with another skeleton than the evaluator's, or with features on another scale.
     ///
-    /// A scale is told by the deviations of positions, rotations and velocities and by how far their means are off. Another body
-    /// of motion moves these a little; metres for millimetres, or features that are normalised already, far.
+    /// The scale is estimated from the deviations of positions, rotations and velocities, and the distance of their
+    /// means. Another body of motion changes these little. Metres in place of millimetres, or features normalised
+    /// before, change them greatly.
     pub fn check(&self, dataset: &Dataset, entries: &[usize]) -> Result<(), StageError> {
         let ours = self.meta.format;
         if dataset.format != ours {
@@ -197,9 +199,9 @@ impl TrainedEvaluator {
     }
 }
 
-/// How many times wider or narrower features may deviate than those that the evaluator was trained on.
+/// Largest allowed ratio between the deviations of the features and those of the evaluator's training data.
 const MOST_RATIO: f64 = 4.0;
-/// How many deviations their mean may be off.
+/// Largest allowed distance of their means, in deviations.
 const MOST_SHIFT: f64 = 2.5;
 
 fn host(tensor: Tensor<2>) -> Vec<f32> {

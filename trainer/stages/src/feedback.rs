@@ -1,11 +1,13 @@
-//! Rounds of feedback: a drawn latent is decoded, its motion held against the positions that it was told, and the latent changed by what a
-//! [`Feedback`] network makes of the difference. Its sources stand there; for motions it is ours. Not its job: what trains it (`train.control`).
+//! Rounds of feedback: a drawn latent is decoded, its motion compared with the target positions, and the latent changed
+//! by a [`Feedback`] network. The network's module lists the sources; the use for motions is ours. Not its job: the
+//! training (`train.control`).
 //!
-//! The network is told of each frame where the root is and which way it faces, and of each joint that is told there how far it is off and how fast that
-//! grows, seen from the root: a latent says how a motion goes on from frame to frame, in the root's own directions, and a path says where it should be.
-//! Distances are divided by the motion's own root mean square distance, and the change multiplied by it, so that a small error is answered as precisely as
-//! a large one and a motion that passes its positions stays as it is. Each motion's result depends on that motion alone, and is what the round that came
-//! nearest gave: on a path unlike those of training a round may lead away.
+//! The inputs of a frame are the root's place and facing direction. Each joint with a target adds its distance from the
+//! target and the growth of that distance, seen from the root. The root is needed because a latent describes motion
+//! from frame to frame in the root's own directions, but a path is in world coordinates. Distances are divided by the
+//! motion's root mean square distance, and the change is multiplied by it. So a small error is corrected as precisely
+//! as a large one, and a motion that meets its targets is not changed. Each motion's result depends on that motion
+//! alone. It is the result of the best round: on a path unlike those of training a round may increase the error.
 
 use burn::tensor::{Tensor, TensorData};
 use models::kernels::Dropout;
@@ -17,34 +19,36 @@ use motion::quaternion::{self as quat, Vec3};
 use crate::hint::Hint;
 use crate::networks::Autoencoder;
 
-/// What is told of the root: height and place, the direction that it faces, and the logarithm of the motion's mean distance.
+/// Inputs of the root: height, place, facing direction, and the logarithm of the motion's mean distance.
 const ROOT: usize = 6;
-/// What is told of a joint: whether it is told, three coordinates of its distance, and three of how that changes.
+/// Inputs of a joint: a flag for its target, three coordinates of its distance, and three of the distance's change.
 const JOINT: usize = 7;
-/// Distances are taken to be at least this, metres.
+/// Lower limit of distances, metres.
 const LEAST: f64 = 1e-3;
-/// And changes are made as for at most this, metres: far off, a latent that is right is another one, not one much further away.
+/// Upper limit of the distance that scales a change, metres. Far from the target the right latent is another one, not
+/// the same changed further.
 const MOST: f64 = 1.0;
 
-/// How many numbers are told of a frame of a skeleton of so many joints.
+/// Number of inputs of a frame for a skeleton of `joints` joints.
 pub(crate) fn inputs(joints: usize) -> usize {
     ROOT + JOINT * joints
 }
 
-/// What a network is told of a batch of motions.
+/// Inputs of the network for a batch of motions.
 #[derive(Debug)]
 pub(crate) struct Seen {
-    /// [B, T, inputs].
+    /// Inputs of shape [B, T, inputs].
     frames_btf: Tensor<3>,
-    /// What changes are multiplied by [B, 1, 1].
+    /// Factor on changes [B, 1, 1].
     scale_b11: Tensor<3>,
-    /// Each motion's root mean square distance, metres; 0 if nothing is told of it.
+    /// Root mean square distance of each motion, metres; 0 without targets.
     distances: Vec<f64>,
     lengths: Vec<usize>,
 }
 
 impl Seen {
-    /// Of motions as a VAE decodes them, [B, T, D] and normalised, motion b having `lengths[b]` frames and being told `hints[b]`.
+    /// Computes inputs from decoded, normalised motions [B, T, D]. Motion b has `lengths[b]` frames and the targets
+    /// `hints[b]`.
     pub(crate) fn of(vae: &Autoencoder, features: Tensor<3>, lengths: &[usize], hints: &[Hint]) -> Self {
         let skeleton = Skeleton::of(vae.meta().format);
         let [batch, frames, width] = features.dims();
@@ -67,13 +71,14 @@ impl Seen {
         }
     }
 
-    /// What `network` changes latents [B, N, d] by whose motions these are.
+    /// The change that `network` predicts for the latents [B, N, d] of these motions.
     pub(crate) fn change(&self, network: &Feedback, latent_bnd: Tensor<3>, dropout: &mut Dropout) -> Tensor<3> {
         network.forward(latent_bnd, self.frames_btf.clone(), &self.lengths, dropout) * self.scale_b11.clone()
     }
 }
 
-/// Writes what is told of the frames of one motion, rows that are not normalised; its root mean square distance, 0 if nothing is told.
+/// Writes the inputs of one motion's frames from rows that are not normalised. Returns its root mean square distance,
+/// or 0 without targets.
 fn tell(out: &mut [f32], rows: &[f32], skeleton: &Skeleton, hint: &Hint) -> f64 {
     let unit = skeleton.metres_per_unit;
     let joints = recover_joints_wide(rows, skeleton);
@@ -92,7 +97,7 @@ fn tell(out: &mut [f32], rows: &[f32], skeleton: &Skeleton, hint: &Hint) -> f64 
     let mean = (squares / count as f64).sqrt().max(LEAST);
     let size = inputs(skeleton.joints);
     for ((heading, root), to) in path.iter().zip(out.chunks_exact_mut(size)) {
-        // The angle of a heading is half of its turn.
+        // A heading's angle is half of its turn.
         let (cos, sin) = (heading[0], heading[2]);
         let told = [root[0] * unit, root[1] * unit, root[2] * unit, cos * cos - sin * sin, 2.0 * sin * cos, mean.ln()];
         to.iter_mut().zip(told).for_each(|(to, value)| *to = value as f32);
@@ -114,8 +119,8 @@ fn tell(out: &mut [f32], rows: &[f32], skeleton: &Skeleton, hint: &Hint) -> f64 
     mean
 }
 
-/// Latents `[batch, N, d]` of motions of `lengths` frames, each as it was after that of so many `rounds`, or before all, which brought its motion nearest;
-/// each change multiplied by `strength`.
+/// Corrects latents `[batch, N, d]` of motions of `lengths` frames in `rounds` rounds, each change multiplied by
+/// `strength`. Each latent is the one whose motion came nearest to its targets, the uncorrected one included.
 pub(crate) fn correct(
     network: &Feedback,
     vae: &Autoencoder,
@@ -153,13 +158,14 @@ pub(crate) fn correct(
 mod tests {
     use super::*;
 
-    /// A motion that turns left a little each frame while it walks, told to be where it is but for one joint's height and, late, the root.
+    /// A motion that turns left by the same angle each frame while it walks. Its targets are its own positions, except
+    /// for one joint's height and, late, the root.
     #[test]
     fn distances_are_seen_from_the_root_and_measured_by_their_mean() {
         let skeleton = Skeleton::of(protocol::stage::DataFormat::Humanml3d);
         let mut rows = vec![0.0; 4 * skeleton.features];
         for row in rows.chunks_exact_mut(skeleton.features) {
-            // A quarter turn in all three steps.
+            // A quarter turn over all three steps.
             row[0] = std::f32::consts::PI / 12.0;
             (row[2], row[3]) = (0.1, 1.0);
         }
@@ -190,7 +196,8 @@ mod tests {
         };
         near(joint(1, 20), &[1.0, 0.0, 0.3 / mean, 0.0, 0.0, 0.0, 0.0]);
         near(joint(0, 0), &[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
-        // The root has turned by a quarter, so a distance along x is one along its own z; it has grown from nothing over three frames.
+        // The root has turned by a quarter, so a distance along x is along its own z; it grew from zero over three
+        // frames.
         let after = joint(3, 0);
         let ahead = f64::from(after[3]);
         assert!((ahead.abs() - 0.4 / mean).abs() < 1e-5 && after[1].abs() < 1e-5, "{after:?}");

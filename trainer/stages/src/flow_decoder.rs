@@ -1,10 +1,11 @@
-//! Trained flow decoders out of artifacts: token ids or latents to motion along a rectified flow. Source: DisCoRD (Cho et al., arXiv:2411.19527).
+//! Trained flow decoders from artifacts: they convert token ids or latents to motion along a rectified flow. Source:
+//! DisCoRD (Cho et al., arXiv:2411.19527).
 //!
-//! Arrays are those of [`crate::tokenizer`]: ids `[tokens, Q]`, normalised rows `[4 tokens, features]`. Clips are decoded one by one, so that
-//! nothing behind a clip's end flows into it.
+//! Arrays are those of [`crate::tokenizer`]: ids `[tokens, Q]`, normalised rows `[4 tokens, features]`. Clips are
+//! decoded one by one, so that padding after a clip's end does not affect it.
 //!
-//! A latent of a VAE has no place in time. What stands for its codes is what the VAE's own decoder makes of it: of every four frames the
-//! normalised rows, one after the other, are a code. That is our choice; the paper decodes tokens alone.
+//! A VAE's latent has no time axis, so its codes are computed by the VAE's own decoder: a code is the normalised rows
+//! of four frames, one after the other. That is our choice; the paper decodes only tokens.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
@@ -26,36 +27,37 @@ use crate::tokenizer::TrainedTokenizer;
 use crate::warm_start::WarmStart;
 use crate::weights;
 
-/// Widths of the U-Net's two levels, over the first.
+/// Widths of the U-Net's two levels as multiples of the first.
 const MULTIPLES: [usize; 2] = [1, 2];
 /// Width of a head of the U-Net's attention in the middle.
 pub(crate) const HEAD: usize = 32;
-/// Feed-forward width of the transformer, over its width.
+/// Feed-forward width of the transformer as a multiple of its width.
 const RATE: usize = 4;
 /// Frames of a code.
 pub const UNIT: usize = 4;
 /// Base of the time's frequencies.
 const THETA: f64 = 10_000.0;
 
-/// Below this much time to the data, a velocity is computed as if there were so much: less than half the last step of any solver that is used.
+/// Lower limit of the remaining time in the conversion to a velocity. It is less than half the last step of any solver
+/// in use.
 const LEAST: f32 = 0.01;
 
 /// Meta of an artifact of kind `flow-decoder`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FlowMeta {
-    /// The data it was trained on.
+    /// Format of the training data.
     pub format: DataFormat,
     /// Width of a feature vector.
     pub features: usize,
     /// Width of a code: four frames of a VAE.
     pub code_dim: usize,
-    /// What the velocity is predicted by.
+    /// Network that predicts the velocity.
     pub backbone: FlowBackbone,
-    /// What its network gives.
+    /// Quantity that the network predicts.
     pub prediction: FlowPrediction,
-    /// Size.
+    /// Size of the network.
     pub network: FlowNetwork,
-    /// How motion is decoded.
+    /// Path from noise to motion.
     pub solver: FlowPath,
     /// Steps of the solver.
     pub steps: usize,
@@ -63,13 +65,13 @@ pub struct FlowMeta {
     pub fits: Parts,
 }
 
-/// How motion is decoded.
+/// Path from noise to motion.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum FlowPath {
-    /// The flow is followed, with an evaluation of the network a step.
+    /// The flow with one evaluation of the network per step.
     Euler,
-    /// With two.
+    /// The flow with two evaluations of the network per step.
     Midpoint,
     /// A student's jumps to the data, with fresh noise between them.
     Jumps,
@@ -85,7 +87,7 @@ impl From<FlowSolver> for FlowPath {
 }
 
 impl FlowPath {
-    /// What follows the flow, if it is followed.
+    /// The solver that follows the flow; `None` for jumps.
     pub fn followed(self) -> Option<Solver> {
         match self {
             Self::Euler => Some(Solver::Euler),
@@ -103,7 +105,7 @@ pub(crate) enum Backbone {
     Dit(FlowDit),
 }
 
-/// The velocity at every place and time.
+/// The velocity at any point and time.
 #[derive(Debug, Clone)]
 pub(crate) struct Field {
     pub(crate) backbone: Backbone,
@@ -146,7 +148,7 @@ impl FlowMeta {
         }
     }
 
-    /// A fresh network.
+    /// Creates a network with initial weights.
     pub(crate) fn field(&self, init: &mut Init<'_>) -> Field {
         let backbone = match self.backbone {
             FlowBackbone::Unet => Backbone::Unet(FlowUnet::new(&self.unet(), init)),
@@ -166,7 +168,7 @@ impl Backbone {
 }
 
 impl Field {
-    /// Its parameters, in their order.
+    /// Reads the parameters in declaration order.
     pub(crate) fn params(&self) -> Vec<f32> {
         match &self.backbone {
             Backbone::Unet(network) => flat::read(network),
@@ -174,10 +176,11 @@ impl Field {
         }
     }
 
-    /// With the weights that training is to begin with.
+    /// Loads the initial weights of a warm start.
     ///
     /// # Errors
-    /// If they give something else than this network is to give: their shapes would fit, and what they learned would mean nothing.
+    /// If the network of `init` predicts another quantity: its shapes would fit, but its weights would be meaningless
+    /// here.
     pub(crate) fn begun_with(self, start: &mut WarmStart) -> Result<Self, StageError> {
         if let Some(theirs) = start.part() {
             let theirs: FlowMeta = artifacts::meta(theirs, "the flow decoder of `init`")?;
@@ -196,7 +199,7 @@ impl Field {
         Ok(Self { backbone, ..self })
     }
 
-    /// Takes over parameters.
+    /// Replaces the parameters.
     pub(crate) fn take(&mut self, params: Values<'_>) {
         match &mut self.backbone {
             Backbone::Unet(network) => params.assign(network),
@@ -204,7 +207,7 @@ impl Field {
         }
     }
 
-    /// Velocity [B, T, F] at `times`, under codes [B, T / 4, d].
+    /// The velocity [B, T, F] at `times`, given codes [B, T / 4, d].
     pub(crate) fn velocity(
         &self,
         x_btf: Tensor<3>,
@@ -224,7 +227,7 @@ impl Field {
         }
     }
 
-    /// What training compares, [B, T, F] twice: what the network gives at `times`, where data and noise are mixed, and what it should.
+    /// The network's output at `times`, on mixtures of data and noise, and its target, each [B, T, F].
     pub(crate) fn compared(
         &self,
         (data_btf, noise_btf): (Tensor<3>, Tensor<3>),
@@ -250,7 +253,7 @@ pub struct FlowDecoder {
 }
 
 impl FlowDecoder {
-    /// Reads an artifact of kind `flow-decoder` for a tokenizer, or a VAE: its role among parts, and its digest.
+    /// Reads an artifact of kind `flow-decoder` for a tokenizer or a VAE, given as its role among parts and its digest.
     ///
     /// # Errors
     /// If it was trained on another one.
@@ -280,36 +283,36 @@ impl FlowDecoder {
         Ok(Self { field: Field { backbone, ..blank }, meta, device })
     }
 
-    /// The same that makes so many steps.
+    /// Changes the number of steps.
     #[must_use]
     pub fn with_steps(mut self, steps: usize) -> Self {
         self.meta.steps = steps;
         self
     }
 
-    /// Its network, on the plain device.
+    /// The network, on the plain device.
     pub(crate) fn into_field(self) -> Field {
         self.field
     }
 
-    /// What it is.
+    /// Meta of the artifact.
     pub fn meta(&self) -> &FlowMeta {
         &self.meta
     }
 
-    /// Normalised rows `[4 tokens, features]` of one motion's ids `[tokens, Q]`, from noise of `stream`.
+    /// Decodes one motion's ids `[tokens, Q]` to normalised rows `[4 tokens, features]`, from noise of `stream`.
     pub fn decode(&self, tokenizer: &TrainedTokenizer, ids: &[i64], stream: &mut Stream) -> Vec<f32> {
         self.decode_codes(tokenizer.codes(ids), stream)
     }
 
-    /// Normalised rows `[frames, features]` of a VAE's latent `[N, d]`, from noise of `stream`.
+    /// Decodes a VAE's latent `[N, d]` to normalised rows `[frames, features]`, from noise of `stream`.
     pub fn decode_latent(&self, vae: &Autoencoder, z: Vec<f32>, frames: usize, stream: &mut Stream) -> Vec<f32> {
         let mut rows = self.decode_codes(vae.decode(z, frames.next_multiple_of(UNIT)), stream);
         rows.truncate(frames * self.meta.features);
         rows
     }
 
-    /// Normalised rows `[4 tokens, features]` of codes `[tokens, code_dim]`.
+    /// Decodes codes `[tokens, code_dim]` to normalised rows `[4 tokens, features]`.
     fn decode_codes(&self, codes: Vec<f32>, stream: &mut Stream) -> Vec<f32> {
         let tokens = codes.len() / self.meta.code_dim;
         let frames = tokens * UNIT;
@@ -357,7 +360,8 @@ mod tests {
         }
     }
 
-    /// Who predicts the data is led there by one step from wherever it is, and by a step of the published flow in the same place.
+    /// A network that predicts the data reaches it in one step from any point. A step of the published flow reaches the
+    /// same point.
     #[test]
     fn a_step_to_the_end_arrives_at_the_data_that_is_predicted() {
         let device = Device::flex();

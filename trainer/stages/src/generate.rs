@@ -1,7 +1,7 @@
-//! From a sentence to a motion, with a model of any kind.
+//! Generation of a motion from a sentence, with a model of any kind.
 //!
-//! Not a stage: nothing is kept, and the clock is read, because the time per sentence is what few-step models are about. The
-//! motion is a function of (model, sentence, frames, sampler, seed).
+//! Not a stage: it keeps nothing, and it reads the clock, because the time per sentence is the purpose of few-step
+//! models. The motion is a function of (model, sentence, frames, sampler, seed).
 
 use std::ops::Range;
 use std::rc::Rc;
@@ -23,10 +23,11 @@ use crate::hint::Hint;
 use crate::length::Lengths;
 use crate::parts::{self, model_error};
 
-/// Length of a motion when neither the user nor the model says: 6 seconds of HumanML3D, 9.6 of KIT-ML, near the mean length of their clips.
+/// Default length of a motion if neither the user nor the model sets one: 6 seconds of HumanML3D, 9.6 of KIT-ML, near
+/// the mean length of their clips.
 pub const DEFAULT_FRAMES: usize = 120;
 
-/// A model that is ready to draw motions, with all that it has of its own: a sampler, a length.
+/// A loaded model with its own defaults: a sampler, a length.
 #[derive(Debug)]
 pub struct Generator {
     model: Box<dyn MotionGenerator>,
@@ -34,7 +35,7 @@ pub struct Generator {
     sampler: Option<Sampler>,
 }
 
-/// Where the time of one sentence went.
+/// Time of each phase of one sentence.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Timing {
     /// Embedding the sentence.
@@ -46,33 +47,33 @@ pub struct Timing {
 }
 
 impl Timing {
-    /// All three.
+    /// Sum of the three phases.
     pub fn total(&self) -> Duration {
         self.text + self.sampling + self.decoding
     }
 }
 
-/// A motion.
+/// A generated motion in features and joints.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Generated {
     /// Feature rows `[frames, features]` in the data's own scale.
     pub features: Vec<f32>,
     /// Global joints `[frames, joints, 3]` in the data's unit.
     pub joints: Vec<f32>,
-    /// Frames.
+    /// Number of frames.
     pub frames: usize,
-    /// Which skeleton.
+    /// The skeleton and feature layout.
     pub format: DataFormat,
-    /// Where the time went.
+    /// Time of each phase.
     pub timing: Timing,
 }
 
-/// A motion of which a part stayed.
+/// A motion that was regenerated in part.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Edited {
-    /// The whole.
+    /// The whole motion.
     pub motion: Generated,
-    /// Frames whose tokens stayed.
+    /// Ranges of frames whose tokens were kept.
     pub kept: Vec<Range<usize>>,
 }
 
@@ -96,13 +97,13 @@ impl Generator {
         Ok(Self { model, lengths, sampler: parts.sampler })
     }
 
-    /// A model that is none of a file.
+    /// Wraps a model that was not loaded from a file.
     #[cfg(test)]
     pub(crate) fn of(model: Box<dyn MotionGenerator>) -> Self {
         Self { model, lengths: None, sampler: None }
     }
 
-    /// How motions are drawn when nobody says: as the model was measured, or as the papers draw from its kind if nobody measured it.
+    /// The default sampler: that of the model's evaluation, or that of the papers for its kind if it has none.
     pub fn sampler(&self) -> Sampler {
         self.sampler.clone().unwrap_or_else(|| self.model.family().published())
     }
@@ -112,12 +113,12 @@ impl Generator {
         generator::check_sampler(&*self.model, sampler)
     }
 
-    /// Which skeleton its motions have.
+    /// The skeleton of its motions.
     pub fn format(&self) -> DataFormat {
         self.model.format()
     }
 
-    /// Frames of `prompt` when nobody says: what the model's length estimator draws, [`DEFAULT_FRAMES`] without one.
+    /// The default length for `prompt`: a draw of the model's length estimator, or [`DEFAULT_FRAMES`] without one.
     pub fn frames(&self, prompt: &str, seed: Seed) -> Result<usize, StageError> {
         let Some(lengths) = &self.lengths else { return Ok(DEFAULT_FRAMES) };
         let pooled = self.model.text().pooled(&[prompt])?;
@@ -125,12 +126,12 @@ impl Generator {
         Ok(drawn.min(self.model.longest()))
     }
 
-    /// Draws those parts of a motion anew, for `prompt`, that lie outside of the frames to `keep`. `motion` are rows `[frames, features]` in the data's
-    /// own scale. Frames behind the last whole token are left out, and a token stays only if all its frames do. Without `sampler` the model's own
-    /// is used.
+    /// Regenerates a motion for `prompt` outside of the frames to `keep`. `motion` are rows `[frames, features]` in the
+    /// data's own scale. Frames after the last whole token are cut off, and a token is kept only if all its frames are.
+    /// The default sampler is the model's own.
     ///
     /// # Errors
-    /// A model that cannot, a motion of another width, or nothing to keep or to draw.
+    /// If the model cannot edit, the motion has another width, or everything or nothing is kept.
     pub fn edit(
         &self,
         prompt: &str,
@@ -168,30 +169,31 @@ impl Generator {
         Ok(Edited { motion, kept: spans.filter(|(kept, _)| *kept).map(|(_, span)| span).collect() })
     }
 
-    /// Frames of a piece that [`edit`](Self::edit) keeps or draws as a whole; `None` if the model draws whole motions alone.
+    /// Frames of a unit that [`edit`](Self::edit) keeps or regenerates; `None` if the model generates only whole
+    /// motions.
     pub fn infilling_unit(&self) -> Option<usize> {
         self.model.infilling().map(|infilling| infilling.unit())
     }
 
-    /// Whether the model makes anything of `prompt`. What it knows nothing of it reads as the empty sentence, and so draws without being told what: the built-in encoder
-    /// has words of Latin letters and digits alone.
+    /// Returns true if the text encoder recognises a word of `prompt`. Otherwise the result is the same as for an empty
+    /// prompt: the built-in encoder has only words of Latin letters and digits.
     pub fn knows(&self, prompt: &str) -> Result<bool, StageError> {
         let texts = self.model.embed(&[prompt, ""])?;
         Ok(texts[0] != texts[1])
     }
 
-    /// Its control part, if it has one.
+    /// The meta of the control part, if the model has one.
     pub fn control(&self) -> Option<&ControlMeta> {
         self.model.control()
     }
 
-    /// Frames of the longest motion that it draws.
+    /// Frames of the longest motion that the model generates.
     pub fn longest(&self) -> usize {
         self.model.longest()
     }
 
-    /// Draws a motion for `prompt`. Without `frames` it is as long as [`frames`](Self::frames) says, without `sampler` the model's own is
-    /// used.
+    /// Generates a motion for `prompt`. The default length is [`frames`](Self::frames), the default sampler the model's
+    /// own.
     pub fn generate(
         &self,
         prompt: &str,
@@ -202,7 +204,8 @@ impl Generator {
         self.draw(prompt, frames, sampler, seed, None)
     }
 
-    /// As [`generate`](Self::generate), a motion as long as `hint` that passes what is told there, with a control part.
+    /// Generates a motion of `hint`'s length through its positions, with a control part; otherwise as
+    /// [`generate`](Self::generate).
     pub fn generate_controlled(
         &self,
         prompt: &str,
@@ -230,7 +233,7 @@ impl Generator {
         })
     }
 
-    /// What `draw` draws for `prompt`, and where the time went.
+    /// Runs `draw` for `prompt`, and measures the time of each phase.
     fn timed(
         &self,
         prompt: &str,
@@ -249,7 +252,7 @@ impl Generator {
         let features = draw(&texts, &seeds, &mut lap)?;
         let skeleton = Skeleton::of(self.format());
         let joints = recover_joints(&features, skeleton);
-        // An autoregressive model ends a motion where it likes.
+        // An autoregressive model decides the length itself.
         let frames = features.len() / skeleton.features;
         let timing = Timing { text: embedded - start, sampling: sampled - embedded, decoding: decoded - sampled };
         Ok(Generated { features, joints, frames, format: self.format(), timing })

@@ -1,10 +1,12 @@
-//! Positions that a motion is told to pass, and how many training tells. Source: MotionLCM (Dai et al., ECCV 2024; v2 of late 2024).
+//! Target positions for a motion, and the number of them in training. Source: MotionLCM (Dai et al., ECCV 2024; v2 of
+//! late 2024).
 //!
-//! Positions are global joints in metres, of a motion that starts at the origin and faces z, as HumanML3D's do. The networks see them as
-//! `(position - mean) / std` a joint and axis; a mask says which are told, since 0 is a position like any other. Mean and deviation are those of the
-//! training entries; upstream reads a file of OmniControl's, which is of HumanML3D alone, and whose making is not documented.
+//! Positions are global joints in metres of a motion that starts at the origin and faces z, as in HumanML3D. The
+//! networks read them as `(position - mean) / std` per joint and axis. A mask marks the given ones, since 0 is a valid
+//! position. Mean and deviation are those of the training entries. Upstream reads a file of OmniControl's that covers
+//! only HumanML3D and whose origin is not documented.
 //!
-//! Not its job: the networks that heed positions (`control`).
+//! Not its job: the networks that steer towards positions (`control`).
 
 use burn::tensor::Device;
 use models::networks::Hints;
@@ -15,31 +17,31 @@ use protocol::stage::{ControlHints, ControlSetting, Split};
 
 use crate::evaluation::control::ControlErrors;
 
-/// Coordinates of a joint.
+/// Number of coordinates of a joint.
 pub(crate) const AXES: usize = 3;
-/// Least deviation that a coordinate is divided by, metres.
+/// Lower limit of a coordinate's deviation, metres.
 const LEAST_STD: f64 = 1e-3;
 
-/// Positions of one motion.
+/// Target positions of one motion.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Hint {
     joints: usize,
-    /// [frames, joints, 3] in metres, 0 where nothing is told.
+    /// Positions [frames, joints, 3] in metres, 0 without a target.
     positions: Vec<f32>,
-    /// [frames, joints].
+    /// Mask [frames, joints] of targets.
     given: Vec<bool>,
-    /// [frames, joints]: what nobody but refinement looks at.
+    /// Mask [frames, joints] of targets that only refinement uses.
     wanted: Vec<bool>,
 }
 
 impl Hint {
-    /// Nothing told of a motion.
+    /// A hint without targets.
     pub fn none(frames: usize, joints: usize) -> Self {
         let none = vec![false; frames * joints];
         Self { joints, positions: vec![0.0; frames * joints * AXES], given: none.clone(), wanted: none }
     }
 
-    /// `joints` of a motion of `count` joints, `[frames, count, 3]` in metres, at `frames`.
+    /// Targets from `joints` of a motion of `count` joints, `[frames, count, 3]` in metres, at `frames`.
     pub fn of(motion: &[f32], count: usize, joints: &[usize], frames: &[usize]) -> Self {
         let mut hint = Self::none(motion.len() / (count * AXES), count);
         for t in frames {
@@ -51,7 +53,7 @@ impl Hint {
         hint
     }
 
-    /// Tells where a joint should be at a frame.
+    /// Sets the target of a joint at a frame.
     ///
     /// # Panics
     /// If the motion has no such frame or joint.
@@ -61,7 +63,8 @@ impl Hint {
         self.positions[at * AXES..(at + 1) * AXES].copy_from_slice(&position);
     }
 
-    /// Tells refinement alone where a joint should be at a frame: one that the control part was not trained to be told. What is told stays.
+    /// Sets a target that only refinement uses, for a joint outside the control part's training. An existing target
+    /// stays.
     ///
     /// # Panics
     /// If the motion has no such frame or joint.
@@ -73,22 +76,22 @@ impl Hint {
         }
     }
 
-    /// Joints of the skeleton.
+    /// Number of joints of the skeleton.
     pub fn joints(&self) -> usize {
         self.joints
     }
 
-    /// Frames of the motion.
+    /// Number of frames of the motion.
     pub fn frames(&self) -> usize {
         self.given.len() / self.joints.max(1)
     }
 
-    /// How many positions are told.
+    /// Number of targets.
     pub fn told(&self) -> usize {
         self.given.iter().filter(|given| **given).count()
     }
 
-    /// Frame, joint and position of all that is told, frame by frame.
+    /// Frame, joint and position of all targets, frame by frame.
     pub fn iter(&self) -> impl Iterator<Item = (usize, usize, [f32; 3])> {
         let told = self.given.iter().enumerate().filter(|(_, given)| **given);
         told.map(|(i, _)| {
@@ -97,12 +100,12 @@ impl Hint {
         })
     }
 
-    /// What refinement alone is told, as if all were told it.
+    /// The targets of refinement, as ordinary targets.
     pub(crate) fn wants(&self) -> Self {
         Self { given: self.wanted.clone(), ..self.clone() }
     }
 
-    /// How far a motion `[frames, joints, 3]` in metres is from it; `None` if nothing is told.
+    /// Errors of a motion `[frames, joints, 3]` in metres against the targets; `None` without targets.
     pub fn errors(&self, motion: &[f32], threshold: f64) -> Option<ControlErrors> {
         let wide = |values: &[f32]| values.iter().map(|v| f64::from(*v)).collect::<Vec<_>>();
         ControlErrors::of(&wide(motion), &wide(&self.positions), &self.given, threshold)
@@ -118,7 +121,7 @@ pub fn metres(features: &[f32], skeleton: &Skeleton) -> Vec<f32> {
     joints
 }
 
-/// Which frames of `length` are told, given how many: the first ones, or any.
+/// Draws the `count` frames of `length` that get targets: the first ones, or any, by `setting`.
 pub fn told_frames(setting: ControlSetting, count: usize, length: usize, draw: &mut Stream) -> Vec<usize> {
     let count = count.min(length);
     match setting {
@@ -135,7 +138,7 @@ pub fn told_frames(setting: ControlSetting, count: usize, length: usize, draw: &
     }
 }
 
-/// How many frames of `length` training tells.
+/// Draws the number of frames of `length` that get targets in training.
 pub fn told_count(hints: &ControlHints, length: usize, draw: &mut Stream) -> usize {
     if hints.any_number() {
         return 1 + draw.below(length.saturating_sub(1).max(1));
@@ -171,19 +174,19 @@ pub fn joint_statistics(dataset: &Dataset) -> (Vec<f32>, Vec<f32>) {
     (mean.iter().map(|v| *v as f32).collect(), std.map(|v| v as f32).collect())
 }
 
-/// Hints of a batch in the networks' scale.
+/// Hints of a batch, normalised for the networks.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NormalisedHints {
-    /// [B, T, joints, 3], 0 where nothing is told.
+    /// Positions [B, T, joints, 3], 0 without a target.
     pub values: Vec<f32>,
-    /// Of the same shape.
+    /// Mask of the same shape.
     pub given: Vec<bool>,
-    /// B, T, joints.
+    /// Sizes B, T and joints.
     pub shape: (usize, usize, usize),
 }
 
 impl NormalisedHints {
-    /// Of `hints`, padded to the longest. `mean` and `std` are `[joints x 3]`, in metres.
+    /// Normalises `hints` and pads them to the longest. `mean` and `std` are `[joints x 3]`, in metres.
     pub fn of(hints: &[Hint], mean: &[f32], std: &[f32]) -> Self {
         let joints = mean.len() / AXES;
         let frames = hints.iter().map(Hint::frames).max().unwrap_or_default();
@@ -201,7 +204,7 @@ impl NormalisedHints {
         Self { values, given, shape: (hints.len(), frames, joints) }
     }
 
-    /// As the trajectory encoder takes them.
+    /// Converts to the input of the trajectory encoder.
     pub fn on(&self, device: &Device) -> Hints {
         Hints::new(&self.values, &self.given, self.shape, device)
     }

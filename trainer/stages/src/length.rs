@@ -1,4 +1,4 @@
-//! The part of a model that says how long a caption's motion is. Its training is `train.length`.
+//! The part of a model that predicts the length of a caption's motion. Stage `train.length` trains it.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
@@ -17,15 +17,15 @@ use crate::weights;
 /// Meta of an artifact of kind `length`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LengthMeta {
-    /// The data it was trained on.
+    /// Format of the training data.
     pub format: DataFormat,
-    /// The parts that it was trained with: the text encoder.
+    /// The text encoder of its training.
     pub fits: Parts,
     /// Width of a caption embedding.
     pub text_dim: usize,
-    /// Lengths told apart: class c is a motion of `c * unit` frames.
+    /// Number of classes; class c is a motion of `c * unit` frames.
     pub classes: usize,
-    /// Frames of one class.
+    /// Frames per class.
     pub unit: usize,
 }
 
@@ -55,12 +55,12 @@ impl Lengths {
         Ok(Self { network, meta, device })
     }
 
-    /// What it is.
+    /// Meta of the artifact.
     pub fn meta(&self) -> &LengthMeta {
         &self.meta
     }
 
-    /// Draws a length in frames for a caption's vector, as MoMask does: the same caption may be told slowly or fast.
+    /// Draws a length in frames for a caption's vector, as MoMask does: a caption may describe a slow or a fast motion.
     pub fn draw(&self, pooled: &[f32], stream: &mut Stream) -> usize {
         let text = TensorData::new(pooled.to_vec(), [1, self.meta.text_dim]);
         let logits = self.network.forward(Tensor::from_data(text, &self.device), &mut Dropout::off());

@@ -1,6 +1,6 @@
 //! The stage kinds: artifacts in, artifacts out, training in between.
 //!
-//! Not its job: leases, databases, HTTP. A stage sees the world through [`context`] alone.
+//! Not its job: leases, databases, HTTP. A stage's only access to the world is [`context`].
 
 pub mod artifacts;
 pub mod context;

@@ -1,9 +1,10 @@
-//! Networks that diffuse motion itself: what they are in artifacts, what conditions them, and how motions are drawn with them.
+//! Networks that diffuse motion itself: their artifacts, their conditions, and sampling with them.
 //!
-//! Sources: MDM (arXiv:2209.14916) and StableMoFusion (arXiv:2405.05691). Motions are rows `[frames, features]`, normalised with the statistics of
-//! the training data, which the meta holds. Without a mask MDM looks at padding, so it always draws `max_frames` frames, as published, and
-//! cuts. Otherwise a motion is drawn at its own length. Departs: upstream StableMoFusion draws a batch at its longest length and cuts, by which
-//! a motion depends on its batch.
+//! Sources: MDM (arXiv:2209.14916) and StableMoFusion (arXiv:2405.05691). Motions are rows `[frames, features]`,
+//! normalised with the statistics of the training data, which the meta holds. Without a mask MDM attends to padding, so
+//! it always generates `max_frames` frames, as published, and cuts. Otherwise a motion is generated at its own length.
+//! Departs: upstream StableMoFusion generates a batch at its longest length and cuts, so that a motion depends on its
+//! batch.
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -26,11 +27,11 @@ use crate::context::{ContextError, StageError};
 /// Added to variances in layer norms.
 const NORM_EPS: f64 = 1e-5;
 
-/// Which network, and its size.
+/// The network's architecture and size.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "name", content = "network", rename_all = "lowercase")]
 pub enum Architecture {
-    /// A transformer, conditioned on a caption's one vector.
+    /// A transformer, conditioned on one vector per caption.
     Mdm(MdmNetwork),
     /// A U-Net, conditioned on a caption's tokens.
     StableMoFusion(StableMoFusionNetwork),
@@ -39,31 +40,30 @@ pub enum Architecture {
 /// Meta of an artifact of kind `denoiser` that diffuses motion itself.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MotionDenoiserMeta {
-    /// What it does.
+    /// Family of the model, which decides its samplers.
     #[serde(flatten)]
     pub family: Family,
-    /// Which network.
     pub architecture: Architecture,
-    /// The data it was trained on.
+    /// Format of the training data.
     pub format: DataFormat,
     /// Noise schedule and prediction.
     pub diffusion: Diffusion,
-    /// Whether attention is kept off padding.
+    /// True if attention excludes padding.
     pub mask_frames: bool,
-    /// Frames of the longest motion.
+    /// Number of frames of the longest motion.
     pub max_frames: usize,
-    /// What was subtracted from features, `[features]`.
+    /// Mean subtracted from features, `[features]`.
     pub mean: Vec<f32>,
-    /// What they were divided by, `[features]`.
+    /// Deviation that divides features, `[features]`.
     pub std: Vec<f32>,
     /// Width of a caption's vector, or of its tokens.
     pub text_dim: usize,
-    /// The text encoder that it was trained with.
+    /// The text encoder of its training.
     pub fits: Parts,
 }
 
 impl MotionDenoiserMeta {
-    /// Timesteps of its schedule.
+    /// Number of timesteps of the schedule.
     pub fn timesteps(&self) -> Result<usize, StageError> {
         match self.family {
             Family::Features { timesteps, .. } => Ok(timesteps),
@@ -71,17 +71,17 @@ impl MotionDenoiserMeta {
         }
     }
 
-    /// Whether a caption is its tokens rather than one vector.
+    /// Returns true if a caption is a sequence of tokens, not one vector.
     pub fn reads_tokens(&self) -> bool {
         matches!(self.architecture, Architecture::StableMoFusion(_))
     }
 
-    /// Whether motions are always padded to `max_frames`, because padding matters to the network.
+    /// Returns true if motions are always padded to `max_frames`, because the network attends to padding.
     pub fn draws_whole(&self) -> bool {
         matches!(self.architecture, Architecture::Mdm(_)) && !self.mask_frames
     }
 
-    /// A fresh MDM of these sizes.
+    /// Creates an MDM of these sizes with initial weights.
     pub fn mdm(&self, network: &MdmNetwork, init: &mut Init<'_>) -> Mdm {
         let config = MdmConfig {
             features: self.mean.len(),
@@ -95,7 +95,7 @@ impl MotionDenoiserMeta {
         Mdm::new(&config, init)
     }
 
-    /// A fresh StableMoFusion network of these sizes.
+    /// Creates a StableMoFusion network of these sizes with initial weights.
     pub fn stablemofusion(&self, network: &StableMoFusionNetwork, init: &mut Init<'_>) -> StableMoFusion {
         let config = StableMoFusionConfig {
             features: self.mean.len(),
@@ -113,31 +113,31 @@ impl MotionDenoiserMeta {
     }
 }
 
-/// The captions of a batch as a text encoder gives them.
+/// The embedded captions of a batch.
 #[derive(Debug, Clone)]
 pub struct CaptionRows {
-    /// For each caption its vector, or those of its tokens one after the other.
+    /// For each caption its vector, or the vectors of its tokens one after the other.
     pub rows: Vec<Vec<f32>>,
-    /// Whether each sample has its caption, or goes without.
+    /// True for a sample with its caption, false for a sample without.
     pub kept: Vec<bool>,
 }
 
-/// What a network is conditioned on.
+/// Condition of a network.
 #[derive(Debug, Clone)]
 pub enum Condition {
-    /// One vector each [B, text_dim].
+    /// One vector per caption [B, text_dim].
     Vector(Tensor<2>),
-    /// Encoded tokens.
+    /// Encoded tokens of each caption.
     Tokens(TokenCondition),
 }
 
-/// A network that says what a noised motion is taken for.
+/// A network that predicts the clean motion from a noised one.
 pub trait MotionNetwork: Module {
-    /// Captions of `dim` numbers a vector, encoded once for any number of predictions.
+    /// Encodes captions of `dim` numbers per vector, once for any number of predictions.
     fn condition(&self, captions: &CaptionRows, dim: usize, device: &Device, drop: &mut Dropout) -> Condition;
 
-    /// Its output for `x_btf` [B, T, F] at `timesteps`, without any caption if there is no condition. With `lengths`, frames past them
-    /// are padding that nothing attends to.
+    /// The output for `x_btf` [B, T, F] at `timesteps`; `None` as condition means that no sample has a caption. With
+    /// `lengths`, frames past them are padding without attention.
     fn predict(
         &self,
         x_btf: Tensor<3>,
@@ -208,7 +208,7 @@ enum Network {
     StableMoFusion(StableMoFusion),
 }
 
-/// A trained network.
+/// A trained network with its meta.
 #[derive(Debug)]
 pub struct MotionDenoiser {
     network: Network,
@@ -217,18 +217,17 @@ pub struct MotionDenoiser {
     device: Device,
 }
 
-/// Motions to be drawn together: they have one length.
+/// Motions of one length to be generated together.
 #[derive(Debug, Clone, Copy)]
 pub struct Drawing<'a> {
-    /// Captions as the text encoder gives them.
+    /// Captions as embedded by the text encoder.
     pub captions: &'a CaptionRows,
-    /// Frames of each.
+    /// Number of frames of each motion.
     pub frames: usize,
-    /// How.
     pub sampler: &'a Sampler,
 }
 
-/// Is told the timestep of each step of a sampler, and a function that gives the clean motions predicted there.
+/// Receives the timestep of each sampler step, and a function that computes the predicted clean motions.
 pub type SeeMotions<'a> = dyn FnMut(usize, &dyn Fn() -> Vec<Vec<f32>>) + 'a;
 
 impl MotionDenoiser {
@@ -250,13 +249,13 @@ impl MotionDenoiser {
         Ok(Self { network, meta, schedule, device })
     }
 
-    /// What it is.
+    /// Meta of the artifact.
     pub fn meta(&self) -> &MotionDenoiserMeta {
         &self.meta
     }
 
-    /// Motions `[frames, features]` in the data's own scale. `noise(k, b, out)` fills in standard normal noise for motion b: number 0 is what it
-    /// starts from, 1 + j is for step j.
+    /// Generates motions `[frames, features]` in the data's own scale. `noise(k, b, out)` writes standard normal noise
+    /// for motion b: number 0 is its initial noise, 1 + j is for step j.
     pub fn draw(
         &self,
         drawing: Drawing<'_>,
@@ -265,7 +264,8 @@ impl MotionDenoiser {
         self.draw_seen(drawing, noise, &mut |_, _| {})
     }
 
-    /// As [`draw`](Self::draw); `see` is told each step's timestep and a function that gives the clean motions predicted there.
+    /// Like [`draw`](Self::draw); `see` receives each step's timestep and a function that computes the predicted clean
+    /// motions.
     pub fn draw_seen(
         &self,
         drawing: Drawing<'_>,
@@ -281,7 +281,7 @@ impl MotionDenoiser {
         Ok(self.motions(drawn, drawing.frames))
     }
 
-    /// Motions of `frames` frames in the data's own scale, out of [B, T, F].
+    /// Converts [B, T, F] to motions of `frames` frames in the data's own scale.
     fn motions(&self, drawn: Tensor<3>, frames: usize) -> Vec<Vec<f32>> {
         let [_, whole, width] = drawn.dims();
         let values = drawn.into_data().try_into_vec::<f32>().expect("networks compute in f32");
@@ -308,7 +308,7 @@ impl MotionDenoiser {
         let off = &mut Dropout::off();
         let condition = network.condition(drawing.captions, self.meta.text_dim, &self.device, off);
         let see = std::cell::RefCell::new(see);
-        // All are of one length, so that a mask would cover nothing.
+        // All have one length, so a mask would be empty.
         let out = |z: Tensor<3>, t: usize| {
             let times = vec![t; batch];
             let off = &mut Dropout::off();

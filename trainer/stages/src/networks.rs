@@ -1,7 +1,8 @@
-//! Trained networks out of artifacts, with plain arrays in and out: what evaluation and generation need of `models`.
+//! Trained networks from artifacts, with plain arrays in and out, for evaluation and generation.
 //!
-//! Everything runs on the plain device, without dropout. Arrays are row-major f32: rows `[batch, frames, D]` of normalised
-//! features, latents `[batch, N, d]`, caption embeddings `[batch, text]`. Not its job: training, and artifacts other than these two.
+//! Everything runs on the plain device, without dropout. Arrays are row-major f32: rows `[batch, frames, D]` of
+//! normalised features, latents `[batch, N, d]`, caption embeddings `[batch, text]`. Not its job: training, and
+//! artifacts other than these two.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
@@ -27,7 +28,7 @@ pub(crate) const TIME_DIM: usize = 768;
 const NORM_EPS: f64 = 1e-5;
 
 impl VaeMeta {
-    /// The network's size. A bottleneck as wide as the transformer has no projections around it (v1), any other has (v2).
+    /// The network's size. A bottleneck of the transformer's width has no projections (v1), any other has them (v2).
     pub fn config(&self) -> VaeConfig {
         VaeConfig {
             features: self.features,
@@ -63,7 +64,7 @@ impl DenoiserMeta {
     }
 }
 
-/// Where a network's parameters come from before the trained ones replace them.
+/// Initial values that the trained parameters replace.
 fn blank(device: &Device) -> Init<'_> {
     Init::new(Seed(0), "blank", Positions::Uniform, device)
 }
@@ -87,14 +88,14 @@ pub struct Autoencoder {
 /// Diagonal normal distributions over latents, `[batch, N, d]`.
 #[derive(Debug, Clone)]
 pub struct Posterior {
-    /// Means.
+    /// Means of the distributions.
     pub mu: Vec<f32>,
-    /// Standard deviations.
+    /// Standard deviations of the distributions.
     pub sigma: Vec<f32>,
 }
 
 impl Posterior {
-    /// A sample, with noise from `stream`.
+    /// Draws a sample, with noise from `stream`.
     pub fn sample(&self, stream: &mut Stream) -> Vec<f32> {
         self.mu.iter().zip(&self.sigma).map(|(mu, sigma)| mu + sigma * stream.normal()).collect()
     }
@@ -110,22 +111,22 @@ impl Autoencoder {
         Ok(Self { vae, meta, device })
     }
 
-    /// What it is.
+    /// Meta of the artifact.
     pub fn meta(&self) -> &VaeMeta {
         &self.meta
     }
 
-    /// Where it computes.
+    /// The device that computes.
     pub(crate) fn device(&self) -> &Device {
         &self.device
     }
 
-    /// Longest motion that it has positions for, both ways.
+    /// Number of frames of the longest motion that encoder and decoder have positions for.
     pub fn max_frames(&self) -> usize {
         POSITIONS - 2 * self.meta.latent.tokens
     }
 
-    /// Refuses data of another format than it was trained on.
+    /// Refuses data of another format than the training data.
     pub fn check_format(&self, format: DataFormat) -> Result<(), StageError> {
         if self.meta.format == format {
             return Ok(());
@@ -134,7 +135,7 @@ impl Autoencoder {
         Err(StageError::Input(format!("the VAE was trained on `{ours}` features, the dataset has `{theirs}` features")))
     }
 
-    /// `(x - mean) / std` with the statistics of its training data.
+    /// Computes `(x - mean) / std` with the statistics of the training data, in place.
     pub fn normalise(&self, rows: &mut [f32]) {
         for row in rows.chunks_exact_mut(self.meta.features) {
             for ((value, mean), std) in row.iter_mut().zip(&self.meta.mean).zip(&self.meta.std) {
@@ -152,7 +153,7 @@ impl Autoencoder {
         }
     }
 
-    /// Posteriors of clips of one length: `rows` are `[batch, frames, D]`, normalised.
+    /// Encodes clips of one length as posteriors: `rows` are `[batch, frames, D]`, normalised.
     pub fn encode(&self, rows: Vec<f32>, frames: usize) -> Posterior {
         let batch = rows.len() / (frames * self.meta.features);
         let rows = tensor(rows, [batch, frames, self.meta.features], &self.device);
@@ -160,7 +161,7 @@ impl Autoencoder {
         Posterior { sigma: host(posterior.sigma()), mu: host(posterior.mu_bnd) }
     }
 
-    /// Clips `[batch, frames, D]`, normalised, of latents `[batch, N, d]`.
+    /// Decodes latents `[batch, N, d]` to clips `[batch, frames, D]`, normalised.
     pub fn decode(&self, z: Vec<f32>, frames: usize) -> Vec<f32> {
         let latent = self.meta.latent;
         let batch = z.len() / (latent.tokens * latent.dim);
@@ -170,13 +171,14 @@ impl Autoencoder {
 }
 
 impl Autoencoder {
-    /// Clips [B, frames, D], normalised, of latents [B, N, d]; frames past `lengths[b]` are 0. Gradients flow to the latents; the VAE has none.
+    /// Decodes latents [B, N, d] to clips [B, frames, D], normalised; frames past `lengths[b]` are 0. Gradients flow to
+    /// the latents, not to the VAE.
     pub fn decode_tensor(&self, z_bnd: Tensor<3>, lengths: &[usize]) -> Tensor<3> {
         let frames = lengths.iter().copied().max().unwrap_or_default();
         self.vae.decode(z_bnd, lengths, frames, &mut Dropout::off())
     }
 
-    /// Clips of `lengths[b]` frames each, normalised, of latents `[batch, N, d]`.
+    /// Decodes latents `[batch, N, d]` to clips of `lengths[b]` frames each, normalised.
     pub fn decode_ragged(&self, z: Vec<f32>, lengths: &[usize]) -> Vec<Vec<f32>> {
         let (latent, width) = (self.meta.latent, self.meta.features);
         let frames = lengths.iter().copied().max().unwrap_or_default();
@@ -187,14 +189,14 @@ impl Autoencoder {
     }
 }
 
-/// What latents are drawn for.
+/// Conditions and initial noise of latents to be sampled.
 #[derive(Debug, Clone)]
 pub struct Conditions {
     /// Caption embeddings, `[batch, text]`.
     pub text: Vec<f32>,
     /// The empty caption's embedding, `[text]`.
     pub null: Vec<f32>,
-    /// Standard normal noise that the sampler starts from, `[batch, N, d]`.
+    /// Standard normal initial noise of the sampler, `[batch, N, d]`.
     pub noise: Vec<f32>,
 }
 
@@ -207,7 +209,7 @@ pub struct Denoiser {
     device: Device,
 }
 
-/// Is told the timestep of each step of a sampler, and a function that gives the clean latents predicted there.
+/// Receives the timestep of each sampler step, and a function that computes the predicted clean latents.
 pub type SeeLatents<'a> = dyn FnMut(usize, &dyn Fn() -> Vec<f32>) + 'a;
 
 impl Denoiser {
@@ -221,14 +223,14 @@ impl Denoiser {
         Ok(Self { network, meta, schedule, device })
     }
 
-    /// What it is.
+    /// Meta of the artifact.
     pub fn meta(&self) -> &DenoiserMeta {
         &self.meta
     }
 
-    /// Draws latents `[batch, N, d]`: a teacher by DDIM or a DPM-Solver with guidance g, an LCM with fresh noise between its jumps, a PCM by one jump a
-    /// phase; students embed w. `step_noise(j)` is asked for noise of the same shape after jump j of an LCM. With `steering` every prediction is a
-    /// controlled one, also that without a caption.
+    /// Samples latents `[batch, N, d]`. A teacher uses DDIM or a DPM-Solver with guidance g, an LCM fresh noise between
+    /// its jumps, a PCM one jump per phase; students embed w. `step_noise(j)` returns noise of the same shape after
+    /// jump j of an LCM. With `steering` every prediction is controlled, including that without a caption.
     pub fn sample(
         &self,
         conditions: &Conditions,
@@ -239,7 +241,8 @@ impl Denoiser {
         self.sample_seen(conditions, sampler, steering, step_noise, &mut |_, _| {})
     }
 
-    /// As [`sample`](Self::sample); `see` is told each step's timestep and a function that gives the clean latents predicted there.
+    /// Like [`sample`](Self::sample); `see` receives each step's timestep and a function that computes the predicted
+    /// clean latents.
     pub fn sample_seen(
         &self,
         conditions: &Conditions,
@@ -278,7 +281,7 @@ impl Denoiser {
                     _ => None,
                 };
                 match form {
-                    // Deterministic forms ask for no noise.
+                    // Deterministic forms need no noise.
                     Some(form) => {
                         let path = DpmPath::even(&self.schedule, sampler.steps);
                         dpm_sample(&self.schedule, &path, form, z.clone(), |_| z.zeros_like(), out)
@@ -345,7 +348,8 @@ impl Denoiser {
     }
 }
 
-/// Timesteps of an LCM's sampler, noisiest first: as given, else spread evenly over the training grid from 999 down.
+/// Timesteps of an LCM's sampler, noisiest first: the given ones, otherwise evenly spread over the training grid from
+/// 999 down.
 fn lcm_path(skip: usize, sampler: &Sampler) -> Vec<usize> {
     match sampler.timesteps.is_empty() {
         true => lcm_timesteps(LcmTimesteps::Even(Grid::new(skip)), sampler.steps),

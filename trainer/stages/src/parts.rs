@@ -1,4 +1,4 @@
-//! Reading the parts of models, and putting models together; what a model is stands in [`checkpoint::model`].
+//! Reads the parts of models, and assembles models; [`checkpoint::model`] defines a model.
 
 use std::collections::BTreeMap;
 
@@ -11,26 +11,26 @@ use protocol::{ArtifactKind, Digest, Manifest};
 use crate::artifacts;
 use crate::context::{AttemptContext, ContextError, StageError};
 
-/// What a broken or unfit model means for the stage.
+/// The stage's error for a broken or unsuitable model.
 pub fn model_error(error: ModelError) -> StageError {
     StageError::Input(error.to_string())
 }
 
-/// The manifest of a part of `model`, which must be of this kind.
+/// The manifest of a part of `model`. Refuses a part of another kind.
 pub fn part(blobs: &dyn Blobs, model: &Model, role: &Role, kind: ArtifactKind) -> Result<Manifest, StageError> {
     let manifest = manifest(blobs, model.part(role).map_err(model_error)?, &format!("the part `{role}`"))?;
     artifacts::expect(&format!("the part `{role}`"), &manifest, kind)?;
     Ok(manifest)
 }
 
-/// A manifest among the blobs of an artifact; `what` names it in errors.
+/// Reads a manifest from the blobs of an artifact; `what` names it in errors.
 pub fn manifest(blobs: &dyn Blobs, digest: Digest, what: &str) -> Result<Manifest, StageError> {
     let bytes = blobs.get(digest).map_err(artifacts::blob_error)?;
     serde_json::from_slice(&bytes)
         .map_err(|e| StageError::Context(ContextError::Corrupt(format!("{what}, {digest}, is not a manifest: {e}"))))
 }
 
-/// Uploads a model that is drawn by `generator` with these parts, whose files are uploaded.
+/// Uploads a model with the generator `generator` and these parts, whose files are already uploaded.
 pub fn publish_model(
     cx: &mut dyn AttemptContext,
     generator: &str,

@@ -1,9 +1,10 @@
-//! Moves drawn latents until their motions pass the positions that they are told. Source: optimisation at sampling time, as of noise in DNO
+//! Moves sampled latents until their motions meet their targets. Source: optimisation at sampling time, of noise in DNO
 //! (Karunratanakul et al., CVPR 2024) and of logits in MaskControl (Pinyoanuntapong et al., 2024).
 //!
-//! Ours: what is moved is the latent that was drawn, so that no gradient goes through the denoiser. Minimised is the mean squared distance of told
-//! positions in metres, that of wanted ones, and how far the motion is from what was drawn: its poses stay, and the root's pace and turn change
-//! smoothly. By Adam, whose rate falls along half a cosine. Each motion's result depends on that motion alone.
+//! Ours: the sampled latent is moved, so that no gradient flows through the denoiser. The loss is the mean squared
+//! distance from targets in metres, and the motion's distance from the sampled one: its poses stay, and the root's
+//! speed and turn change smoothly. The optimizer is Adam, whose rate falls along half a cosine. Each motion's result
+//! depends on that motion alone.
 
 use std::f64::consts::PI;
 
@@ -15,15 +16,15 @@ use motion::Skeleton;
 use crate::hint::{Hint, NormalisedHints};
 use crate::networks::Autoencoder;
 
-/// First rate, in a latent's own unit.
+/// Initial learning rate, in a latent's own unit.
 const RATE: f64 = 0.1;
-/// Metres squared that weigh as much as poses whose features all changed by one deviation.
+/// Weight of the pose in square metres: the penalty if all features change by one deviation.
 const POSE: f64 = 0.1;
-/// The same of how much the root's change of pace and turn differs from frame to frame.
+/// Weight of the root in square metres, for the frame-to-frame difference of its change of speed and turn.
 const ROOT: f64 = 0.1;
 const ADAM: AdamW = AdamW { beta1: 0.9, beta2: 0.99, eps: 1e-8, weight_decay: 0.0 };
 
-/// Refines latents `[batch, N, d]` of motions of `lengths` frames in so many `steps`, towards what `hints` tell and want.
+/// Refines latents `[batch, N, d]` of motions of `lengths` frames in `steps` steps towards the targets of `hints`.
 pub(crate) fn refine(vae: &Autoencoder, z: &mut [f32], lengths: &[usize], hints: &[Hint], steps: usize) {
     let meta = vae.meta();
     let (skeleton, latent, device) = (Skeleton::of(meta.format), meta.latent, vae.device());
@@ -48,17 +49,17 @@ pub(crate) fn refine(vae: &Autoencoder, z: &mut [f32], lengths: &[usize], hints:
     }
 }
 
-/// What holds motions of a batch where they were drawn.
+/// The sampled motions of a batch, to which the result must stay near.
 struct AsDrawn {
-    /// [B, T, D], normalised, 0 past each motion's end.
+    /// Features [B, T, D], normalised, 0 past each motion's end.
     features: Tensor<3>,
-    /// Features of the root's turn and pace, which come first.
+    /// Number of leading features, the root's turn and speed.
     root: usize,
-    /// The first feature of the pose.
+    /// Index of the first feature of the pose.
     pose: usize,
-    /// [B, 1, 1]: what makes a mean of a sum over a motion's pose features.
+    /// Divisors [B, 1, 1] that make a mean of a sum over a motion's pose features.
     poses: Tensor<3>,
-    /// [B, T - 1, 1]: the same of what differs between two frames of it, 0 past its end; `None` if no motion has two.
+    /// Divisors [B, T - 1, 1] for differences of two frames, 0 past a motion's end; `None` if no motion has two frames.
     moves: Option<Tensor<3>>,
 }
 
@@ -93,15 +94,15 @@ impl AsDrawn {
     }
 }
 
-/// Positions that motions of a batch should pass.
+/// Targets of the motions of a batch.
 struct Target {
     of: ControlTarget,
-    /// What makes a mean of the sum over a motion's positions.
+    /// Weights that make a mean of the sum over a motion's targets.
     weights: Vec<f32>,
 }
 
 impl Target {
-    /// Of what is told, in metres.
+    /// Collects the targets of `hints`, in metres.
     fn new(hints: &[Hint], device: &Device) -> Self {
         let coordinates = 3 * hints.first().map(Hint::joints).unwrap_or_default();
         let (zero, one) = (vec![0.0; coordinates], vec![1.0; coordinates]);

@@ -1,4 +1,4 @@
-//! A worker that is nobody's: the whole gang is one thread, and what it makes is kept in memory, over a store that is read and never changed.
+//! An in-memory, single-process context for verifying and estimating: a gang of one thread over a read-only store.
 
 use std::collections::{BTreeMap, HashMap};
 use std::ops::Range;
@@ -13,12 +13,12 @@ use protocol::{Digest, Manifest};
 use crate::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
 use crate::train::{STATE_FILE, tree_sum};
 
-/// The digest of a checkpoint's training state. Its manifest says besides by which build on which processor it was made.
+/// The digest of a checkpoint's training state. Its manifest also names the build and processor that made it.
 pub fn state_digest(checkpoint: &Manifest) -> Option<Digest> {
     checkpoint.files.get(STATE_FILE).map(|entry| entry.digest)
 }
 
-/// A store below, if there is one, and what was put since in memory.
+/// Blobs in memory over an optional read-only store.
 #[derive(Debug, Default)]
 pub(crate) struct Overlay {
     below: Option<Arc<dyn Blobs>>,
@@ -48,7 +48,7 @@ impl Blobs for Overlay {
     }
 }
 
-/// A gang of one.
+/// An attempt context for a gang of one.
 #[derive(Debug)]
 pub(crate) struct Solo {
     task: StageTask,
@@ -56,16 +56,17 @@ pub(crate) struct Solo {
     blobs: Arc<Overlay>,
     checkpoint: Option<Manifest>,
     until: u64,
-    /// What was recorded: step and name, value.
+    /// Recorded values by step and name.
     pub(crate) values: BTreeMap<(u64, String), f64>,
-    /// The digest of the training state after a step, wherever one was saved.
+    /// Digest of the training state by step, for each saved one.
     pub(crate) states: BTreeMap<u64, Digest>,
-    /// When it said how far it is.
+    /// Times of the progress reports.
     pub(crate) progressed: Vec<Instant>,
 }
 
 impl Solo {
-    /// Does `task`, from `checkpoint` if there is one, and stops once `until` steps are applied.
+    /// Creates the context of `task`, to start from `checkpoint`, if there is one, and to stop once `until` steps are
+    /// applied.
     pub(crate) fn new(
         task: StageTask,
         device: Device,

@@ -1,24 +1,23 @@
-//! What a ControlNet adds to the denoiser that it steers. Source: MotionLCM (Dai et al., ECCV 2024). Not its job: reading the part (`control`), asking the
-//! denoiser (`networks`).
+//! The residuals that a ControlNet adds to its denoiser. Source: MotionLCM (Dai et al., ECCV 2024). Not its job:
+//! reading the part (`control`), running the denoiser (`networks`).
 
 use burn::tensor::Tensor;
 use models::kernels::Dropout;
 use models::networks::Denoiser;
 
-/// A ControlNet and what it is told of a batch.
+/// A ControlNet and its inputs for a batch.
 #[derive(Debug, Clone)]
 pub struct Steering<'a> {
-    /// The ControlNet.
     pub(crate) control: &'a Denoiser,
-    /// What the trajectory encoder made of the batch's hints, [B, N, d].
+    /// The trajectory encoder's tokens for the batch's hints, [B, N, d].
     pub(crate) tokens_bnd: Tensor<3>,
-    /// What the residuals are multiplied by.
+    /// Factor on the residuals.
     pub(crate) scale: f64,
 }
 
 impl Steering<'_> {
-    /// What is added to the denoiser's blocks, and times how much, for the arguments that it is given. A batch that stands there several times, as
-    /// for guidance, is told the same each time.
+    /// The residuals for the denoiser's blocks and their factor, for the denoiser's arguments. A batch that repeats the
+    /// motions, as for guidance, repeats the tokens.
     pub(crate) fn residuals(
         &self,
         latent_bnd: &Tensor<3>,

@@ -1,20 +1,23 @@
-//! Motion without end: segments, each of which goes on where the one before it stopped.
+//! Unlimited motion: segments, each of which continues the one before it.
 //!
-//! Source: MotionLCM (Dai et al., ECCV 2024), Fig. 1: the end of one motion is the control of the next. A segment of a model with a control part is
-//! told, in its first frames, the positions of the last frames of the stream, turned and shifted so that they begin above the origin and face z
-//! ("re-canonicalised"); as many frames and those joints that the part was trained with. Those frames are not given out a second time. What is drawn behind them is placed
-//! in the world by the same turn and shift.
+//! Source: MotionLCM (Dai et al., ECCV 2024), Fig. 1: the end of one motion is the control of the next. For a model
+//! with a control part, the targets of a segment's first frames are the positions of the stream's last frames. They are
+//! turned and shifted so that they start above the origin and face z ("re-canonicalised"). Their number and joints are
+//! those of the part's training. Those frames are not output a second time. The frames generated after them are placed
+//! in the world by the inverse turn and shift.
 //!
 //! Departs, where the paper says nothing:
-//! - a masked token model keeps the tokens of the last frames and fills in the rest (`Infilling`);
-//! - any other model draws a motion of its own, whose first frame is laid on the last one of the stream;
-//! - a segment without waypoints is then turned and shifted so that its root is where the stream's is at the junction, and faces the same way: where the model does not quite
-//!   begin where it was told, the body does not glide there. With waypoints it stays where they are;
-//! - what the two still differ by at the junction fades within `blend` frames ([`Fade`]), joint by joint, so bones change their length a little
-//!   there.
+//! - A masked token model keeps the tokens of the last frames and fills in the rest (`Infilling`).
+//! - Any other model generates an independent motion, whose first frame is placed on the last frame of the stream.
+//! - A segment without waypoints is then turned and shifted so that its root has the stream's place and heading at the
+//!   junction: if the model misses its first targets, the body does not glide there. With waypoints the segment stays
+//!   in place.
+//! - The remaining difference at the junction fades within `blend` frames ([`Fade`]), joint by joint, so bones change
+//!   their length slightly there.
 //!
-//! Joints are metres in one world frame: y is up, the stream starts with its root at x = z = 0 and faces z. A stream is a function of (model, what is
-//! asked, settings); each segment has its own seed. Its memory is bounded: only as many frames as the model draws at once are kept.
+//! Joints are in metres in one world frame: y is up, the stream starts with its root at x = z = 0 and faces z. A stream
+//! is a function of (model, requests, settings); each segment has its own seed. Memory is bounded: only as many frames
+//! are kept as the model generates at once.
 
 use motion::features::{recover_joints_wide, root_path};
 use motion::placement::{BEFORE, Fade, Placement};
@@ -29,39 +32,39 @@ use crate::control::Heed;
 use crate::generate::Generator;
 use crate::hint::{Hint, share};
 
-/// Percent of a segment that are frames of the one before it, where the control part's training does not say: tau of MotionLCM.
+/// Overlap in percent of a segment, if the control part's training has none: tau of MotionLCM.
 const OVERLAP_PERCENT: f64 = 25.0;
-/// Frames in which the rest of a difference fades: half a second of HumanML3D. Ours.
+/// Frames in which the remaining difference fades: half a second of HumanML3D. Ours.
 pub const BLEND: usize = 10;
 
-/// How a stream is drawn.
+/// Settings of a stream.
 #[derive(Debug, Clone)]
 pub struct Settings {
-    /// The model's own without one.
+    /// The sampler; `None` for the model's own.
     pub sampler: Option<Sampler>,
-    /// Another one gives another stream.
+    /// Seed of the stream's draws.
     pub seed: Seed,
-    /// How told positions are heeded.
+    /// Strength of the steering towards targets.
     pub heed: Heed,
-    /// Frames of the last segment that the next one is told; without it a share of the segment.
+    /// Number of the last frames that the next segment gets as targets; `None` for a share of the segment.
     pub overlap: Option<usize>,
-    /// Frames in which what differs at a junction fades.
+    /// Number of frames in which the difference at a junction fades.
     pub blend: usize,
 }
 
-/// How a segment comes to go on where the last one stopped.
+/// Method of continuing a stream with a segment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Joining {
-    /// A control part is told the last frames.
+    /// The last frames are targets of a control part.
     Control,
-    /// A masked token model keeps their tokens.
+    /// A masked token model keeps the tokens of the last frames.
     Infilling,
-    /// Its first frame is laid on the last one.
+    /// The segment's first frame is placed on the stream's last frame.
     Placement,
 }
 
 impl Joining {
-    /// For people.
+    /// Name of the method for users.
     pub fn name(self) -> &'static str {
         match self {
             Self::Control => "control",
@@ -71,40 +74,40 @@ impl Joining {
     }
 }
 
-/// What a segment should be.
+/// A request for a segment.
 #[derive(Debug, Clone, Default)]
 pub struct Ask {
-    /// In words.
+    /// Description of the motion.
     pub caption: String,
-    /// How many new frames there should be; there are fewer if the model draws no more at once. Without it the model says.
+    /// Number of new frames; fewer if the model cannot generate as many at once. `None` for the model's own length.
     pub frames: Option<usize>,
-    /// Where joints should be, in metres of the world; the first new frame is frame 0.
+    /// Target positions of joints, in metres of the world; the first new frame is frame 0.
     pub waypoints: Vec<Waypoint>,
 }
 
 /// New frames of a stream.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Segment {
-    /// `[frames, joints, 3]` in metres of the world.
+    /// Joints `[frames, joints, 3]` in metres of the world.
     pub joints: Vec<f64>,
-    /// How many.
+    /// Number of new frames.
     pub frames: usize,
-    /// Frames of the stream's end that it was drawn with.
+    /// Number of frames of the stream's end that the segment was generated with.
     pub overlap: usize,
-    /// How far it was off at the junction before that faded: the farthest joint, metres.
+    /// Largest distance of a joint at the junction before fading, metres.
     pub offset: f64,
-    /// Distances from the waypoints that lie in it, metres.
+    /// Distances from the waypoints in the segment, metres.
     pub missed: Vec<f64>,
 }
 
 /// The end of a stream.
 #[derive(Debug, Clone, Default)]
 struct Tail {
-    /// Feature rows as the model drew them, in the data's own scale.
+    /// Feature rows as generated by the model, in the data's own scale.
     features: Vec<f32>,
-    /// `[frames, joints, 3]`, metres of the world, as they were given out.
+    /// Joints `[frames, joints, 3]` as output, in metres of the world.
     joints: Vec<f64>,
-    /// Where a clip lies that begins at each frame.
+    /// Placement of a clip that starts at each frame.
     places: Vec<Placement>,
 }
 
@@ -113,7 +116,7 @@ impl Tail {
         self.places.len()
     }
 
-    /// Leaves only frames `range`.
+    /// Keeps only frames `range`.
     fn keep(&mut self, range: std::ops::Range<usize>, skeleton: &Skeleton) {
         let (row, frame) = (skeleton.features, 3 * skeleton.joints);
         self.features.truncate(range.end * row);
@@ -125,31 +128,31 @@ impl Tail {
     }
 }
 
-/// A stream of motion.
+/// A stream of motion, which generates segment after segment.
 #[derive(Debug, Clone)]
 pub struct MotionStream {
     settings: Settings,
     joining: Joining,
     skeleton: &'static Skeleton,
-    /// Joints that the control part is told of the last frames.
+    /// Joints of the last frames that are targets of the control part.
     told: Vec<usize>,
-    /// Percent of a segment that the last frames make up.
+    /// Overlap in percent of a segment.
     percent: f64,
     /// Lengths of segments are multiples of this.
     unit: usize,
-    /// Frames of the longest segment, with what it is told.
+    /// Number of frames of the longest segment, overlap included.
     longest: usize,
     tail: Tail,
-    /// Frames of the last segment.
+    /// Number of frames of the last segment.
     last: usize,
     segments: u64,
 }
 
 impl MotionStream {
-    /// A stream of a model that has not begun.
+    /// Starts a stream of a model.
     ///
     /// # Errors
-    /// A sampler that the model does not have, or an overlap that leaves nothing new.
+    /// If the model does not support the sampler, or the overlap leaves no new frames.
     pub fn new(generator: &Generator, settings: Settings) -> Result<Self, StageError> {
         let skeleton = Skeleton::of(generator.format());
         if let Some(sampler) = &settings.sampler {
@@ -167,7 +170,7 @@ impl MotionStream {
                 percent = control.hints.density.1;
             }
         }
-        // What it could draw beyond the longest clips of the benchmark it has never seen.
+        // The model has never seen clips beyond the longest of the benchmark, even if it could generate longer ones.
         let longest = generator.longest().min(skeleton.max_frames - 1) / unit * unit;
         let stream = Self {
             settings,
@@ -181,7 +184,7 @@ impl MotionStream {
             last: 0,
             segments: 0,
         };
-        // As much as the stream can ever be told.
+        // The largest overlap that the stream can have.
         let overlap = stream.overlap(longest, usize::MAX);
         if overlap >= longest {
             return Err(StageError::Input(format!(
@@ -191,25 +194,24 @@ impl MotionStream {
         Ok(stream)
     }
 
-    /// How its segments are joined.
+    /// The method of joining its segments.
     pub fn joining(&self) -> Joining {
         self.joining
     }
 
-    /// Its skeleton.
     pub fn skeleton(&self) -> &'static Skeleton {
         self.skeleton
     }
 
-    /// Where its root stands, metres of the world; the origin before it begins.
+    /// The place of the root, metres of the world; the origin before the first segment.
     pub fn root(&self) -> Vec3 {
         self.joint(self.tail.frames().saturating_sub(1), 0).unwrap_or_default()
     }
 
-    /// Draws the next segment.
+    /// Generates the next segment.
     ///
     /// # Errors
-    /// What the model refuses; waypoints for a model without a control part.
+    /// The errors of the model; also if there are waypoints and the model has no control part.
     pub fn draw(&mut self, generator: &Generator, ask: &Ask) -> Result<Segment, StageError> {
         if !ask.waypoints.is_empty() && self.joining != Joining::Control {
             return Err(StageError::Input("the model has no control part, and so cannot be told where to go".into()));
@@ -256,7 +258,7 @@ impl MotionStream {
         Ok(segment)
     }
 
-    /// Takes back all but the first `frames` of the last segment: the next one goes on behind them.
+    /// Removes all but the first `frames` of the last segment; the next segment continues there.
     pub fn cut(&mut self, frames: usize) {
         let gone = self.last.saturating_sub(frames);
         let all = self.tail.frames();
@@ -264,7 +266,7 @@ impl MotionStream {
         self.last -= gone;
     }
 
-    /// Frames of the stream's end, of which there are `have`, in a segment of `total`.
+    /// Overlap in frames of a segment of `total` frames, when the stream has `have` frames left.
     fn overlap(&self, total: usize, have: usize) -> usize {
         let wanted = self.settings.overlap.unwrap_or_else(|| share(self.percent, total));
         match self.joining {
@@ -274,7 +276,7 @@ impl MotionStream {
         }
     }
 
-    /// Frames to draw for `frames` new ones, if the model draws so many.
+    /// Number of frames to generate for `frames` new ones, limited to the model's longest segment.
     fn total(&self, frames: usize) -> usize {
         let have = self.tail.frames();
         let mut total = self.skeleton.min_frames.next_multiple_of(self.unit).min(self.longest);
@@ -284,24 +286,25 @@ impl MotionStream {
         total
     }
 
-    /// As many frames, in lengths that the model draws.
+    /// Number of frames to generate, rounded up to a length that the model supports, limited to its longest segment.
     fn total_for_all(&self, frames: usize) -> usize {
         frames.max(self.skeleton.min_frames).next_multiple_of(self.unit).min(self.longest)
     }
 
-    /// Where a clip lies that begins at frame `start` of the tail. What faded in there did not turn the body, but moved its root.
+    /// Placement of a clip that starts at frame `start` of the tail. Fading there did not turn the body, but moved its
+    /// root.
     fn place(&self, start: usize) -> Placement {
         let place = self.tail.places.get(start).copied().unwrap_or_default();
         self.joint(start, 0).map_or(place, |root| place.below(root))
     }
 
-    /// A joint of the tail.
+    /// Position of a joint of the tail.
     fn joint(&self, frame: usize, joint: usize) -> Option<Vec3> {
         let at = 3 * (frame * self.skeleton.joints + joint);
         self.tail.joints.get(at..at + 3).map(|p| [p[0], p[1], p[2]])
     }
 
-    /// Feature rows of a segment whose first `overlap` frames are the tail's last ones.
+    /// Feature rows of a segment whose first `overlap` frames are the last ones of the tail.
     fn features(
         &self,
         generator: &Generator,
@@ -320,7 +323,7 @@ impl MotionStream {
             Joining::Infilling if overlap >= self.unit => {
                 let mut rows = self.tail.features[(self.tail.frames() - overlap) * width..].to_vec();
                 let last = rows[rows.len() - width..].to_vec();
-                // What is drawn anew is not looked at, but must be motion.
+                // The frames to be generated are ignored, but must be valid motion.
                 (overlap..total).for_each(|_| rows.extend(&last));
                 let kept = std::iter::once(0..overlap).collect::<Vec<_>>();
                 generator.edit(&ask.caption, &rows, &kept, sampler, seed)?.motion
@@ -330,7 +333,7 @@ impl MotionStream {
         Ok(drawn.features)
     }
 
-    /// What a segment is told: the tail's last frames and the waypoints, in its own frame.
+    /// The targets of a segment, in its own frame: the tail's last frames and the waypoints.
     fn hint(&self, ask: &Ask, total: usize, overlap: usize, place: Placement) -> Hint {
         let mut hint = Hint::none(total, self.skeleton.joints);
         let start = self.tail.frames() - overlap;
@@ -350,7 +353,8 @@ impl MotionStream {
         hint
     }
 
-    /// `frames` new frames of drawn rows in the world, behind `overlap` that are there already, joined to those; and how far off they were.
+    /// Places `frames` new frames of generated rows in the world, after `overlap` existing ones, and joins them.
+    /// Returns the joints and the distance at the junction before fading.
     fn placed(&self, rows: &[f32], (overlap, frames): (usize, usize), place: Placement) -> (Vec<f64>, f64) {
         let (joints, metres) = (self.skeleton.joints, self.skeleton.metres_per_unit);
         let mut world: Vec<f64> = recover_joints_wide(rows, self.skeleton)
@@ -364,7 +368,7 @@ impl MotionStream {
             let was = |k: usize, i: usize| self.tail.joints[have.saturating_sub(1 + k) * width + i];
             let is = |k: usize, i: usize| match (overlap - 1).checked_sub(k) {
                 Some(frame) => world[frame * width + i],
-                // Before the clip begins it moves on as it does then.
+                // Before its start the clip moves with its initial velocity.
                 None => {
                     let (first, behind) = ((k + 1 - overlap) as f64, usize::from(world.len() / width > 1));
                     world[i] - first * (world[behind * width + i] - world[i])

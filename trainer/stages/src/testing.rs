@@ -1,6 +1,6 @@
-//! A world in memory for tests: blobs, attempts, and gangs of threads that lose and gain members on cue.
+//! A world in memory for tests: blobs, attempts, and gangs of threads that lose and gain members by a script.
 //!
-//! What it promises is what [`context`](crate::context) promises, no more: sums along the fixed tree, one leader, verified
+//! It guarantees exactly what [`context`](crate::context) guarantees: sums along the fixed tree, one leader, verified
 //! blobs. Not its job: fences, leases, networks; the worker's own tests cover those.
 
 mod attempt;
@@ -24,23 +24,23 @@ pub use crate::train::tree_sum;
 pub use attempt::{MemoryAttempt, MemoryBlobs, Ran, Told};
 pub use gang::{Body, Script};
 
-/// Runs stages one after the other, with what they make kept in memory.
+/// Runs stages one after the other, and keeps their outputs in memory.
 #[derive(Debug)]
 pub struct Bench {
     device: Device,
     seed: Seed,
     blobs: Arc<MemoryBlobs>,
     checkpoints: BTreeMap<String, Vec<(u64, Manifest)>>,
-    /// Cadence handed to gang stages.
+    /// Checkpoint cadence of gang stages.
     pub checkpoint: CheckpointPolicy,
-    /// Members of a gang.
+    /// Number of members of a gang.
     pub members: usize,
-    /// Who leaves or joins a gang, and when.
+    /// Losses and joins of members.
     pub script: Script,
 }
 
 impl Bench {
-    /// An empty world in which `members` threads make up a gang.
+    /// Creates an empty world in which a gang has `members` threads.
     pub fn new(device: Device, seed: u64, members: usize) -> Self {
         Self {
             device,
@@ -53,12 +53,10 @@ impl Bench {
         }
     }
 
-    /// The blobs of this world.
     pub fn blobs(&self) -> Arc<MemoryBlobs> {
         Arc::clone(&self.blobs)
     }
 
-    /// The device of this world.
     pub fn device(&self) -> Device {
         self.device.clone()
     }
@@ -69,12 +67,12 @@ impl Bench {
         serde_json::from_slice(&bytes).map_err(|e| ContextError::Corrupt(e.to_string()))
     }
 
-    /// The steps at which the stage `name` has saved checkpoints.
+    /// Steps of the saved checkpoints of the stage `name`.
     pub fn checkpoints(&self, name: &str) -> Vec<u64> {
         self.checkpoints.get(name).into_iter().flatten().map(|(step, _)| *step).collect()
     }
 
-    /// Forgets the checkpoints of the stage `name` after step `last`, as if it had not got further. Returns them.
+    /// Removes the checkpoints of the stage `name` after step `last`, and returns them.
     pub fn forget_after(&mut self, name: &str, last: u64) -> Vec<(u64, Manifest)> {
         let saved = self.checkpoints.entry(name.to_owned()).or_default();
         let (kept, forgotten) = std::mem::take(saved).into_iter().partition(|(step, _)| *step <= last);
@@ -82,7 +80,7 @@ impl Bench {
         forgotten
     }
 
-    /// Forgets all checkpoints of the stage `name`: it begins anew.
+    /// Removes all checkpoints of the stage `name`, so that it starts again.
     pub fn forget(&mut self, name: &str) {
         self.checkpoints.remove(name);
     }
@@ -92,17 +90,17 @@ impl Bench {
         self.checkpoints.get(name).and_then(|saved| saved.last())
     }
 
-    /// The newest checkpoint of the stage `name`, which is forgotten with all others of it: what a rung of a sweep leaves.
+    /// Removes all checkpoints of the stage `name` and returns the newest, as at the end of a sweep's rung.
     pub fn take_checkpoint(&mut self, name: &str) -> Option<(u64, Digest)> {
         self.checkpoints.remove(name)?.pop().map(|(step, manifest)| (step, manifest.digest()))
     }
 
     /// Runs the stage `name` to its end, or until its script stops it. A gang stage continues its newest checkpoint.
     ///
-    /// Shards of a map stage run last to first: their order must not matter.
+    /// Shards of a map stage run last to first, because their order must not matter.
     ///
     /// # Panics
-    /// If the stage records or gives what its kind does not say.
+    /// If the stage records or returns values that its kind does not declare.
     pub fn run(&mut self, name: &str, settings: &StageSettings, inputs: &[(&str, Digest)]) -> Result<Ran, StageError> {
         let task = self.task(name, settings, inputs);
         let attempt = || MemoryAttempt::new(task.clone(), self.device.clone(), Arc::clone(&self.blobs));
@@ -123,7 +121,7 @@ impl Bench {
                 let mut cx = attempt();
                 let outcome = kinds::run_part(&mut cx, Part::Merge { shards })?;
                 let ran = Ran { outcome, told: cx.told };
-                // A gate on anything else is refused before a run.
+                // A gate on any other metric is refused before a run.
                 if let Some(may) = settings.metrics() {
                     let unsaid: Vec<&String> = ran.metrics().keys().filter(|name| !may.contains(*name)).collect();
                     assert!(unsaid.is_empty(), "`{}` gives {unsaid:?}, and does not say so", settings.kind());
@@ -132,7 +130,7 @@ impl Bench {
             }
             Shape::Gang => {
                 let ran = self.run_gang(name, settings, inputs, &kinds::run_gang)?;
-                // Keeping checkpoints by anything else is refused before a run.
+                // Keeping checkpoints by any other value is refused before a run.
                 let recorded: BTreeSet<&str> = ran.told.records.iter().map(|(_, name, _)| name.as_str()).collect();
                 let said = BTreeSet::from_iter(settings.recorded());
                 assert!(
@@ -146,10 +144,10 @@ impl Bench {
         }
     }
 
-    /// Runs `body` as the gang stage `name`, whatever kind its settings are of: a stage that no kind is yet.
+    /// Runs `body` as the gang stage `name`, for any kind of its settings, such as a kind that does not exist yet.
     ///
     /// # Errors
-    /// What the last member said no with.
+    /// The error of the last member.
     pub fn run_gang(
         &mut self,
         name: &str,

@@ -1,10 +1,11 @@
-//! Average inference time per sentence (AITS), of several models side by side.
+//! Average inference time per sentence (AITS), for several models side by side.
 //!
-//! Source: MLD and MotionLCM, which divide the time of a test set by its sentences: one sentence at a time, the model loaded, from the text
-//! to the decoded motion, without the way from features to joints. Departs: every motion has the same length, the text encoder is that of the
-//! model (hashed words cost nothing, where the papers' CLIP and T5 are most of a one-step model's time), bringing features back to the
-//! data's own scale counts, and the first sentences are left out, in which caches fill. Only times of one machine can be compared, so none
-//! is ever a stage's value.
+//! Source: MLD and MotionLCM, which divide the time of a test set by its sentences. One sentence at a time is timed
+//! with the model loaded, from the text to the decoded motion, without the conversion of features to joints. Departs:
+//! every motion has the same length. The text encoder is that of the model: hashed words cost nothing, where the
+//! papers' CLIP and T5 are most of a one-step model's time. The conversion of features to the data's own scale is
+//! included. The first sentences, during which caches fill, are left out. Only times of one machine can be compared, so
+//! a time is never a stage's value.
 
 use std::time::Duration;
 
@@ -18,35 +19,35 @@ use crate::text;
 
 pub use crate::generate::Timing;
 
-/// Sentences of each model that are not counted.
+/// Number of first sentences of each model that are not counted.
 pub const WARM_UP: usize = 5;
 
-/// What the times of many sentences come to, in seconds.
+/// Statistics of the times of many sentences, in seconds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Times {
-    /// Sentences.
+    /// Number of sentences.
     pub sentences: usize,
-    /// AITS: the mean.
+    /// AITS, the mean time.
     pub mean: f64,
-    /// Half of the sentences took no longer.
+    /// Median time.
     pub median: f64,
-    /// 95 of 100 took no longer.
+    /// 95th percentile of the times.
     pub p95: f64,
-    /// The mean's parts.
+    /// Mean time of embedding the text.
     pub text: f64,
-    /// See `text`.
+    /// Mean time of the sampler.
     pub sampling: f64,
-    /// See `text`.
+    /// Mean time of decoding.
     pub decoding: f64,
 }
 
 impl Times {
-    /// `None` of no sentences.
+    /// Computes the statistics; `None` without sentences.
     pub fn of(timings: &[Timing]) -> Option<Self> {
         let mut seconds: Vec<f64> = timings.iter().map(|t| t.total().as_secs_f64()).collect();
         seconds.sort_by(f64::total_cmp);
         let count = seconds.len();
-        // The smallest value that so many percent of all do not exceed.
+        // The smallest value that `percent` of all do not exceed.
         let rank = |percent: usize| seconds.get((count * percent).div_ceil(100).max(1) - 1).copied();
         let mean =
             |of: fn(&Timing) -> Duration| timings.iter().map(|t| of(t).as_secs_f64()).sum::<f64>() / count as f64;
@@ -62,8 +63,8 @@ impl Times {
     }
 }
 
-/// Has each of `models` say something of each of `sentences`, in turn: sentence by sentence all models, so that whatever else the machine
-/// does falls on all alike, and each time another one first. `warm_up` rounds go before, and what is said in them is dropped.
+/// Runs each of `models` on each of `sentences`, sentence by sentence all models, so that other load of the machine
+/// affects all alike. Each sentence starts with another model. The results of the first `warm_up` rounds are dropped.
 fn side_by_side<T>(
     models: usize,
     sentences: usize,
@@ -84,8 +85,8 @@ fn side_by_side<T>(
     Ok(all)
 }
 
-/// Times models with their samplers, one motion of `frames` frames a sentence: a time for each sentence, by model. `done` is told after each
-/// motion, those of the warm-up included.
+/// Times models with their samplers, one motion of `frames` frames per sentence. Returns the times of each model by
+/// sentence. `done` is called after each motion, including warm-up.
 pub fn time(
     models: &[(&Generator, &Sampler)],
     sentences: &[String],
@@ -94,7 +95,7 @@ pub fn time(
 ) -> Result<Vec<Vec<Timing>>, StageError> {
     side_by_side(models.len(), sentences.len(), WARM_UP, |model, sentence| {
         let (generator, sampler) = models[model];
-        // Sentences come again, and a model may have the encoder of another.
+        // Sentences repeat, and models may share an encoder.
         text::forget();
         let motion = generator.generate(&sentences[sentence], frames, Some(sampler), Seed(sentence as u64))?;
         done();
@@ -102,7 +103,7 @@ pub fn time(
     })
 }
 
-/// Sentences to time models with: captions of synthetic clips.
+/// Sentences for timing: captions of synthetic clips.
 pub fn sentences(count: usize) -> Vec<String> {
     let clips = DataSynthetic { clips: count, val: 0.0, test: 0.0, mirror: false };
     let dataset = synthetic::generate(&clips, Seed(0));
@@ -110,7 +111,7 @@ pub fn sentences(count: usize) -> Vec<String> {
     first.take(count).map(|caption| caption.text.clone()).collect()
 }
 
-/// Threads that this process computes with.
+/// Number of threads that this process computes with.
 pub fn threads() -> usize {
     rayon::current_num_threads()
 }

@@ -1,7 +1,7 @@
-//! Trained tokenizers out of artifacts: motion to token ids and back, with plain arrays.
+//! Trained tokenizers from artifacts: motion to token ids and back, with plain arrays.
 //!
-//! Everything runs on the plain device, without dropout. Ids are rows `[tokens, quantizers]`; [`NO_CODE`](models::quantizer::NO_CODE) adds nothing. Not its job:
-//! training, and who makes up ids.
+//! Everything runs on the plain device, without dropout. Ids are rows `[tokens, quantizers]`;
+//! [`NO_CODE`](models::quantizer::NO_CODE) adds nothing. Not its job: training, and generating ids.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
@@ -19,28 +19,28 @@ use crate::context::{AttemptContext, ContextError, StageError};
 use crate::kinds::word;
 use crate::weights;
 
-/// Levels of every published tokenizer, each of which halves the frames.
+/// Number of levels of every published tokenizer; each halves the frames.
 const LEVELS: usize = 2;
 const STRIDE: usize = 2;
 
 /// Meta of an artifact of kind `tokenizer`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TokenizerMeta {
-    /// The data it was trained on.
+    /// Format of the training data.
     pub format: DataFormat,
     /// Width of a feature vector.
     pub features: usize,
-    /// Codes K of a codebook.
+    /// Number of codes K of a codebook.
     pub codes: usize,
     /// Width d of a code.
     pub code_dim: usize,
-    /// Codebooks Q.
+    /// Number of codebooks Q.
     pub quantizers: usize,
-    /// Size.
+    /// Size of encoder and decoder.
     pub network: TokenizerNetwork,
     /// Mean of the training features, `[features]`.
     pub mean: Vec<f32>,
-    /// Their standard deviation, `[features]`.
+    /// Standard deviation of the training features, `[features]`.
     pub std: Vec<f32>,
 }
 
@@ -65,7 +65,7 @@ impl TokenizerMeta {
         (0..self.quantizers).map(|q| Entry { name: name(q), shape: shape.clone() }).collect()
     }
 
-    /// Uploads a tokenizer: its parameters, and its codebooks.
+    /// Uploads a tokenizer's parameters and codebooks.
     pub fn publish(
         &self,
         cx: &mut dyn AttemptContext,
@@ -95,7 +95,7 @@ impl TrainedTokenizer {
         Self::load(artifacts::meta(manifest, "the tokenizer")?, &artifacts::file(blobs, manifest, MODEL_FILE)?, device)
     }
 
-    /// A tokenizer from its meta and weights.
+    /// Creates a tokenizer from its meta and weights.
     pub fn load(meta: TokenizerMeta, weights: &[u8], device: &Device) -> Result<Self, StageError> {
         let device = device.clone().inner();
         let fresh = Tokenizer::new(&meta.config(), &mut Init::new(Seed(0), "blank", Positions::Uniform, &device));
@@ -107,12 +107,12 @@ impl TrainedTokenizer {
         Ok(Self { network: flat::write(fresh, &all), books, meta, device })
     }
 
-    /// What it is.
+    /// Meta of the artifact.
     pub fn meta(&self) -> &TokenizerMeta {
         &self.meta
     }
 
-    /// Frames that one token stands for.
+    /// Number of frames per token.
     pub fn unit(&self) -> usize {
         self.meta.config().unit()
     }
@@ -122,7 +122,7 @@ impl TrainedTokenizer {
         &self.books
     }
 
-    /// Refuses data of another format than it was trained on.
+    /// Refuses data of another format than the training data.
     pub fn check_format(&self, format: DataFormat) -> Result<(), StageError> {
         if self.meta.format == format {
             return Ok(());
@@ -133,7 +133,7 @@ impl TrainedTokenizer {
         )))
     }
 
-    /// `(x - mean) / std` with the statistics of its training data.
+    /// Computes `(x - mean) / std` with the statistics of the training data, in place.
     pub fn normalise(&self, rows: &mut [f32]) {
         for row in rows.chunks_exact_mut(self.meta.features) {
             for ((value, mean), std) in row.iter_mut().zip(&self.meta.mean).zip(&self.meta.std) {
@@ -151,7 +151,7 @@ impl TrainedTokenizer {
         }
     }
 
-    /// Ids `[frames / 4, Q]` of one motion of normalised rows `[frames, features]`, at least 4 of them.
+    /// Encodes one motion of at least 4 normalised rows `[frames, features]` as ids `[frames / 4, Q]`.
     pub fn encode(&self, rows: Vec<f32>) -> Vec<i64> {
         let frames = rows.len() / self.meta.features;
         let rows = Tensor::<3>::from_data(TensorData::new(rows, [1, frames, self.meta.features]), &self.device);
@@ -167,7 +167,7 @@ impl TrainedTokenizer {
         look_up(ids, self.meta.quantizers, &self.books, self.meta.code_dim)
     }
 
-    /// Normalised rows `[4 tokens, features]` of one motion's ids `[tokens, Q]`.
+    /// Decodes one motion's ids `[tokens, Q]` to normalised rows `[4 tokens, features]`.
     pub fn decode(&self, ids: &[i64]) -> Vec<f32> {
         let codes = self.codes(ids);
         let tokens = codes.len() / self.meta.code_dim;
@@ -180,35 +180,35 @@ impl TrainedTokenizer {
     }
 }
 
-/// Where ids are: `ids` `[tokens of all entries, Q]`.
+/// File of ids: `ids` `[tokens of all entries, Q]`.
 pub const TOKENS_FILE: &str = "tokens.safetensors";
 
 /// Meta of an artifact of kind `tokens`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TokensMeta {
-    /// The data.
+    /// Format of the encoded data.
     pub format: DataFormat,
-    /// The tokenizer that encoded.
+    /// The tokenizer that encoded the data.
     pub tokenizer: Digest,
-    /// Codes K of a codebook.
+    /// Number of codes K of a codebook.
     pub codes: usize,
-    /// Codebooks Q.
+    /// Number of codebooks Q.
     pub quantizers: usize,
     /// Split of each entry.
     pub splits: Vec<motion::dataset::Split>,
-    /// Captions of each entry, by number in the dataset and so by row in the embeddings.
+    /// Captions of each entry, as indices in the dataset and so as rows of the embeddings.
     pub captions: Vec<Vec<usize>>,
-    /// Tokens of each entry.
+    /// Number of tokens of each entry.
     pub lengths: Vec<usize>,
 }
 
 /// Token ids with their meta.
 #[derive(Debug, Clone)]
 pub struct Tokens {
-    /// What they are.
+    /// Meta of the artifact.
     pub meta: TokensMeta,
     ids: HostTensor<i64>,
-    /// Where each entry's tokens begin.
+    /// Index of each entry's first token.
     starts: Vec<usize>,
 }
 

@@ -1,8 +1,8 @@
-//! Re-runs steps of a training stage from a committed checkpoint and keeps what came out, to be compared with what was
+//! Re-runs steps of a training stage from a committed checkpoint and keeps the results, to be compared with those
 //! stored when the stage ran.
 //!
-//! The whole gang is this thread: a sum along the fixed tree does not depend on who computed its leaves. What is computed is
-//! written to memory only; the store is read and never changed.
+//! The whole gang is this thread: a sum along the fixed tree does not depend on the members that computed its leaves.
+//! Results are written only to memory; the store is read and never changed.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -18,25 +18,25 @@ use crate::solo::{Overlay, Solo};
 
 pub use crate::solo::state_digest;
 
-/// What re-run steps gave.
+/// Results of re-run steps.
 #[derive(Debug, Clone)]
 pub struct Rerun {
-    /// Steps of the state it began from.
+    /// Number of steps in the initial state.
     pub from: u64,
-    /// Steps of the state it ended with.
+    /// Number of steps in the final state.
     pub to: u64,
-    /// What was recorded on the way: step and name, value.
+    /// Recorded values by step and name.
     pub values: BTreeMap<(u64, String), f64>,
-    /// The digest of the whole training state after a step, wherever one was saved.
+    /// Digest of the whole training state by step, for each saved one.
     pub states: BTreeMap<u64, Digest>,
-    /// The stage's output, if it came to its end.
+    /// Output of the stage, if it reached its end.
     pub output: Option<Digest>,
 }
 
-/// Runs `task` from `checkpoint` (from nothing if there is none) until `until` steps are applied, or to its end.
+/// Runs `task` from `checkpoint`, or from the start without one, until `until` steps are applied, or to its end.
 ///
 /// # Errors
-/// Whatever the stage says no with.
+/// Any error of the stage.
 pub fn rerun(
     task: StageTask,
     device: Device,

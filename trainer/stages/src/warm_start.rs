@@ -1,11 +1,11 @@
-//! What a training begins with instead of fresh weights: the settings key `init`, the same for every kind.
+//! Initial weights of a training from an existing model: the settings key `init`, the same for every kind.
 //!
-//! `init` names a stage or a version of the registry. What fits is found by kind of artifact: an artifact of the kind that is trained, or
-//! the one part of that kind that a model has. Tensors are taken over where name and shape are the same; all others stay as they would be
-//! without `init`, and are said. So a VAE of KIT-ML begins with one of HumanML3D, fresh only where features go in and come out. That
-//! nothing fits is an error, and so it is if nothing does but biases and the like, which have one axis. What else differs (statistics of the
-//! data, another text encoder, another noise schedule) is said too, and hinders nothing, unless the kind refuses it. Not its job: a checkpoint,
-//! which is all of a training's state and comes after.
+//! `init` names a stage or a version of the registry. The source is found by kind of artifact: an artifact of the
+//! trained kind, or the only part of that kind in a model. Tensors with equal name and shape are copied; all others
+//! keep their fresh values and are listed in the log. So a VAE of KIT-ML starts from one of HumanML3D, fresh only at
+//! the features' input and output. It is an error if nothing fits, or only tensors with one axis such as biases. Other
+//! differences (statistics of the data, another text encoder, another noise schedule) are logged and allowed, unless
+//! the kind refuses them. Not its job: a checkpoint, which is the complete state of a training and is loaded later.
 
 use std::collections::BTreeSet;
 
@@ -21,32 +21,32 @@ use crate::artifacts::{self, MODEL_FILE};
 use crate::context::{AttemptContext, ContextError, GangContext, StageError};
 use crate::parts::{self, model_error};
 
-/// The settings key.
+/// The settings key that names the source.
 const INIT: &str = "init";
 
-/// Tensors that the log lists one by one.
+/// Largest number of tensors that the log lists one by one.
 const LISTED: usize = 40;
 
-/// What training begins with, if anything is named.
+/// Initial weights of a training; `None` if `init` is not set.
 #[derive(Debug)]
 pub(crate) struct WarmStart(Option<Weights>);
 
-/// The weights that are taken over.
+/// The weights to be copied.
 #[derive(Debug)]
 struct Weights {
     digest: Digest,
     part: Manifest,
     file: Box<dyn Blob>,
     taken: usize,
-    /// Those of them that have two axes or more.
+    /// Number of copied tensors with two axes or more.
     matrices: usize,
     fresh: Vec<String>,
-    /// Names of the file that a network of ours has.
+    /// Names in the file that our network has too.
     known: BTreeSet<String>,
 }
 
 impl WarmStart {
-    /// Opens the artifact of `kind` that `init` names or that is a part of the model there.
+    /// Opens the artifact of `kind` that `init` names, or that is a part of the model there.
     pub(crate) fn find(cx: &dyn AttemptContext, kind: ArtifactKind) -> Result<Self, StageError> {
         let Some(&digest) = cx.task().inputs.get(INIT) else { return Ok(Self(None)) };
         let (blobs, manifest) = (cx.blobs(), cx.manifest(digest)?);
@@ -63,12 +63,12 @@ impl WarmStart {
         Ok(Self(Some(Weights { digest, part, file, taken: 0, matrices: 0, fresh: Vec::new(), known: BTreeSet::new() })))
     }
 
-    /// The artifact whose weights are taken over, if any is named: what hinders that beside names and shapes is for its kind to say.
+    /// The manifest of the source, if `init` is set, so that a kind can check more than names and shapes.
     pub(crate) fn part(&self) -> Option<&Manifest> {
         self.0.as_ref().map(|weights| &weights.part)
     }
 
-    /// `network` with the weights that fit it, of those whose names begin with `prefix`.
+    /// Loads into `network` the weights that fit it, from names with `prefix`.
     pub(crate) fn take<M: Module>(&mut self, network: M, prefix: &str) -> Result<M, StageError> {
         let entries = flat::layout(&network);
         let Some(values) = self.values(&entries, prefix)? else { return Ok(network) };
@@ -84,7 +84,7 @@ impl WarmStart {
         Ok(flat::write(network, &all))
     }
 
-    /// The values that fit `entries`, for what is trained besides networks; `None` if nothing is named.
+    /// The values that fit `entries`, for trained values outside networks; `None` if `init` is not set.
     pub(crate) fn values(
         &mut self,
         entries: &[Entry],
@@ -103,7 +103,7 @@ impl WarmStart {
         Ok(Some(fitted.values))
     }
 
-    /// Says what was taken over and what was not; `meta` is what the artifact in the making says of itself.
+    /// Logs the tensors that were copied and those that were not; `meta` is the meta of the new artifact.
     ///
     /// # Errors
     /// If nothing fitted.
@@ -140,7 +140,7 @@ impl WarmStart {
     }
 }
 
-/// The first of some tensors, a line for each.
+/// Logs the first of some tensors, one per line.
 fn list(cx: &mut dyn GangContext, what: &str, tensors: &[String]) {
     tensors.iter().take(LISTED).for_each(|tensor| cx.log(&format!("{what}: {tensor}")));
     if tensors.len() > LISTED {
@@ -148,7 +148,7 @@ fn list(cx: &mut dyn GangContext, what: &str, tensors: &[String]) {
     }
 }
 
-/// What two metas of one kind say differently, by key.
+/// The differences between two metas of one kind, by key.
 fn differing(theirs: &Value, ours: &Value) -> Vec<String> {
     let (Some(theirs), Some(ours)) = (theirs.as_object(), ours.as_object()) else { return Vec::new() };
     let differs = |key: &&String| theirs.get(*key) != ours.get(*key);

@@ -1,4 +1,4 @@
-//! Weights on their way between a flat buffer or a network and a store, without a second copy of them in memory.
+//! Transfer of weights between a flat buffer or a network and a store, without a second copy in memory.
 
 use burn::module::Module;
 use checkpoint::Blobs;
@@ -9,20 +9,20 @@ use protocol::{ArtifactKind, Digest, Manifest};
 use crate::artifacts::{self, Draft, MODEL_FILE};
 use crate::context::{AttemptContext, ContextError, StageError};
 
-/// Where tensors are that published files have beside the weights and that follow from a network's size: no reader of ours needs them.
+/// File of published tensors that a network's size determines; our readers do not need them.
 pub const CONSTANTS_FILE: &str = "constants.safetensors";
 
-/// Uploads weights as the file of an artifact.
+/// Uploads weights as a file of an artifact.
 pub fn add(draft: &mut Draft, entries: &[Entry], values: &[f32]) -> Result<(), StageError> {
     draft.add_pieces(MODEL_FILE, &Weights::new(entries, values).pieces())
 }
 
-/// Uploads weights that lie in several buffers as the one file of an artifact.
+/// Uploads weights from several buffers as one file of an artifact.
 pub fn add_all(draft: &mut Draft, buffers: &[(&[Entry], &[f32])]) -> Result<(), StageError> {
     draft.add_pieces(MODEL_FILE, &Weights::of(buffers).pieces())
 }
 
-/// Uploads weights and a manifest around them.
+/// Uploads weights and their manifest.
 pub fn publish(
     cx: &mut dyn AttemptContext,
     kind: ArtifactKind,
@@ -34,12 +34,12 @@ pub fn publish(
     draft.finish(cx)
 }
 
-/// `blank` with the weights of an artifact, read tensor by tensor; `what` names them in the error.
+/// Loads the weights of an artifact into `blank`, tensor by tensor; `what` names them in the error.
 pub fn load<M: Module>(blank: M, blobs: &dyn Blobs, manifest: &Manifest, what: &str) -> Result<M, StageError> {
     load_under(blank, blobs, manifest, "", what)
 }
 
-/// As [`load`], of those weights alone whose names begin with `prefix`.
+/// Like [`load`], only for weights whose names have `prefix`.
 pub fn load_under<M: Module>(
     blank: M,
     blobs: &dyn Blobs,

@@ -1,8 +1,9 @@
-//! Captions as the evaluators read them: a vector and a class for each of 22 words.
+//! Captions in the form that evaluators read: a vector and a class for each of 22 words.
 //!
-//! Word vectors are the published vocabulary, or built in: the word and its letter triples hashed to directions, so that any word has
-//! one and related forms lie near each other. An evaluator keeps what it was trained with, and its meta names it: numbers taken with different word
-//! vectors are of different evaluators. Source of the published form: text-to-motion (Guo et al.), whose vocabulary is cut from GloVe.
+//! Word vectors are the published vocabulary, or built in. A built-in vector hashes the word and its letter triples to
+//! directions, so that any word has one and related forms are similar. An evaluator keeps the vectors of its training,
+//! and its meta names them: metrics with different word vectors belong to different evaluators. Source of the published
+//! form: text-to-motion (Guo et al.), whose vocabulary is an extract of GloVe.
 
 use std::collections::{BTreeMap, HashMap};
 use std::io::Read as _;
@@ -21,64 +22,64 @@ use crate::context::{ContextError, StageError};
 
 /// Width of a word vector.
 pub const WORD_WIDTH: usize = motion::text::WORD_WIDTH;
-/// Words of a caption, with markers and filling.
+/// Number of words of a caption, with markers and padding.
 pub const WORDS: usize = MAX_TOKENS + 2;
-/// Classes of words.
+/// Number of word classes.
 pub const CLASSES: usize = POS_CLASSES.len();
-/// The class of words that a vocabulary does not have.
+/// The class of words that are not in a vocabulary.
 const OTHER: usize = CLASSES - 1;
-/// Stands for a word that a vocabulary does not have.
+/// Entry for words that are not in a vocabulary.
 const UNKNOWN: &str = "unk";
-/// Where an evaluator keeps its vectors, `vectors` `[n, 300]`.
+/// File of an evaluator's vectors, `vectors` `[n, 300]`.
 const VECTORS_FILE: &str = "words.safetensors";
-/// Where it keeps their rows by word.
+/// File of their rows by word.
 const INDEX_FILE: &str = "words.json";
 
-/// Which word vectors an evaluator reads.
+/// The word vectors of an evaluator.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase")]
 pub enum WordsMeta {
-    /// Built in.
+    /// Built-in vectors, hashed from words.
     Hashed,
     /// A published vocabulary.
     Vocabulary {
-        /// Of the vectors and their index.
+        /// Digest of the vectors and their index.
         digest: Digest,
-        /// Words.
+        /// Number of words.
         words: usize,
     },
 }
 
-/// Word vectors.
+/// Word vectors of either kind.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Words {
-    /// Built in.
+    /// Built-in vectors, hashed from words.
     Hashed,
     /// A published vocabulary.
     Vocabulary {
-        /// `[n, 300]`.
+        /// Vectors of shape `[n, 300]`.
         vectors: Floats,
         /// Row of each word.
         index: HashMap<String, usize>,
     },
 }
 
-/// Captions as tensors' values.
+/// Captions as values of tensors.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct CaptionBatch {
-    /// `[captions, 22, 300]`.
+    /// Word vectors of shape `[captions, 22, 300]`.
     pub words: Vec<f32>,
-    /// `[captions, 22, 15]`.
+    /// One-hot classes of shape `[captions, 22, 15]`.
     pub classes: Vec<f32>,
-    /// Words of each, markers counted, filling not.
+    /// Number of words of each caption, with markers and without padding.
     pub lengths: Vec<usize>,
 }
 
 impl Words {
-    /// Reads a folder with `our_vab_data.npy` and `our_vab_idx.pkl`; an empty path is the built-in vectors.
+    /// Reads a folder with `our_vab_data.npy` and `our_vab_idx.pkl`; an empty path selects the built-in vectors.
     ///
     /// # Errors
-    /// What is wrong with which file.
+    /// If a file is missing or invalid; the message names it.
     pub fn open(folder: &str) -> Result<Self, StageError> {
         if folder.is_empty() {
             return Ok(Self::Hashed);
@@ -124,7 +125,7 @@ impl Words {
         Ok(Self::Vocabulary { vectors: array.data.into(), index })
     }
 
-    /// What an evaluator's meta says of them.
+    /// The description of the vectors in an evaluator's meta.
     pub fn meta(&self) -> WordsMeta {
         match self {
             Self::Hashed => WordsMeta::Hashed,
@@ -136,7 +137,7 @@ impl Words {
         }
     }
 
-    /// Adds them to an evaluator in the making; the built-in ones need no file.
+    /// Adds the vectors to an evaluator's artifact; the built-in ones need no file.
     pub fn write(&self, draft: &mut Draft) -> Result<(), StageError> {
         if let Self::Vocabulary { vectors, index } = self {
             let rows = vectors.len() / WORD_WIDTH;
@@ -149,7 +150,7 @@ impl Words {
         Ok(())
     }
 
-    /// Those of an evaluator.
+    /// Reads the vectors of an evaluator.
     pub fn read(blobs: &dyn Blobs, manifest: &Manifest, meta: &WordsMeta) -> Result<Self, StageError> {
         if *meta == WordsMeta::Hashed {
             return Ok(Self::Hashed);
@@ -177,7 +178,7 @@ impl Words {
         }
     }
 
-    /// Captions as an evaluator takes them.
+    /// Converts captions to the form that an evaluator reads.
     pub fn batch<'a>(&self, captions: impl IntoIterator<Item = &'a Caption>) -> CaptionBatch {
         let mut batch = CaptionBatch::default();
         for caption in captions {

@@ -1,4 +1,4 @@
-//! Controlled motion, at sizes at which a step takes a few milliseconds: training, drawing, measuring.
+//! Controlled motion: training, sampling and measuring, with sizes for which a step takes a few milliseconds.
 
 use std::collections::BTreeMap;
 
@@ -21,7 +21,7 @@ use stages::testing::{Bench, Script};
 
 const STEPS: u64 = 9;
 
-/// A stage: its name, its settings, and which stage gives each of its inputs.
+/// A stage: its name, its settings, and the stage of each of its inputs.
 type Described<'a> = (&'a str, StageSettings, &'a [(&'a str, &'a str)]);
 
 fn training(steps: u64) -> Training {
@@ -123,7 +123,8 @@ fn run(bench: &mut Bench, name: &str, settings: &StageSettings, inputs: &Inputs)
     bench.run(name, settings, inputs).unwrap_or_else(|e| panic!("{name}: {e}")).output()
 }
 
-/// 1 member, 3 of which the leader is lost while another joins, and a kill of all with a resume: one value. A teacher and both students.
+/// One member, three members with a lost leader and a joiner, and a kill of all with a resume have the same result, for
+/// a teacher and both students.
 #[test]
 fn p6_members_kills_and_resumes_change_no_byte() {
     let (mut bench, outputs) = world(v2());
@@ -149,7 +150,7 @@ fn p6_members_kills_and_resumes_change_no_byte() {
             let steps = if there { STEPS as usize } else { 0 };
             assert_eq!(positive, steps, "{name}: {term} is {values:?}");
         }
-        // All parts of the base stay as they are.
+        // All parts of the base are unchanged.
         let read = |digest| Model::read(&bench.manifest(digest).unwrap()).unwrap().parts;
         let (mut with, without) = (read(expected), read(outputs[base]));
         assert!(with.remove(&Role::CONTROL).is_some());
@@ -173,7 +174,7 @@ fn p6_members_kills_and_resumes_change_no_byte() {
     }
 }
 
-/// A wave of the pelvis and one wrist in some frames.
+/// Targets for a wave of the pelvis and one wrist in some frames.
 fn hint(frames: usize) -> Hint {
     let mut hint = Hint::none(frames, 22);
     for t in (0..frames).step_by(7) {
@@ -188,7 +189,8 @@ fn generator(bench: &Bench, manifest: &Manifest) -> Generator {
     Generator::load(manifest, &*bench.blobs(), &Device::flex()).expect("it opens")
 }
 
-/// Training lowers the distance from what is told, and a model draws what it was told; with scale 0 it draws what its base does.
+/// Training lowers the distance from targets, and a model follows its targets; with scale 0 its motion is that of the
+/// base.
 #[test]
 fn a_control_part_learns_and_is_heeded() {
     for (latent, base) in [(v2(), "lcm"), (LatentShape { tokens: 1, dim: 16 }, "pcm")] {
@@ -223,7 +225,7 @@ fn a_control_part_learns_and_is_heeded() {
         assert!(silent < 1e-5, "{base}: scale 0 moves a feature by {silent}");
         assert_ne!(draw(1.0), without);
         assert_eq!(draw(1.0), draw(1.0));
-        // Feet hold the path of what is told none, and nothing else of it.
+        // Without targets footing changes the root's path and nothing else.
         let feet = Sampler { footing: true, ..sampler.clone() };
         let held = free.generate("a person walks", Some(60), Some(&feet), Seed(3)).expect("a motion").features;
         let skeleton = Skeleton::of(DataFormat::Humanml3d);
@@ -252,10 +254,10 @@ fn a_control_part_learns_and_is_heeded() {
         };
         let (few, many) = (refined(5), refined(100));
         eprintln!("{base}: {:.3} m off as drawn, {few:.3} and {many:.3} m refined", errors.average);
-        // The decoder of so small a VAE can do little.
+        // The decoder of so small a VAE can correct little.
         assert!(few < errors.average && many < 0.9 * errors.average, "{base}: {} to {few} to {many}", errors.average);
         assert_eq!(refined(5), few);
-        // A motion of one frame does not move.
+        // A motion of one frame has no movement.
         let told = (&hint(1), Heed { refine: 2, ..Heed::default() });
         let one = controlled.generate_controlled("a person walks", Some(&sampler), Seed(3), told).expect("a motion");
         assert_eq!(one.frames, 1);
@@ -267,7 +269,8 @@ fn a_control_part_learns_and_is_heeded() {
     }
 }
 
-/// Rounds of feedback bring what was drawn nearer to what is told, each motion by itself; without them the part draws as it would have without the network.
+/// Rounds of feedback reduce the distance from targets, each motion by itself. Without them the result is that of a
+/// part without the network.
 #[test]
 fn feedback_corrects_what_was_drawn() {
     let (mut bench, outputs) = world(v2());
@@ -298,7 +301,7 @@ fn feedback_corrects_what_was_drawn() {
     };
     let rounds = |feedback| Heed { feedback, ..Heed::default() };
     let skeleton = Skeleton::of(DataFormat::Humanml3d);
-    // What another motion of the same model does, in all frames, as in training.
+    // Targets from another motion of the same model, in all frames, as in training.
     let other = metres(&draw(&plain, &Hint::none(60, skeleton.joints), 100, Heed::default()), skeleton);
     let told = Hint::of(&other, skeleton.joints, &[0, 10, 11, 15, 20, 21], &(0..60).collect::<Vec<_>>());
     let off =
@@ -317,8 +320,8 @@ fn feedback_corrects_what_was_drawn() {
     eprintln!("{none:.3} m off without feedback, {two:.3} m after two rounds");
     assert!(two < none, "{none} m to {two} m");
 
-    // A round that leads away is not heeded: more rounds come as near as fewer, also on another path and when each change is many times what it was in
-    // training.
+    // A round that increases the distance is ignored: more rounds come as near as fewer. It also holds for another
+    // path, and when each change is many times larger than in training.
     for (hint, scale) in [(&told, 1.0), (&hint(60), 1.0), (&hint(60), 30.0)] {
         for seed in 0..4 {
             let off =
@@ -329,7 +332,7 @@ fn feedback_corrects_what_was_drawn() {
     }
 }
 
-/// Root mean square distance of a motion `[frames, joints, 3]` from what is told of it, metres.
+/// Root mean square distance of a motion `[frames, joints, 3]` from its targets, metres.
 fn distance(hint: &Hint, motion: &[f32]) -> f64 {
     let square = |(t, j, position): (usize, usize, [f32; 3])| -> f64 {
         let at = 3 * (t * hint.joints() + j);
@@ -338,7 +341,7 @@ fn distance(hint: &Hint, motion: &[f32]) -> f64 {
     (hint.iter().map(square).sum::<f64>() / hint.told() as f64).sqrt()
 }
 
-/// A report has the same bytes for any number of shards, and measures with the part and without.
+/// A report has the same bytes for any number of shards, and has values with the part and without.
 #[test]
 fn control_is_measured_by_case() {
     let (mut bench, outputs) = world(v2());

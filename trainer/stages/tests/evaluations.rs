@@ -1,4 +1,4 @@
-//! Map stages on untrained networks: what they give must not depend on how the work was cut, and misfits are refused.
+//! Map stages on untrained networks: their outputs do not depend on the division into shards, and misfits are refused.
 
 use std::collections::BTreeMap;
 use std::rc::Rc;
@@ -312,7 +312,7 @@ fn a_model_generates_as_it_was_measured_and_repeats_itself() {
     let load = |model: &Manifest| Generator::load(model, &*bench.blobs(), &bench.device());
     let generator = load(&manifest(pcm)).expect("it loads");
     assert_eq!(generator.sampler(), Sampler { steps: 2, guidance: 2.0, ..Sampler::default() }, "nobody measured it");
-    // Once it is measured it is drawn from in that way, and so it gives other motions.
+    // After an evaluation the model uses that sampler, and so generates other motions.
     let teacher = manifest(untrained(&bench, vae, Family::Mld));
     let measured = Sampler { steps: 2, guidance: 4.5, ..Sampler::default() };
     let registered = model::extend(&teacher, Some(&measured), &BTreeMap::new()).expect("it is a model");
@@ -339,7 +339,7 @@ fn a_model_generates_as_it_was_measured_and_repeats_itself() {
     let meta: VaeMeta = artifacts::meta(&manifest(vae), "the VAE").unwrap();
     assert_eq!(generator.format(), meta.format);
 
-    // Timed beside itself: a time for every sentence and model, the warm-up made but not counted.
+    // Timed against itself: a time for every sentence and model; the warm-up runs and is not counted.
     let own = &generator.sampler();
     let mut motions = 0;
     let times = time(&[(&generator, own), (&generator, own)], &sentences(4), Some(40), &mut || motions += 1).unwrap();
@@ -384,7 +384,7 @@ fn a_model_with_a_length_estimator_says_how_long_a_motion_is() {
     assert!(refused.contains("`length` was made for the `text`"), "{refused}");
 }
 
-/// What a student takes the motion for in its last step is the motion that it draws, and a teacher's steps are all seen.
+/// A student's prediction in its last step equals the generated motion, and all steps of a teacher are reported.
 #[test]
 fn each_step_of_the_sampler_is_seen_down_to_the_motion_that_is_drawn() {
     let bench = bench();

@@ -1,4 +1,5 @@
-//! The evaluator's stages: the same bytes however the work is cut, chance where it must be chance, and misfits refused.
+//! The evaluator's stages: the same bytes for any division into shards, chance level where expected, and misfits
+//! refused.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -175,7 +176,7 @@ fn t2m_is_the_same_however_the_motions_are_cut() {
     }
     assert!(metrics["fid"] > 0.0 && metrics["multimodality"] > 0.0 && metrics["samples"] >= 40.0, "{metrics:?}");
 
-    // The lineage says what was looked at, the details which repeats made the interval.
+    // The lineage names the inputs, the details the repeats of the interval.
     let manifest = bench.manifest(reports[0].0).unwrap();
     assert_eq!(manifest.meta["split"], "test");
     assert_eq!(manifest.meta["words"]["kind"], "hashed");
@@ -186,7 +187,7 @@ fn t2m_is_the_same_however_the_motions_are_cut() {
     assert!(report["details"]["note"].as_str().is_some_and(|note| note.contains("FID is taken of")), "{report}");
 }
 
-/// The metrics of `settings`, and what a reader is told.
+/// The metrics of `settings`, and the log.
 fn measured(
     bench: &mut Bench,
     settings: &EvaluateT2m,
@@ -240,7 +241,7 @@ fn pools_have_names_of_their_own_and_drop_last_leaves_out_what_fills_none() {
     assert_eq!(dropped["r_precision_top1"], both["r_precision_top1"], "retrieval always leaves them out");
     assert!(dropped["fid"] != both["fid"] && dropped["skating_ratio"] != both["skating_ratio"], "{dropped:?}");
     assert!(both["fid_halves"] > both["fid"], "other clips are further apart than other crops: {both:?}");
-    // Nothing is left over of a pool that takes all.
+    // A pool of all entries leaves nothing over.
     let (whole, ..) = measured(&mut bench, &of(&[entries], false), &inputs);
     let (kept, ..) = measured(&mut bench, &of(&[entries], true), &inputs);
     assert_eq!(whole, kept);
@@ -323,7 +324,7 @@ fn real_motion_is_found_and_shuffled_captions_are_left_to_chance() {
     let chance = 3.0 / 32.0;
     assert!(real["r_precision_top3"] > 3.0 * chance, "{real:?}");
     assert!(real["r_precision_top1"] < real["r_precision_top3"]);
-    // 20 repeats of 96 motions: a deviation of about .007.
+    // 20 repeats of 96 motions have a deviation of about .007.
     assert!((shuffled["r_precision_top3"] - chance).abs() < 0.03, "{shuffled:?}");
     assert_eq!(real["fid"], shuffled["fid"], "the motions are the same");
     assert!(real["mm_dist"] < shuffled["mm_dist"]);
@@ -340,7 +341,7 @@ fn shared(part: &str) -> Option<PathBuf> {
     Some(path)
 }
 
-/// A fixture's evaluator laid out as published.
+/// A fixture's evaluator in the published layout.
 fn published(fixture: &Path, file: &str, features: usize) -> tempfile::TempDir {
     let dir = tempfile::tempdir().expect("a test's own files");
     let model = dir.path().join("text_mot_match/model");
@@ -375,7 +376,7 @@ fn a_published_evaluator_is_read_from_its_pickle() {
         let trained = TrainedEvaluator::read(&*bench.blobs(), &manifest, &bench.device()).unwrap();
         assert_eq!((trained.meta().origin.as_str(), &trained.meta().words), ("imported", &WordsMeta::Hashed));
         assert_eq!(trained.meta().mean, vec![0.25; features]);
-        // What is read is what the published file holds.
+        // The values read equal those of the published file.
         let stored = std::fs::read(root.join(fixture).join("weights.safetensors")).unwrap();
         let (stored, ours) = (safetensors::SafeTensors::deserialize(&stored).unwrap(), trained.weights());
         let ours = safetensors::SafeTensors::deserialize(&ours).unwrap();
@@ -399,7 +400,7 @@ fn a_published_evaluator_is_read_from_its_pickle() {
     }
 }
 
-/// Stores a dataset that a test changed.
+/// Stores a dataset that a test modified.
 fn store(bench: &Bench, dataset: &Dataset, like: Digest) -> Digest {
     let blobs = bench.blobs();
     let mut manifest = Manifest::new(ArtifactKind::Dataset, bench.manifest(like).expect("a test's own files").meta);

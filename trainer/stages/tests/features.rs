@@ -1,4 +1,4 @@
-//! Models that diffuse motion itself, and Free-T2M's losses, at sizes at which a step takes a few milliseconds.
+//! Models that diffuse motion itself, and Free-T2M's losses, with sizes for which a step takes a few milliseconds.
 
 use std::collections::BTreeMap;
 
@@ -66,7 +66,7 @@ fn losses() -> FrequencyLosses {
     }
 }
 
-/// A stage: its name, its settings, and which stage gives each of its inputs.
+/// A stage: its name, its settings, and the stage of each of its inputs.
 type Described = (&'static str, StageSettings, &'static [(&'static str, &'static str)]);
 
 /// The stages before the models.
@@ -104,7 +104,7 @@ fn inputs(outputs: &BTreeMap<&'static str, Digest>, losses: bool) -> Inputs {
     inputs
 }
 
-/// Every kind of model here: name, settings, whether it reads an evaluator.
+/// Every kind of model here: name, settings, and true if it reads an evaluator.
 fn models() -> Vec<(&'static str, StageSettings, bool)> {
     let full = StableMoFusionNetwork { full_attention: true, ..stablemofusion().network };
     let noise = protocol::stage::Diffusion { prediction: Prediction::Velocity, ..mdm().diffusion };
@@ -121,7 +121,7 @@ fn run(bench: &mut Bench, name: &str, settings: &StageSettings, inputs: &Inputs)
     bench.run(name, settings, inputs).unwrap_or_else(|e| panic!("{name}: {e}")).output()
 }
 
-/// 1 member, 3 of which the leader is lost while another joins, and a kill of all with a resume: one value.
+/// One member, three members with a lost leader and a joiner, and a kill of all with a resume have the same result.
 #[test]
 fn p6_members_kills_and_resumes_change_no_byte() {
     let (mut bench, outputs) = world(1);
@@ -157,7 +157,7 @@ fn p6_members_kills_and_resumes_change_no_byte() {
     }
 }
 
-/// What is trained is a model like any other: it is drawn from by every solver, at any length, and measured.
+/// A trained model of motion is a model like any other: every solver samples from it at any length, and it is measured.
 #[test]
 fn models_of_motion_are_drawn_from_and_measured() {
     let (mut bench, outputs) = world(1);
@@ -202,7 +202,7 @@ fn models_of_motion_are_drawn_from_and_measured() {
     }
 }
 
-/// Weights of a trained model are begun with as far as they fit.
+/// Training starts with the weights of a trained model that fit.
 #[test]
 fn training_goes_on_from_a_trained_model() {
     let (mut bench, outputs) = world(1);

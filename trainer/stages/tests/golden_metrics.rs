@@ -28,7 +28,7 @@ fn wide(path: &Path) -> (usize, Vec<f64>) {
     (shape[1] as usize, values.into_iter().map(f64::from).collect())
 }
 
-/// The worst of the differences, each relative to its own scale.
+/// The largest of the differences, each relative to its own scale.
 fn worst(pairs: &[(f64, f64)]) -> f64 {
     pairs.iter().map(|(found, expected)| (found - expected).abs() / expected.abs().max(1e-12)).fold(0.0, f64::max)
 }
@@ -76,7 +76,7 @@ fn golden_metrics() {
             pairs.extend(aligned.iter().zip(frames).map(|(a, e)| (*a, e.as_f64().expect("a number"))));
             worst(&pairs)
         } else if name.starts_with("sjpe") {
-            // The arrays are those of the MPJPE, which every item of joints shares.
+            // The arrays are those of the MPJPE, which all items with joints share.
             let item_of = |key: &str| folder.join(expected["mpjpe"][key].as_str().expect("a file"));
             let ((shape, truth), (_, guess)) = (array(&item_of("gt")), array(&item_of("pred")));
             let count = shape[shape.len() - 2] as usize;
@@ -144,7 +144,7 @@ fn indices(list: &Value) -> Vec<usize> {
     list.as_array().expect("a list").iter().map(|v| v.as_u64().expect("an index") as usize).collect()
 }
 
-/// Stored indices, of whichever integer type.
+/// Stored indices of any integer type.
 fn whole(path: &Path) -> Vec<usize> {
     let bytes = std::fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
     let read = || npyz::NpyFile::new(&bytes[..]).unwrap_or_else(|e| panic!("{}: {e}", path.display()));

@@ -1,4 +1,5 @@
-//! What is told of a motion and how it is missed, against MotionLCM's loader and metric (fixtures `02_control*` that have draws or sampled motions).
+//! Target positions and their errors, against MotionLCM's loader and metric (fixtures `02_control*` with draws or
+//! sampled motions).
 
 use std::path::{Path, PathBuf};
 
@@ -7,7 +8,7 @@ use safetensors::{Dtype, SafeTensors};
 use serde_json::Value;
 use stages::hint::{Hint, NormalisedHints, share, told_frames};
 
-/// The fixtures of groups whose names begin so, if they are there.
+/// The fixtures of groups with this prefix, if they exist.
 fn folders(prefix: &str) -> Vec<PathBuf> {
     let root = match std::env::var_os("STRIDE_SHARED") {
         Some(path) => PathBuf::from(path),
@@ -25,7 +26,7 @@ fn folders(prefix: &str) -> Vec<PathBuf> {
     found
 }
 
-/// Shape and values of a tensor of any kind.
+/// Shape and values of a tensor of any type.
 fn array(file: &SafeTensors<'_>, name: &str) -> Option<(Vec<usize>, Vec<f64>)> {
     let view = file.tensor(name).ok()?;
     let data = view.data();
@@ -70,7 +71,7 @@ fn parity_hints() {
     assert!(folders.is_empty() || (draws > 0 && motions > 0), "{draws} draws, {motions} motions");
 }
 
-/// One draw of the loader: how many frames, and the hint of those that it drew.
+/// Checks one draw of the loader: the number of frames, and the hint of the drawn frames.
 fn draw(io: &SafeTensors<'_>, key: &str, case: &Value) {
     let (shape, wanted) = array(io, &format!("{key}/hint")).expect("a hint");
     let (_, mask) = array(io, &format!("{key}/mask")).expect("a mask");
@@ -110,7 +111,7 @@ fn draw(io: &SafeTensors<'_>, key: &str, case: &Value) {
     assert!(found.given.iter().zip(&mask).all(|(found, wanted)| *found == (*wanted != 0.0)), "{key}: the mask");
 }
 
-/// Sampled motions against what they were told.
+/// Checks the errors of sampled motions against their targets.
 fn missed(io: &SafeTensors<'_>, key: &str, case: &Value) {
     let get = |name: &str| array(io, &format!("{key}/{name}")).expect("stored");
     let (shape, joints) = get("joints");
@@ -131,7 +132,7 @@ fn missed(io: &SafeTensors<'_>, key: &str, case: &Value) {
         }
         let motion = f32s(&joints[from..from + length * count * 3]);
         let wanted: Vec<f64> = serde_json::from_value(row.clone()).expect("numbers");
-        // Trajectories and positions missed by 20 and by 50 cm, in pairs, and the mean.
+        // Trajectories and positions that miss by 20 and by 50 cm, in pairs, and the mean.
         for (k, threshold) in [(0, 0.2), (1, 0.5)] {
             let found = hint.errors(&motion, threshold).expect("something is told");
             let off = |found: f64, wanted: f64| (found - wanted).abs() < 1e-5;

@@ -1,4 +1,5 @@
-//! The importers of evaluators and of published models on changed files, for a time, and on files that were made to do harm; see `hostile::fuzz` for the rules and for what to do with what is found.
+//! The importers of evaluators and of published models on mutated files, for a limited time, and on crafted hostile
+//! files. The rules, and the use of findings, are in `hostile::fuzz`.
 
 use std::alloc::System;
 use std::path::Path;
@@ -20,7 +21,7 @@ static MEMORY: Cap<System> = Cap::new(System, usize::MAX);
 
 const NETWORKS: [&str; 3] = ["text_encoder", "motion_encoder", "movement_encoder"];
 
-/// A file behind the byte that says which of two it is.
+/// A file after the byte that selects its kind.
 fn marked(mark: u8, bytes: Vec<u8>) -> Vec<u8> {
     [vec![mark], bytes].concat()
 }
@@ -54,7 +55,7 @@ fn vocabularies() -> Vec<Vec<u8>> {
     vec![seeds::pickled_rows(&[("sos", 0), ("eos", 1), ("unk", 2), ("walk", 3)])]
 }
 
-/// Of each part a file in each form, and the file of torch in the form before archives.
+/// For each part a file in each form, and the torch file also in the form before archives.
 fn models() -> Vec<Vec<u8>> {
     let all = PARTS.into_iter().flat_map(|part| {
         let small = hostile_models::small(part);
@@ -63,12 +64,12 @@ fn models() -> Vec<Vec<u8>> {
     all.chain([at(0, Form::Torch, &seeds::torch_legacy(&["state_dict"]))]).collect()
 }
 
-/// A file behind the bytes that say of which part and in which form it is.
+/// A file after the bytes that select its part and form.
 fn at(part: usize, form: Form, bytes: &[u8]) -> Vec<u8> {
     [&[part as u8, form as u8], bytes].concat()
 }
 
-/// A part's list with something else in it.
+/// A part's list with a changed line.
 fn changed(part: usize, change: &dyn Fn(&mut Vec<String>)) -> Vec<u8> {
     let list = hostile_models::marked(PARTS[part], Form::List, &hostile_models::small(PARTS[part]));
     let mut lines: Vec<String> = String::from_utf8_lossy(&list[2..]).lines().map(str::to_owned).collect();
@@ -76,13 +77,13 @@ fn changed(part: usize, change: &dyn Fn(&mut Vec<String>)) -> Vec<u8> {
     at(part, Form::List, lines.join("\n").as_bytes())
 }
 
-/// Published weights that run something, lie about their size, or make no network.
+/// Published weights that execute code, declare wrong sizes, or fit no network.
 fn hostile_networks() -> Vec<Named> {
     let mut all = Vec::new();
     let torch = named::torch().into_iter().map(|(what, bytes)| (what, at(0, Form::Torch, &bytes)));
     all.extend(torch);
     all.extend(named::safetensors().into_iter().map(|(what, bytes)| (what, at(1, Form::Safetensors, &bytes))));
-    // A frame behind so many tokens has no position.
+    // A frame after that many tokens has no position.
     all.push((
         "a latent of 249 tokens",
         changed(0, &|lines| {
@@ -94,7 +95,7 @@ fn hostile_networks() -> Vec<Named> {
         let each = |change: &dyn Fn(&str) -> String| {
             changed(part, &|lines| lines.iter_mut().for_each(|line| *line = change(line)))
         };
-        // The first line is of a tensor that the network cannot do without.
+        // The first line is a tensor that the network requires.
         let first = |element: &str, shape: &str| {
             changed(part, &|lines| {
                 let name = lines[0].split(' ').nth(1).expect("a name").to_owned();
@@ -178,7 +179,7 @@ fn vocabulary() {
     run("vocabulary");
 }
 
-/// A part whose files are all refused would be tried for nothing.
+/// A part whose files are all refused would not be tested.
 #[test]
 fn every_part_is_imported_in_every_form() {
     for part in PARTS {

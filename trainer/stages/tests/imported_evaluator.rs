@@ -1,8 +1,9 @@
-//! An evaluator that was imported as users import one, on real clips: what `evaluate.t2m` embeds and measures with it.
+//! An imported evaluator on real clips: the embeddings and metrics of `evaluate.t2m`.
 //!
-//! The fixtures (`04_evaluator_*`) store embeddings of motions and words of their own, and distances, but none of real clips. So there is a third party: the
-//! networks once more, in plain loops over f64. They are held against what the fixtures store; then what the stage embeds of the clips of
-//! `humanml3d-mini` is held against them, and what it measures against metrics that are computed anew.
+//! The fixtures (`04_evaluator_*`) store embeddings of their own motions and words, and distances, but none of real
+//! clips. So there is a second implementation of the networks, in plain loops over f64. It is compared with the
+//! fixtures. Then the stage's embeddings of the clips of `humanml3d-mini` are compared with it, and the stage's metrics
+//! with recomputed ones.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -30,22 +31,22 @@ mod fixtures;
 
 use fixtures::{Array, Arrays, Gates, device, folders, name, shared};
 
-/// One forward pass, as the fixtures' README has it.
+/// Gate of one forward pass, from the fixtures' README.
 const FORWARD: f64 = 3e-6;
-/// A distance that is computed by the expanded square in f32, as the fixtures' are.
+/// Gate of a distance computed by the expanded square in f32, as in the fixtures.
 const DISTANCE: f64 = 1e-5;
-/// A metric of embeddings that are as far apart as [`FORWARD`] allows.
+/// Gate of a metric of embeddings that differ by [`FORWARD`].
 const METRIC: f64 = 1e-5;
-/// What the stages of this test are keyed by.
+/// Seed of the stages in this test.
 const SEED: Seed = Seed(7);
-/// Frames of a movement, and features that no movement is made of.
+/// Frames of a movement, and number of features that movements leave out.
 const UNIT: usize = 4;
 const CONTACTS: usize = 4;
 
-/// Vectors, one after the other in time.
+/// Vectors in order of time.
 type Rows = Vec<Vec<f64>>;
 
-/// The evaluator in plain loops.
+/// The evaluator's networks in plain loops.
 struct Plain(Arrays);
 
 fn dot(a: &[f64], b: &[f64]) -> f64 {
@@ -61,7 +62,7 @@ fn sigmoid(x: f64) -> f64 {
 }
 
 impl Plain {
-    /// A matrix times a vector, and a bias.
+    /// A matrix times a vector, plus a bias.
     fn affine(&self, weight: &str, bias: &str, x: &[f64]) -> Vec<f64> {
         let (weight, bias) = (self.0.get(weight), self.0.get(bias));
         weight.values.chunks_exact(x.len()).zip(&bias.values).map(|(row, bias)| dot(row, x) + bias).collect()
@@ -71,7 +72,7 @@ impl Plain {
         rows.iter().map(|row| self.affine(&format!("{layer}.weight"), &format!("{layer}.bias"), row)).collect()
     }
 
-    /// Four frames, every second one, a frame of zeros on either side.
+    /// A convolution over four frames with stride 2 and one frame of zeros on either side.
     fn convolution(&self, layer: &str, rows: &Rows) -> Rows {
         let (weight, bias) = (self.0.get(&format!("{layer}.weight")), self.0.get(&format!("{layer}.bias")));
         let (inner, taps) = (weight.shape[1], weight.shape[2]);
@@ -86,7 +87,7 @@ impl Plain {
         (0..rows.len() / 2).map(|t| (0..bias.values.len()).map(|out| at(t, out)).collect()).collect()
     }
 
-    /// The last state of a GRU over `rows` in their order, which are the second direction's if `reverse`.
+    /// The last state of a GRU over `rows` in their order, which is that of the backward direction if `reverse`.
     fn state(&self, network: &str, rows: impl Iterator<Item = Vec<f64>>, reverse: bool) -> Vec<f64> {
         let end = if reverse { "_reverse" } else { "" };
         let gates = |what: &str, x: &[f64]| {
@@ -110,7 +111,7 @@ impl Plain {
         state
     }
 
-    /// Vectors to an embedding.
+    /// Embeds vectors.
     fn embedding(&self, network: &str, rows: &Rows) -> Vec<f64> {
         let rows = self.linear(&format!("{network}.input_emb"), rows);
         let mut both = self.state(network, rows.iter().cloned(), false);
@@ -125,7 +126,7 @@ impl Plain {
         self.linear(&format!("{network}.output_net.3"), &leaky(vec![normed])).remove(0)
     }
 
-    /// A normalised motion, of which the first `length` frames count.
+    /// Embeds a normalised motion; the first `length` frames are valid.
     fn motion(&self, rows: &[Vec<f64>], length: usize) -> Vec<f64> {
         let rows: Rows = rows.iter().map(|row| row[..row.len() - CONTACTS].to_vec()).collect();
         let x = leaky(self.convolution("movement_encoder.main.0", &rows));
@@ -135,7 +136,7 @@ impl Plain {
         self.embedding("motion_encoder", &movements)
     }
 
-    /// Word vectors and their classes, of which the first `length` count.
+    /// Embeds word vectors and their classes; the first `length` are valid.
     fn caption(&self, words: &[Vec<f64>], classes: &[Vec<f64>], length: usize) -> Vec<f64> {
         let places = self.linear("text_encoder.pos_emb", &classes[..length].to_vec());
         let sum = |(word, place): (&Vec<f64>, &Vec<f64>)| word.iter().zip(place).map(|(a, b)| a + b).collect();
@@ -168,7 +169,7 @@ fn import(bench: &mut Bench, fixture: &Path, format: DataFormat, [mean, std]: [&
     bench.run("evaluator", &settings.into(), &[]).unwrap_or_else(|e| panic!("{e}")).output()
 }
 
-/// Statistics that change nothing, in `folder`.
+/// Writes statistics that normalise nothing to `folder`.
 fn nothing(folder: &Path, features: usize) -> [std::path::PathBuf; 2] {
     [("mean.npy", 0.0), ("std.npy", 1.0)].map(|(name, value)| {
         let file = folder.join(name);
@@ -181,7 +182,8 @@ fn wide(values: &[f32]) -> Vec<f64> {
     values.iter().map(|v| f64::from(*v)).collect()
 }
 
-/// The plain loops give what the fixtures store, and what is imported has the distances that they store: matching score and ranks.
+/// The plain loops reproduce the fixtures, and the imported evaluator has the stored distances: matching score and
+/// ranks.
 #[test]
 fn the_fixtures_numbers_come_out_of_plain_loops_and_of_what_is_imported() {
     let Some(root) = shared("parity") else { return };
@@ -239,7 +241,7 @@ fn the_fixtures_numbers_come_out_of_plain_loops_and_of_what_is_imported() {
     }
 }
 
-/// What a shard of the evaluation embedded, by name, row by row.
+/// The embeddings of a shard of the evaluation, by name, row by row.
 fn shard(bench: &Bench, settings: &StageSettings, inputs: &BTreeMap<String, Digest>) -> BTreeMap<String, Vec<f32>> {
     let task = StageTask {
         run: RunId::new("test-1"),
@@ -260,7 +262,8 @@ fn shard(bench: &Bench, settings: &StageSettings, inputs: &BTreeMap<String, Dige
     tensors.iter().map(|(name, view)| (name.to_owned(), floats(view.data()))).collect()
 }
 
-/// Embeddings of all crops that the evaluation may have drawn of an entry: the longest number of movements or one less, from any frame.
+/// Embeddings of all crops of an entry that the evaluation can draw: the largest number of movements or one less, from
+/// any frame.
 fn crops(plain: &Plain, dataset: &Dataset, entry: &Entry, [mean, std]: [&[f32]; 2]) -> Rows {
     let width = mean.len();
     let normalised: Rows = dataset
@@ -273,7 +276,7 @@ fn crops(plain: &Plain, dataset: &Dataset, entry: &Entry, [mean, std]: [&[f32]; 
     let places = lengths.flat_map(|length| (0..=entry.len - length).map(move |start| (start, length)));
     places
         .map(|(start, length)| {
-            // Zeros behind its end, as its authors' loader pads; more than a movement of them changes nothing.
+            // Padded with zeros as in the authors' loader; more than a movement of them changes nothing.
             let mut crop = normalised[start..start + length].to_vec();
             crop.resize(length + UNIT, vec![0.0; width]);
             plain.motion(&crop, length)
@@ -281,7 +284,7 @@ fn crops(plain: &Plain, dataset: &Dataset, entry: &Entry, [mean, std]: [&[f32]; 
         .collect()
 }
 
-/// The row of `candidates` that is nearest to `found`.
+/// The row of `candidates` nearest to `found`.
 fn nearest(found: &[f32], candidates: Rows) -> Vec<f64> {
     let off = |row: &Vec<f64>| row.iter().zip(found).map(|(a, b)| (a - f64::from(*b)).abs()).fold(0.0, f64::max);
     candidates.into_iter().min_by(|a, b| off(a).total_cmp(&off(b))).expect("a candidate")
@@ -295,7 +298,8 @@ fn gaussian(rows: &Rows) -> (DMatrix<f64>, DMatrix<f64>) {
     (mean, centred.transpose() * centred / (n as f64 - 1.0))
 }
 
-/// FID and the sum of all variances, which says what is little of it. The trace of the root of the product is that of the roots of its eigenvalues.
+/// FID, and the sum of all variances as its scale. The trace of the product's root is the sum of its eigenvalues'
+/// roots.
 fn fid(real: &Rows, made: &Rows) -> (f64, f64) {
     let ((a_mean, a), (b_mean, b)) = (gaussian(real), gaussian(made));
     let roots: f64 = (&a * &b).complex_eigenvalues().iter().map(|value| value.re.max(0.0).sqrt()).sum();
@@ -306,7 +310,7 @@ fn distance(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
 }
 
-/// `import.evaluator`, `data.open` and `evaluate.t2m` on the test clips, of which one pool takes all.
+/// `import.evaluator`, `data.open` and `evaluate.t2m` on the test clips, with one pool of all clips.
 #[test]
 fn the_evaluation_of_real_clips_agrees_with_plain_loops() {
     let (Some(parity), Some(clips)) = (shared("parity"), shared("humanml3d-mini")) else { return };

@@ -1,7 +1,7 @@
-//! A training stage that is killed at any step, and any number of times, ends with the bytes of one that is not.
+//! A training stage that is killed at any step, any number of times, ends with the bytes of an undisturbed one.
 //!
-//! In memory: a kill of all members loses everything but the committed checkpoints, which is what `kill -9` of the whole
-//! gang leaves. The process tests do the same to real processes at sampled steps.
+//! In memory: a kill of all members loses everything but the committed checkpoints, like `kill -9` of the whole gang.
+//! The process tests do the same to real processes at sampled steps.
 
 mod common;
 
@@ -14,7 +14,7 @@ use stages::testing::{Bench, Script};
 /// Steps of the stage that is killed at every step.
 const STEPS: u64 = 60;
 
-/// A stage to be disturbed: the world before it, its settings, its inputs, and what it should give.
+/// A stage to be disturbed: the world before it, its settings, its inputs, and its expected output.
 struct Case {
     bench: Bench,
     settings: StageSettings,
@@ -25,7 +25,7 @@ struct Case {
 /// Runs everything up to the stage `name`, and that stage undisturbed by one member.
 fn case(name: &str, steps: common::Steps4) -> Case {
     let mut bench = Bench::new(burn::tensor::Device::flex(), 7, 1);
-    // No divisor of the steps, and not in step with the batches.
+    // Neither a divisor of the steps nor in step with the batches.
     bench.checkpoint = CheckpointPolicy { every: Steps(7), ..CheckpointPolicy::default() };
     let mut outputs: BTreeMap<&'static str, Digest> = BTreeMap::new();
     for (stage, settings, inputs) in common::chain(2, steps) {
@@ -40,8 +40,8 @@ fn case(name: &str, steps: common::Steps4) -> Case {
 }
 
 impl Case {
-    /// Runs the stage afresh, with all members killed at each of `kills` and started again in other numbers; then to its
-    /// end. `as_name` is for people.
+    /// Runs the stage from the start and kills all members at each of `kills`. They restart in other numbers, and
+    /// finally run to the end. `as_name` is for messages.
     fn run(&mut self, name: &str, as_name: &str, kills: &[u64]) {
         self.bench.forget(name);
         for (round, step) in kills.iter().enumerate() {
@@ -58,8 +58,8 @@ impl Case {
     }
 }
 
-/// All 60 steps of the stages of a latent model, one after the other. A kill at a step loses what came after the last
-/// checkpoint before it; from there the next checkpoint is reached again, and must be the same object. The last one goes on
+/// All 60 steps of the stages of a latent model, one after the other. A kill at a step loses everything after the last
+/// checkpoint before it. The next checkpoint is then reached again and must be the same object. The last run continues
 /// to the end.
 #[test]
 fn p5_a_kill_at_every_step_changes_no_byte() {
@@ -84,8 +84,8 @@ fn p5_a_kill_at_every_step_changes_no_byte() {
     }
 }
 
-/// Chains of 1, 2 and 5 kills with 1 to 3 members in turn, for every kind of training stage: some right after a
-/// checkpoint, some before the first, two at one step.
+/// Chains of 1, 2 and 5 kills with 1 to 3 members in turn, for every kind of training stage. Some kills are right after
+/// a checkpoint, some before the first, two at one step.
 #[test]
 fn p5_chains_of_1_2_and_5_kills_change_no_byte() {
     let chains: [&[u64]; 3] = [&[13], &[7, 8], &[2, 9, 9, 15, 17]];
@@ -97,9 +97,8 @@ fn p5_chains_of_1_2_and_5_kills_change_no_byte() {
     }
 }
 
-/// 1 -> 3 -> 2 -> 1 members within one stage, without a restart, for every kind of training stage. The joiners take the
-/// state of a peer, the first member is lost, and so is one of the joiners,
-/// in one order or the other.
+/// 1 -> 3 -> 2 -> 1 members within one stage, without a restart, for every kind of training stage. The joiners adopt
+/// the state of a peer. The first member is lost, and so is one of the joiners, in either order.
 #[test]
 fn p6_members_1_to_3_to_2_to_1_change_no_byte() {
     for name in ["vae", "length", "mld", "lcm", "pcm", "control"] {
@@ -114,8 +113,9 @@ fn p6_members_1_to_3_to_2_to_1_change_no_byte() {
     }
 }
 
-/// Sampled: the VAE with two and three members, and no checkpoint but the last. The leader is lost in that save, and with three members
-/// the one that takes over is lost there too: those that are left still have the state, and nothing is computed again.
+/// Sampled: the VAE with two and three members, and only the last checkpoint. The leader is lost in that save. With
+/// three members its successor is lost there too. The remaining members still have the state, and nothing is computed
+/// again.
 #[test]
 fn p4_a_leader_that_is_lost_in_its_last_save_costs_nothing() {
     let mut case = case("vae", [20; 4]);

@@ -1,4 +1,4 @@
-//! The whole chain in memory, small: its value must not depend on who computed what.
+//! The whole chain in memory, small: its result does not depend on the members that computed it.
 
 mod common;
 
@@ -39,7 +39,7 @@ fn p6_every_digest_is_the_same_with_any_number_of_members_and_shards() {
     let pair = run(&mut bench(2), 3);
     assert_eq!(alone, pair, "1 member and 1 shard against 2 and 3");
     let mut three = bench(3);
-    // One is lost in each training stage, the leader, and another joins.
+    // One member is lost in each training stage, the leader, and another joins.
     three.script = Script { lost: vec![(0, 3)], joins: vec![(5, 1)], ..Script::default() };
     assert_eq!(alone, run(&mut three, 4), "1 member against 3 of which the leader is lost and a fourth joins");
 }
@@ -68,7 +68,7 @@ fn a_stage_that_yields_and_goes_on_gives_the_same_bytes() {
     }
 }
 
-/// What a sweep rests on: a trial that is trained in rungs is bit for bit the stage that is trained in one go.
+/// A trial trained in rungs is bit for bit the stage trained in one piece; sweeps depend on it.
 #[test]
 fn a_stage_that_is_trained_in_rungs_gives_the_same_bytes() {
     let mut bench = bench(1);

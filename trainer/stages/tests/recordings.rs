@@ -26,7 +26,7 @@ fn a_folder_becomes_the_same_dataset_however_it_is_cut() {
         let settings = DataFeatures { shards, ..settings(folder.path()) };
         bench.run("dataset", &StageSettings::DataFeatures(settings), &[]).unwrap_or_else(|e| panic!("{e}"))
     };
-    // More shards than files leave some with nothing.
+    // More shards than files leave some shards empty.
     let (one, many) = (run(1), run(13));
     assert_eq!(one.output(), many.output());
     assert_eq!(one.metrics()["clips"], 20.0);
@@ -36,7 +36,7 @@ fn a_folder_becomes_the_same_dataset_however_it_is_cut() {
     assert_eq!((dataset.format, dataset.clips.len()), (DataFormat::Humanml3d, 20));
     for split in Split::ALL {
         let clips = dataset.entries.iter().filter(|entry| entry.split == split);
-        // A clip and its mirrored twin are of one recording.
+        // A clip and its mirrored twin come from one recording.
         let mut stems: Vec<&str> = clips.map(|entry| entry.id.trim_start_matches('M')).collect();
         stems.sort_unstable();
         assert!(!stems.is_empty() && stems.chunks(2).all(|pair| pair.len() == 2 && pair[0] == pair[1]), "{stems:?}");
@@ -72,7 +72,7 @@ fn broken_recordings_are_all_named_or_left_out() {
     let skipping = DataFeatures { skip_broken: true, ..base.clone() };
     let ran = bench.run("dataset", &StageSettings::DataFeatures(skipping), &[]).unwrap();
     assert_eq!((ran.metrics()["clips"], ran.metrics()["skipped"]), (8.0, 2.0));
-    // What the user says holds: along z everybody lies, and nobody has lists.
+    // The user's settings take precedence: a map, splits, axis or captions that do not fit the recordings are refused.
     for (settings, part) in [
         (DataFeatures { map: "nobody".into(), ..base.clone() }, "no joint map `nobody` ships"),
         (DataFeatures { map: "lafan1".into(), ..base.clone() }, "joint map `lafan1`"),

@@ -13,7 +13,7 @@ fn shared() -> PathBuf {
     }
 }
 
-/// Rows of a guess at a clip: global, aligned and local error in mm, smooth-L1 of the features.
+/// Rows of a reconstruction of a clip: global, aligned and local error in mm, smooth L1 of the features.
 type Row = (&'static str, fn(&[f32], usize) -> Vec<f32>, [f64; 4]);
 
 #[test]

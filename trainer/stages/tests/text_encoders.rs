@@ -1,5 +1,5 @@
-//! Published text encoders from their folders (fixtures `09_text_clip*`, `09_text_t5*`): their vectors, in the folder and out of an artifact, and
-//! models that are trained and drawn with them.
+//! Published text encoders from their folders (fixtures `09_text_clip*`, `09_text_t5*`): their vectors, from the folder
+//! and from an artifact, and models that are trained and sampled with them.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -20,10 +20,10 @@ use stages::text::{self, Named};
 
 mod common;
 
-/// One forward pass, as the fixtures' README has it.
+/// Gate of one forward pass, from the fixtures' README.
 const GATE: f64 = 3e-6;
 
-/// Folders of fixtures that start with `prefix`; none, said loudly, where this checkout has none.
+/// Folders of fixtures with the prefix `prefix`; none, with a notice, if this checkout has none.
 fn folders(prefix: &str) -> Vec<PathBuf> {
     let root = std::env::var_os("STRIDE_SHARED")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"), PathBuf::from);
@@ -67,13 +67,13 @@ fn close(what: &str, found: &[f32], expected: &[f32]) {
     assert!(off <= GATE * largest, "{what}: off by {:e} of the largest", off / largest);
 }
 
-/// The encoder in a folder.
+/// Opens the encoder in a folder.
 fn ready(settings: &TextEmbed) -> Box<dyn text::TextEncoder> {
     let named = Named::open(settings).unwrap_or_else(|e| panic!("{e}"));
     named.ready(settings, &Device::flex()).unwrap_or_else(|e| panic!("{e}"))
 }
 
-/// That of the artifact which is made of the folder.
+/// Opens the encoder of the artifact made from the folder.
 fn stored(settings: &TextEmbed) -> Box<dyn text::TextEncoder> {
     let blobs = Arc::new(MemoryBlobs::default());
     let task = StageTask {
@@ -105,7 +105,7 @@ fn parity_of_clip_from_its_folder() {
         let listed: Vec<usize> =
             io.take_integers("states_of_captions", 1, "io").expect("rows").values.iter().map(|i| *i as usize).collect();
         let mut tried = 0;
-        // What the published models read; the two ways to pad make one pooled vector and other words.
+        // The inputs of the published models; the two ways of padding have the same pooled vector and different words.
         for (case, ids, most) in
             [("hf77", ClipIds::HuggingFace, 0), ("openai77", ClipIds::OpenAi, 0), ("mdm22", ClipIds::OpenAi, 22)]
         {
@@ -179,7 +179,7 @@ fn run(bench: &mut Bench, name: &str, settings: StageSettings, inputs: &[(&str, 
     bench.run(name, &settings, inputs).unwrap_or_else(|e| panic!("{name}: {e}")).output()
 }
 
-/// The vectors do not depend on how the work is cut, and equal texts are embedded once.
+/// The vectors do not depend on the division into shards, and equal texts are embedded once.
 #[test]
 fn shards_change_no_byte() {
     let mut bench = Bench::new(Device::flex(), 7, 1);
@@ -207,7 +207,8 @@ fn shards_change_no_byte() {
     assert!(said.contains("/nowhere/at/all: no such folder"), "{said}");
 }
 
-/// A few steps of a latent model and of one that reads words, and motions that they draw, with encoders of the folders, which are gone by then.
+/// A few steps of a latent model and of one that reads words, and motions of both, with encoders from folders that are
+/// deleted by then.
 #[test]
 fn models_are_trained_and_drawn_with_encoders_of_folders() {
     let clips = folders("09_text_clip");
@@ -226,7 +227,7 @@ fn models_are_trained_and_drawn_with_encoders_of_folders() {
             let inputs: Vec<(&str, Digest)> = inputs.iter().map(|(field, from)| (*field, outputs[from])).collect();
             outputs.insert(name, run(&mut bench, name, chained, &inputs));
         }
-        // Enough for the layers that begin at zero to open.
+        // Enough steps for the zero-initialised layers to have an effect.
         let training = Training {
             batch: Batch { global: 4, slices: 2 },
             steps: Steps(6),

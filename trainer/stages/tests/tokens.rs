@@ -1,4 +1,4 @@
-//! Tokenizers and what draws their tokens: end to end at toy sizes, and with members that come, go and are killed.
+//! Tokenizers and token generators: end to end with tiny sizes, and with members that come, go and are killed.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 #![allow(clippy::single_range_in_vec_init, reason = "one span that is kept")]
 
@@ -33,7 +33,7 @@ fn training(steps: u64) -> Training {
     }
 }
 
-/// So many codebooks of eight codes. A batch has 24 rows; with 40 codes they are repeated.
+/// A tokenizer with codebooks of `codes` codes. A batch has 24 rows; with 40 codes they are repeated.
 fn tokenizer(quantizers: usize, codes: usize, resets: Resets) -> StageSettings {
     StageSettings::from(TrainTokenizer {
         codes,
@@ -78,7 +78,7 @@ fn discord() -> StageSettings {
     })
 }
 
-/// A student of a flow decoder, of a VAE's latents if it is named.
+/// A student of a flow decoder, which decodes a VAE's latents if `vae` names one.
 fn jumps(vae: &str, solver_steps: usize) -> StageSettings {
     StageSettings::from(DistillDiscord {
         vae: vae.into(),
@@ -101,7 +101,7 @@ fn evaluator() -> StageSettings {
 
 type Link = (&'static str, StageSettings, Vec<(&'static str, &'static str)>);
 
-/// A VAE and a model of its latents, and the flow decoders that take the place of the VAE's own.
+/// A VAE and a model of its latents, and the flow decoders that replace the VAE's own.
 fn of_latents(shards: usize) -> Vec<Link> {
     let StageSettings::TrainDiscord(flow) = discord() else { unreachable!() };
     // A code of four frames is wide, and the published projection grows with its square.
@@ -129,7 +129,8 @@ fn of_latents(shards: usize) -> Vec<Link> {
     links
 }
 
-/// Everything from clips to models: a plain tokenizer with an autoregressive generator and MMM's, a residual one with a masked one.
+/// Everything from clips to models: a plain tokenizer with an autoregressive generator and MMM's, a residual one with a
+/// masked one.
 fn chain(shards: usize) -> Vec<Link> {
     let encode = || StageSettings::from(EncodeTokens { padded: 40, shards, ..EncodeTokens::default() });
     let evaluate = || {
@@ -272,7 +273,7 @@ fn masked_generators_draw_a_part_of_a_motion_and_keep_the_tokens_of_the_rest() {
         assert_eq!((edited.motion.frames, &edited.motion.features), (64, &again.motion.features), "{name}");
         assert_ne!(edited.motion.features, other.motion.features, "{name}: another seed draws another jump");
 
-        // Where no drawn token is near, what comes out is what the kept tokens stand for, in all layers.
+        // Far from generated tokens, the result is the decoded kept tokens, in all layers.
         let manifest = world.bench.manifest(world.outputs[tokenizer]).unwrap();
         let tokenizer = TrainedTokenizer::read(&*blobs, &manifest, &device).unwrap();
         let mut rows = source.features.clone();
@@ -299,8 +300,8 @@ fn masked_generators_draw_a_part_of_a_motion_and_keep_the_tokens_of_the_rest() {
     assert!(refused.contains("draws whole motions"), "{refused}");
 }
 
-/// Chains of kills with 1 to 3 members in turn, some right after a checkpoint, one before the first step; then members that join, take
-/// the state of a peer and are lost.
+/// Chains of kills with 1 to 3 members in turn, some right after a checkpoint, one before the first step. Then members
+/// join, adopt the state of a peer and are lost.
 #[test]
 fn p5_p6_kills_joins_and_losses_change_no_byte() {
     let whole = run(1, 1);
@@ -345,8 +346,8 @@ fn run_up_to(name: &str) -> World {
     world
 }
 
-/// Over one interval the student's jump is the teacher's step of Euler, with which it starts, whatever its network gives; over shorter ones it has
-/// something to learn.
+/// Over one interval the student's jump is the teacher's Euler step, for any output of its network. Over shorter ones
+/// it can learn.
 #[test]
 fn a_student_starts_as_its_teachers_step() {
     let mut world = run_up_to("discord");
@@ -371,7 +372,8 @@ fn a_student_starts_as_its_teachers_step() {
     }
 }
 
-/// The weights of a network that gives the velocity fit one that gives the data by name and shape, and mean nothing there.
+/// The weights of a network that predicts the velocity fit one that predicts the data by name and shape, but are
+/// meaningless there.
 #[test]
 fn what_begins_with_another_prediction_is_refused() {
     let mut world = run_up_to("jumps");
@@ -387,7 +389,7 @@ fn what_begins_with_another_prediction_is_refused() {
     let output = world.bench.run("data", &data.clone().into(), &inputs).unwrap().output();
     let begun = world.bench.run("more", &data.into(), &with(&[("init", output)])).unwrap();
     assert!(begun.told.log.iter().any(|line| line.starts_with("begins with")), "{:?}", begun.told.log);
-    // A student is of its teacher's prediction.
+    // A student has its teacher's prediction.
     let of_data = with(&[("teacher", output), velocity]);
     let error = world.bench.run("jumps", &jumps("", 1), &of_data).unwrap_err().to_string();
     assert!(error.contains(said), "{error}");
@@ -433,6 +435,7 @@ fn what_does_not_fit_is_refused_with_a_reason() {
 #[test]
 fn every_kind_of_tokens_begins_with_what_it_gave() {
     let mut world = run(1, 1);
-    // 2 tokenizers, 3 generators, 2 flow decoders and their students, the evaluator, the VAE and the teacher of its latents.
+    // 2 tokenizers, 3 generators, 2 flow decoders and their students, the evaluator, the VAE and the teacher of its
+    // latents.
     assert_eq!(common::begin_again(&mut world.bench, chain(1), &world.outputs), 12);
 }

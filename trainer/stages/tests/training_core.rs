@@ -1,5 +1,5 @@
-//! The loop with all that a stage may bring: a codebook that follows sums over the slices and resets what nobody uses, two groups that
-//! take turns, one that is frozen, and a first step that only looks.
+//! The loop with every feature of a stage: a codebook that follows sums over the slices and resets unused codes, two
+//! groups that take turns, a frozen group, and a first step that only gathers sums.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use std::path::Path;
@@ -22,24 +22,25 @@ use stages::train::{
 
 const MU: f32 = 0.99;
 
-/// Where the rows to be quantised come from.
+/// Source of the rows to be quantised.
 #[derive(Clone)]
 enum Rows {
-    /// So many keyed draws of this width for each example.
+    /// `each` keyed draws of this width for each example.
     Drawn { each: usize, width: usize },
-    /// Rows by example and by step; the first step is looked at twice if the codebook starts from it.
+    /// Rows by example and by step; the first step is used twice if the codebook starts from it.
     Stored(Arc<Vec<Vec<Vec<f32>>>>),
 }
 
-/// Noise on tiled rows.
+/// Noise on repeated rows.
 #[derive(Clone)]
 enum Noise {
     Drawn,
-    /// For the initialisation, then for every update.
+    /// Noise for the initialisation, then for every update.
     Stored(Arc<Vec<Vec<f32>>>),
 }
 
-/// Rows are shifted and scaled by two trained groups and then quantised; the loss is the commitment of the rows to their codes.
+/// Rows are shifted and scaled by two trained groups and then quantised; the loss is the commitment of the rows to
+/// their codes.
 #[derive(Clone)]
 struct Toy {
     rows: Rows,
@@ -47,7 +48,7 @@ struct Toy {
     codes: usize,
     width: usize,
     training: Training,
-    /// Codebook, sums and counts to start from; otherwise the first step's rows give them.
+    /// Initial codebook, sums and counts; otherwise the first step's rows supply them.
     given: Option<[Vec<f32>; 3]>,
     shift: Vec<f32>,
     scale: Vec<f32>,
@@ -57,18 +58,18 @@ struct Toy {
 }
 
 impl Toy {
-    /// Steps that only look.
+    /// Number of steps that only gather sums.
     fn looks(&self) -> u64 {
         u64::from(self.given.is_none())
     }
 
-    /// The rows of one slice, as they are.
+    /// The rows of one slice before shift and scale.
     fn raw(&self, step: u64, slice: usize) -> Vec<f32> {
         match &self.rows {
             Rows::Drawn { each, width } => {
                 let mut values = vec![0.0; each * width];
                 Stream::new(Seed(3), "rows", slice as u64, step).fill_normal(&mut values);
-                // A few clusters that wander, so that codes fall out of use.
+                // A few clusters that move, so that codes fall out of use.
                 let centre = (slice as f32 * 1.7 + step as f32 * 0.2).sin() * 3.0;
                 values.iter_mut().for_each(|value| *value = *value * 0.3 + centre);
                 values
@@ -83,7 +84,7 @@ impl Toy {
         all.min_by(|a, b| a.1.total_cmp(&b.1)).expect("a codebook has codes").0
     }
 
-    /// The first rows of the batch, one for each code: tiled with noise where there are fewer rows than codes.
+    /// The first rows of the batch, one for each code, repeated with noise if there are fewer rows than codes.
     fn candidates(&self, after: &AfterStep<'_>, update: Option<u64>) -> Vec<f32> {
         let rows = after.sum("rows");
         let (wanted, deviation) = (self.codes * self.width, 0.01 / (self.width as f32).sqrt());
@@ -161,7 +162,7 @@ impl Objective for Toy {
             raw.iter().enumerate().map(|(i, x)| x * self.scale[i % width] + self.shift[i % width]).collect();
         let plans = self.sums();
         let mut sums: Vec<Vec<f32>> = plans.iter().map(|plan| vec![0.0; plan.len]).collect();
-        // Each slice puts its rows where they stand in the batch; all others add zeros there.
+        // Each slice writes its rows at their places in the batch; all others add zeros there.
         let first = slice * raw.len();
         for (place, value) in sums[0].iter_mut().skip(first).zip(&encoded) {
             *place = *value;
@@ -250,7 +251,7 @@ fn toy(rows: Rows, codes: usize, width: usize, training: Training) -> Toy {
     }
 }
 
-/// A stage around the objective: what it gives is all of its state.
+/// A stage around the objective; its output is its whole state.
 fn stage(toy: &Toy, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
     let mut objective = toy.clone();
     match train(&mut objective, &toy.training, cx)? {
@@ -276,7 +277,7 @@ fn run(bench: &mut Bench, toy: &Toy) -> Result<protocol::Digest, StageError> {
     bench.run_gang("toy", &settings, &[], &|cx| stage(toy, cx)).map(|ran| ran.output())
 }
 
-/// Codes are reset all the time: with fewer rows than codes from keyed noise, with more from the batch.
+/// Codes are reset in every step: with fewer rows than codes from keyed noise, with more from the batch.
 fn toys() -> [Toy; 2] {
     [4, 24].map(|codes| toy(Rows::Drawn { each: 2, width: 3 }, codes, 3, training(STEPS, 6, 0.05)))
 }
@@ -290,15 +291,16 @@ fn p6_buffers_have_the_same_bits_for_any_number_of_members() {
         for members in [2, 3, 6] {
             assert_eq!(run(&mut world(members), &toy).unwrap(), expected, "{members} members");
         }
-        // Joiners take the buffers of a peer, and one of them is lost. The first member stays: the steps take so little time that it may be
-        // far ahead when they come.
+        // Joiners adopt the buffers of a peer, and one of them is lost. The first member stays: steps are so short that
+        // it may be far ahead when they join.
         let mut bench = world(1);
         bench.script = Script { joins: vec![(1, 5), (2, 5)], lost: vec![(2, 17)], ..Script::default() };
         assert_eq!(run(&mut bench, &toy).unwrap(), expected, "members that come and go");
     }
 }
 
-/// A joiner has part of a peer's state in the place of its own when the peer is lost: it goes on from a checkpoint, or from the beginning.
+/// A joiner has part of a peer's state in place of its own when the peer is lost. It continues from a checkpoint, or
+/// from the beginning.
 #[test]
 fn p4_a_state_that_is_cut_short_on_its_way_is_not_used() {
     for toy in toys() {
@@ -346,7 +348,7 @@ fn groups_take_turns_and_what_is_frozen_stays() {
     assert_eq!(names.len(), 4, "{names:?}");
 }
 
-/// A result of another shape than planned is a fault that says so, not a wrong sum.
+/// A result of another shape than planned is an explicit fault, not a wrong sum.
 #[test]
 fn a_slice_that_breaks_its_plan_is_refused() {
     struct Broken(Toy);
@@ -373,8 +375,8 @@ fn a_slice_that_breaks_its_plan_is_refused() {
     assert!(error.contains("a slice gave gradients of [3, 3, 3] values"), "{error}");
 }
 
-/// Codebooks, sums and counts over several steps against those of the published quantiser (fixture `05_rvq_ema`): what a hook makes of
-/// sums over slices, one slice a clip.
+/// Codebooks, sums and counts over several steps against those of the published quantiser (fixture `05_rvq_ema`): the
+/// hook's result for sums over slices, one clip per slice.
 #[test]
 fn parity_ema_codebook() {
     let root = std::env::var_os("STRIDE_SHARED")
@@ -404,7 +406,7 @@ fn parity_ema_codebook() {
             .tensor(&format!("{case}/start_codebook"))
             .ok()
             .map(|_| ["codebook", "sum", "count"].map(|part| stored(&format!("{case}/start_{part}")).1));
-        // A rate of zero, or nearly: the rows must stay as they are.
+        // A learning rate near zero: the rows must not change.
         let looks = u64::from(given.is_none());
         let settings = training(steps as u64 + looks, clips, f64::MIN_POSITIVE);
         let mut toy = Toy { given, ..toy(Rows::Stored(Arc::new(rows)), codes, width, settings) };

@@ -1,4 +1,4 @@
-//! `init`: what a training begins with, found by kind, taken over where it fits, said where it does not.
+//! `init`: the source is found by kind, its weights are copied where they fit, and the rest is logged.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;

@@ -1,4 +1,4 @@
-//! Clips and an evaluator that nobody has made: noise of the right shape.
+//! Placeholder clips and an untrained evaluator: noise of the right shape.
 
 use models::flat;
 use models::networks::{Evaluator, Init};
@@ -12,12 +12,12 @@ use crate::context::{AttemptContext, StageError};
 use crate::evaluator::{self, EvaluatorMeta};
 use crate::words::Words;
 
-/// Frames of each clip: 142 in the mean, as HumanML3D's have.
+/// Frames of each clip: 142 on average, as in HumanML3D.
 const FRAMES: [usize; 6] = [196, 160, 144, 144, 120, 88];
-/// Clips.
+/// Number of clips.
 pub(super) const CLIPS: usize = FRAMES.len();
 
-/// Clips of noise; the last two are not for training.
+/// Makes clips of noise; the last two are not for training.
 pub(super) fn dataset(cx: &mut dyn AttemptContext, format: DataFormat) -> Result<Digest, StageError> {
     let width = Skeleton::of(format).features;
     let clip = |(i, frames): (usize, &usize)| {
@@ -64,7 +64,7 @@ pub(super) fn evaluator(cx: &mut dyn AttemptContext, format: DataFormat) -> Resu
     evaluator::publish(cx, &meta, (&entries[..], &values[..]), &words)
 }
 
-/// Why a file was not kept.
+/// An error that prevented a file from being kept.
 struct Failure(StageError);
 
 impl From<PackError> for Failure {

@@ -1,23 +1,25 @@
-//! How far a controlled motion is from the positions that it was told to pass.
+//! Distance of a controlled motion from its target positions.
 //!
-//! Source: OmniControl and MotionLCM. The error of a told (frame, joint) is the distance to its position. Trajectory error: the motion
-//! has one above the threshold. Location error: the share of those above it. Average error: their mean.
+//! Source: OmniControl and MotionLCM. The error of a (frame, joint) with a target is the distance to it. Trajectory
+//! error: the motion has an error above the threshold. Location error: the share of errors above it. Average error:
+//! their mean.
 
 const AXES: usize = 3;
 
 /// Errors of one motion.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ControlErrors {
-    /// 1 if any told position is missed by more than the threshold, else 0.
+    /// 1 if any target is missed by more than the threshold, else 0.
     pub trajectory: f64,
-    /// Share of told positions missed by more than the threshold.
+    /// Share of targets missed by more than the threshold.
     pub location: f64,
-    /// Mean distance.
+    /// Mean distance to the targets.
     pub average: f64,
 }
 
 impl ControlErrors {
-    /// Of a motion against a hint of its shape, `[.., 3]` both; `told` says of which positions the hint speaks. `None` if of none.
+    /// Compares a motion with a hint of its shape, both `[.., 3]`; `told` marks the positions with a target. `None` if
+    /// there is no target.
     ///
     /// # Panics
     /// If the shapes differ.

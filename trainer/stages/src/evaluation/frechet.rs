@@ -1,8 +1,8 @@
-//! Frechet distance between Gaussians fitted to two sets, and the principal components it is taken in.
+//! Frechet distance between Gaussians fitted to two sets, and the principal components in which it is computed.
 //!
-//! Source: Heusel et al., arXiv:1706.08500, eq. 6: `|m1 - m2|^2 + Tr(C1 + C2 - 2 (C1 C2)^(1/2))`, covariances with n - 1.
-//! Departs: the trace of the root is taken from the eigenvalues of the symmetric `C1^(1/2) C2 C1^(1/2)`, which has the same
-//! eigenvalues as `C1 C2` and needs no complex arithmetic; rounding below zero counts as zero.
+//! Source: Heusel et al., arXiv:1706.08500, eq. 6: `|m1 - m2|^2 + Tr(C1 + C2 - 2 (C1 C2)^(1/2))`, covariances with n -
+//! 1. Departs: the trace of the root is computed from the eigenvalues of the symmetric `C1^(1/2) C2 C1^(1/2)`. They
+//! equal those of `C1 C2` and need no complex arithmetic; rounding below zero counts as zero.
 
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
@@ -34,7 +34,7 @@ impl Gaussian {
     pub fn distance(&self, other: &Self) -> f64 {
         let root = square_root(&self.covariance);
         let product = &root * &other.covariance * &root;
-        // Rounding leaves it not quite symmetric, and the solver reads one triangle only.
+        // Rounding makes it slightly asymmetric, and the solver reads only one triangle.
         let product = (&product + product.transpose()) * 0.5;
         let trace_root: f64 = product.symmetric_eigenvalues().iter().map(|v| v.max(0.0).sqrt()).sum();
         let shift = (&self.mean - &other.mean).norm_squared();
@@ -46,13 +46,13 @@ impl Gaussian {
 #[derive(Debug, Clone)]
 pub struct PrincipalComponents {
     mean: DVector<f64>,
-    /// `[components, dim]`.
+    /// Matrix of shape `[components, dim]`.
     basis: DMatrix<f64>,
     explained: f64,
 }
 
 impl PrincipalComponents {
-    /// The first `components` directions of `values`, rows of `dim` values each; fewer when the set spans fewer.
+    /// Finds the first `components` directions of `values`, rows of `dim` values each; fewer if the set spans fewer.
     ///
     /// # Panics
     /// If there are fewer than two rows.
@@ -69,17 +69,17 @@ impl PrincipalComponents {
         Self { mean, basis, explained }
     }
 
-    /// How many there are.
+    /// Number of components.
     pub fn len(&self) -> usize {
         self.basis.nrows()
     }
 
-    /// Whether there are none.
+    /// Returns true if there are no components.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Their share of the variance of the set they were fitted to.
+    /// The components' share of the variance of the set they were fitted to.
     pub fn explained(&self) -> f64 {
         self.explained
     }
@@ -95,7 +95,7 @@ impl PrincipalComponents {
     }
 }
 
-/// The mean, and the rows less their mean as the columns of a matrix.
+/// The mean, and the centred rows as the columns of a matrix.
 fn centre(values: &[f64], dim: usize) -> (DVector<f64>, DMatrix<f64>) {
     assert!(dim > 0 && values.len().is_multiple_of(dim), "{} values are no rows of {dim}", values.len());
     let mut columns = DMatrix::from_column_slice(dim, values.len() / dim, values);
@@ -114,7 +114,7 @@ fn square_root(matrix: &DMatrix<f64>) -> DMatrix<f64> {
     scaled * eigenvectors.transpose()
 }
 
-/// Widens.
+/// Converts values to f64 without loss.
 pub fn to_f64(values: &[f32]) -> Vec<f64> {
     values.iter().map(|&v| f64::from(v)).collect()
 }
@@ -134,7 +134,8 @@ mod tests {
             Gaussian::fit(&corners([1.0, 2.0, 3.0], [0.0; 3]), 3),
             Gaussian::fit(&corners([2.0, 2.0, 1.0], [1.0, 0.0, -2.0]), 3),
         );
-        // Variance h^2 * 8/7 along each axis: the distance is the shift squared plus the differences of the deviations squared.
+        // The variance is h^2 * 8/7 along each axis. The distance is the shift squared plus the differences of the
+        // deviations squared.
         let expected = 5.0 + 8.0 / 7.0 * (1.0 + 0.0 + 4.0);
         assert!((a.distance(&b) - expected).abs() < 1e-12);
         assert!((b.distance(&a) - expected).abs() < 1e-12);

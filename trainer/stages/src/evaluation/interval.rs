@@ -1,22 +1,22 @@
-//! The mean of repeated measurements with its 95% interval, as the papers print it: `mean ± 1.96 sd / sqrt(n)`, with the standard
-//! deviation that divides by n.
+//! The mean of repeated measurements with its 95% interval, as the papers print it: `mean ± 1.96 sd / sqrt(n)`, with
+//! the standard deviation that divides by n.
 
 use serde::{Deserialize, Serialize};
 
-/// Of a standard normal, 95% lie within so many deviations.
+/// Half width of the 95% interval of a standard normal, in deviations.
 const NORMAL_95: f64 = 1.96;
 
-/// A mean and how far it may be off.
+/// A mean with its confidence interval.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Interval {
     /// Mean of the repeats.
     pub mean: f64,
-    /// Half the width of the interval; 0 for a single repeat, which says nothing about its spread.
+    /// Half the width of the interval; 0 for a single repeat, whose spread is unknown.
     pub half: f64,
 }
 
 impl Interval {
-    /// Of the values of all repeats.
+    /// Computes the interval from the values of all repeats.
     ///
     /// # Panics
     /// If there are none.
@@ -28,12 +28,12 @@ impl Interval {
         Self { mean, half: NORMAL_95 * (variance / n).sqrt() }
     }
 
-    /// Its lower end.
+    /// Lower end of the interval.
     pub fn lower(self) -> f64 {
         self.mean - self.half
     }
 
-    /// Its upper end.
+    /// Upper end of the interval.
     pub fn upper(self) -> f64 {
         self.mean + self.half
     }

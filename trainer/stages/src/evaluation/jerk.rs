@@ -1,16 +1,17 @@
-//! Symmetric jerk percentage error: whether a motion shakes (noise) or stands still (static) where the real one does not.
+//! Symmetric jerk percentage error: measures shaking (noise) and stillness (static) compared with the real motion.
 //!
-//! Source: DisCoRD (Cho et al., arXiv:2411.19527), sJPE. Jerk is the length of the third difference of a joint's position times fps^3, in
-//! m/s^3, of the joints that move freely: feet and wrists. Per frame and joint `(p - g) / (g + p + 1e-6)`, the positive part is noise, the
-//! negative static, sJPE their sum. Departs: a mean over joints where the code has a sum (the paper's numbers are such means), and f64
-//! from the positions on, because fps^3 magnifies rounding.
+//! Source: DisCoRD (Cho et al., arXiv:2411.19527), sJPE. Jerk is the length of the third difference of a joint's
+//! position times fps^3, in m/s^3, of the joints that move freely: feet and wrists. Per frame and joint the error is
+//! `(p - g) / (g + p + 1e-6)`: the positive part is noise, the negative static, sJPE their sum. Departs: a mean over
+//! joints where the code has a sum (the paper's numbers are such means), and f64 from the positions on, because fps^3
+//! magnifies rounding.
 
 use protocol::stage::DataFormat;
 
 const EPS: f64 = 1e-6;
 const AXES: usize = 3;
 
-/// Joints that the papers look at.
+/// Joints that the papers measure: feet and wrists.
 pub fn joints_of(format: DataFormat) -> &'static [usize] {
     match format {
         DataFormat::Humanml3d => &[10, 11, 20, 21],
@@ -32,18 +33,18 @@ pub fn jerk(motion: &[f64], count: usize, of: &[usize], fps: f64) -> Vec<f64> {
 /// The parts of sJPE.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct JerkError {
-    /// Where the guess is smoother than the truth.
+    /// Part where the guess is smoother than the truth.
     pub statics: f64,
-    /// Where it shakes more.
+    /// Part where the guess shakes more than the truth.
     pub noise: f64,
     /// `statics` weighted by jerk: sum of differences over sum of jerks.
     pub weighted_static: f64,
-    /// `noise` likewise.
+    /// `noise` weighted by jerk: sum of differences over sum of jerks.
     pub weighted_noise: f64,
 }
 
 impl JerkError {
-    /// Between jerks of one shape.
+    /// Compares jerks of equal shape.
     ///
     /// # Panics
     /// If there are none (a motion needs 4 frames) or their numbers differ.
@@ -68,7 +69,7 @@ impl JerkError {
         }
     }
 
-    /// sJPE.
+    /// sJPE, the sum of both parts.
     pub fn total(&self) -> f64 {
         self.statics + self.noise
     }

@@ -1,19 +1,19 @@
 //! Errors between a motion and its reconstruction.
 //!
-//! Source: the protocol of MotionLCM and MLD for VAE reconstruction. All errors are in the unit of their input, averaged over
-//! the joints of a frame; the caller averages over frames. f64 sums in order.
+//! Source: the protocol of MotionLCM and MLD for VAE reconstruction. All errors are in the unit of their input,
+//! averaged over the joints of a frame; the caller averages over frames. Sums are in f64 and in order.
 
-/// Three coordinates a joint.
+/// Number of coordinates of a joint.
 const AXES: usize = 3;
 
-/// Mean distance per joint of each frame, with the pelvis (joint 0) of either motion at the origin: the usual MPJPE.
+/// Mean distance per joint of each frame, with the pelvis (joint 0) of both motions at the origin: the usual MPJPE.
 ///
 /// `truth` and `guess` are `[frames, joints, 3]`.
 pub fn root_aligned(truth: &[f32], guess: &[f32], joints: usize) -> Vec<f64> {
     per_frame(truth, guess, joints, |frame, joint, axis| f64::from(frame[joint * AXES + axis]) - f64::from(frame[axis]))
 }
 
-/// Mean distance per joint of each frame as the motions lie in the world, drift included.
+/// Mean distance per joint of each frame in world coordinates, drift included.
 pub fn global(truth: &[f32], guess: &[f32], joints: usize) -> Vec<f64> {
     per_frame(truth, guess, joints, |frame, joint, axis| f64::from(frame[joint * AXES + axis]))
 }
@@ -31,9 +31,11 @@ fn per_frame(truth: &[f32], guess: &[f32], joints: usize, at: impl Fn(&[f32], us
         .collect()
 }
 
-/// The posture part of feature vectors: joints in the heading frame with the pelvis at the origin, `[frames, joints, 3]`.
+/// The posture part of feature vectors: joints in the heading frame with the pelvis at the origin, `[frames, joints,
+/// 3]`.
 ///
-/// Channel 3 of a feature vector is the root's height, channels from 4 on the other joints' positions with that height in.
+/// Channel 3 of a feature vector is the root's height. Channels from 4 on are the other joints' positions, which
+/// include that height.
 pub fn posture(features: &[f32], width: usize, joints: usize) -> Vec<f32> {
     let mut out = Vec::with_capacity(features.len() / width * joints * AXES);
     for frame in features.chunks_exact(width) {
@@ -50,7 +52,7 @@ pub fn feature_distance(truth: &[f32], guess: &[f32]) -> f64 {
     truth.iter().zip(guess).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2)).sum::<f64>().sqrt()
 }
 
-/// Smooth-L1 with beta 1, a mean over all values.
+/// Smooth L1 with beta 1, averaged over all values.
 pub fn smooth_l1(truth: &[f32], guess: &[f32]) -> f64 {
     let one = |(&a, &b): (&f32, &f32)| {
         let d = (f64::from(a) - f64::from(b)).abs();
@@ -59,7 +61,7 @@ pub fn smooth_l1(truth: &[f32], guess: &[f32]) -> f64 {
     truth.iter().zip(guess).map(one).sum::<f64>() / truth.len() as f64
 }
 
-/// The sequence that repeats the mean over time of `features`, rows of `width`.
+/// A sequence that repeats the mean over time of `features`, rows of `width`.
 pub fn time_mean(features: &[f32], width: usize) -> Vec<f32> {
     let frames = features.len() / width;
     let mut sums = vec![0.0f64; width];

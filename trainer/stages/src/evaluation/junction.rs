@@ -1,31 +1,32 @@
-//! How much a motion made of segments jumps where they meet.
+//! Jumps of a motion at the junctions of its segments.
 //!
-//! At a boundary between two frames the jump in velocity is the largest second difference of a joint's position that reaches across it, times fps,
-//! in m/s; the jump in acceleration is the largest third difference, times fps^2, in m/s^2: by how much velocity and acceleration change in one
-//! frame. They are taken over all joints, and over all differences across the boundary, two and three of them, which takes three frames on either
-//! side. A boundary inside of real motion has the same two numbers, so that a junction is held against their 99th percentile. Our own measure:
-//! MotionLCM shows its junctions and does not measure them.
+//! A boundary lies between two frames. Its jump in velocity is the largest second difference of a joint's position
+//! across it, times fps, in m/s. Its jump in acceleration is the largest third difference, times fps^2, in m/s^2. They
+//! are the changes of velocity and acceleration within one frame. The largest is over all joints and over the two or
+//! three differences across the boundary, which need three frames on either side. A boundary inside real motion has the
+//! same two numbers, so a junction is compared with their 99th percentile. Our own measure: MotionLCM shows its
+//! junctions and does not measure them.
 
 use std::collections::VecDeque;
 
-/// Coordinates of a joint.
+/// Number of coordinates of a joint.
 const AXES: usize = 3;
-/// Frames that count on either side of a boundary.
+/// Number of frames used on either side of a boundary.
 pub const SIDE: usize = 3;
-/// Boundaries that are remembered of a stream: 80 minutes at 20 frames per second.
+/// Number of boundaries kept for a stream: 80 minutes at 20 frames per second.
 const MOST: usize = 100_000;
 
-/// By how much a motion changes its course from one frame to the next.
+/// Sudden change of a motion from one frame to the next.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Jump {
-    /// In velocity, m/s.
+    /// Change of velocity, m/s.
     pub velocity: f64,
-    /// In acceleration, m/s^2.
+    /// Change of acceleration, m/s^2.
     pub acceleration: f64,
 }
 
 impl Jump {
-    /// Across the middle of `window`, `[6, joints, 3]` in metres.
+    /// Measures the jump in the middle of `window`, `[6, joints, 3]` in metres.
     ///
     /// # Panics
     /// If the window has another number of frames.
@@ -47,13 +48,13 @@ impl Jump {
     }
 }
 
-/// The jump at each boundary of a motion `[frames, joints, 3]` in metres that has three frames on either side.
+/// The jump at each boundary of a motion `[frames, joints, 3]` in metres with three frames on either side.
 pub fn jumps(motion: &[f64], joints: usize, fps: f64) -> Vec<Jump> {
     let frames: Vec<&[f64]> = motion.chunks_exact(joints * AXES).collect();
     frames.windows(2 * SIDE).map(|window| Jump::across(window, fps)).collect()
 }
 
-/// The smallest of `values` that is not below a share of them; `None` of none. In another order afterwards.
+/// The smallest of `values` that is not below the given share of them; `None` without values. Reorders `values`.
 pub fn percentile(values: &mut [f64], share: f64) -> Option<f64> {
     values.sort_unstable_by(f64::total_cmp);
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "at most as many as there are")]
@@ -61,7 +62,7 @@ pub fn percentile(values: &mut [f64], share: f64) -> Option<f64> {
     values.get(rank.clamp(1, values.len().max(1)) - 1).copied()
 }
 
-/// The 99th percentile of either kind of jump; `None` of none.
+/// The 99th percentile of either kind of jump; `None` without jumps.
 pub fn usual(jumps: &[Jump]) -> Option<Jump> {
     let of = |value: fn(&Jump) -> f64| percentile(&mut jumps.iter().map(value).collect::<Vec<_>>(), 0.99);
     Some(Jump { velocity: of(|jump| jump.velocity)?, acceleration: of(|jump| jump.acceleration)? })
@@ -71,21 +72,21 @@ pub fn usual(jumps: &[Jump]) -> Option<Jump> {
 #[derive(Debug, Clone)]
 pub struct JunctionMeter {
     fps: f64,
-    /// The last frames.
+    /// The last frames, oldest first.
     window: VecDeque<Vec<f64>>,
-    /// Whether each of them is the first of a segment.
+    /// For each of them, true for the first frame of a segment.
     first: VecDeque<bool>,
     junctions: Vec<Jump>,
     interior: Vec<Jump>,
 }
 
 impl JunctionMeter {
-    /// Of frames at `fps`.
+    /// Creates a meter for frames at `fps`.
     pub fn new(fps: f64) -> Self {
         Self { fps, window: VecDeque::new(), first: VecDeque::new(), junctions: Vec::new(), interior: Vec::new() }
     }
 
-    /// The next frame, `[joints, 3]` in metres; `junction` if it begins a segment that follows another one.
+    /// Adds the next frame, `[joints, 3]` in metres; `junction` is true if it starts a segment after another one.
     pub fn push(&mut self, frame: &[f64], junction: bool) {
         let mut row = match self.window.len() == 2 * SIDE {
             true => self.window.pop_front().unwrap_or_default(),
@@ -112,12 +113,12 @@ impl JunctionMeter {
         }
     }
 
-    /// Those where segments meet. One is known three frames after it.
+    /// Jumps at junctions of segments. A jump is known three frames after its boundary.
     pub fn junctions(&self) -> &[Jump] {
         &self.junctions
     }
 
-    /// Those at boundaries whose differences touch no junction.
+    /// Jumps at boundaries whose differences reach across no junction.
     pub fn interior(&self) -> &[Jump] {
         &self.interior
     }
@@ -137,15 +138,15 @@ mod tests {
         let steady = jumps(&on_a_line(|t| 2.0 * t, 8), 1, 10.0);
         assert_eq!(steady.len(), 3);
         assert!(steady.iter().all(|jump| jump.velocity < 1e-9 && jump.acceleration < 1e-9));
-        // Constant acceleration of 4 m/s^2: velocity changes by 0.4 m/s a frame, acceleration not.
+        // Constant acceleration of 4 m/s^2: velocity changes by 0.4 m/s per frame, acceleration does not change.
         let falls = jumps(&on_a_line(|t| 2.0 * t * t, 8), 1, 10.0);
         assert!(falls.iter().all(|jump| (jump.velocity - 0.4).abs() < 1e-9 && jump.acceleration < 1e-9));
-        // It sets off at frame 5 with 1 m/s: within one frame, and so the acceleration jumps by 10 m/s^2, there and back.
+        // It starts at frame 5 with 1 m/s, within one frame. So the acceleration jumps by 10 m/s^2, there and back.
         let starts = jumps(&on_a_line(|t| (t - 0.5).max(0.0), 12), 1, 10.0);
         let velocity: Vec<f64> = starts.iter().map(|jump| (jump.velocity * 1e6).round() / 1e6).collect();
         assert_eq!(velocity, [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0], "at the boundaries 4|5 and 5|6, the third is 2|3");
         assert!((starts[2].acceleration - 10.0).abs() < 1e-9);
-        // The worst joint counts.
+        // The joint with the largest jump counts.
         let two: Vec<f64> = (0..6).flat_map(|t| [0.0, 0.0, 0.0, 0.0, f64::from(t).powi(2) * 0.02, 0.0]).collect();
         assert!((jumps(&two, 2, 10.0)[0].velocity - 0.4).abs() < 1e-9);
         assert!(jumps(&two, 2, 10.0).len() == 1 && jumps(&two[..30], 2, 10.0).is_empty());
@@ -161,7 +162,7 @@ mod tests {
         let all = jumps(&motion, 1, 10.0);
         assert_eq!(meter.junctions(), [all[10 - SIDE]]);
         assert!((meter.junctions()[0].velocity - 10.0).abs() < 1e-9, "a metre in a frame");
-        // Those whose differences reach across it are neither.
+        // Boundaries whose differences reach across a junction are neither.
         assert_eq!(meter.interior().len(), all.len() - 5);
         assert!(meter.interior().iter().all(|jump| jump.velocity < 1e-9));
         let usual = usual(meter.interior()).unwrap();

@@ -1,13 +1,16 @@
-//! How well sampled latents match real ones, and their captions, without an evaluator network.
+//! Agreement of sampled latents with real ones and with their captions, without an evaluator network.
 //!
 //! Source: our own definitions, made to rank students on sets that are too small for a learned evaluator.
-//! * `latent_fid`: Frechet distance between samples and real latents in the first principal components of the train latents,
-//!   divided by the total variance of the real ones there. 0 is perfect, 1 is every sample at the data's mean. With few clips it is not 0 even
-//!   for real motion, so it is to be read beside two values of real latents: the `floor` is another draw from the posteriors of the same
-//!   clips, as many as there are samples, which is what a model scores that redraws these clips; `halves` is one half of the clips against the
-//!   other, which is how far apart two sets of other clips are, at half the count.
-//! * R-precision: each sample ranks the mean latent of its own entry among those of 31 random entries that share no caption.
-//! * `match`: squared distance to another model's samples from the same noise and captions, as a share of their variance.
+//! * `latent_fid`: Frechet distance between samples and real latents in the first principal components of the train
+//!   latents, divided by the total variance of the real ones there. 0 is perfect, 1 is every sample at the data's mean.
+//!   With few clips it is not 0 even for real motion, so two values of real latents accompany it. The `floor` is
+//!   another draw from the posteriors of the same clips, as many as there are samples: the score of a model that
+//!   redraws these clips. `halves` compares one half of the clips with the other: the distance of two sets of other
+//!   clips, at half the count.
+//! * R-precision: each sample ranks the mean latent of its own entry among those of 31 random entries without a common
+//!   caption.
+//! * `match`: squared distance to another model's samples from the same noise and captions, as a share of their
+//!   variance.
 
 use std::collections::{BTreeSet, HashMap};
 
@@ -18,10 +21,10 @@ use protocol::Seed;
 use super::frechet::{Gaussian, PrincipalComponents, to_f64};
 use super::retrieval;
 
-/// Entries that a sample's own one is ranked among, itself included.
+/// Size of the pool in which a sample's own entry is ranked, itself included.
 pub const POOL: usize = 32;
 
-/// The real latents of some entries, along the components.
+/// The real latents of some entries, projected on the components.
 #[derive(Debug)]
 pub struct Target {
     gaussian: Gaussian,
@@ -42,12 +45,12 @@ impl Target {
     }
 }
 
-/// What samples are compared with.
+/// Real data to compare samples with.
 #[derive(Debug)]
 pub struct Reference {
     components: PrincipalComponents,
     target: Target,
-    /// Mean latent of each entry along the components, `[entries, components]`.
+    /// Mean latent of each entry on the components, `[entries, components]`.
     anchors: Vec<f64>,
     /// Captions of each entry; equal captions have equal numbers.
     captions: Vec<BTreeSet<usize>>,
@@ -58,20 +61,19 @@ pub struct Reference {
 pub struct Real<'a> {
     /// One draw of z from each posterior.
     pub z: &'a [f32],
-    /// Posterior means.
     pub mu: &'a [f32],
-    /// Crops per entry.
+    /// Number of crops per entry.
     pub crops: usize,
-    /// N d.
+    /// Values of a latent, N d.
     pub width: usize,
 }
 
-/// Values of one set of samples.
+/// Metrics of one set of samples.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SetMetrics {
-    /// Frechet distance over the real variance.
+    /// Frechet distance divided by the real variance.
     pub latent_fid: f64,
-    /// Rank of its own entry for each sample, 0 for the nearest.
+    /// Rank of each sample's own entry, 0 for the nearest.
     pub ranks: Vec<usize>,
     /// Standard deviation over all values of all samples.
     pub latent_std: f64,
@@ -106,12 +108,12 @@ impl Reference {
         self.components.explained()
     }
 
-    /// All that is compared with.
+    /// The target of all entries to compare with.
     pub fn whole(&self) -> &Target {
         &self.target
     }
 
-    /// The entries `entries` alone.
+    /// Fits the target of `entries` alone.
     pub fn target(&self, real: Real<'_>, entries: &[usize]) -> Target {
         Target::of(&self.components, real, entries)
     }
@@ -125,8 +127,8 @@ impl Reference {
         target.gaussian.distance(&Gaussian::fit(projected, self.components.len())) / target.total_variance
     }
 
-    /// Distance of one half of `entries` to the other, over the variance of all of them: a mean over five ways of halving. `None` of fewer
-    /// than four entries.
+    /// Distance of one half of `entries` to the other, divided by the variance of all of them; a mean over five
+    /// divisions into halves. `None` for fewer than four entries.
     pub fn halves(&self, real: Real<'_>, entries: &[usize], seed: Seed) -> Option<f64> {
         const WAYS: u64 = 5;
         if entries.len() < 4 {
@@ -160,10 +162,10 @@ impl Reference {
         }
     }
 
-    /// Up to 31 different entries that share no caption with `entry`; fewer on tiny sets.
+    /// Draws up to 31 different entries without a caption in common with `entry`; fewer on tiny sets.
     fn pool(&self, entry: usize, stream: &mut Stream) -> Vec<usize> {
         let count = self.captions.len();
-        // A shuffle that only remembers what it has swapped, since most of a large set is never looked at.
+        // A shuffle that stores only the swapped positions, since most of a large set is never read.
         let mut swapped: HashMap<usize, usize> = HashMap::new();
         let mut pool = Vec::with_capacity(POOL - 1);
         for first in 0..count {
@@ -189,7 +191,7 @@ pub fn top(ranks: impl Iterator<Item = usize>, k: usize) -> f64 {
     hits as f64 / count as f64
 }
 
-/// Numbers captions so that those of the same words have equal numbers.
+/// Numbers captions so that those with the same words have equal numbers.
 pub fn same_captions(captions: impl Iterator<Item = Vec<String>>) -> Vec<usize> {
     let mut known: HashMap<Vec<String>, usize> = HashMap::new();
     captions
@@ -243,7 +245,7 @@ mod tests {
     const WIDTH: usize = 6;
     const CROPS: usize = 4;
 
-    /// `entries` clusters far apart, two entries to a caption.
+    /// `entries` distant clusters, two entries per caption.
     fn clusters(entries: usize) -> (Vec<f32>, Vec<BTreeSet<usize>>) {
         let mut stream = Stream::new(Seed(1), "test", 0, 0);
         let mut z = vec![];
@@ -269,11 +271,11 @@ mod tests {
 
         let (mean, _) = mean_and_spread(&z.iter().map(|v| f64::from(*v)).collect::<Vec<_>>());
         assert!(mean.is_finite());
-        // Every sample at the data's mean: all of the variance is missing.
+        // With every sample at the data's mean, all of the variance is missing.
         let middle: Vec<f32> =
             (0..WIDTH).map(|i| z.iter().skip(i).step_by(WIDTH).sum::<f32>() / (60 * CROPS) as f32).collect();
         assert!((reference.distance(reference.whole(), &middle.repeat(20)) - 1.0).abs() < 1e-3);
-        // Against the entries that they are of alone, half of the rows are as near; two halves of other clusters are far apart.
+        // Against only their own entries, half of the rows are as near; two halves of other clusters are far apart.
         let (some, rows) = (&all[..30], &z[..30 * CROPS * WIDTH]);
         assert!(reference.distance(&reference.target(real, some), rows).abs() < 1e-9);
         assert!(reference.distance(reference.whole(), rows) > 1e-3);
@@ -300,7 +302,7 @@ mod tests {
     fn the_relative_distance_is_a_share_of_the_variance() {
         let others = [0.0, 0.0, 2.0, 4.0];
         assert_eq!(relative_distance(&others, &others, 2), 0.0);
-        // Everything at the mean.
+        // All samples are at the mean.
         assert_eq!(relative_distance(&[1.0, 2.0, 1.0, 2.0], &others, 2), 1.0);
         let captions = ["A man walks.", "a man", "a man walks"];
         assert_eq!(same_captions(captions.into_iter().map(motion::text::words)), [0, 1, 0]);

@@ -1,7 +1,8 @@
 //! MPJPE after each frame's best similarity (scale, rotation, shift), and the error of accelerations.
 //!
-//! Source: the reconstruction protocol of MLD (PA-MPJPE, ACCEL). The alignment is Kabsch's and Umeyama's, from the singular values of
-//! the cross-covariance, without reflections. In the unit of the input; the caller averages over frames.
+//! Source: the reconstruction protocol of MLD (PA-MPJPE, ACCEL). The alignment is that of Kabsch and Umeyama, computed
+//! from the singular values of the cross-covariance, without reflections. Errors are in the unit of the input; the
+//! caller averages over frames.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -28,7 +29,7 @@ fn frame(truth: &[f64], guess: &[f64]) -> f64 {
     let (Some(u), Some(vt)) = (svd.u, svd.v_t) else { unreachable!("both factors were asked for") };
     let mut signs = Vector3::repeat(1.0);
     if (u * vt).determinant() < 0.0 {
-        // The direction of the smallest singular value is turned, so that a mirror image is not taken for a match.
+        // The direction of the smallest singular value is flipped, so that a mirror image does not match.
         signs[svd.singular_values.imin()] = -1.0;
     }
     let rotation = u * Matrix3::from_diagonal(&signs) * vt;
@@ -70,7 +71,7 @@ mod tests {
         assert!(aligned(&truth, &similar, 7).iter().all(|e| *e < 1e-12));
         let mirrored = moved(&truth, |p| Vector3::new(-p.x, p.y, p.z));
         assert!(aligned(&truth, &mirrored, 7).iter().all(|e| *e > 0.1));
-        // One joint moved by d of seven costs less than d / 7 after alignment, and something.
+        // Moving one of seven joints by d costs more than nothing and less than d / 7 after alignment.
         let mut one = truth.clone();
         one[4] += 0.07;
         let error = aligned(&truth, &one, 7);

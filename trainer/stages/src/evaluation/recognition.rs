@@ -1,19 +1,20 @@
-//! A classifier of motions by what people do in them.
+//! A classifier of motions by action.
 //!
-//! A motion is described by statistics of its normalised feature rows over time, whatever its length, and told apart by ridge regression on one-hot labels
-//! with a Gaussian kernel: a closed form without draws, so that the same clips give the same answers. Ours; the classifier behind the recognition accuracy of
-//! Action2Motion (Guo et al., 2020) is a recurrent network.
+//! Statistics of a motion's normalised feature rows over time describe it, for any length. Ridge regression on one-hot
+//! labels with a Gaussian kernel classifies it: a closed form without draws, so that the same clips give the same
+//! answers. Ours; the classifier for the recognition accuracy of Action2Motion (Guo et al., 2020) is a recurrent
+//! network.
 
 use motion::Skeleton;
 use nalgebra::{DMatrix, DVector};
 
 /// Added to the kernel's diagonal, which is 1.
 const RIDGE: f64 = 0.05;
-/// Statistics of each channel.
+/// Number of statistics per channel.
 const STATISTICS: usize = 5;
 
-/// What a motion's rows `[frames, features]`, normalised, come to: of each channel but the joint rotations, which say what positions say, the mean, the
-/// standard deviation, the extremes and the mean change from frame to frame.
+/// Describes a motion of normalised rows `[frames, features]`. Each channel has its mean, standard deviation, extremes
+/// and mean change from frame to frame. Joint rotations are left out, since they repeat the positions.
 pub fn describe(rows: &[f32], skeleton: &Skeleton) -> Vec<f64> {
     let layout = skeleton.layout();
     let width = skeleton.features;
@@ -31,21 +32,22 @@ pub fn describe(rows: &[f32], skeleton: &Skeleton) -> Vec<f64> {
     all
 }
 
-/// Tells described motions apart.
+/// A trained classifier of described motions.
 #[derive(Debug)]
 pub struct Classifier {
     mean: Vec<f64>,
     scale: Vec<f64>,
-    /// What it has learnt from, standardised.
+    /// The training motions, standardised.
     known: Vec<Vec<f64>>,
-    /// [known, classes].
+    /// Weights of shape [known, classes].
     weights: DMatrix<f64>,
-    /// Of squared distances.
+    /// Width of the kernel, for squared distances.
     bandwidth: f64,
 }
 
 impl Classifier {
-    /// Learns from motions that [`describe`] has described, with the class of each, below `classes`. `None` if there are too few to tell, or they are not finite.
+    /// Trains on motions from [`describe`], with the class of each, below `classes`. `None` if there are too few
+    /// motions or a value is not finite.
     pub fn fit(motions: &[Vec<f64>], labels: &[usize], classes: usize) -> Option<Self> {
         let n = motions.len();
         let width = motions.first()?.len();
@@ -55,7 +57,7 @@ impl Classifier {
         let over = |f: &dyn Fn(&Vec<f64>) -> f64| motions.iter().map(f).sum::<f64>() / n as f64;
         let mean: Vec<f64> = (0..width).map(|i| over(&|m| m[i])).collect();
         let deviation = |i: usize| over(&|m| (m[i] - mean[i]).powi(2)).sqrt();
-        // A statistic that does not vary tells nothing.
+        // A statistic that does not vary carries no information.
         let scale = (0..width).map(deviation).map(|sd| if sd > 1e-6 { 1.0 / sd } else { 0.0 }).collect();
         let mut fitted = Self { mean, scale, known: vec![], weights: DMatrix::zeros(0, 0), bandwidth: 1.0 };
         let known: Vec<Vec<f64>> = motions.iter().map(|m| fitted.standard(m)).collect();
@@ -71,7 +73,7 @@ impl Classifier {
         Some(fitted)
     }
 
-    /// The class that a described motion is taken for.
+    /// The predicted class of a described motion.
     pub fn classify(&self, motion: &[f64]) -> usize {
         let motion = self.standard(motion);
         let near = DVector::from_iterator(self.known.len(), self.known.iter().map(|known| self.near(known, &motion)));

@@ -1,10 +1,11 @@
-//! What a VAE loses: errors of one clip, and their summary over clips.
+//! Reconstruction loss of a VAE: errors of one clip, and their summary over clips.
 //!
-//! Source: the VAE protocol of MotionLCM and MLD, sJPE of DisCoRD. MPJPE is a mean over all frames of all clips, pelvis at the origin;
-//! PA-MPJPE likewise, after each frame's best similarity. The error of accelerations is a mean over all frames but two of each clip, as
-//! they lie in the world. The feature error is the sum over clips of the Frobenius norm of the normalised difference, divided by the
-//! number of frames; it is not a mean per frame. Smooth-L1 is a mean over all values of all clips (the VAE's loss instead weighs clips
-//! equally). sJPE with its parts and the skating ratio are means over clips; a clip of fewer than 4 frames has no jerk and is left out.
+//! Source: the VAE protocol of MotionLCM and MLD, sJPE of DisCoRD. MPJPE is a mean over all frames of all clips, pelvis
+//! at the origin. PA-MPJPE is the same after each frame's best similarity. The error of accelerations, in world
+//! coordinates, is a mean over all frames but two of each clip. The feature error is the sum over clips of the
+//! Frobenius norm of the normalised difference, divided by the number of frames; it is not a mean per frame. Smooth L1
+//! is a mean over all values of all clips; the VAE's loss instead weighs clips equally. sJPE with its parts and the
+//! skating ratio are means over clips. A clip of fewer than 4 frames has no jerk and is left out.
 
 use std::collections::BTreeMap;
 
@@ -18,39 +19,39 @@ use super::{joints, procrustes, skating};
 /// Errors of one clip, summed over its frames, in the unit of the data.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ClipErrors {
-    /// Frames.
+    /// Number of frames.
     pub frames: usize,
-    /// Pelvis at the origin, in each frame.
+    /// Sum of MPJPE over the frames, pelvis at the origin.
     pub aligned: f64,
-    /// After each frame's best scale, rotation and shift.
+    /// The same after each frame's best scale, rotation and shift.
     pub similar: f64,
-    /// Pelvis at the origin and the body facing its heading, in each frame: the posture alone.
+    /// The same with the body also facing its heading in each frame: the posture alone.
     pub local: f64,
-    /// As they lie in the world, drift included.
+    /// The same in world coordinates, drift included.
     pub global: f64,
-    /// Of accelerations, summed over the frames but two.
+    /// Error of accelerations, summed over all frames but two.
     pub acceleration: f64,
     /// Frobenius norm of the difference of the normalised features.
     pub feature_distance: f64,
     /// Smooth-L1 of the normalised features, mean over the clip.
     pub smooth_l1: f64,
-    /// sJPE's parts; none of fewer than 4 frames.
+    /// Parts of sJPE; `None` for fewer than 4 frames.
     pub jerk: Option<ClipJerk>,
     /// Share of the steps in which a foot of the guess skates.
     pub skating: f64,
 }
 
-/// sJPE's parts of one clip.
+/// Parts of sJPE of one clip.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ClipJerk {
-    /// Where the guess shakes more than the truth.
+    /// Part where the guess shakes more than the truth.
     pub noise: f64,
-    /// Where it is smoother.
+    /// Part where the guess is smoother than the truth.
     pub statics: f64,
 }
 
 impl ClipErrors {
-    /// Compares a clip with a guess at it; both are rows `[L, D]` of normalised features.
+    /// Compares a clip with its reconstruction; both are rows `[L, D]` of normalised features.
     pub fn between(truth: &[f32], guess: &[f32], mean: &[f32], std: &[f32], skeleton: &Skeleton) -> Self {
         let (truth_natural, guess_natural) = (natural(truth, mean, std), natural(guess, mean, std));
         let (a, b) = (recover_joints(&truth_natural, skeleton), recover_joints(&guess_natural, skeleton));
@@ -73,7 +74,7 @@ impl ClipErrors {
     }
 }
 
-/// Features in the data's own scale.
+/// Converts features to the data's own scale.
 fn natural(rows: &[f32], mean: &[f32], std: &[f32]) -> Vec<f32> {
     let scaled = rows.chunks_exact(mean.len()).flat_map(|row| row.iter().zip(std).zip(mean));
     scaled.map(|((x, s), m)| x * s + m).collect()
@@ -100,12 +101,12 @@ fn skates(joints: Vec<f64>, skeleton: &Skeleton) -> f64 {
     skating::ratio(&in_metres(joints, skeleton), skeleton.joints, skating::feet(skeleton.format), skeleton.fps)
 }
 
-/// The skating ratio of a clip itself: rows `[L, D]` of normalised features.
+/// The skating ratio of the original clip, rows `[L, D]` of normalised features.
 pub fn real_skating(truth: &[f32], mean: &[f32], std: &[f32], skeleton: &Skeleton) -> f64 {
     skates(recover_joints_wide(&natural(truth, mean, std), skeleton), skeleton)
 }
 
-/// The metrics of a set of clips; names begin with `prefix`, distances are in millimetres.
+/// Summarises a set of clips as metrics; their names start with `prefix`, distances are in millimetres.
 pub fn summary(clips: &[ClipErrors], skeleton: &Skeleton, prefix: &str) -> BTreeMap<String, f64> {
     let frames: usize = clips.iter().map(|c| c.frames).sum();
     let inner: usize = clips.iter().map(|c| c.frames.saturating_sub(2)).sum();
@@ -171,7 +172,7 @@ mod tests {
                 let found = found[&format!("mu_{name}")];
                 assert!((found - value).abs() <= 1e-6 * value.abs(), "{format:?} {name}: {found}, expected {value}");
             };
-            // 35 frames; second differences 1, -2 and 1 times the jump, in the 10 + 18 + 1 inner frames.
+            // 35 frames; second differences are 1, -2 and 1 times the jump, in the 10 + 18 + 1 inner frames.
             expect("mpjpe_mm", 0.5 / skeleton.joints as f64 / 35.0 * millimetres);
             expect("acceleration_mm", 4.0 * 0.5 / skeleton.joints as f64 / 29.0 * millimetres);
             assert!(found["mu_pa_mpjpe_mm"] > 0.0, "a jump of one joint is no similarity");
@@ -182,7 +183,7 @@ mod tests {
             }
             let scaled = ClipErrors::between(&still(skeleton, 12, rest), &larger, &mean, &std, skeleton);
             assert!(scaled.similar < 1e-5 && scaled.aligned > 1.0, "the scale is aligned: {scaled:?}");
-            // Jerk in 4 of 9 frames of one of the joints, none in the truth; the clip of 3 frames does not count.
+            // One joint has jerk in 4 of 9 frames, the truth has none; the clip of 3 frames does not count.
             let share = 4.0 / 9.0 / joints_of(format).len() as f64;
             expect("sjpe_noise", share / 2.0);
             expect("sjpe_static", 0.0);
@@ -203,7 +204,7 @@ mod tests {
             let rest = still(skeleton, 21, |_| 0.0);
             let mut dragged = rest.clone();
             for row in dragged.chunks_exact_mut(skeleton.features) {
-                // One metre a second, all joints on the ground.
+                // One metre per second, with all joints on the ground.
                 row[1] = (1.0 / skeleton.fps / skeleton.metres_per_unit) as f32;
                 row[skeleton.layout().positions].fill(0.0);
             }

@@ -1,9 +1,9 @@
-//! How well one set of vectors finds its partners in another.
+//! Retrieval of the partners of one set of vectors in another.
 //!
-//! Source: the R-precision and matching score of Guo et al. (Text2Motion). Departs: distances are taken directly in f64 instead
-//! of by the expanded square in f32, which gives NaN for near-equal rows.
+//! Source: the R-precision and matching score of Guo et al. (Text2Motion). Departs: distances are computed directly in
+//! f64 instead of by the expanded square in f32, which gives NaN for near-equal rows.
 
-/// Shares of hits, and the mean distance of partners.
+/// Shares of hits, and the mean distance between partners.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Retrieval {
     /// Share of queries whose partner is among the k + 1 nearest, at index k.
@@ -25,7 +25,7 @@ pub fn in_groups(queries: &[f64], targets: &[f64], dim: usize, group: usize) -> 
         for query in start..start + group {
             let to = |target: usize| squared(row(queries, query, dim), row(targets, target, dim));
             let own = to(query);
-            // A tie counts for the row that comes first, as a stable sort has it.
+            // Of equal distances the first row counts, as in a stable sort.
             let rank = (start..start + group).filter(|&t| to(t) < own || (to(t) == own && t < query)).count();
             hits.iter_mut().skip(rank).for_each(|h| *h += 1);
             distances += own.sqrt();
@@ -35,7 +35,7 @@ pub fn in_groups(queries: &[f64], targets: &[f64], dim: usize, group: usize) -> 
     Retrieval { top: hits.map(|h| h as f64 / count), matching_score: distances / count }
 }
 
-/// How many of `others` are nearer to `query` than `own` is.
+/// Number of `others` that are nearer to `query` than `own` is.
 pub fn rank(query: &[f64], own: &[f64], others: impl Iterator<Item = impl AsRef<[f64]>>) -> usize {
     let distance = squared(query, own);
     others.filter(|other| squared(query, other.as_ref()) < distance).count()
@@ -60,7 +60,7 @@ mod tests {
         let targets = [0.0, 1.0, 2.0, 3.0, 99.0];
         let queries = [0.0, 1.9, 2.0, 0.0, 0.0];
         let found = in_groups(&queries, &targets, 1, 4);
-        // Ranks 0, 1, 0, 3; the fifth row is of no full group.
+        // Ranks are 0, 1, 0, 3; the fifth row belongs to no full group.
         assert_eq!(found.top, [0.5, 0.75, 0.75]);
         assert!((found.matching_score - (0.9 + 3.0) / 4.0).abs() < 1e-12);
         assert_eq!(rank(&[0.0], &[2.0], [[1.0], [3.0], [0.5]].iter()), 2);

@@ -1,13 +1,14 @@
-//! Foot skating: how often a foot slides while it is on the ground.
+//! Foot skating: the frequency of a foot sliding while it is on the ground.
 //!
-//! Source: the control protocol of MotionLCM and OmniControl. A foot is down in a step if its height is below 5 cm in both frames; it
-//! skates if it is down, its horizontal speed above 0.5 m/s, and so is the mean of the speed over 5 steps (zeros beyond the ends).
+//! Source: the control protocol of MotionLCM and OmniControl. A foot is down in a step if its height is below 5 cm in
+//! both frames. It skates if it is down and its horizontal speed is above 0.5 m/s, and so is the mean speed over 5
+//! steps (zeros beyond the ends).
 
 use protocol::stage::DataFormat;
 
 const HEIGHT: f64 = 0.05;
 const SPEED: f64 = 0.5;
-/// Steps on either side of the moving average's middle.
+/// Steps on either side of the centre of the moving average.
 const REACH: usize = 2;
 const AXES: usize = 3;
 

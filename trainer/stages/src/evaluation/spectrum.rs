@@ -1,24 +1,24 @@
 //! Energy of a motion by frequency.
 //!
-//! Features are normalised with the dataset's statistics, and each is transformed along time by the orthonormal cosine transform of its clip's length n,
-//! whose coefficient k stands for `k fps / (2 n)` Hz. A band's energy is the sum of the squares of its coefficients, a mean over features and frames, so
-//! that clips of all lengths count alike.
+//! Features are normalised with the dataset's statistics. The orthonormal cosine transform along time, of the clip's
+//! length n, has coefficient k at `k fps / (2 n)` Hz. A band's energy is the sum of the squares of its coefficients,
+//! averaged over features and frames, so that clips of all lengths count alike.
 
 use std::f64::consts::PI;
 
 /// Cosine transforms of one length, cut into bands.
 #[derive(Debug)]
 pub struct Bands {
-    /// [n, n]: coefficient by frame.
+    /// Basis [n, n]: coefficient by frame.
     basis: Vec<f64>,
-    /// Which band each coefficient is in.
+    /// Band of each coefficient.
     band: Vec<usize>,
     bands: usize,
     frames: usize,
 }
 
 impl Bands {
-    /// Of motions of `frames` frames, `fps` a second; bands end at `ends` in hertz, and a last one takes the rest.
+    /// Prepares motions of `frames` frames at `fps`. Bands end at `ends` in hertz, and a last band takes the rest.
     pub fn new(frames: usize, fps: f64, ends: &[f64]) -> Self {
         let n = frames as f64;
         let scale = |k: usize| if k == 0 { (1.0 / n).sqrt() } else { (2.0 / n).sqrt() };
@@ -32,7 +32,7 @@ impl Bands {
         }
     }
 
-    /// Energy in each band of rows `[frames, width]`.
+    /// The energy in each band of rows `[frames, width]`.
     pub fn energy(&self, rows: &[f64], width: usize) -> Vec<f64> {
         let mut energy = vec![0.0; self.bands];
         let mut coefficients = vec![0.0; width];
@@ -55,7 +55,7 @@ mod tests {
     fn a_wave_is_in_its_band_and_energy_is_kept() {
         let (frames, fps) = (40, 20.0);
         let bands = Bands::new(frames, fps, &[0.5, 1.0, 2.0, 4.0]);
-        // Coefficient 6 of 40 frames: 1.5 Hz.
+        // Coefficient 6 of 40 frames is at 1.5 Hz.
         let wave = |i: usize| (PI * (2 * i + 1) as f64 * 6.0 / 80.0).cos();
         let rows: Vec<f64> = (0..frames).flat_map(|i| [wave(i), 0.0]).collect();
         let energy = bands.energy(&rows, 2);

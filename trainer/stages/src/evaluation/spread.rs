@@ -1,11 +1,11 @@
-//! How different motions are: Diversity over a set, MultiModality within the motions of one caption.
+//! Variety of motions: Diversity over a set, MultiModality within the motions of one caption.
 //!
-//! Source: Guo et al. (text-to-motion). Diversity is the mean distance of pairs of two draws from the set, MultiModality the same
-//! within each caption's motions, one draw for all captions. The draws are the caller's.
+//! Source: Guo et al. (text-to-motion). Diversity is the mean distance of pairs of two draws from the set.
+//! MultiModality is the same within each caption's motions, with one draw for all captions. The caller makes the draws.
 
 use super::retrieval::{row, squared};
 
-/// Pairs of two draws that Diversity compares, where the set has as many.
+/// Number of pairs that Diversity compares if the set is large enough.
 pub const DIVERSITY_PAIRS: usize = 300;
 
 /// Mean distance of row `first[i]` to row `second[i]`.
@@ -18,7 +18,7 @@ pub fn diversity(rows: &[f64], dim: usize, first: &[usize], second: &[usize]) ->
     first.iter().zip(second).map(distance).sum::<f64>() / first.len() as f64
 }
 
-/// The same within each caption: `rows` are `[captions, samples, dim]`, the draws are of samples.
+/// Mean distance within each caption: `rows` are `[captions, samples, dim]`, and the draws are of samples.
 ///
 /// # Panics
 /// As [`diversity`], and if the rows are not whole captions.

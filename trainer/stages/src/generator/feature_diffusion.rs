@@ -1,6 +1,7 @@
-//! Diffusion of motion itself: a denoiser draws the features of frames, and nothing decodes them. Source: MDM, StableMoFusion.
+//! Diffusion of motion itself: a denoiser generates the features of frames, without a decoder. Source: MDM,
+//! StableMoFusion.
 //!
-//! Parts: `denoiser`, `text`. Of a caption MDM reads one vector, StableMoFusion the tokens.
+//! Parts: `denoiser`, `text`. MDM reads one vector of a caption, StableMoFusion its tokens.
 
 use std::collections::BTreeMap;
 
@@ -17,7 +18,7 @@ use crate::motion_networks::{CaptionRows, Drawing, MotionDenoiser};
 use crate::parts;
 use crate::text::{self, TextEncoder};
 
-/// Its name in manifests.
+/// Name of this generator in manifests.
 pub(crate) const NAME: &str = "feature-diffusion";
 
 #[derive(Debug)]
@@ -26,7 +27,7 @@ struct FeatureDiffusion {
     text: Box<dyn TextEncoder>,
 }
 
-/// Opens its parts, which must fit each other.
+/// Opens the parts and checks that they fit each other.
 pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<Box<dyn MotionGenerator>, StageError> {
     let part = |role: &Role, kind| parts::part(blobs, model, role, kind);
     let denoiser = MotionDenoiser::read(blobs, &part(&Role::DENOISER, ArtifactKind::Denoiser)?, device)?;
@@ -81,7 +82,7 @@ impl MotionGenerator for FeatureDiffusion {
     }
 
     fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError> {
-        // Those of one length are drawn together; those of a network that always draws all frames, all.
+        // Motions of one length are generated together; a network with a fixed length generates all of them together.
         let mut groups: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
         let whole = self.denoiser.meta().draws_whole();
         for (b, frames) in batch.lengths.iter().enumerate() {

@@ -1,4 +1,4 @@
-//! What a generator is asked.
+//! The interface of motion generators.
 
 use std::rc::Rc;
 
@@ -11,35 +11,34 @@ use crate::control::{ControlMeta, Heed};
 use crate::hint::Hint;
 use crate::text::TextEncoder;
 
-/// A caption as a generator wants it: what it asked its text encoder for.
+/// A caption in the form that a generator requested from its text encoder.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Text {
-    /// The caption's one vector, a vector for each of its tokens, or both, the caption's first.
+    /// The caption's vector, a vector for each of its tokens, or both, with the caption's first.
     pub values: Vec<f32>,
 }
 
-/// The `k`-th stream of random numbers of motion `b` of a batch. Stream 0 is the noise that a motion starts from.
+/// Returns the `k`-th stream of random numbers of motion `b` of a batch. Stream 0 is the motion's initial noise.
 pub type Seeds<'a> = dyn Fn(usize, usize) -> Stream + 'a;
 
-/// What motions are drawn for, one of each for every motion.
+/// Conditions of a batch, one of each per motion.
 #[derive(Clone, Copy)]
 pub struct Batch<'a> {
-    /// Captions.
     pub texts: &'a [Rc<Text>],
-    /// Frames.
+    /// Number of frames of each motion.
     pub lengths: &'a [usize],
-    /// What keys the draws: motions depend on nothing else that is random.
+    /// Streams of the draws: motions depend on no other random numbers.
     pub seeds: &'a Seeds<'a>,
-    /// Positions that the motions should pass.
+    /// Target positions of the motions.
     pub control: Option<ControlRequest<'a>>,
 }
 
-/// Positions that the motions of a batch should pass.
+/// Target positions for the motions of a batch.
 #[derive(Debug, Clone, Copy)]
 pub struct ControlRequest<'a> {
-    /// For each motion, as long as it.
+    /// A hint for each motion, of the motion's length.
     pub hints: &'a [Hint],
-    /// How they are heeded.
+    /// Strength of the steering.
     pub heed: Heed,
 }
 
@@ -49,73 +48,75 @@ impl std::fmt::Debug for Batch<'_> {
     }
 }
 
-/// What has just been done, for a caller that takes the time.
+/// Phase that just ended, for a caller that measures time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Lap {
-    /// The sampler is through.
+    /// The sampler is done.
     Sampled,
-    /// What it drew is motion.
+    /// The sample is decoded to motion.
     Decoded,
 }
 
-/// A model that is ready to draw motions.
+/// A loaded model that generates motions.
 pub trait MotionGenerator: std::fmt::Debug {
     /// The skeleton of its motions.
     fn format(&self) -> DataFormat;
 
-    /// Frames of the longest motion that it draws.
+    /// Frames of the longest motion that the model generates.
     fn longest(&self) -> usize;
 
-    /// What it was trained to do, and so which samplers it has.
+    /// Family of the model, which decides its samplers.
     fn family(&self) -> &Family;
 
-    /// What its captions are embedded with.
+    /// Encoder of its captions.
     fn text(&self) -> &dyn TextEncoder;
 
-    /// Captions as it wants them.
+    /// Embeds captions in the form that the model reads.
     fn embed(&self, captions: &[&str]) -> Result<Vec<Text>, StageError>;
 
-    /// A motion for each of the batch, feature rows `[frames, features]` in the data's own scale, of the length asked for unless the model
-    /// decides on its own. The lengths and the sampler are ones that it has; [`motions`](super::motions) sees to that.
+    /// Generates feature rows `[frames, features]` in the data's own scale for each motion of the batch. They have the
+    /// requested length unless the model decides it. [`motions`](super::motions) checks that the model supports the
+    /// lengths and the sampler.
     fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError>;
 
-    /// What a denoising model takes the clean motion for in each step of the sampler, with the step's timestep, the last step last: of a batch of one motion.
+    /// A denoising model's estimates of the clean motion in all steps of the sampler, with their timesteps, for a batch
+    /// of one motion.
     fn predictions(&self, _: Batch<'_>, _: &Sampler) -> Result<Vec<(usize, Vec<f32>)>, StageError> {
         Err(StageError::Input("the model draws without denoising, so that it has no steps to look at".into()))
     }
 
-    /// Its control part, if it has one, without which a batch has no `control`.
+    /// Meta of the control part; without one a batch has no `control`.
     fn control(&self) -> Option<&ControlMeta> {
         None
     }
 
-    /// The way to its latents, if it draws motion from such.
+    /// Access to the latents, if the model generates motion from latents.
     fn latents(&self) -> Option<&dyn LatentGenerator> {
         None
     }
 
-    /// How it fills in a part of a motion, if it can.
+    /// The in-filling of the model, if it supports it.
     fn infilling(&self) -> Option<&dyn Infilling> {
         None
     }
 }
 
-/// A motion of which a part stays.
+/// A motion to be regenerated in part.
 #[derive(Debug, Clone, Copy)]
 pub struct Edit<'a> {
-    /// Feature rows `[frames, features]` in the data's own scale, as many as the pieces have.
+    /// Feature rows `[frames, features]` in the data's own scale, a whole number of units.
     pub motion: &'a [f32],
-    /// Whether each piece stays.
+    /// True for each unit that is kept.
     pub kept: &'a [bool],
 }
 
-/// A generator that draws a part of a motion so that it fits the rest.
+/// A generator that regenerates a part of a motion to fit the rest.
 pub trait Infilling {
-    /// Frames of a piece, which stays or is drawn as a whole.
+    /// Frames of a unit, which is kept or regenerated as a whole.
     fn unit(&self) -> usize;
 
-    /// The motion with the pieces drawn anew that do not stay. What stays is decoded with them, so its frames change a little where the two meet.
-    /// The sampler is one that the model has.
+    /// Regenerates the units that are not kept. Kept units are decoded with them, so their frames change slightly at
+    /// the borders. The sampler must be one of the model's.
     fn fill_in(
         &self,
         edit: Edit<'_>,
@@ -126,14 +127,14 @@ pub trait Infilling {
     ) -> Vec<f32>;
 }
 
-/// A generator that draws latents and decodes them.
+/// A generator that samples latents and decodes them.
 pub trait LatentGenerator {
     /// The shape of a latent.
     fn shape(&self) -> LatentShape;
 
-    /// The VAE whose latents they are.
+    /// Digest of the VAE of the latents.
     fn vae(&self) -> Digest;
 
-    /// Latents `[batch, N, d]`.
+    /// Samples latents `[batch, N, d]`.
     fn sample(&self, texts: &[Rc<Text>], seeds: &Seeds<'_>, sampler: &Sampler) -> Result<Vec<f32>, StageError>;
 }

@@ -1,7 +1,8 @@
-//! Latent diffusion and its students: a denoiser draws a latent, a VAE turns it into motion. Source: MLD, MotionLCM, MotionPCM.
+//! Latent diffusion and its students: a denoiser samples a latent, and a VAE decodes it to motion. Source: MLD,
+//! MotionLCM, MotionPCM.
 //!
-//! Parts: `denoiser`, `vae`, `text`, `control` where motions can be told where to go, and `decoder` if a flow decodes in the VAE's place. The
-//! denoiser reads a caption's one vector.
+//! Parts: `denoiser`, `vae`, `text`; `control` if motions can be steered; `decoder` if a flow decodes instead of the
+//! VAE. The denoiser reads one vector of a caption.
 
 use std::rc::Rc;
 
@@ -21,23 +22,23 @@ use crate::parts::{self, model_error};
 use crate::refine::refine;
 use crate::text::{self, TextEncoder};
 
-/// Its name in manifests.
+/// Name of this generator in manifests.
 pub(crate) const NAME: &str = "latent-diffusion";
 
 #[derive(Debug)]
 struct LatentDiffusion {
     denoiser: Denoiser,
     vae: Autoencoder,
-    /// The VAE's manifest.
+    /// Digest of the VAE's manifest.
     vae_digest: Digest,
     decoder: Option<FlowDecoder>,
     text: Box<dyn TextEncoder>,
     control: Option<TrainedControl>,
-    /// The empty caption.
+    /// Embedding of the empty caption.
     null: Vec<f32>,
 }
 
-/// Opens its parts, which must fit each other.
+/// Opens the parts and checks that they fit each other.
 pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<Box<dyn MotionGenerator>, StageError> {
     let part = |role: &Role, kind| parts::part(blobs, model, role, kind);
     let denoiser = Denoiser::read(blobs, &part(&Role::DENOISER, ArtifactKind::Denoiser)?, device)?;
@@ -98,7 +99,7 @@ impl MotionGenerator for LatentDiffusion {
 
     fn longest(&self) -> usize {
         let most = self.vae.max_frames();
-        // A flow decodes whole codes.
+        // A flow decodes only whole codes.
         if self.decoder.is_some() { most / UNIT * UNIT } else { most }
     }
 
@@ -135,7 +136,7 @@ impl MotionGenerator for LatentDiffusion {
             None => self.vae.decode_ragged(z, batch.lengths),
             Some(decoder) => {
                 let clips = z.chunks_exact(self.shape().tokens * self.shape().dim).zip(batch.lengths).enumerate();
-                // Behind the streams of all steps.
+                // A stream after those of all steps.
                 let noise = |b| (batch.seeds)(1 + sampler.steps, b);
                 clips.map(|(b, (z, n))| decoder.decode_latent(&self.vae, z.to_vec(), *n, &mut noise(b))).collect()
             }

@@ -1,7 +1,8 @@
-//! Models as evaluation, `generate`, `time` and registering know them: captions, lengths and seeds in, motions out.
+//! Models as evaluation, `generate`, `time` and registration use them: captions, lengths and seeds in, motions out.
 //!
-//! A model is opened from its artifact alone, by the generator that its manifest names; which parts there are and what they are is the
-//! generator's own matter. To add one: a file here that implements [`MotionGenerator`], and a line in the table of [`open`].
+//! A model is opened from its artifact alone, by the generator that its manifest names. The generator decides which
+//! parts the model needs. To add one: a file here that implements [`MotionGenerator`], and a line in the table of
+//! [`open`].
 
 mod feature_diffusion;
 mod interface;
@@ -37,7 +38,7 @@ type Open = fn(&Model, &dyn Blobs, &Device) -> Result<Box<dyn MotionGenerator>, 
 const GENERATORS: [(&str, Open); 3] =
     [(LATENT_DIFFUSION, latent_diffusion::open), (FEATURE_DIFFUSION, feature_diffusion::open), (TOKENS, tokens::open)];
 
-/// The generator of an artifact of kind `model`.
+/// Opens the generator of an artifact of kind `model`.
 pub fn open(manifest: &Manifest, blobs: &dyn Blobs, device: &Device) -> Result<Box<dyn MotionGenerator>, StageError> {
     let model = Model::read(manifest).map_err(model_error)?;
     let Some((_, open)) = GENERATORS.iter().find(|(name, _)| *name == model.generator) else {
@@ -63,10 +64,10 @@ pub fn check_sampler(generator: &dyn MotionGenerator, sampler: &Sampler) -> Resu
     generator.family().accepts(sampler).map_err(StageError::Input)
 }
 
-/// A motion for each of the batch, feature rows `[frames, features]` in the data's own scale.
+/// Generates feature rows `[frames, features]` in the data's own scale for each motion of the batch.
 ///
 /// # Errors
-/// A sampler, a length or a control part that the model does not have, or motions that are not finite.
+/// If the model lacks the sampler, the length or the control part, or a motion is not finite.
 pub fn motions(
     generator: &dyn MotionGenerator,
     batch: Batch<'_>,
@@ -104,10 +105,10 @@ fn finite<'v>(mut values: impl Iterator<Item = &'v f32>) -> Result<(), StageErro
     }
 }
 
-/// How a model fills in a part of a motion.
+/// The in-filling of a model.
 ///
 /// # Errors
-/// It does not.
+/// If the model does not support it.
 pub fn infilling(generator: &dyn MotionGenerator) -> Result<&dyn Infilling, StageError> {
     generator.infilling().ok_or_else(|| {
         StageError::Input(
@@ -116,10 +117,10 @@ pub fn infilling(generator: &dyn MotionGenerator) -> Result<&dyn Infilling, Stag
     })
 }
 
-/// A motion with those pieces drawn anew that do not stay.
+/// Regenerates the units of a motion that are not kept.
 ///
 /// # Errors
-/// A model that fills in nothing, a sampler or a length that it does not have, or a motion that is not finite.
+/// If the model does not support in-filling, the sampler or the length, or the motion is not finite.
 pub fn edited(
     generator: &dyn MotionGenerator,
     edit: Edit<'_>,
@@ -139,7 +140,7 @@ pub fn edited(
     Ok(motion)
 }
 
-/// The captions of a dataset as a generator wants them, each embedded once.
+/// The captions of a dataset in the generator's form, each embedded once.
 #[derive(Debug)]
 pub(crate) struct Texts<'a> {
     generator: &'a dyn MotionGenerator,
@@ -151,7 +152,7 @@ impl<'a> Texts<'a> {
         Self { generator, known: RefCell::default() }
     }
 
-    /// Captions by number; `text` gives one's words.
+    /// Embeds captions by index; `text` returns the words of one.
     pub(crate) fn get<'t>(
         &self,
         numbers: &[usize],

@@ -1,14 +1,18 @@
-//! Token generators: a network draws ids for a caption, a tokenizer turns them into motion. Source: T2M-GPT, MoMask, MMM.
+//! Token generators: a network draws ids for a caption, and a tokenizer decodes them to motion. Source: T2M-GPT,
+//! MoMask, MMM.
 //!
-//! Parts: `generator`, `tokenizer`, `text`, and `decoder` if a flow decodes in the tokenizer's place. The generator reads a caption's one vector,
-//! MMM's also one for each word. An autoregressive one decides how long a motion is: what is asked for is not looked at; where it ends at once it gives a motion of the single id 1, as T2M-GPT's evaluation does.
+//! Parts: `generator`, `tokenizer`, `text`, and `decoder` if a flow decodes instead of the tokenizer. The generator
+//! reads one vector of a caption; MMM's also reads one per word. An autoregressive generator decides the length and
+//! ignores the requested one. If it ends at once, the motion is the single id 1, as in T2M-GPT's evaluation.
 //!
-//! Layers above the first are drawn at guidance 5, as published for both datasets, whatever the sampler says of the first.
+//! Layers above the first are drawn at guidance 5, as published for both datasets; the sampler's guidance applies only
+//! to the first.
 //!
-//! A masked generator also fills in a part of a motion: the rest's tokens stay, in all layers, and are looked at. Layers above the first are drawn
-//! at guidance 2 then, as MoMask's script for edits does.
+//! A masked generator also fills in a part of a motion: the tokens of the rest are kept in all layers and condition it.
+//! The layers above the first are then drawn at guidance 2, as in MoMask's script for edits.
 //!
-//! Departs: MoMask draws the layers above the first anew for the whole clip then. MMM's published code ends early where a batch is one motion; here no motion depends on what it is drawn together with.
+//! Departs: MoMask then draws the layers above the first again for the whole clip. MMM's published code ends early for
+//! a batch of one motion; here no motion depends on its batch.
 
 use std::rc::Rc;
 
@@ -34,41 +38,41 @@ use crate::text::{self, TextEncoder};
 use crate::tokenizer::TrainedTokenizer;
 use crate::weights;
 
-/// Its name in manifests.
+/// Name of this generator in manifests.
 pub(crate) const NAME: &str = "tokens";
 /// Guidance of the layers above the first.
 const RESIDUAL_GUIDANCE: f32 = 5.0;
-/// The same where a part of a motion is filled in.
+/// Guidance of the layers above the first when a part of a motion is filled in.
 const EDIT_GUIDANCE: f32 = 2.0;
-/// Share of the classes that a masked generator cannot draw.
+/// Share of the classes that a masked generator excludes.
 const THRESHOLD: f64 = 0.9;
 /// Prefix of the first layer's network in the file of a masked generator.
 pub(crate) const MASKED_PREFIX: &str = "mask.";
-/// Prefix of the other network there.
+/// Prefix of the residual network in that file.
 pub(crate) const RESIDUAL_PREFIX: &str = "res.";
 
 /// Meta of an artifact of kind `token-generator`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct GeneratorMeta {
-    /// How it draws.
+    /// Family of the generator, which decides its samplers.
     #[serde(flatten)]
     pub(crate) family: Family,
-    /// Size.
+    /// Size of the transformer.
     pub(crate) network: TokenNetwork,
-    /// Codes K of a codebook.
+    /// Number of codes K of a codebook.
     pub(crate) codes: usize,
-    /// Codebooks Q.
+    /// Number of codebooks Q.
     pub(crate) quantizers: usize,
-    /// Tokens of the longest motion.
+    /// Number of tokens of the longest motion.
     pub(crate) longest: usize,
     /// Width of a caption embedding.
     pub(crate) text_dim: usize,
-    /// The parts that it was trained with: the tokenizer whose ids it draws, the text encoder.
+    /// The parts of its training: the tokenizer whose ids it draws, and the text encoder.
     pub(crate) fits: Parts,
 }
 
 impl GeneratorMeta {
-    /// Size of an autoregressive network: one place for the caption, one for the end.
+    /// Size of an autoregressive network, with one place for the caption and one for the end.
     pub(crate) fn gpt(&self) -> GptConfig {
         GptConfig {
             codes: self.codes,
@@ -81,7 +85,7 @@ impl GeneratorMeta {
         }
     }
 
-    /// Size of either of a masked generator's networks.
+    /// Size of each of a masked generator's networks.
     pub(crate) fn momask(&self) -> MomaskConfig {
         MomaskConfig {
             codes: self.codes,
@@ -95,7 +99,7 @@ impl GeneratorMeta {
         }
     }
 
-    /// Size of MMM's network, on codes of `code_dim` numbers.
+    /// Size of MMM's network, on codes of width `code_dim`.
     pub(crate) fn mmm(&self, code_dim: usize) -> MmmConfig {
         let TokenNetwork { width, layers, heads, feed_forward, word_blocks, .. } = self.network;
         MmmConfig {
@@ -111,22 +115,22 @@ impl GeneratorMeta {
         }
     }
 
-    /// Whether there are layers above the first.
+    /// Returns true if there are layers above the first.
     pub(crate) fn layered(&self) -> bool {
         self.quantizers > 1
     }
 }
 
-/// What draws ids.
+/// Networks that draw ids.
 #[derive(Debug)]
 enum Network {
     Autoregressive(Box<Gpt>),
     Masked(Box<MaskedTransformer>, Option<Box<ResidualTransformer>>),
-    /// With the tokenizer's codes [K, d].
+    /// MMM's network with the tokenizer's codes [K, d].
     Mmm(Box<Mmm>, Box<Tensor<2>>),
 }
 
-/// Ids `[tokens, Q]` of a motion, of which those that are `kept` stay.
+/// Ids `[tokens, Q]` of a motion; those marked in `kept` stay.
 #[derive(Debug, Clone, Copy)]
 struct Known<'a> {
     ids: &'a [i64],
@@ -134,7 +138,7 @@ struct Known<'a> {
 }
 
 impl Known<'_> {
-    /// The id of layer `layer` of `quantizers` at a place, if it is kept.
+    /// The id of layer `layer` of `quantizers` at `place`, if it is kept.
     fn id(&self, quantizers: usize, layer: usize, place: usize) -> Option<usize> {
         self.kept[place].then(|| self.ids[place * quantizers + layer] as usize)
     }
@@ -150,7 +154,7 @@ struct TokenModel {
     device: Device,
 }
 
-/// Opens its parts, which must fit each other.
+/// Opens the parts and checks that they fit each other.
 pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<Box<dyn MotionGenerator>, StageError> {
     let part = |role: &Role, kind| parts::part(blobs, model, role, kind);
     let manifest = part(&Role::GENERATOR, ArtifactKind::TokenGenerator)?;
@@ -230,7 +234,7 @@ fn network(
 }
 
 impl TokenModel {
-    /// Ids `[tokens, Q]` of each motion; what is known is of the only one.
+    /// Draws ids `[tokens, Q]` of each motion; `known` applies to a batch of one.
     fn ids(&self, batch: Batch<'_>, sampler: &Sampler, known: Option<Known<'_>>) -> Vec<Vec<i64>> {
         let text = || {
             let values = batch.texts.iter().flat_map(|text| text.values.iter().copied()).collect();
@@ -252,14 +256,14 @@ impl TokenModel {
         }
     }
 
-    /// What is known of the first layer of each motion.
+    /// Known ids of the first layer of each motion.
     fn given(&self, batch: Batch<'_>, known: Option<Known<'_>>) -> Vec<Vec<Option<usize>>> {
         let (unit, quantizers) = (self.tokenizer.unit(), self.meta.quantizers);
         let id = |place: usize| known.and_then(|known| known.id(quantizers, 0, place));
         batch.lengths.iter().map(|frames| (0..frames.div_ceil(unit)).map(id).collect()).collect()
     }
 
-    /// As MMM draws them.
+    /// Draws ids with MMM's network.
     fn with_words(
         &self,
         (network, codes_kd): (&Mmm, &Tensor<2>),
@@ -282,9 +286,9 @@ impl TokenModel {
         own.map(|(ids, given)| ids[..given.len()].iter().map(|id| *id as i64).collect()).collect()
     }
 
-    /// Rows of motion `b`'s ids in the data's own scale.
+    /// Decodes the ids of motion `b` to rows in the data's own scale.
     fn decoded(&self, ids: &[i64], sampler: &Sampler, seeds: &Seeds<'_>, b: usize) -> Vec<f32> {
-        // Behind all streams that ids are drawn from.
+        // A stream after all those that ids are drawn from.
         let noise = (sampler.steps + self.meta.quantizers) * self.meta.longest.max(2);
         let mut rows = match &self.decoder {
             None => self.tokenizer.decode(ids),
@@ -312,7 +316,7 @@ impl TokenModel {
             temperature: 1.0,
             threshold: THRESHOLD,
         };
-        // Streams are numbered by step, then by position; those of the layers above follow those of the first.
+        // Streams are numbered by step, then by position; those of the layers above come after those of the first.
         let fill = |stream: usize, b: usize, out: &mut [f32], seeds: &Seeds<'_>| {
             let mut draw = seeds(stream, b);
             out.iter_mut().for_each(|u| *u = draw.uniform() as f32);

@@ -1,4 +1,4 @@
-//! What MMM's network looks at besides the ids: the tokenizer's codes, captions and their words.
+//! Conditions of MMM's network: the tokenizer's codes, captions and their words.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use models::networks::MmmCondition;
@@ -11,7 +11,8 @@ pub(crate) fn codebook(tokenizer: &TrainedTokenizer, device: &Device) -> Tensor<
     Tensor::from_data(TensorData::new(tokenizer.books()[0].clone(), shape), device)
 }
 
-/// The condition of captions: of each its one vector, `dim` numbers, and behind it one for each word, of which there is at least one.
+/// The condition of captions. Each is its vector of `dim` numbers followed by one for each word; there is at least one
+/// word.
 pub(crate) fn with_words(codes_kd: &Tensor<2>, captions: &[&[f32]], dim: usize, device: &Device) -> MmmCondition {
     let counts: Vec<usize> = captions.iter().map(|caption| caption.len() / dim - 1).collect();
     let most = counts.iter().copied().max().unwrap_or(0);

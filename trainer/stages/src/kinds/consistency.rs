@@ -1,8 +1,8 @@
-//! What both distillations share: the student and its target, the frozen teacher, and one guided solver step between neighbouring
-//! grid points. Source: MotionLCM (arXiv:2404.19759), after Luo et al., arXiv:2310.04378.
+//! Common part of both distillations: the student and its target, the frozen teacher, and one guided solver step
+//! between neighbouring grid points. Source: MotionLCM (arXiv:2404.19759), after Luo et al., arXiv:2310.04378.
 //!
-//! The student starts as the teacher plus a zero guidance projection; the target is the moving average of the student. Frozen networks
-//! run without dropout unless `upstream_dropout` asks for the original script's accident.
+//! The student starts as the teacher plus a zero guidance projection. The target is the moving average of the student.
+//! Frozen networks run without dropout unless `upstream_dropout` reproduces the original script's mistake.
 
 use std::collections::BTreeMap;
 
@@ -33,7 +33,7 @@ pub(super) struct Distiller {
     pub(super) data: LatentData,
     pub(super) teacher: Denoiser,
     pub(super) teacher_meta: DenoiserMeta,
-    /// What the teacher draws with, which its student draws with too.
+    /// The teacher's model, whose other parts the student keeps.
     base: Model,
     pub(super) student: Denoiser,
     target: Denoiser,
@@ -43,18 +43,18 @@ pub(super) struct Distiller {
     seed: u64,
 }
 
-/// The teacher's move of one slice, and what it was made of.
+/// The teacher's step of one slice, and its inputs.
 pub(super) struct SolverStep {
     pub(super) batch: LatentSlice,
     /// Grid index of each sample.
     pub(super) index: Vec<usize>,
-    /// Timesteps that the student starts from.
+    /// The student's starting timesteps.
     pub(super) from: Vec<usize>,
-    /// Timesteps that the teacher's step lands on.
+    /// Timesteps at the end of the teacher's step.
     pub(super) to: Vec<usize>,
     /// Noised latents [B, N, d].
     pub(super) noisy_bnd: Tensor<3>,
-    /// The teacher's guided step from there [B, N, d].
+    /// Result of the teacher's guided step [B, N, d].
     pub(super) solved_bnd: Tensor<3>,
     /// Guidance embeddings [B, g].
     pub(super) guidance_bg: Tensor<2>,
@@ -114,18 +114,18 @@ impl Distiller {
 
     /// The student as a group of parameters.
     pub(super) fn group(&self) -> GroupPlan {
-        // The target network is the average, whatever its decay.
+        // The target network is the average, for any decay.
         GroupPlan {
             average: Some(Average::of(self.settings.ema)),
             ..group("model", &self.student, &self.settings.training, 0.0)
         }
     }
 
-    /// Takes over student and target.
+    /// Loads student and target from the state.
     pub(super) fn load(&mut self, state: &TrainState) {
         let group = &state.groups[0];
         group.trained().assign(&mut self.student);
-        // The group was planned with an average.
+        // The group was created with an average.
         group.averaged().assign(&mut self.target);
     }
 
@@ -134,7 +134,7 @@ impl Distiller {
         Dropout::new(self.teacher_meta.network.dropout, self.seed, step, slice as u64)
     }
 
-    /// Dropout of a frozen network in one slice; `which` keeps the networks apart.
+    /// Dropout of a frozen network in one slice; `which` separates the networks.
     fn frozen(&self, step: u64, slice: usize, which: u64) -> Dropout {
         if self.settings.upstream_dropout {
             Dropout::new(self.teacher_meta.network.dropout, self.seed ^ which, step, slice as u64)
@@ -225,7 +225,7 @@ impl Distiller {
     }
 }
 
-/// `student` with the teacher's parameters where both have them; the guidance projection stays zero.
+/// Copies the parameters that both have from the teacher; the guidance projection stays zero.
 fn start_from(student: Denoiser, teacher: &Denoiser) -> Denoiser {
     let from: std::collections::HashMap<String, (usize, Entry)> = {
         let mut at = 0;

@@ -1,19 +1,20 @@
-//! `train.control`: a trajectory encoder and a ControlNet beside a frozen latent denoiser. Source: MotionLCM (Dai et al., ECCV 2024; v2 of late
-//! 2024).
+//! `train.control`: a trajectory encoder and a ControlNet beside a frozen latent denoiser. Source: MotionLCM (Dai et
+//! al., ECCV 2024; v2 of late 2024).
 //!
-//! The ControlNet starts as a copy of the denoiser whose residuals are zero. `z_t = alpha_t z_0 + sigma_t eps`; the controlled denoiser's clean latent
-//! is compared with `z_0` (a teacher's output with what it learned to predict), and through the frozen decoder the joints of its motion with those that
-//! were told. Only trajectory encoder and ControlNet are trained, with dropout; all else is frozen and without.
+//! The ControlNet starts as a copy of the denoiser whose residuals are zero. `z_t = alpha_t z_0 + sigma_t eps`. The
+//! controlled denoiser's clean latent is compared with `z_0` (a teacher's output with its usual target). The joints of
+//! its motion, through the frozen decoder, are compared with the target positions. Only trajectory encoder and
+//! ControlNet are trained, with dropout; everything else is frozen and runs without.
 //!
-//! A phased student (MotionPCM) is trained alike, which nobody has published: from a given `z_t` its jump to any edge differs from the true one by a
-//! constant times the error of the clean latent, so that one loss serves both students.
+//! A phased student (MotionPCM) is trained the same way, which is unpublished. From a given `z_t` its jump to any edge
+//! differs from the true one by a constant times the error of the clean latent, so one loss serves both students.
 //!
-//! Ours: `loss.tokens` compares the trajectory encoder's tokens with `z_0` themselves. `feedback` trains a third network, which corrects what was
-//! predicted in rounds; each round's latent and motion have the same terms as the prediction, in the mean over rounds, and no gradient goes from a round to
-//! what was before it.
+//! Ours: `loss.tokens` compares the trajectory encoder's tokens directly with `z_0`. `feedback` trains a third network,
+//! which corrects the prediction in rounds. Each round's latent and motion have the same terms as the prediction,
+//! averaged over rounds. No gradient flows from a round to earlier ones.
 //!
-//! Departs: a sample of which nothing is told adds nothing to the motion term, where two of the three published means divide by zero. Hints of KIT-ML
-//! are in metres too, so that one weight suits both datasets.
+//! Departs: a sample without targets adds nothing to the motion term, where two of the three published means divide by
+//! zero. Hints of KIT-ML are in metres too, so that one weight suits both datasets.
 
 use std::collections::BTreeMap;
 
@@ -47,20 +48,20 @@ use crate::train::{Clip, GroupPlan, Losses, Objective, Pick, SliceResult, TrainS
 use crate::warm_start::WarmStart;
 use crate::weights;
 
-/// Batches that are sorted by length together: what a step costs is reading and decoding whole clips.
+/// Batches that are sorted by length together; a step's cost is mostly reading and decoding whole clips.
 const POOL: usize = 8;
-/// The term on latents.
+/// Name of the term on latents.
 const LATENT: &str = "latent";
-/// The term on the trajectory encoder's tokens.
+/// Name of the term on the trajectory encoder's tokens.
 const TOKENS: &str = "tokens";
-/// The term on joints.
+/// Name of the term on joints.
 const CONTROL: &str = "control";
-/// The term on latents after rounds of feedback, in the mean over rounds.
+/// Name of the term on latents after rounds of feedback, averaged over rounds.
 const FEEDBACK_LATENT: &str = "feedback_latent";
-/// The term on joints then.
+/// Name of the term on joints after rounds of feedback, averaged over rounds.
 const FEEDBACK_CONTROL: &str = "feedback_control";
 
-/// What the motion term looks through.
+/// The frozen decoder of the motion term.
 struct Decoder {
     vae: Autoencoder,
     body: Body,
@@ -68,25 +69,25 @@ struct Decoder {
     metres: f32,
 }
 
-/// Compares motions with what was told of them.
+/// The term that compares motions with their targets.
 struct MotionTerm<'a> {
     decoder: &'a Decoder,
-    /// Frames of each motion.
+    /// Number of frames of each motion.
     lengths: &'a [usize],
     target: ControlTarget,
     distance: Pointwise,
-    /// Of each motion.
+    /// Weight of each motion.
     weights: Vec<f32>,
 }
 
 impl MotionTerm<'_> {
-    /// Features [B, T, D] of the motions of latents.
+    /// Decodes latents to features [B, T, D].
     fn decode(&self, latent_bnd: Tensor<3>) -> Tensor<3> {
         self.decoder.vae.decode_tensor(latent_bnd, self.lengths)
     }
 
-    /// The distance of their joints from those that were told, summed over the slice so that dividing by the global batch gives the mean that is asked
-    /// for.
+    /// The distance of the joints from their targets. It is summed over the slice so that dividing by the global batch
+    /// gives the configured mean.
     fn of(&self, features: Tensor<3>) -> Tensor<1> {
         let (joints, metres) = (self.decoder.body.joints(features), self.decoder.metres);
         let joints = if metres == 1.0 { joints } else { joints * metres };
@@ -98,7 +99,7 @@ struct Controlled {
     settings: TrainControl,
     data: LatentData,
     dataset: Dataset,
-    /// Numbers of the joints that may be told.
+    /// Indices of the joints that may get targets.
     joints: Vec<usize>,
     base: Denoiser,
     base_meta: DenoiserMeta,
@@ -112,7 +113,7 @@ struct Controlled {
     device: Device,
 }
 
-/// Joints and frames that are told of one example.
+/// Joints and frames of one example's targets.
 struct Told {
     joints: Vec<usize>,
     frames: Vec<usize>,
@@ -213,7 +214,7 @@ impl Controlled {
         }
     }
 
-    /// What is told of an example of `length` frames.
+    /// Draws the targets of an example of `length` frames.
     fn told(&self, pick: Pick, length: usize) -> Told {
         let mut draw = self.data.stream("hint", pick);
         let setting = self.settings.hints.setting;
@@ -225,7 +226,7 @@ impl Controlled {
         Told { joints, frames: told_frames(setting, count, length, &mut draw) }
     }
 
-    /// What is told of a slice: joints of the very crops that its latents were encoded from.
+    /// The hints of a slice: joints of the same crops from which its latents were encoded.
     fn hints(&self, batch: &LatentSlice) -> Vec<Hint> {
         let (meta, skeleton) = (self.data.meta(), self.dataset.skeleton());
         let one = |((pick, row), length): ((&Pick, &usize), &usize)| {
@@ -239,7 +240,7 @@ impl Controlled {
         Dropout::new(probability, self.seed ^ network, step, slice)
     }
 
-    /// The controlled denoiser's output, on the tape of what is trained.
+    /// The controlled denoiser's output, on the tape of the trained networks.
     fn predict(
         &self,
         batch: &LatentSlice,
@@ -264,7 +265,7 @@ impl Controlled {
         self.base.forward_controlled(noisy_bnd.clone(), timesteps, text.clone(), guidance, control, off)
     }
 
-    /// What compares a slice's motions with what was told of them.
+    /// The motion term of a slice.
     fn motion_term<'a>(
         &self,
         decoder: &'a Decoder,
@@ -299,8 +300,9 @@ impl Controlled {
         MotionTerm { decoder, lengths: &slice.lengths, target, distance, weights }
     }
 
-    /// Adds the terms of the rounds of feedback on latents [B, N, d] and their motions' features [B, T, D], if they are decoded already. Each round
-    /// begins with what the one before came to and trains on its own result alone, so that the network learns to answer what it will see.
+    /// Adds the terms of the rounds of feedback on latents [B, N, d] and their motions' features [B, T, D], if those
+    /// are decoded already. Each round starts from the previous result and trains on its own result alone. So the
+    /// network learns to correct the inputs that it will receive.
     fn rounds(
         &self,
         all: &mut Losses,
@@ -333,7 +335,7 @@ impl Controlled {
         }
     }
 
-    /// Uploads the model that was controlled, with the control part beside its others.
+    /// Uploads the base model with the control part added.
     fn publish(&self, cx: &mut dyn AttemptContext, base: &Manifest, state: &TrainState) -> Result<Digest, StageError> {
         let named = |prefix: &str, entries: &[Entry]| -> Vec<Entry> {
             entries.iter().map(|e| Entry { name: format!("{prefix}{}", e.name), shape: e.shape.clone() }).collect()
@@ -352,14 +354,14 @@ impl Controlled {
     }
 }
 
-/// What of `gradients` is a network's.
+/// Removes the gradients of `network`'s parameters from `gradients`, as one flat buffer.
 fn taken<M: Module>(network: &M, gradients: &mut Gradients) -> Vec<f32> {
     let mut own = vec![0.0; network.num_params()];
     flat::add_gradients(network, gradients, &mut own);
     own
 }
 
-/// A model that has a denoiser of latents, of which these are.
+/// Checks that the model has a denoiser of these latents, and returns its meta.
 fn base_meta(denoiser: &Manifest, model: &Model, data: &LatentData) -> Result<DenoiserMeta, StageError> {
     let refuse = |text: &str| Err(StageError::Input(text.to_owned()));
     if model.parts.contains_key(&Role::CONTROL) {

@@ -1,12 +1,13 @@
-//! `evaluate.control`: how well motions pass the positions that they are told, and what that costs. Source: OmniControl, MotionLCM (tables 3 and 4).
+//! `evaluate.control`: accuracy of motions at target positions, and its cost in quality. Source: OmniControl, MotionLCM
+//! (tables 3 and 4).
 //!
-//! Captions, crops and noise are those of `evaluate.t2m`. Of every crop, for every case (joints and density), positions are told to the model, and
-//! its motion is measured against them: trajectory, location and average error, each a mean over motions; and, as any motions are, by FID,
-//! R-precision, MM-Dist, Diversity and the skating ratio. The same model drawing the same noise without its control part is measured against the same
-//! positions, as `uncontrolled_...`.
+//! Captions, crops and noise are those of `evaluate.t2m`. For every case (joints and density) positions of every crop
+//! are given to the model, and its motion is measured against them: trajectory, location and average error, each a mean
+//! over motions. The motion is also measured by FID, R-precision, MM-Dist, Diversity and the skating ratio. Without its
+//! control part the same model, with the same noise, is measured against the same positions as `uncontrolled_...`.
 //!
-//! Departs: upstream measures 1,024 random entries in its spatial setting, here it is the whole split, as in its temporal one. A motion of which
-//! nothing is told has no error.
+//! Departs: upstream measures 1,024 random entries in its spatial setting; here it is the whole split, as in its
+//! temporal setting. A motion without targets has no error.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -26,9 +27,9 @@ use crate::evaluation::interval::Interval;
 use crate::generator::{self, Batch, ControlRequest, MotionGenerator, Texts};
 use crate::hint::{Hint, metres, share, told_frames};
 
-/// Where a shard's values are.
+/// File of a shard's values.
 const VALUES_FILE: &str = "values.safetensors";
-/// What is said of one motion and what it was told.
+/// Errors of one motion against its targets.
 const ERRORS: [&str; 3] = ["trajectory_error", "location_error", "average_error"];
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -43,7 +44,7 @@ enum Density {
     Frames(usize),
 }
 
-/// Joints that are told together, and in how many frames.
+/// Joints with targets, and the density of frames with targets.
 #[derive(Debug, Clone, PartialEq)]
 struct Case {
     name: String,
@@ -65,7 +66,7 @@ fn cases(settings: &EvaluateControl, format: DataFormat) -> Result<Vec<Case>, St
     Ok(all)
 }
 
-/// What all shards and the merge agree on.
+/// The common plan of all shards and the merge.
 struct Plan<'a> {
     settings: &'a EvaluateControl,
     of: EntryDraws,
@@ -84,12 +85,12 @@ impl<'a> Plan<'a> {
         (0..self.settings.repeats).flat_map(move |repeat| (0..blocks).map(move |block| Unit { repeat, block }))
     }
 
-    /// What is told of entry number `i` of the split, whose crop has the joints `motion` in metres.
+    /// Draws the targets of entry number `i` of the split, whose crop has the joints `motion` in metres.
     fn hint(&self, case: &Case, repeat: usize, i: usize, motion: &[f32]) -> Hint {
         let joints = self.of.dataset.skeleton().joints;
         let length = motion.len() / (3 * joints);
         let count = match case.density {
-            // Of a clip so short that none would be told, one is.
+            // A clip too short for the percentage gets one.
             Density::Percent(percent) => share(percent, length).max(1),
             Density::Frames(count) => count,
         };
@@ -99,7 +100,7 @@ impl<'a> Plan<'a> {
     }
 }
 
-/// What makes motions.
+/// The generator of motions, and its captions.
 struct Maker<'a> {
     generator: &'a dyn MotionGenerator,
     texts: Texts<'a>,
@@ -129,11 +130,12 @@ impl Maker<'_> {
 struct Values {
     text: Vec<f32>,
     real: Vec<f32>,
-    /// Embeddings, unit by unit, in a unit way by way of drawing (none first).
+    /// Embeddings by unit; within a unit by variant, without the control part first.
     made: Vec<f32>,
-    /// In the same order.
+    /// Skating ratios in the same order.
     skating: Vec<f32>,
-    /// Unit by unit, case by case: [`ERRORS`] of each motion without the control part, then with it; not a number where nothing was told.
+    /// [`ERRORS`] by unit and case, of each motion without the control part, then with it; NaN for a motion without
+    /// targets.
     errors: Vec<f32>,
 }
 
@@ -220,7 +222,7 @@ impl Map for EvaluateControl {
         for (name, values) in &values {
             let interval = Interval::of(values);
             metrics.insert(name.clone(), interval.mean);
-            // Of a case the mean is enough; the report has every repeat.
+            // The mean of a case is enough here; the report has every repeat.
             if !name.contains('/') {
                 metrics.insert(format!("{name}.lower"), interval.lower());
                 metrics.insert(format!("{name}.upper"), interval.upper());
@@ -263,15 +265,15 @@ impl Map for EvaluateControl {
     }
 }
 
-/// Everything that the shards made, by repeat: entries in their order.
+/// All values of the shards by repeat, with entries in order.
 #[derive(Debug, Clone, Default)]
 struct Gathered {
     text: Vec<f64>,
     real: Vec<f64>,
-    /// By way of drawing.
+    /// Embeddings by variant, without the control part first.
     made: Vec<Vec<f64>>,
     skating: Vec<Vec<f64>>,
-    /// By case, without the control part and with it.
+    /// Errors by case, without the control part and with it.
     errors: Vec<[Vec<f64>; 2]>,
 }
 
@@ -333,7 +335,7 @@ fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, shards: &[Digest]) -> Result
     Ok(all)
 }
 
-/// The metrics of one repeat: of each case, and the means over the cases.
+/// The metrics of one repeat: of each case, and means over the cases.
 fn measure(plan: &Plan<'_>, all: &[Gathered], repeat: usize) -> BTreeMap<String, f64> {
     let all = &all[repeat];
     let n = plan.of.entries.len() as f64;

@@ -1,6 +1,7 @@
-//! `data.open` and `data.synthetic`: a dataset as an artifact.
+//! `data.open` and `data.synthetic`: stores a dataset as an artifact.
 //!
-//! Files: those of [`Dataset::write_files`], and `report.txt`, which names every clip and caption that was left out and why.
+//! Files: those of [`Dataset::write_files`], and `report.txt`, which lists every clip and caption left out with its
+//! reason.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -14,7 +15,7 @@ use super::Plain;
 use crate::artifacts::{DatasetMeta, Draft, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
 
-/// The file that says what was left out.
+/// The file that lists the clips and captions left out.
 const REPORT_FILE: &str = "report.txt";
 
 impl Plain for DataOpen {
@@ -26,7 +27,7 @@ impl Plain for DataOpen {
     }
 }
 
-/// A line for each clip that was left out, and the totals.
+/// Logs a line for each clip left out, and the totals.
 fn log_report(cx: &mut dyn AttemptContext, report: &OpenReport) {
     for skip in &report.skips {
         cx.log(&format!("skipped {skip}, {}: {}", skip.split, skip.reason.heading()));
@@ -47,10 +48,10 @@ impl Plain for DataSynthetic {
     }
 }
 
-/// A file besides those of every dataset.
+/// An additional file of a dataset.
 pub(super) type Extra = (&'static str, Vec<u8>);
 
-/// Uploads a dataset with its report and other files.
+/// Uploads a dataset with its report and additional files.
 pub(super) fn pack(
     cx: &mut dyn AttemptContext,
     dataset: &Dataset,
@@ -86,7 +87,7 @@ pub(super) fn pack(
     Ok(Outcome::Finished { output: draft.finish(cx)?, metrics })
 }
 
-/// Why a file of the dataset was not stored.
+/// An error that prevented a file from being stored.
 enum Failure {
     Store(StageError),
     Pack(PackError),

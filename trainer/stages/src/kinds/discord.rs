@@ -1,12 +1,12 @@
-//! `train.discord`: a rectified flow from noise to motion under the codes of frozen tokens, or of a frozen VAE's latents. Source: DisCoRD (Cho et
-//! al., arXiv:2411.19527).
+//! `train.discord`: a rectified flow from noise to motion, conditioned on the codes of frozen tokens or of a frozen
+//! VAE's latents. Source: DisCoRD (Cho et al., arXiv:2411.19527).
 //!
-//! `t ~ U(0, 1)`, `x_t = t x + (1 - t) noise`, loss `mean (v(x_t, t, z) - (x - noise))^2`, on windows; z is encoded from the window alone, as
-//! published. Time runs from noise at 0 to data at 1.
+//! `t ~ U(0, 1)`, `x_t = t x + (1 - t) noise`, loss `mean (v(x_t, t, z) - (x - noise))^2`, on windows; z is encoded
+//! from the window alone, as published. Time is 0 at noise and 1 at data.
 //!
-//! Departs: z is computed in each step instead of being kept in memory; the moving average, which the released script computes and never
-//! uses, is the result. With `prediction: data` the network gives the data x' itself, the loss is `mean (x' - x)^2` without the weight that the velocity
-//! would give it, and the velocity is `(x' - x_t) / (1 - t)`.
+//! Departs: z is computed in each step instead of being kept in memory. The result is the moving average, which the
+//! released script computes and never uses. With `prediction: data` the network predicts the data x'. The loss is then
+//! `mean (x' - x)^2`, without the weight of the velocity, and the velocity is `(x' - x_t) / (1 - t)`.
 
 use checkpoint::model::Parts;
 use models::kernels::Dropout;

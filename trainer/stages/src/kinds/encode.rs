@@ -1,7 +1,7 @@
 //! `encode.latents`: posteriors of random crops, computed once for every stage that trains in the latent space.
 //!
-//! Crop `c` of entry `e` is keyed by (seed, stage, c, e). The crops of one entry that have one length are one batch, so what a
-//! clip is computed together with is a function of the entry alone and the bits do not depend on how the work was cut.
+//! Crop `c` of entry `e` is keyed by (seed, stage, c, e). All crops of an entry that have equal length are one batch.
+//! So a clip's batch depends on the entry alone, and the bits do not depend on the division into shards.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -18,14 +18,14 @@ use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::latent_fid::standard_deviation;
 use crate::networks::Autoencoder;
 
-/// Meta of one shard: its entries' part of [`LatentsMeta`].
+/// Meta of one shard, its entries' part of [`LatentsMeta`].
 #[derive(Debug, Serialize, Deserialize)]
 struct ShardMeta {
     latents: LatentsMeta,
     first: usize,
 }
 
-/// The part of `count` things that is shard `index` of `of`.
+/// Shard `index` of `of` of a range of `count` items.
 pub(super) fn shard_range(count: usize, index: usize, of: usize) -> Range<usize> {
     count * index / of..count * (index + 1) / of
 }

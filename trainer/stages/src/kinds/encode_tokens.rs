@@ -1,6 +1,6 @@
-//! `encode.tokens`: the ids of every entry, as many tokens as it has whole groups of four frames.
+//! `encode.tokens`: the ids of every entry, one token per whole group of four frames.
 //!
-//! An entry is encoded alone, so its ids depend on nothing but itself and `padded`.
+//! An entry is encoded alone, so its ids depend only on itself and `padded`.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -14,7 +14,7 @@ use crate::artifacts::{self, Tensors, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::tokenizer::{TOKENS_FILE, TokensMeta, TrainedTokenizer};
 
-/// Meta of one shard: its entries' part of [`TokensMeta`].
+/// Meta of one shard, its entries' part of [`TokensMeta`].
 #[derive(Debug, Serialize, Deserialize)]
 struct ShardMeta {
     tokens: TokensMeta,

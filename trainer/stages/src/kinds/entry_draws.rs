@@ -1,8 +1,8 @@
-//! What the evaluations in an evaluator's space share: the entries of a split, of each a caption and a crop in every repeat, and the metrics of
-//! their embeddings.
+//! Common part of the evaluations in an evaluator's space: the entries of a split, a caption and a crop of each entry
+//! in every repeat, and the metrics of their embeddings.
 //!
-//! All draws are keyed by (seed, repeat, entry) and not by the stage's name or kind, so that two models of a run are compared on the same captions,
-//! lengths and noise. Motions are made in blocks that are cut from the entry's number alone.
+//! All draws are keyed by (seed, repeat, entry) and not by the stage's name or kind. So two models of a run are
+//! compared on the same captions, lengths and noise. Motions are made in blocks that depend only on the entry's number.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -23,11 +23,11 @@ use crate::evaluation::{skating, spread};
 use crate::evaluator::TrainedEvaluator;
 use crate::generator::{self, MotionGenerator};
 
-/// Motions computed together.
+/// Number of motions computed together.
 pub(super) const BLOCK: usize = 32;
-/// Motions that a caption's own is ranked among.
+/// Size of the pool in which a caption's own motion is ranked.
 pub(super) const POOL: usize = 32;
-/// Below this many motions a dimension, FID's covariances say little.
+/// Motions per dimension below which FID's covariances are unreliable.
 const FEW: usize = 5;
 
 /// A caption and a crop of an entry.
@@ -39,14 +39,14 @@ pub(super) struct Draw {
     pub(super) len: usize,
 }
 
-/// The entries of a split, and who embeds them.
+/// The entries of a split, and their evaluator.
 pub(super) struct EntryDraws {
     pub(super) seed: Seed,
     pub(super) dataset: Dataset,
     pub(super) entries: Vec<usize>,
     pub(super) trained: TrainedEvaluator,
     pub(super) evaluator: Digest,
-    /// What they are of.
+    /// The split of the entries.
     pub(super) split: Split,
 }
 
@@ -94,12 +94,13 @@ impl EntryDraws {
         Stream::new(self.seed, &format!("evaluate.t2m/{what}"), repeat as u64, index as u64)
     }
 
-    /// `n` things in the order of one repeat.
+    /// A permutation of `n` items for one repeat.
     pub(super) fn order(&self, what: &str, repeat: usize, n: usize) -> Vec<u32> {
         permutation(self.seed, &format!("evaluate.t2m/{what}"), repeat as u64, n)
     }
 
-    /// A caption and a crop of entry number `i` of the split, for the motions (`main`) or for real ones to compare with.
+    /// Draws a caption and a crop of entry number `i` of the split, for the motions (`main`) or for real ones to
+    /// compare with.
     pub(super) fn draw(&self, repeat: usize, i: usize, main: bool) -> Draw {
         let entry = &self.dataset.entries[self.entries[i]];
         let mut stream = self.stream(if main { "entry" } else { "other" }, repeat, i);
@@ -112,7 +113,7 @@ impl EntryDraws {
         self.entries.len().div_ceil(BLOCK)
     }
 
-    /// Entries, by number in the split, of a block.
+    /// Entries of a block, by number in the split.
     pub(super) fn block(&self, block: usize) -> Range<usize> {
         block * BLOCK..((block + 1) * BLOCK).min(self.entries.len())
     }
@@ -123,7 +124,7 @@ impl EntryDraws {
         rows[draw.start * width..(draw.start + draw.len) * width].to_vec()
     }
 
-    /// The model that is measured, which must draw such motions with this sampler.
+    /// Opens the model to be measured, and checks its format and sampler.
     pub(super) fn open(
         &self,
         cx: &dyn AttemptContext,
@@ -143,8 +144,8 @@ impl EntryDraws {
         Ok(generator)
     }
 
-    /// FID, R-precision, MM-Dist and diversity of one repeat: embeddings of captions, motions and real crops, a row an entry. `shuffled` deals the
-    /// captions out at random.
+    /// FID, R-precision, MM-Dist and diversity of one repeat from embeddings of captions, motions and real crops, one
+    /// row per entry. `shuffled` assigns the captions at random.
     pub(super) fn in_space(
         &self,
         repeat: usize,
@@ -169,7 +170,7 @@ impl EntryDraws {
         ])
     }
 
-    /// What there is to say about a FID of so few motions.
+    /// A warning if FID is unreliable with so few motions.
     pub(super) fn few(&self) -> Option<String> {
         let (samples, width) = (self.entries.len(), self.trained.width());
         (samples < FEW * width).then(|| {
@@ -180,7 +181,7 @@ impl EntryDraws {
         })
     }
 
-    /// Says in the log what a reader of the metrics should know.
+    /// Logs what a reader of the metrics needs: the split, and warnings about it.
     pub(super) fn log(&self, cx: &mut dyn AttemptContext, asked: Split) {
         if let Some(few) = self.few() {
             cx.log(&few);
@@ -195,14 +196,14 @@ impl EntryDraws {
     }
 }
 
-/// Share of skating steps of a motion.
+/// Share of a motion's steps in which a foot skates.
 pub(super) fn skates(features: &[f32], skeleton: &Skeleton) -> f32 {
     let joints = recover_joints(features, skeleton);
     let metres: Vec<f64> = joints.iter().map(|v| f64::from(*v) * skeleton.metres_per_unit).collect();
     skating::ratio(&metres, skeleton.joints, skating::feet(skeleton.format), skeleton.fps) as f32
 }
 
-/// Refuses metrics that are no numbers.
+/// Refuses metrics that are not finite.
 pub(super) fn finite(metrics: &BTreeMap<String, f64>) -> Result<(), StageError> {
     match metrics.iter().find(|(_, value)| !value.is_finite()) {
         Some((name, value)) => {
@@ -212,7 +213,7 @@ pub(super) fn finite(metrics: &BTreeMap<String, f64>) -> Result<(), StageError> 
     }
 }
 
-/// The rows of `values` in the order of `rows`.
+/// Reorders the rows of `values` by `rows`.
 fn reorder(values: &[f64], rows: &[u32], width: usize) -> Vec<f64> {
     rows.iter().flat_map(|row| values[*row as usize * width..(*row as usize + 1) * width].iter().copied()).collect()
 }

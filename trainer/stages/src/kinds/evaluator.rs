@@ -1,13 +1,13 @@
 //! `train.evaluator`: the text-motion evaluator, in two phases. Source: text-to-motion (Guo et al., CVPR 2022).
 //!
-//! First movements: an autoencoder on windows, `L1(x', x) + a mean|m| + b L1(m[i+1], m[i])`, with x the features in the evaluator's
-//! normalisation. Then, with the movements frozen, the two GRUs: `|t - m|^2` for a caption and its motion, `max(0, margin - |t - m|)^2` for
-//! others.
+//! The first phase trains movements: an autoencoder on windows, `L1(x', x) + a mean|m| + b L1(m[i+1], m[i])`, with x
+//! the features in the evaluator's normalisation. With the movements frozen, the second phase trains the two GRUs: `|t
+//! - m|^2` for a caption and its motion, `max(0, margin - |t - m|)^2` for other motions.
 //!
-//! Departs: the others are all of the slice, in the mean, where the original draws one cyclic shift of the batch (that is the expectation
-//! of the draw, without the draw that leaves every pair in its place), but for those with the same sentence; the result is the last
-//! step's, not that with the lowest validation loss; the deviations of root and contacts are divided by `emphasis` once, not twice by
-//! 5 in passing.
+//! Departs: the other motions are all of the slice except those with the same sentence, averaged. The original draws
+//! one cyclic shift of the batch; ours is the expectation of the draw, without the draw that leaves every pair in
+//! place. The result is that of the last step, not that with the lowest validation loss. The deviations of root and
+//! contacts are divided by `emphasis` once; the original divides twice by 5 in passing.
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -27,14 +27,14 @@ use crate::train::{GroupPlan, Objective, Order, Pick, SliceResult, TrainState, T
 use crate::warm_start::WarmStart;
 use crate::words::{CLASSES, CaptionBatch, WORD_WIDTH, WORDS, Words};
 
-/// Keeps the slope of a distance finite at 0, as in the original.
+/// Keeps the gradient of a distance finite at 0, as in the original.
 const NEAR: f64 = 1e-6;
 
-/// Phases, which key the draws.
+/// The two phases, which key the draws.
 const MOVEMENTS: u64 = 0;
 const MATCHING: u64 = 1;
 
-/// What the first phase trains; the encoder comes first.
+/// The networks of the first phase; the encoder comes first.
 #[derive(Module, Debug)]
 struct Movements {
     encoder: MovementEncoder,
@@ -48,7 +48,7 @@ struct EvaluatorObjective {
     train: Vec<usize>,
     words: Words,
     movements: Movements,
-    /// The encoder of `movements`, off the tape.
+    /// The encoder of `movements` without tape.
     frozen: MovementEncoder,
     text: TextEncoder,
     motion: MotionEncoder,
@@ -60,21 +60,22 @@ struct EvaluatorObjective {
     device: Device,
 }
 
-/// Motions cut to a slice.
+/// Cropped motions of a slice.
 struct Cuts {
-    /// `[B, T, features]` in the evaluator's normalisation, zeros behind the ends.
+    /// Rows `[B, T, features]` in the evaluator's normalisation, with zeros past the ends.
     rows: Vec<f32>,
     lengths: Vec<usize>,
     frames: usize,
 }
 
 impl EvaluatorObjective {
-    /// Steps of the first phase.
+    /// Number of steps of the first phase.
     fn turning_point(&self) -> u64 {
         turning_point(&self.settings)
     }
 
-    /// The members of a slice: every `slices`-th of the batch, which is not sorted by length, because within a slice motions are told apart.
+    /// The members of a slice: every `slices`-th of the batch. The batch is not sorted by length, because motions are
+    /// discriminated within a slice.
     fn pick(&mut self, phase: u64, step: u64, slice: usize) -> (Vec<Pick>, usize) {
         let slices = self.settings.training.batch.slices;
         let order = if phase == MOVEMENTS { &mut self.windows } else { &mut self.clips };
@@ -104,7 +105,7 @@ impl EvaluatorObjective {
             .collect();
         let width = self.meta.mean.len();
         let lengths: Vec<usize> = parts.iter().map(|(_, _, len)| *len).collect();
-        // A movement of padding, as an evaluation has it behind every motion.
+        // A movement of padding follows every motion, as in an evaluation.
         let frames = lengths.iter().max().map_or(0, |most| most / UNIT * UNIT + UNIT);
         let mut rows = vec![0.0; parts.len() * frames * width];
         for ((e, start, len), to) in parts.iter().zip(rows.chunks_exact_mut(frames * width)) {
@@ -115,7 +116,7 @@ impl EvaluatorObjective {
         Cuts { rows, lengths, frames }
     }
 
-    /// A weight for each of `count` places of a sequence: `1 / valid` on the first `valid`, 0 behind.
+    /// Weights of the `count` places of a sequence: `1 / valid` on the first `valid`, 0 after them.
     fn weights(&self, valid: &[usize], count: usize) -> Tensor<3> {
         let weight = |n: usize| (0..count).map(move |i| if i < n { 1.0 / n as f32 } else { 0.0 });
         let values: Vec<f32> = valid.iter().flat_map(|n| weight(*n)).collect();
@@ -212,8 +213,8 @@ fn turning_point(settings: &TrainEvaluator) -> u64 {
     (settings.training.steps.0 as f64 * settings.movement.until).round() as u64
 }
 
-/// For each caption, the weights of the motions that it must be apart from: equal, together 1, none for itself and for motions with the
-/// same sentence.
+/// For each caption, the weights of the motions to be separated from it: equal, summing to 1, and 0 for its own motion
+/// and for motions with the same sentence.
 fn apart(sentences: &[&str]) -> Vec<f32> {
     let row = |own: &&str| {
         let others = sentences.iter().filter(|other| other != &own).count().max(1) as f32;
@@ -243,7 +244,7 @@ impl Objective for EvaluatorObjective {
         state.groups[1].trained().assign(&mut self.motion);
         state.groups[2].trained().assign(&mut self.movements);
         if state.step >= self.turning_point() {
-            // The average, where one is kept: it is what the evaluator will have.
+            // The average, if one is kept: the evaluator will have its weights.
             state.groups[2].averaged().assign_first(&mut self.frozen);
         }
     }
@@ -253,7 +254,7 @@ impl Objective for EvaluatorObjective {
     }
 }
 
-/// The dataset's deviations, those of root and contacts divided by `emphasis`.
+/// The dataset's deviations; those of root and contacts are divided by `emphasis`.
 fn emphasised(dataset: &Dataset, emphasis: f64) -> Vec<f32> {
     let layout = dataset.skeleton().layout();
     let close = |i: usize| i < layout.positions.start || layout.contacts.contains(&i);

@@ -1,4 +1,4 @@
-//! Examples of the stages that diffuse motion itself: a clip's frames, its caption, and keyed draws about it.
+//! Examples for stages that diffuse motion itself: a clip's frames, its caption, and their keyed draws.
 
 use std::cell::RefCell;
 
@@ -17,37 +17,37 @@ use crate::parts;
 use crate::text::{self, TextEncoder};
 use crate::train::{Order, Pick};
 
-/// Batches that are sorted by length together, where padding is to be little.
+/// Batches that are sorted by length together, to reduce padding.
 const POOL: usize = 4;
 
-/// Which frames of a clip are an example.
+/// Selection of an example's frames from a clip.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Cut {
-    /// A multiple of the unit length, the longest or one unit less: MDM.
+    /// A multiple of the unit length, the longest one or one unit less: MDM.
     Jittered,
-    /// All: StableMoFusion.
+    /// The whole clip: StableMoFusion.
     Whole,
 }
 
-/// What captions become.
+/// Form of the captions.
 #[derive(Debug)]
 enum Words {
-    /// One vector each, embedded before.
+    /// One vector per caption, embedded earlier.
     Vectors(Embeddings),
-    /// Tokens, embedded where they are needed.
+    /// The tokens of a caption, embedded on demand.
     Tokens(Box<dyn TextEncoder>),
 }
 
-/// How examples are made.
+/// Rules for making examples.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Rules {
     pub(super) cut: Cut,
-    /// Whether a caption is its tokens.
+    /// Captions are sequences of tokens.
     pub(super) tokens: bool,
-    /// Whether every example is padded to `max_frames`.
+    /// Every example is padded to `max_frames`.
     pub(super) whole: bool,
     pub(super) max_frames: usize,
-    /// What the deviations of root and contacts are divided by.
+    /// Divisor of the deviations of root and contacts.
     pub(super) bias: f64,
 }
 
@@ -67,20 +67,19 @@ pub(super) struct FeatureData {
     device: Device,
 }
 
-/// One slice of a batch.
+/// A slice of a batch with its draws.
 #[derive(Debug)]
 pub(super) struct FeatureSlice {
-    /// Frames of each motion.
+    /// Number of frames of each motion.
     pub(super) lengths: Vec<usize>,
-    /// Motions [B, T, F], normalised, with zeros behind their ends.
+    /// Motions [B, T, F], normalised, with zeros past their ends.
     pub(super) clean_btf: Tensor<3>,
     /// Standard normal noise [B, T, F].
     pub(super) noise_btf: Tensor<3>,
-    /// Captions.
     pub(super) captions: CaptionRows,
-    /// A timestep each.
+    /// Timestep of each motion.
     pub(super) timesteps: Vec<usize>,
-    /// Those of the whole batch.
+    /// Timesteps of the whole batch.
     pub(super) batch_timesteps: Vec<usize>,
 }
 
@@ -132,12 +131,11 @@ impl FeatureData {
         })
     }
 
-    /// The data.
     pub(super) fn dataset(&self) -> &Dataset {
         &self.dataset
     }
 
-    /// What features are divided by, `[features]`.
+    /// Deviations that divide features, `[features]`.
     pub(super) fn std(&self) -> &[f32] {
         &self.std
     }
@@ -150,7 +148,7 @@ impl FeatureData {
         }
     }
 
-    /// The encoder that embeds the captions.
+    /// Manifest of the encoder that embeds the captions.
     pub(super) fn text_encoder(&self, cx: &dyn AttemptContext) -> Result<Manifest, StageError> {
         parts::manifest(&*cx.blobs(), self.text_meta.text, "the text encoder")
     }
@@ -159,7 +157,7 @@ impl FeatureData {
         Stream::new(self.seed, &format!("{}/{what}", self.stage), pick.place, 0)
     }
 
-    /// First frame and frames of the example at a place.
+    /// First frame and length of the example at a place.
     fn cut(&self, pick: Pick) -> (usize, usize) {
         let entry = &self.dataset.entries[self.train[pick.example]];
         let mut draw = self.stream("crop", pick);
@@ -173,7 +171,8 @@ impl FeatureData {
         }
     }
 
-    /// Slice `slice` of the batch of `step`, at timesteps below `timesteps`. With probability `drop` a caption is left out.
+    /// Slice `slice` of the batch of `step`, at timesteps below `timesteps`. A caption is dropped with probability
+    /// `drop`.
     pub(super) fn slice(
         &self,
         step: u64,
@@ -181,7 +180,7 @@ impl FeatureData {
         timesteps: usize,
         drop: f64,
     ) -> Result<FeatureSlice, StageError> {
-        // Where every example is padded alike, there is nothing to sort by.
+        // If all examples have equal padding, sorting gains nothing.
         let length = |pick: Pick| if self.rules.whole { 0 } else { self.cut(pick).1 };
         let batch = self.order.borrow_mut().batch(step, length);
         let range = self.order.borrow().slice(slice, self.slices);
@@ -201,7 +200,8 @@ impl FeatureData {
             let to = &mut rows[at..at + len * width];
             to.copy_from_slice(&self.dataset.features(entry)[start * width..(start + len) * width]);
             normalise(to, &self.dataset.mean, &self.std);
-            // Of padding too; how much there is of it depends on the slice, whose frames come first.
+            // The noise covers padding too. The amount of padding depends on the slice, so the motion's own frames come
+            // first.
             self.stream("noise", *pick).fill_normal(&mut noise[at..at + frames * width]);
             let mut draw = self.stream("example", *pick);
             let caption = entry.captions[draw.below(entry.captions.len())];
@@ -219,7 +219,7 @@ impl FeatureData {
         })
     }
 
-    /// A caption by number, as the network reads it.
+    /// A caption by index, in the form that the network reads.
     fn caption(&self, number: usize) -> Result<Vec<f32>, StageError> {
         match &self.words {
             Words::Vectors(embeddings) => Ok(embeddings.captions.row(number).to_vec()),

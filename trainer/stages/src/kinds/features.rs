@@ -1,9 +1,9 @@
-//! `train.mdm` and `train.stablemofusion`: diffusion of motion itself. Sources: MDM (arXiv:2209.14916), StableMoFusion (arXiv:2405.05691), with the
-//! losses of Free-T2M where they are asked for.
+//! `train.mdm` and `train.stablemofusion`: diffusion of motion itself. Sources: MDM (arXiv:2209.14916), StableMoFusion
+//! (arXiv:2405.05691), with the losses of Free-T2M as an option.
 //!
-//! `t ~ U{0..T-1}`, `x_t = alpha_t x_0 + sigma_t eps` on normalised features, loss `mean over a clip's own frames of (x_0 hat - x_0)^2` (of the noise
-//! or the velocity where `diffusion` says so). A caption is left out with probability `guidance_dropout`: MDM then reads a zero vector,
-//! StableMoFusion skips its cross-attention.
+//! `t ~ U{0..T-1}`, `x_t = alpha_t x_0 + sigma_t eps` on normalised features, loss `mean over a clip's own frames of
+//! (x_0 hat - x_0)^2` (of the noise or the velocity, according to `diffusion`). A caption is dropped with probability
+//! `guidance_dropout`: MDM then reads a zero vector, StableMoFusion skips its cross-attention.
 
 use std::collections::BTreeMap;
 
@@ -29,7 +29,7 @@ use crate::parts;
 use crate::train::{Average, GroupPlan, Losses, Objective, SliceResult, TrainState, Trained, train};
 use crate::warm_start::WarmStart;
 
-/// The term of the loss that every diffusion has.
+/// Name of the loss term that every diffusion has.
 const DENOISING: &str = "denoising";
 
 struct Features<N> {
@@ -91,7 +91,7 @@ impl<N: MotionNetwork> Objective for Features<N> {
     }
 }
 
-/// What the two kinds tell the common way of training.
+/// Differences between the two kinds.
 struct Recipe<'a> {
     architecture: Architecture,
     rules: Rules,
@@ -105,7 +105,7 @@ struct Recipe<'a> {
     family: protocol::stage::Family,
 }
 
-/// Trains `make`'s network to the recipe.
+/// Trains the network of `make` by the recipe.
 fn run<N: MotionNetwork>(
     cx: &mut dyn GangContext,
     recipe: Recipe<'_>,

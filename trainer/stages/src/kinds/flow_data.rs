@@ -1,7 +1,7 @@
-//! Examples of what decodes along a flow: windows of motion, their codes, noise and times.
+//! Examples for decoders along a flow: windows of motion, their codes, noise and times.
 //!
-//! Codes are of a frozen tokenizer, or of a sample of a frozen VAE's posterior as [`crate::flow_decoder`] makes codes of it; either encodes the
-//! window alone, as published. They are computed in each step instead of being kept in memory.
+//! Codes are those of a frozen tokenizer, or of a sample of a frozen VAE's posterior as in [`crate::flow_decoder`].
+//! Either encodes the window alone, as published. They are computed in each step instead of being kept in memory.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use motion::Stream;
@@ -18,7 +18,7 @@ use crate::networks::Autoencoder;
 use crate::tokenizer::TrainedTokenizer;
 use crate::train::{GroupPlan, Losses, Order, SliceResult};
 
-/// What gives the codes that are decoded.
+/// Source of the codes.
 #[expect(clippy::large_enum_variant, reason = "there is one of it")]
 pub(super) enum Encoder {
     Tokenizer(TrainedTokenizer),
@@ -26,7 +26,7 @@ pub(super) enum Encoder {
 }
 
 impl Encoder {
-    /// The input `vae` if `of_vae`, or else `tokenizer`, with its role among parts and its digest.
+    /// Reads the input `vae` if `of_vae`, else `tokenizer`, and returns its role among parts and its digest.
     pub(super) fn read(cx: &dyn GangContext, of_vae: bool) -> Result<(Self, Role, Digest), StageError> {
         let blobs = cx.blobs();
         if of_vae {
@@ -53,7 +53,7 @@ impl Encoder {
         }
     }
 
-    /// Width of a frame, and of a code.
+    /// Widths of a frame and of a code.
     pub(super) fn widths(&self) -> (usize, usize) {
         match self {
             Self::Tokenizer(tokenizer) => (tokenizer.meta().features, tokenizer.meta().code_dim),
@@ -61,7 +61,7 @@ impl Encoder {
         }
     }
 
-    /// Codes `[frames / 4, code]` of normalised rows `[frames, features]`.
+    /// Encodes normalised rows `[frames, features]` as codes `[frames / 4, code]`.
     fn codes(&self, window: &[f32], stream: &mut Stream) -> Vec<f32> {
         match self {
             Self::Tokenizer(tokenizer) => tokenizer.codes(&tokenizer.encode(window.to_vec())),
@@ -92,7 +92,7 @@ pub(super) struct FlowSlice {
     pub(super) noise_btf: Tensor<3>,
     /// Codes [B, T / 4, d].
     pub(super) codes_bnd: Tensor<3>,
-    /// A uniform draw each, in [0, 1).
+    /// A uniform draw in [0, 1) per window.
     pub(super) uniforms: Vec<f32>,
 }
 
@@ -118,7 +118,7 @@ impl FlowData {
         &self.encoder
     }
 
-    /// Seed and name of the stage, which key draws.
+    /// Seed and name of the stage, which key the draws.
     pub(super) fn purpose(&self) -> (Seed, &str) {
         (self.windows.seed, &self.windows.purpose)
     }
@@ -156,7 +156,7 @@ pub(super) fn field_group(field: &Field, training: &Training, ema: f64) -> Group
     }
 }
 
-/// What a slice gives that trains it.
+/// The result of a slice: its losses, and their gradient for the network.
 pub(super) fn field_result(field: &Field, losses: &Losses, terms: &[&'static str]) -> Result<SliceResult, StageError> {
     match &field.backbone {
         Backbone::Unet(network) => slice_result(network, losses, terms),

@@ -1,9 +1,11 @@
-//! `distill.discord`: a flow decoder that decodes in one or two jumps, distilled from one that follows its flow. Source: consistency distillation
-//! (Song et al., arXiv:2303.01469) as `distill.lcm` has it, on DisCoRD's flow; nobody has published it, so sizes and settings are ours.
+//! `distill.discord`: a flow decoder with one or two jumps, distilled from one that follows its flow. Source:
+//! consistency distillation (Song et al., arXiv:2303.01469) as in `distill.lcm`, applied to DisCoRD's flow. This is
+//! unpublished, so sizes and settings are ours.
 //!
-//! The student's function `f(x, t) = x + (1 - t) v(x, t)` goes from any time to the data, and is the identity at time 1 whatever the network says.
-//! The loss holds it at a point `k / K` of a grid against the target, the student's moving average, at the next point, where one step of the teacher's
-//! solver leads. The student starts as the teacher. Frozen networks run without dropout. The online network is what is kept.
+//! The student's function `f(x, t) = x + (1 - t) v(x, t)` maps any time to the data; at time 1 it is the identity for
+//! any network. The loss compares it at a point `k / K` of a grid with the target at the next point, which one step of
+//! the teacher's solver reaches. The target is the student's moving average. The student starts as the teacher. Frozen
+//! networks run without dropout. The result is the online network.
 
 use models::flat::Values;
 use models::flow::{Solver, between, to_data};
@@ -35,7 +37,7 @@ struct Student {
 
 impl Objective for Student {
     fn groups(&mut self) -> Vec<GroupPlan> {
-        // The target network is the average, whatever its decay.
+        // The target network is the average, for any decay.
         let group = field_group(&self.student, &self.settings.training, 0.0);
         vec![GroupPlan { average: Some(Average::of(self.settings.ema)), ..group }]
     }
@@ -47,7 +49,7 @@ impl Objective for Student {
     fn load(&mut self, state: &TrainState) {
         let group = &state.groups[0];
         self.student.take(group.trained());
-        // The group was planned with an average.
+        // The group was created with an average.
         self.target.take(group.averaged());
     }
 

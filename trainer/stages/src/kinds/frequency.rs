@@ -1,5 +1,6 @@
-//! Free-T2M's losses on predicted motions: their slow part, and how well their embeddings agree with those of real ones. Each acts at some noise
-//! levels only. Source and departures: `models::frequency` and `protocol::stage::frequency`.
+//! Free-T2M's losses on predicted motions: on their slow part, and on the agreement of their embeddings with those of
+//! real motions. Each acts only at some noise levels. Source and departures: `models::frequency` and
+//! `protocol::stage::frequency`.
 
 use burn::tensor::{Int, Tensor, TensorData};
 use models::diffusion::{Schedule, affine, unzip};
@@ -14,14 +15,15 @@ use crate::evaluator::TrainedEvaluator;
 use crate::kinds::word;
 use crate::train::Losses;
 
-/// Terms by name.
+/// Name of the term on the slow part.
 pub(super) const LOW_FREQUENCY: &str = "low_frequency";
 pub(super) const SEMANTIC: &str = "semantic";
 
-/// Timesteps at which a clean sample is more than so many times an output are left out: there it is mostly the output's error.
+/// Largest factor of the network's output in the clean sample. Timesteps with a larger one are left out: the clean
+/// sample there is mostly the output's error.
 const MOST_GAIN: f64 = 10.0;
 
-/// The terms of a stage.
+/// The loss terms of a stage.
 #[derive(Debug)]
 pub(super) struct FrequencyTerms {
     settings: FrequencyLosses,
@@ -33,21 +35,21 @@ pub(super) struct FrequencyTerms {
     readable: Vec<bool>,
 }
 
-/// What is predicted of a slice.
+/// The predictions of a slice, and their targets.
 pub(super) struct Predicted<'a> {
-    /// Clean motions as they are predicted [B, T, F], normalised.
+    /// Predicted clean motions [B, T, F], normalised.
     pub(super) found: Tensor<3>,
-    /// What they should be.
+    /// Target motions of the same shape.
     pub(super) target: Tensor<3>,
-    /// Frames of each.
+    /// Number of frames of each motion.
     pub(super) lengths: &'a [usize],
-    /// A timestep each.
+    /// Timestep of each motion.
     pub(super) timesteps: &'a [usize],
-    /// Those of all samples that the terms act on, over all slices.
+    /// Timesteps of all samples with these terms, over all slices.
     pub(super) batch_timesteps: &'a [usize],
 }
 
-/// The clean samples that a network's outputs imply at `timesteps`.
+/// Computes the clean samples that a network's outputs imply at `timesteps`.
 pub(super) fn clean(schedule: &Schedule, noisy: Tensor<3>, out: Tensor<3>, timesteps: &[usize]) -> Tensor<3> {
     let pairs: Vec<(f64, f64)> = timesteps.iter().map(|t| schedule.clean(*t)).collect();
     if pairs.iter().all(|pair| *pair == (0.0, 1.0)) {
@@ -58,7 +60,8 @@ pub(super) fn clean(schedule: &Schedule, noisy: Tensor<3>, out: Tensor<3>, times
 }
 
 impl FrequencyTerms {
-    /// Those that the settings ask for, of motions of `format` that were normalised with `mean` and `std`; none without a weight.
+    /// Creates the configured terms for motions of `format`, normalised with `mean` and `std`; `None` if all weights
+    /// are zero.
     pub(super) fn read(
         cx: &dyn AttemptContext,
         settings: &FrequencyLosses,
@@ -98,7 +101,7 @@ impl FrequencyTerms {
         }))
     }
 
-    /// Whether any term acts at timestep `t`.
+    /// Returns true if any term acts at timestep `t`.
     pub(super) fn acts(&self, t: usize) -> bool {
         let (low, meaning) = (&self.settings.low_frequency, &self.settings.semantic);
         (low.weight > 0.0 && self.in_stage(&self.low, t)) || (meaning.weight > 0.0 && self.in_stage(&self.meaning, t))
@@ -108,7 +111,7 @@ impl FrequencyTerms {
         stage.has(t) && self.readable[t]
     }
 
-    /// For each sample of the slice what its value counts for, so that dividing by the global batch gives the mean that is meant.
+    /// The weight of each sample of the slice, so that dividing by the global batch gives the configured mean.
     fn weights(&self, stage: &Stage, over: Over, predicted: &Predicted<'_>, global: usize) -> Vec<f32> {
         let count = predicted.batch_timesteps.iter().filter(|t| self.in_stage(stage, **t)).count();
         let one = match over {
@@ -150,7 +153,7 @@ impl FrequencyTerms {
             let weights: Vec<f32> = chosen.iter().map(|b| weights[*b]).collect();
             let embed = |x: Tensor<3>| evaluator.embed_normalised(x, &lengths, &self.mean, &self.std);
             let target = embed(rows(&predicted.target));
-            // At 1 the hinge is the cosine's distance itself.
+            // With a threshold of 1 the hinge is the cosine distance itself.
             let agreement = match meaning.threshold < 1.0 {
                 true => Agreement::Below(meaning.threshold),
                 false => Agreement::Cosine,

@@ -1,12 +1,13 @@
-//! `import.evaluator`: the published evaluators, for HumanML3D and KIT-ML, or one in their layout.
+//! `import.evaluator`: imports the published evaluators for HumanML3D and KIT-ML, or one in their layout.
 //!
-//! Read are `text_mot_match/model/finest.tar`, a torch pickle of three state dicts beside optimizer states, or `finest.safetensors` in its
-//! place with `text_encoder.`, `motion_encoder.` and `movement_encoder.` before the names; and `Comp_*/meta/{mean,std}.npy`, the statistics that its
-//! motions are normalised with. Sizes are read off the shapes. Nothing in a pickle is run.
+//! It reads `text_mot_match/model/finest.tar`, a torch pickle of three state dicts beside optimizer states.
+//! Alternatively it reads `finest.safetensors` with the prefixes `text_encoder.`, `motion_encoder.` and
+//! `movement_encoder.`. The statistics for normalising motions are `Comp_*/meta/{mean,std}.npy`. Sizes are derived from
+//! the shapes. No code of a pickle is executed.
 //!
-//! The files are somebody else's. What they declare is held against what they hold before memory is asked for: an archive unpacks to no more than
-//! its own length, the tensors of a pickle take no more than the file, and the network that the shapes describe has no more parameters than the
-//! file.
+//! The files are not trusted. Declared sizes are checked against the file before memory is allocated. An archive
+//! unpacks to no more than its own length. The tensors of a pickle take no more than the file. The network that the
+//! shapes describe has no more parameters than the file.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
@@ -29,9 +30,9 @@ use crate::words::{CLASSES, WORD_WIDTH, Words};
 /// The state dicts of the pickle.
 const PARTS: [&str; 3] = ["text_encoder", "motion_encoder", "movement_encoder"];
 
-/// The published ones have 49.
+/// Upper limit of the number of tensors; the published evaluators have 49.
 const MAX_TENSORS: usize = 1_000;
-/// Bytes that name so many, with room.
+/// Upper limit of the header's bytes, with room for that many names.
 const MAX_HEADER: u64 = 1 << 20;
 
 impl Plain for ImportEvaluator {
@@ -82,7 +83,7 @@ impl Plain for ImportEvaluator {
     }
 }
 
-/// The file of the weights, and its tensors as safetensors.
+/// Reads the file of the weights, and returns its path and its tensors as safetensors.
 fn weights(folder: &Path) -> Result<(PathBuf, Vec<u8>), StageError> {
     let below = folder.join("text_mot_match/model");
     for base in [&below, folder] {
@@ -106,7 +107,7 @@ fn weights(folder: &Path) -> Result<(PathBuf, Vec<u8>), StageError> {
     )))
 }
 
-/// The three state dicts of a torch file.
+/// Reads the three state dicts of a torch file.
 fn unpickle(file: &Path) -> Result<Vec<u8>, String> {
     let length = text_models::archive_length(file)?;
     let mut tensors = Vec::new();
@@ -136,7 +137,7 @@ fn unpickle(file: &Path) -> Result<Vec<u8>, String> {
     all.to_bytes().map_err(|e| e.to_string())
 }
 
-/// Sizes out of shapes.
+/// Derives sizes from shapes.
 fn sizes(bytes: &[u8]) -> Result<EvaluatorConfig, String> {
     let header = bytes.first_chunk::<8>().map_or(0, |length| u64::from_le_bytes(*length));
     if header > MAX_HEADER {
@@ -167,7 +168,7 @@ fn sizes(bytes: &[u8]) -> Result<EvaluatorConfig, String> {
     })
 }
 
-/// Refuses shapes that describe a larger network than the file holds, before it is made.
+/// Refuses shapes of a larger network than the file holds, before the network is created.
 fn check_parameters(config: &EvaluatorConfig, bytes: &[u8]) -> Result<(), String> {
     let wide = |n: usize| n as u128;
     let linear = |from: u128, to: u128| (from + 1).saturating_mul(to);
@@ -190,7 +191,7 @@ fn check_parameters(config: &EvaluatorConfig, bytes: &[u8]) -> Result<(), String
     Ok(())
 }
 
-/// A statistic in `meta`, or in the `meta` of the one `Comp_*` folder.
+/// Reads a statistic from `meta`, or from the `meta` of the only `Comp_*` folder.
 fn statistic(folder: &Path, name: &str, skeleton: &Skeleton) -> Result<Vec<f32>, StageError> {
     let missing = |what: String| StageError::Input(format!("{}: {what}", folder.display()));
     let entries = std::fs::read_dir(folder).map_err(|e| missing(e.to_string()))?;
@@ -242,14 +243,14 @@ mod tests {
         }
     }
 
-    /// A small evaluator as safetensors.
+    /// Serialises a small evaluator as safetensors.
     fn small() -> Vec<u8> {
         let device = burn::tensor::Device::flex();
         let network = Evaluator::new(&config(), &mut Init::new(Seed(0), "small", Positions::Uniform, &device));
         to_bytes(&layout(&network), &flat::read(&network))
     }
 
-    /// The tensors of `small`, some with other shapes.
+    /// Serialises the tensors of `small`, some with other shapes.
     fn reshaped(change: &dyn Fn(&str, &mut Vec<usize>)) -> Vec<u8> {
         let bytes = small();
         let file = SafeTensors::deserialize(&bytes).unwrap();
@@ -277,14 +278,14 @@ mod tests {
 
     #[test]
     fn shapes_that_ask_for_more_than_the_file_are_refused_before_anything_is_made() {
-        // An axis of zero holds nothing, so that the others cost nothing.
+        // An axis of zero has no elements, so the other axes cost nothing.
         let empty = reshaped(&|name, shape| {
             if name.ends_with("hidden") {
                 *shape = vec![2, 0, 1 << 40];
             }
         });
         assert!(sizes(&empty).unwrap_err().contains("which holds nothing"));
-        // First states are a row, the matrices behind them its square.
+        // The initial states are one row; the matrices after them are its square.
         let wide = reshaped(&|name, shape| {
             if name == "motion_encoder.hidden" {
                 shape[2] = 1 << 20;
@@ -319,7 +320,7 @@ mod tests {
         assert!(said.contains("finest.tar: is a named pipe; expected a file"), "{said}");
     }
 
-    /// Overwritten, cut and doubled bytes: any answer will do, but no panic.
+    /// Overwritten, cut and doubled bytes must not cause a panic; any result is allowed.
     #[test]
     fn no_bytes_break_the_importer() {
         let mut state = 0x9e37_79b9_7f4a_7c15_u64;
@@ -342,7 +343,8 @@ mod tests {
         let (archive, weights) = (archive.finish().unwrap().into_inner(), small());
         for round in 0..600 {
             let mut bytes = if round % 2 == 0 { archive.clone() } else { weights.clone() };
-            // What matters stands in headers, at the ends of the files.
+            // The important bytes are headers at either end of a file; half of the safetensors rounds change only the
+            // first 4,000.
             let head = if round % 4 == 1 { 4_000 } else { bytes.len() };
             for _ in 0..=next(4) {
                 let at = next(head.min(bytes.len()));

@@ -1,9 +1,9 @@
-//! `import.model`: published weights as what a training stage of ours would have given. Sources: MLD, MotionLCM, T2M-GPT, MoMask, MMM, MDM,
-//! DisCoRD.
+//! `import.model`: converts published weights to the output of our training stages. Sources: MLD, MotionLCM, T2M-GPT,
+//! MoMask, MMM, MDM, DisCoRD.
 //!
-//! What the weights do not say and the publication does (the noise schedule of a latent diffusion, MDM's cosine, DisCoRD's frequencies) is taken
-//! from there; what it left to a user is a setting. Tables of positions and other constants that stand in a published file are kept beside the
-//! weights, where an export finds them.
+//! Facts that the weights lack come from the publication: the noise schedule of a latent diffusion, MDM's cosine,
+//! DisCoRD's frequencies. Facts that the publication leaves to the user are settings. Tables of positions and other
+//! constants of a published file are kept beside the weights, for a later export.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -38,9 +38,9 @@ use crate::published::{Checkpoint, Found, Taken, sizes};
 use crate::tokenizer::TokenizerMeta;
 use crate::weights;
 
-/// The codebook of a tokenizer that has one, in our files and in those of T2M-GPT and MMM.
+/// Name of a single codebook, in our files and in those of T2M-GPT and MMM.
 const CODEBOOK: (&str, &str) = ("quantizer.layers.0.codebook", "quantizer.codebook");
-/// Dilations of a tokenizer reach no further.
+/// Upper limit of a tokenizer's dilations.
 const REACH: usize = 10_000;
 
 impl Plain for ImportModel {
@@ -73,7 +73,7 @@ struct Import<'a> {
     file: &'a Checkpoint,
     heads: usize,
     device: Device,
-    /// Names of the file that were read.
+    /// Names of the tensors that were read from the file.
     read: BTreeSet<String>,
     parameters: usize,
 }
@@ -85,7 +85,7 @@ struct Network {
 }
 
 impl Network {
-    /// With `prefix` before all names.
+    /// Adds `prefix` to all names.
     fn under(mut self, prefix: &str) -> Self {
         let rename = |entry: &mut Entry| entry.name.insert_str(0, prefix);
         self.entries.iter_mut().for_each(rename);
@@ -109,12 +109,12 @@ fn add(draft: &mut Draft, networks: &[Network]) -> Result<(), StageError> {
     draft.add_pieces(weights::CONSTANTS_FILE, &Weights::of(&constants).pieces())
 }
 
-/// What settings say where it departs from the rule.
+/// The setting's value if it departs from the rule, else `None`.
 fn departing(found: bool, rule: bool) -> Option<bool> {
     (found != rule).then_some(found)
 }
 
-/// A statistic of a folder: the first of `names` that is there, `len` finite numbers.
+/// Reads a statistic of a folder: the first existing file of `names`, with `len` finite numbers.
 fn statistic(folder: &str, names: [&str; 2], len: usize) -> Result<Vec<f32>, StageError> {
     let refuse = |what: String| StageError::Input(format!("{folder}: {what}"));
     let file = names.iter().map(|name| Path::new(folder).join(name)).find(|file| file.symlink_metadata().is_ok());
@@ -130,7 +130,7 @@ fn statistic(folder: &str, names: [&str; 2], len: usize) -> Result<Vec<f32>, Sta
     Ok(array.data)
 }
 
-/// Mean and deviation of a folder.
+/// Reads mean and deviation from a folder.
 fn statistics(folder: &str, names: [[&str; 2]; 2], len: usize) -> Result<(Vec<f32>, Vec<f32>), StageError> {
     let (mean, std) = (statistic(folder, names[0], len)?, statistic(folder, names[1], len)?);
     if let Some(i) = std.iter().position(|s| *s <= 0.0) {
@@ -139,13 +139,13 @@ fn statistics(folder: &str, names: [[&str; 2]; 2], len: usize) -> Result<(Vec<f3
     Ok((mean, std))
 }
 
-/// Of features.
+/// File names of the statistics of features.
 const FEATURES: [[&str; 2]; 2] = [["mean.npy", "Mean.npy"], ["std.npy", "Std.npy"]];
-/// Of joints.
+/// File names of the statistics of joints.
 const JOINTS: [[&str; 2]; 2] = [["Mean_raw.npy", "mean_raw.npy"], ["Std_raw.npy", "std_raw.npy"]];
 
 impl Import<'_> {
-    /// The tensors of a network, which is made of shapes alone.
+    /// Reads the tensors of a network, which is created from shapes alone.
     fn network<M: Module>(
         &mut self,
         found: &Found<'_>,
@@ -162,7 +162,7 @@ impl Import<'_> {
         Network { entries, taken }
     }
 
-    /// What it was trained on: the format, and the mean and deviation of its features.
+    /// The training data: its format, and the mean and deviation of its features.
     fn statistics(
         &self,
         cx: &dyn AttemptContext,
@@ -191,7 +191,7 @@ impl Import<'_> {
         Ok((format, mean, std))
     }
 
-    /// The text encoder of `text`, which must give captions of `dim` numbers.
+    /// Opens the text encoder `text`, and checks that its captions have `dim` numbers.
     fn text(&self, cx: &dyn AttemptContext, found: &Found<'_>, dim: usize) -> Result<Manifest, StageError> {
         let (_, manifest) = artifacts::input(cx, "text", ArtifactKind::Embeddings)?;
         let meta: EmbeddingsMeta = artifacts::meta(&manifest, "the caption embeddings")?;
@@ -210,7 +210,7 @@ impl Import<'_> {
         Ok((digest, manifest, meta))
     }
 
-    /// Refuses a network in the file that is not the one of a part, with the entries `entries`.
+    /// Checks that a network in the file equals that of a part with the entries `entries`.
     fn expect_same(
         &mut self,
         cx: &dyn AttemptContext,
@@ -390,7 +390,7 @@ impl Import<'_> {
         draft.finish(cx)
     }
 
-    /// Uploads a model of tokens.
+    /// Uploads a model of tokens with its parts.
     fn generator(
         &self,
         cx: &mut dyn AttemptContext,
@@ -415,7 +415,7 @@ impl Import<'_> {
         parts::publish_model(cx, TOKENS, tokenizer.format, &parts.into())
     }
 
-    /// Refuses a network for other codebooks than the tokenizer has.
+    /// Refuses a network for other codebooks than the tokenizer's.
     fn expect_codes(found: &Found<'_>, codes: usize, tokenizer: &TokenizerMeta, one: bool) -> Result<(), StageError> {
         if codes != tokenizer.codes || (one && tokenizer.quantizers != 1) {
             return Err(found.refuse(format!(
@@ -495,7 +495,7 @@ impl Import<'_> {
         self.generator(cx, (Family::Masked, size), lengths, (tokenizer, text), &networks)
     }
 
-    /// MoMask's network of the layers above the first.
+    /// Reads MoMask's network of the layers above the first.
     fn above(&mut self, cx: &mut dyn AttemptContext, path: &Path, first: &MomaskConfig) -> Result<Network, StageError> {
         let file = Checkpoint::open(path)?;
         let found = sizes::residual(&file)?;

@@ -1,4 +1,5 @@
-//! Examples of the stages that train in the latent space: a latent drawn from its posterior, its caption, and keyed draws about it.
+//! Examples for stages that train in the latent space: a latent drawn from its posterior, its caption, and their keyed
+//! draws.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -32,26 +33,26 @@ pub(super) struct LatentData {
     device: Device,
 }
 
-/// One slice of a batch.
+/// A slice of a batch with its draws.
 #[derive(Debug)]
 pub(super) struct LatentSlice {
     /// Keys of all draws.
     pub(super) picks: Vec<Pick>,
-    /// Rows of the latents: which entry and which crop of it.
+    /// Rows of the latents, which select the entry and its crop.
     pub(super) rows: Vec<usize>,
-    /// Frames of the motion behind each latent.
+    /// Number of frames of each latent's motion.
     pub(super) lengths: Vec<usize>,
     /// Latents [B, N, d], drawn from their posteriors.
     pub(super) clean_bnd: Tensor<3>,
     /// Caption embeddings [B, 1, text].
     pub(super) text_blc: Tensor<3>,
-    /// The empty caption's embedding as often [B, 1, text].
+    /// The empty caption's embedding, repeated [B, 1, text].
     pub(super) null_blc: Tensor<3>,
 }
 
 impl LatentData {
-    /// Reads the inputs `latents` and `text`. Of `pool` batches those examples stand together whose motions are of like length; one that looks at no motion
-    /// needs but one.
+    /// Reads the inputs `latents` and `text`. Groups examples of similar length within `pool` batches; stages that
+    /// decode no motion need only 1.
     pub(super) fn read(cx: &dyn AttemptContext, training: &Training, pool: usize) -> Result<Self, StageError> {
         let blobs = cx.blobs();
         let (_, manifest) = artifacts::input(cx, "latents", ArtifactKind::Latents)?;
@@ -75,32 +76,32 @@ impl LatentData {
         Ok(Self { latents, embeddings, train, order, seed, stage, slices: training.batch.slices, device: cx.device() })
     }
 
-    /// The VAE whose latents these are.
+    /// The VAE of the latents.
     pub(super) fn vae(&self) -> Digest {
         self.latents.meta.vae
     }
 
-    /// Latents' meta.
+    /// Meta of the latents.
     pub(super) fn meta(&self) -> &artifacts::LatentsMeta {
         &self.latents.meta
     }
 
-    /// Embeddings' meta.
+    /// Meta of the embeddings.
     pub(super) fn text_meta(&self) -> &artifacts::EmbeddingsMeta {
         &self.embeddings.meta
     }
 
-    /// The encoder that embedded the captions.
+    /// Manifest of the encoder that embedded the captions.
     pub(super) fn text_encoder(&self, cx: &dyn AttemptContext) -> Result<Manifest, StageError> {
         parts::manifest(&*cx.blobs(), self.embeddings.meta.text, "the text encoder")
     }
 
-    /// The generator of one kind of draw about one example.
+    /// The generator for one kind of draw of one example.
     pub(super) fn stream(&self, what: &str, pick: Pick) -> Stream {
         Stream::new(self.seed, &format!("{}/{what}", self.stage), pick.place, 0)
     }
 
-    /// Standard normal noise [B, N, d] of a purpose.
+    /// Standard normal noise [B, N, d] for one purpose.
     pub(super) fn noise(&self, what: &str, picks: &[Pick]) -> Tensor<3> {
         let latent = self.latents.meta.latent;
         let size = latent.tokens * latent.dim;
@@ -118,13 +119,13 @@ impl LatentData {
         order.batch(step, |pick| if sorted { self.meta().lengths[self.row(pick)] } else { 0 })
     }
 
-    /// The row of the latents that [`slice`](Self::slice) takes for an example.
+    /// The row of the latents that [`slice`](Self::slice) uses for an example.
     pub(super) fn row(&self, pick: Pick) -> usize {
         let crops = self.latents.meta.crops;
         self.train[pick.example] * crops + self.stream("example", pick).below(crops)
     }
 
-    /// Slice `slice` of the batch of `step`. With probability `drop` a caption is replaced by the empty one.
+    /// Slice `slice` of the batch of `step`. A caption is replaced by the empty one with probability `drop`.
     pub(super) fn slice(&self, step: u64, slice: usize, drop: f64) -> LatentSlice {
         let range = self.order.borrow().slice(slice, self.slices);
         let picks: Vec<Pick> = self.picks(step)[range].to_vec();
@@ -160,8 +161,8 @@ impl LatentData {
     }
 }
 
-/// Uploads a model of latent diffusion: the denoiser, made of its meta and its weights in a flat buffer, and the parts that it was
-/// trained with.
+/// Uploads a latent-diffusion model: the denoiser, from its meta and a flat buffer of weights, and the parts that it
+/// was trained with.
 pub(super) fn publish(
     cx: &mut dyn AttemptContext,
     format: DataFormat,

@@ -1,15 +1,19 @@
-//! `evaluate.latent_fid`: how close a model's latents come to real latents, to their captions, and to its teacher's.
+//! `evaluate.latent_fid`: distance of a model's latents from real latents, from their captions, and from its teacher's
+//! latents.
 //!
-//! Sample `i` of a repeat is of entry `i mod n`; its caption and noise are keyed by (seed, repeat, i) and not by the stage's name, so
-//! that two models of a run are compared on the same noise. Samples are made in blocks that are cut from the sample's number alone, and
-//! blocks are dealt to shards in turn; what a sample is computed together with does not depend on the number of shards.
+//! Sample `i` of a repeat belongs to entry `i mod n`. Its caption and noise are keyed by (seed, repeat, i) and not by
+//! the stage's name, so that two models of a run are compared on the same noise. Samples are made in blocks that depend
+//! only on the sample's number, and shards take blocks in turn. So a sample's batch does not depend on the number of
+//! shards.
 //!
-//! `match` compares repeat 0 with the teacher's 50-step DDIM from the same noise and captions, at g = w + 1 for a student.
-//! `match_other_noise` is its yardstick: a teacher's sample against the teacher's next sample for the same entry.
+//! `match` compares repeat 0 with the teacher's 50-step DDIM from the same noise and captions, at g = w + 1 for a
+//! student. Its reference value is `match_other_noise`: a teacher's sample against the teacher's next sample for the
+//! same entry.
 //!
-//! Where all splits are compared with, each has values of its own besides, such as `latent_fid_test`: samples of its captions against its
-//! clips, for a model knows most of the captions of all from its training. The principal components are those of the train latents either way.
-//! Definitions: [`evaluation::latent_fid`](crate::evaluation::latent_fid).
+//! A comparison with all splits has additional values for each, such as `latent_fid_test`: samples for its captions
+//! against its clips. They are needed because a model has seen most of all captions in its training. The principal
+//! components are those of the train latents in either case. Definitions:
+//! [`evaluation::latent_fid`](crate::evaluation::latent_fid).
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -29,15 +33,15 @@ use crate::evaluation::latent_fid::{
 };
 use crate::generator::{self, LatentGenerator, MotionGenerator, Texts};
 
-/// Samples computed together. Measured with 5 blocks of width 128 on one core: 32 take a tenth less time each than 64, which with
-/// guidance are 128 sequences and leave the cache.
+/// Samples computed together. Measured with 5 blocks of width 128 on one core: with 32 each takes a tenth less time
+/// than with 64, which with guidance are 128 sequences and do not fit the cache.
 const BLOCK: usize = 32;
 /// Steps of the teacher that `match` compares with.
 const TEACHER_STEPS: usize = 50;
-/// Where a shard's samples are.
+/// File of a shard's samples.
 const SAMPLES_FILE: &str = "samples.safetensors";
 
-/// Whose samples a block holds.
+/// The model that generates a block.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 enum Maker {
@@ -53,18 +57,18 @@ struct Unit {
     block: usize,
 }
 
-/// What all shards and the merge agree on.
+/// The common plan of all shards and the merge.
 struct Plan<'a> {
     settings: &'a EvaluateLatentFid,
     seed: Seed,
     latents: Latents,
     captions: Vec<Caption>,
     model: Box<dyn MotionGenerator>,
-    /// Entries that are sampled.
+    /// Entries to generate samples for.
     entries: Vec<usize>,
-    /// The teacher, where its samples are needed besides the model's.
+    /// The teacher, if its samples are needed in addition to the model's.
     teacher: Option<Box<dyn MotionGenerator>>,
-    /// Whether `match` is measured.
+    /// True if `match` is measured.
     matched: bool,
 }
 
@@ -117,7 +121,7 @@ impl<'a> Plan<'a> {
         Ok(Self { settings, seed, latents, captions, model, entries, teacher, matched })
     }
 
-    /// Samples of one repeat.
+    /// Number of samples of one repeat.
     fn samples(&self) -> usize {
         self.entries.len() * self.settings.samples
     }
@@ -134,7 +138,8 @@ impl<'a> Plan<'a> {
         self.entries[sample % self.entries.len()]
     }
 
-    /// All blocks; shard `index` of `of` takes every `of`-th one of each maker, since a teacher's block costs a hundred of a student's.
+    /// All blocks. Shard `index` of `of` takes every `of`-th one of each maker, since a teacher's block costs a hundred
+    /// of a student's.
     fn units(&self) -> Vec<Unit> {
         let blocks = self.samples().div_ceil(BLOCK);
         let of = |maker, repeat| (0..blocks).map(move |block| Unit { maker, repeat, block });
@@ -147,7 +152,7 @@ impl<'a> Plan<'a> {
         Stream::new(self.seed, &format!("evaluate.latent_fid/{what}"), unit.repeat as u64, sample as u64)
     }
 
-    /// The caption of each sample of a block, by number.
+    /// Index of the caption of each sample of a block.
     fn block_captions(&self, unit: Unit) -> Vec<usize> {
         let caption = |sample| {
             let captions = &self.latents.meta.captions[self.entry(sample)];
@@ -156,7 +161,7 @@ impl<'a> Plan<'a> {
         self.block(unit.block).map(caption).collect()
     }
 
-    /// The samples of a block.
+    /// Generates the samples of a block.
     fn sample(
         &self,
         unit: Unit,
@@ -173,14 +178,14 @@ impl<'a> Plan<'a> {
         latents_of("model", generator)?.sample(&texts, &seeds, sampler)
     }
 
-    /// The sampler of the teacher that `match` compares with.
+    /// The sampler of the teacher for `match`.
     fn teacher_sampler(&self) -> Sampler {
         let shift = if self.model.family().is_student() { 1.0 } else { 0.0 };
         Sampler { steps: TEACHER_STEPS, guidance: self.settings.sampler.guidance + shift, ..Sampler::default() }
     }
 }
 
-/// The way to a model's latents.
+/// The latent generator of a model, or an error naming the input `field`.
 fn latents_of<'g>(field: &str, generator: &'g dyn MotionGenerator) -> Result<&'g dyn LatentGenerator, StageError> {
     generator.latents().ok_or_else(|| {
         let text = format!("`{field}` draws motion from no latents, which is what this measures; use `evaluate.t2m`");
@@ -188,7 +193,7 @@ fn latents_of<'g>(field: &str, generator: &'g dyn MotionGenerator) -> Result<&'g
     })
 }
 
-/// Whether a model makes these latents.
+/// Refuses a model that does not generate these latents.
 fn fits(field: &str, generator: &dyn MotionGenerator, latents: &Latents) -> Result<(), StageError> {
     let refuse = |text: String| Err(StageError::Input(format!("`{field}` does not fit: {text}")));
     let model = latents_of(field, generator)?;
@@ -213,7 +218,7 @@ impl Map for EvaluateLatentFid {
         let (texts, teacher_sampler) = (Texts::new(&*plan.model), plan.teacher_sampler());
         let teacher = plan.teacher.as_deref().map(|teacher| (teacher, Texts::new(teacher)));
 
-        // Network evaluations, so that the progress is even.
+        // Cost in network evaluations, so that progress is even.
         let cost = |unit: &Unit| match unit.maker {
             Maker::Model => self.sampler.steps as u64,
             Maker::Teacher => TEACHER_STEPS as u64,
@@ -292,7 +297,7 @@ impl Map for EvaluateLatentFid {
                 let teacher = if plan.teacher.is_some() { of(Maker::Teacher, 0) } else { samples.clone() };
                 put("match", relative_distance(&samples, &teacher, plan.width()));
                 if self.samples > 1 {
-                    // One entry's samples are a whole number of entries apart.
+                    // The samples of one entry are a whole number of entries apart.
                     let mut others = teacher.clone();
                     others.rotate_left(plan.entries.len() * plan.width());
                     put("match_other_noise", relative_distance(&others, &teacher, plan.width()));
@@ -315,7 +320,7 @@ impl Map for EvaluateLatentFid {
     }
 }
 
-/// What a reader of the report may want besides the metrics.
+/// Details for the report beside the metrics.
 fn details(
     plan: &Plan<'_>,
     reference: &Reference,
@@ -333,7 +338,7 @@ fn details(
     })
 }
 
-/// A draw of z from the posterior of every crop, `[rows, width]`.
+/// Draws z from the posterior of every crop, `[rows, width]`.
 fn draw(plan: &Plan<'_>, repeat: u64) -> Vec<f32> {
     let mut z = plan.latents.sigma.values.to_vec();
     for (row, (z, mu)) in
@@ -347,21 +352,21 @@ fn draw(plan: &Plan<'_>, repeat: u64) -> Vec<f32> {
     z
 }
 
-/// The real latents: `z` is a draw of each.
+/// The real latents, with one draw `z` of each.
 fn real<'p>(plan: &'p Plan<'_>, z: &'p [f32]) -> Real<'p> {
     Real { z, mu: &plan.latents.mu.values, crops: plan.latents.meta.crops, width: plan.width() }
 }
 
-/// A split that is compared with besides all of them.
+/// The target of one split, when all splits are compared.
 struct SplitTarget {
     split: Split,
-    /// The samples that are of its entries.
+    /// Samples for the split's entries.
     samples: Vec<usize>,
     target: Target,
 }
 
 impl SplitTarget {
-    /// Of every split that has two entries or more, where all are compared with.
+    /// The targets of every split with two entries or more, if all splits are compared; otherwise none.
     fn all(plan: &Plan<'_>, reference: &Reference, real: Real<'_>) -> Vec<Self> {
         if plan.settings.split != Wanted::All {
             return Vec::new();
@@ -379,8 +384,8 @@ fn entries_of(plan: &Plan<'_>, split: Split) -> Vec<usize> {
     plan.entries.iter().copied().filter(|e| plan.latents.meta.splits[*e] == split).collect()
 }
 
-/// Of real latents, for all that is compared with and for each split: another draw of the same clips, and one half of the clips against the
-/// other.
+/// Reference values of real latents, for the whole target and each split: another draw of the same clips, and one half
+/// of the clips against the other.
 fn floors(plan: &Plan<'_>, reference: &Reference, real: Real<'_>, splits: &[SplitTarget]) -> Vec<(String, f64)> {
     let fresh = fresh(plan);
     let mut found = vec![("latent_fid_floor".to_owned(), reference.distance(reference.whole(), &fresh))];
@@ -394,7 +399,7 @@ fn floors(plan: &Plan<'_>, reference: &Reference, real: Real<'_>, splits: &[Spli
     found
 }
 
-/// The rows `rows` of `values`.
+/// Selects the rows `rows` of `values`.
 fn taken(values: &[f32], rows: &[usize], width: usize) -> Vec<f32> {
     rows.iter().flat_map(|row| values[row * width..(row + 1) * width].iter().copied()).collect()
 }
@@ -408,13 +413,13 @@ fn reference(plan: &Plan<'_>, z: &[f32]) -> Reference {
     Reference::new(real(plan, z), &train, &plan.entries, captions, plan.settings.components)
 }
 
-/// The rows of the entries that are compared with.
+/// Rows of the compared entries.
 fn compared(plan: &Plan<'_>, z: &[f32]) -> Vec<f32> {
     let size = plan.latents.meta.crops * plan.width();
     plan.entries.iter().flat_map(|e| z[e * size..(e + 1) * size].iter().copied()).collect()
 }
 
-/// Another draw of real latents, as many of each entry as there are samples: what a perfect sampler would score.
+/// Another draw of real latents, as many of each entry as there are samples. It scores like a perfect sampler.
 fn fresh(plan: &Plan<'_>) -> Vec<f32> {
     let z = draw(plan, 1);
     let (crops, width) = (plan.latents.meta.crops, plan.width());

@@ -1,6 +1,7 @@
 //! `distill.lcm`: latent consistency distillation. Source: MotionLCM (arXiv:2404.19759).
 //!
-//! `y = c_skip(t) z_t + c_out(t) z_0(z_t, t)` by the student against the same at the teacher's solver step by the target.
+//! The student's `y = c_skip(t) z_t + c_out(t) z_0(z_t, t)` is compared with the target's at the end of the teacher's
+//! solver step.
 
 use models::diffusion::{affine, consistency, unzip};
 use protocol::stage::{DistillLcm, StageSpec};
@@ -44,7 +45,7 @@ impl Gang for DistillLcm {
         match train(&mut objective, &self.distillation.training, cx)? {
             Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
             Trained::Finished { state, metrics } => {
-                // The online network is what is kept, as upstream; its average only was the target.
+                // The result is the online network, as upstream; its average was only the target.
                 let trained = (&state.groups[0].entries[..], state.params(0));
                 let family = self.family().expect("a distillation gives a student");
                 let output = objective.0.publish(cx, family, trained)?;

@@ -1,9 +1,11 @@
-//! `train.length`: how long the motion of a caption is. Source: MoMask's length estimator (Guo et al., CVPR 2024).
+//! `train.length`: predicts the length of a caption's motion. Source: MoMask's length estimator (Guo et al., CVPR
+//! 2024).
 //!
-//! A class is a movement of four frames; cross-entropy against `frames / 4`, with one of the clip's captions drawn for each step.
+//! A class is a movement of four frames. The loss is the cross-entropy against `frames / 4`, with one of the clip's
+//! captions drawn in each step.
 //!
-//! Departs: every entry has its whole length, where the original shortens it by a movement now and then; a draw of a length gives at least
-//! one movement.
+//! Departs: every entry has its whole length, where the original sometimes shortens it by a movement. A drawn length is
+//! at least one movement.
 
 use burn::tensor::activation::softmax;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -24,7 +26,7 @@ use crate::train::{GroupPlan, Losses, Objective, Order, SliceResult, TrainState,
 use crate::warm_start::WarmStart;
 use crate::weights;
 
-/// Frames between the mean of the predicted lengths and the true one.
+/// Name of the distance in frames between the mean of the predicted lengths and the true one.
 const OFF: &str = "frames_off";
 
 struct Lengths {

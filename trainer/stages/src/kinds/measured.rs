@@ -1,4 +1,4 @@
-//! What evaluations that draw read: the clips, and the model that is measured.
+//! Inputs of the evaluations that sample: the clips, and the model to be measured.
 
 use motion::Dataset;
 use protocol::ArtifactKind;
@@ -8,10 +8,10 @@ use crate::artifacts;
 use crate::context::{AttemptContext, StageError};
 use crate::generator::{self, MotionGenerator};
 
-/// The inputs `dataset` and `model` of an evaluation that draws with `sampler`.
+/// Opens the inputs `dataset` and `model` of an evaluation with `sampler`.
 ///
 /// # Errors
-/// A model of another skeleton, or without that sampler.
+/// If the model has another skeleton, or does not support the sampler.
 pub(super) fn measured(
     cx: &dyn AttemptContext,
     sampler: &Sampler,

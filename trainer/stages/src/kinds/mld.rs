@@ -1,10 +1,12 @@
 //! `train.mld`: the latent-diffusion teacher. Source: MLD (arXiv:2212.04048), MotionLCM v2's recipe.
 //!
-//! `t ~ U{0..999}`, `z_t = alpha_t z_0 + sigma_t eps`, loss `mean (eps_hat(z_t, t, c) - eps)^2` (of the sample or the velocity where `diffusion`
-//! says so), the caption replaced by the empty one with probability `guidance_dropout`. Latents are samples of their posteriors, unscaled.
+//! `t ~ U{0..999}`, `z_t = alpha_t z_0 + sigma_t eps`, loss `mean (eps_hat(z_t, t, c) - eps)^2` (of the sample or the
+//! velocity, according to `diffusion`). The caption is replaced by the empty one with probability `guidance_dropout`.
+//! Latents are samples of their posteriors, unscaled.
 //!
-//! With Free-T2M's losses, which look at motion: of a part of the batch the clean latent that is predicted goes through the frozen decoder, and is
-//! compared with what the decoder makes of the true one. Departs: the paper has no latent host; what the VAE itself loses is not charged here.
+//! Free-T2M's losses apply to motion: for a part of the batch the predicted clean latent is decoded by the frozen
+//! decoder, and compared with the decoded true latent. Departs: the paper has no latent host; the VAE's own error is
+//! not counted here.
 
 use std::collections::BTreeMap;
 
@@ -27,10 +29,10 @@ use crate::networks::Autoencoder;
 use crate::train::{GroupPlan, Losses, Objective, Pick, SliceResult, TrainState, Trained, train};
 use crate::warm_start::WarmStart;
 
-/// The term of the loss that every latent diffusion has.
+/// Name of the loss term that every latent diffusion has.
 const DENOISING: &str = "denoising";
 
-/// Free-T2M's terms, and the decoder that they look through.
+/// Free-T2M's terms, and their frozen decoder.
 struct Decoded {
     terms: FrequencyTerms,
     vae: Autoencoder,
@@ -88,7 +90,7 @@ impl Mld {
         self.data.stream("timestep", pick).below(TIMESTEPS)
     }
 
-    /// Places of the batch whose latents are decoded, with their timesteps, and how many samples the batch has.
+    /// Places of the batch whose latents are decoded, with their timesteps and the number of samples in the batch.
     fn chosen(&self, decoded: &Decoded, batch: &[Pick]) -> Chosen {
         let drawn = |pick: &&Pick| self.data.stream("decoded", **pick).chance(self.settings.decoded);
         let timed = batch.iter().filter(drawn).map(|pick| (pick.place, self.timestep(*pick)));
@@ -96,7 +98,7 @@ impl Mld {
     }
 }
 
-/// What of a batch is decoded.
+/// The decoded part of a batch.
 struct Chosen {
     timesteps: BTreeMap<u64, usize>,
     global: usize,

@@ -1,10 +1,11 @@
 //! MMM's objective in `train.tokens`. Source: MMM (Pinyoanuntapong et al., CVPR 2024), `train_t2m_trans.py`.
 //!
-//! Half of a clip's tokens are replaced by random codes, then a share between a half and all of them is hidden; the loss is the cross-entropy
-//! over all tokens, hidden or not, the end excepted: a mean of each clip, then over clips. Captions are never left out, so there is no guidance.
-//! A token is the frozen code of the tokenizer, a caption its one vector and a vector for each word.
+//! Half of a clip's tokens are replaced by random codes, then a share between a half and all of them is masked. The
+//! loss is the cross-entropy over all tokens, masked or not, except the end: a mean per clip, then over clips. Captions
+//! are never dropped, so there is no guidance. A token is the frozen code of the tokenizer; a caption is its vector and
+//! one vector per word.
 //!
-//! Departs with the built-in encoder: nothing is looked at behind a caption's last word, where CLIP has always 77 of them.
+//! Departs with the built-in encoder: attention covers only a caption's own words; CLIP always has 77.
 
 use burn::tensor::{Device, Tensor};
 use models::kernels::Dropout;
@@ -25,7 +26,7 @@ use crate::tokenizer::TrainedTokenizer;
 use crate::train::{GroupPlan, Losses, Objective, Pick, SliceResult, TrainState};
 use crate::warm_start::WarmStart;
 
-/// Trains MMM's network.
+/// Objective that trains MMM's network.
 pub(super) struct WithWords {
     settings: TrainTokens,
     config: MmmConfig,
@@ -39,7 +40,7 @@ pub(super) struct WithWords {
 }
 
 impl WithWords {
-    /// Reads the inputs `dataset` and `tokenizer`; the others are in `data`.
+    /// Reads the inputs `dataset` and `tokenizer`; `data` holds the others.
     pub(super) fn new(
         settings: &TrainTokens,
         data: TokenData,

@@ -1,5 +1,5 @@
-//! How each stage kind runs: one file a kind, and the list that finds it. What a kind is called, takes and gives is in its file in
-//! `protocol::stage`.
+//! Implementation of each stage kind, one file per kind, and the list of them. The name, settings and outputs of a kind
+//! are in its file in `protocol::stage`.
 
 mod consistency;
 mod control;
@@ -54,20 +54,20 @@ use crate::artifacts;
 use crate::context::{AttemptContext, GangContext, Outcome, Part, StageError};
 use crate::train::{Average, Clip, GroupPlan, Losses, SliceResult, Turns};
 
-/// Where a report's details are.
+/// File of a report's details.
 pub const REPORT_FILE: &str = "report.json";
 
-/// A kind that one worker does alone.
+/// A kind that one worker runs alone.
 trait Plain {
-    /// Does it.
+    /// Runs the stage.
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError>;
 }
 
-/// A kind that is cut into shards.
+/// A kind that is divided into shards.
 trait Map {
-    /// Does shard `index` of `of`.
+    /// Computes shard `index` of `of`.
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError>;
-    /// Makes the stage's artifact of those of all shards, in order.
+    /// Merges the artifacts of all shards, in order, into the stage's.
     fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError>;
 }
 
@@ -77,17 +77,17 @@ trait Gang {
     fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError>;
 }
 
-/// What runs a stage.
+/// A stage in the form that its kind is run in.
 enum Stage<'a> {
     Plain(&'a dyn Plain),
     Map(&'a dyn Map),
     Gang(&'a dyn Gang),
 }
 
-/// Makes [`runner`] of the list of kinds.
+/// Generates [`runner`] from the list of kinds.
 macro_rules! runners {
     ($($shape:ident: $($name:ident),+;)*) => {
-        /// What runs stages with these settings; nothing runs those that the coordinator does itself.
+        /// The runner of a stage with these settings; `None` for kinds that the coordinator runs itself.
         fn runner(settings: &StageSettings) -> Option<Stage<'_>> {
             match settings {
                 $($(StageSettings::$name(settings) => Some(Stage::$shape(settings)),)+)*
@@ -97,7 +97,7 @@ macro_rules! runners {
     };
 }
 
-// The list of what runs. It is held against `protocol`'s list of kinds by a test below.
+// The list of implemented kinds. A test below compares it with the list of kinds in `protocol`.
 runners! {
     Plain: DataOpen, DataSynthetic, ImportEvaluator, ImportModel, ModelDecoder, EvaluateSpectrum, EvaluateRecognition;
     Map: TextEmbed, DataFeatures, EncodeLatents, EncodeTokens, EvaluateReconstruction, EvaluateLatentFid, EvaluateT2m, EvaluateControl;
@@ -133,8 +133,8 @@ pub fn run_gang(cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
     }
 }
 
-/// All parameters of `module` as one group that every step trains as `training` says and that is clipped by its own norm, with a moving
-/// average of decay `ema` beside them unless that is 0.
+/// All parameters of `module` as one group that `training` applies to in every step. Its gradient is clipped by its own
+/// norm. It has a moving average with decay `ema`, unless that is 0.
 fn group<M: Module>(name: &'static str, module: &M, training: &Training, ema: f64) -> GroupPlan {
     GroupPlan {
         name,
@@ -148,7 +148,7 @@ fn group<M: Module>(name: &'static str, module: &M, training: &Training, ema: f6
     }
 }
 
-/// The gradient of a slice's loss for all parameters of `module`.
+/// The gradient of a slice's loss for all parameters of `module`, as a flat buffer.
 fn slice_gradient<M: Module>(module: &M, loss: Tensor<1>) -> Vec<f32> {
     let mut gradients = loss.backward();
     let mut flat = vec![0.0; module.num_params()];
@@ -156,7 +156,7 @@ fn slice_gradient<M: Module>(module: &M, loss: Tensor<1>) -> Vec<f32> {
     flat
 }
 
-/// What a slice gives that trains `module` alone, on all of `losses`.
+/// The result of a slice that trains only `module`, on all of `losses`.
 fn slice_result<M: Module>(module: &M, losses: &Losses, terms: &[&'static str]) -> Result<SliceResult, StageError> {
     let total = losses.total().ok_or_else(|| {
         StageError::Input("every weight of the loss is 0, so there is nothing to learn; set one".into())
@@ -165,22 +165,22 @@ fn slice_result<M: Module>(module: &M, losses: &Losses, terms: &[&'static str]) 
     Ok(SliceResult { gradients, terms: losses.values(terms), ..SliceResult::default() })
 }
 
-/// What a stage's dropout is keyed by: the run's seed and the stage's name.
+/// The dropout seed of a stage, derived from the run's seed and the stage's name.
 fn dropout_seed(cx: &dyn AttemptContext) -> u64 {
     Stream::new(cx.task().seed, &format!("{}/dropout", cx.task().name), 0, 0).bits()
 }
 
-/// Settings' own word for one of them, such as `humanml3d` or `test`.
+/// The name of a setting's value, such as `humanml3d` or `test`.
 pub(crate) fn word(setting: &impl serde::Serialize) -> String {
     serde_json::to_value(setting).ok().and_then(|value| Some(value.as_str()?.to_owned())).unwrap_or_default()
 }
 
-/// A split that an evaluation cannot be of.
+/// The error for an evaluation on a split without entries.
 fn no_entries(split: Split) -> StageError {
     StageError::Input(format!("the split `{}` has no entries; set `split` to one that has", word(&split)))
 }
 
-/// Nothing to train on.
+/// The error for a training split without clips.
 fn no_clips() -> StageError {
     StageError::Input("the training split has no clips; list some in the dataset's `train.txt`".into())
 }
@@ -189,8 +189,8 @@ fn misplaced(settings: &StageSettings, how: &str) -> StageError {
     StageError::Fault(format!("stage kind `{}` does not run {how}", settings.kind()))
 }
 
-/// Which model an evaluation measured, and how it drew from it; nothing of real motion. A report says this, so that a reader who has the
-/// report of a model knows how to draw from the model.
+/// The model and sampler of an evaluation, or null for real motion. Every report contains them, so that its reader
+/// knows the settings of the model.
 fn drawn(cx: &dyn AttemptContext) -> Result<Value, StageError> {
     let task = cx.task();
     let Some(sampler) = task.settings.sampler() else { return Ok(Value::Null) };
@@ -207,7 +207,7 @@ fn publish_report(
     publish_illustrated(cx, metrics, details, vec![])
 }
 
-/// [`publish_report`] with pictures beside it: their names and files.
+/// Like [`publish_report`], with pictures given as names and files.
 fn publish_illustrated(
     cx: &mut dyn AttemptContext,
     metrics: BTreeMap<String, f64>,

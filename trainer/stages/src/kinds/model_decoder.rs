@@ -1,4 +1,4 @@
-//! `model.decoder`: the parts of a model of tokens, or of latents, and a flow decoder.
+//! `model.decoder`: combines the parts of a token or latent model with a flow decoder.
 
 use std::collections::BTreeMap;
 

@@ -1,13 +1,15 @@
-//! `distill.pcm`: phased consistency distillation with a discriminator. Source: MotionPCM (arXiv:2501.19083), Algorithm 1, and the image
-//! repository it follows.
+//! `distill.pcm`: phased consistency distillation with a discriminator. Source: MotionPCM (arXiv:2501.19083), Algorithm
+//! 1, and the image repository that it follows.
 //!
-//! Student and target jump to the edge `s_m` of their phase, `F(z, t, s) = A z + E eps`. At grid points next to an edge the target is the teacher's
-//! step itself. The discriminator sees block features of the frozen teacher at a level `s` within the phase: fake is the student's jump
-//! noised on from `s_m`, real the data latent noised to `s`, with independent noise.
+//! Student and target jump to the edge `s_m` of their phase, `F(z, t, s) = A z + E eps`. At grid points next to an edge
+//! the target is the teacher's step itself. The discriminator reads block features of the frozen teacher at a level `s`
+//! within the phase. Fake is the student's jump, noised from `s_m`; real is the data latent noised to `s`, with
+//! independent noise.
 //!
-//! Readings and departures: the student's input is the noised latent (the paper's line 10 is a slip); hinge signs as in Algorithm 1, not
-//! Eq. 13; levels end at the true next edge. Unless `alternate` says otherwise, both networks are updated in every step from gradients of the
-//! same step, so one exchange carries both; the discriminator therefore sees the student before its update.
+//! Readings and departures: the student's input is the noised latent (the paper's line 10 is an error). Hinge signs are
+//! those of Algorithm 1, not of Eq. 13. Levels end at the true next edge. Unless `alternate` is set, both networks are
+//! updated in every step from gradients of the same step, so that one exchange carries both. The discriminator
+//! therefore sees the student before its update.
 
 use burn::tensor::Tensor;
 use models::diffusion::{Phases, affine, unzip};
@@ -59,7 +61,7 @@ impl Objective for Pcm {
         let phases: Vec<usize> = solved.index.iter().map(|i| self.phases.phase_of(*i)).collect();
         let edges: Vec<usize> = phases.iter().map(|m| self.phases.edge_time(*m)).collect();
 
-        // The jump from a point to itself is the identity, which is what the target is next to an edge (t' = s_m).
+        // The jump from a point to itself is the identity; that is the target next to an edge (t' = s_m).
         let (a, e) = unzip(solved.to.iter().zip(&edges).map(|(t, s)| self.distiller.noise.jump(*t, *s)));
         let target = affine(solved.solved_bnd.clone(), self.distiller.target_out(&solved, step, slice), &a, &e);
         let (a, e) = unzip(solved.from.iter().zip(&edges).map(|(t, s)| self.distiller.noise.jump(*t, *s)));
@@ -102,7 +104,7 @@ impl Objective for Pcm {
 }
 
 impl Pcm {
-    /// The steps that train the student, and those that train the discriminator.
+    /// The steps that train the student, and the steps that train the discriminator.
     fn turns(&self) -> [Turns; 2] {
         if self.settings.alternate {
             [Turns::ALWAYS.one_in(2, 0), Turns::ALWAYS.one_in(2, 1)]
@@ -111,7 +113,7 @@ impl Pcm {
         }
     }
 
-    /// The student's jump noised from `s_m` to the level (on the tape), and the data latent noised to it.
+    /// The student's jump, noised from `s_m` to the level (on the tape), and the data latent noised to the level.
     fn levels(
         &self,
         solved: &SolverStep,

@@ -1,10 +1,14 @@
-//! `evaluate.recognition`: whether motions show what their captions name. Source: the recognition accuracy of Action2Motion (Guo et al., 2020).
+//! `evaluate.recognition`: the share of motions that show the activity of their captions. Source: the recognition
+//! accuracy of Action2Motion (Guo et al., 2020).
 //!
-//! What a clip shows is read off its captions: the first activity one of whose words they have. A classifier ([`crate::evaluation::recognition`]) learns that from
-//! clips of the train split, at most [`TAUGHT`] of an activity. Then motions are drawn for captions and lengths of `split`, activity by activity in turn, keyed by
-//! (seed, number of the motion), and each is right if it is taken for what its caption names. An activity that `split` has no clip of is said and not asked for.
+//! A clip's activity comes from its captions: the first activity with a word in them. A classifier
+//! ([`crate::evaluation::recognition`]) is trained on clips of the train split, at most [`TAUGHT`] per activity. Then
+//! motions are generated for captions and lengths of `split`, activity by activity in turn, keyed by (seed, number of
+//! the motion). A motion is correct if the classifier predicts its caption's activity. An activity without a clip in
+//! `split` is reported and skipped.
 //!
-//! Departs: the paper's classifier is a recurrent network and its classes are labels; ours is a closed form, and classes are words.
+//! Departs: the paper's classifier is a recurrent network and its classes are labels; ours is a closed form, and
+//! classes are words.
 //!
 //! Files: the report, and `contact-sheet.png` with the first motion of each activity that has `sheet: true`.
 
@@ -25,19 +29,19 @@ use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::recognition::{Classifier, describe};
 use crate::generator::{self, Batch};
 
-/// Clips of an activity that the classifier learns from at most: its time grows with the cube of all of them.
+/// Largest number of training clips per activity; the training time grows with the cube of all clips.
 const TAUGHT: usize = 64;
-/// Motions computed together.
+/// Number of motions computed together.
 const BLOCK: usize = 32;
-/// Poses of a motion on the sheet.
+/// Number of poses per motion on the sheet.
 const POSES: usize = 9;
 
-/// Words of a sentence, in lower case and without what stands around them.
+/// Words of a sentence, in lower case and without surrounding punctuation.
 fn words(text: &str) -> Vec<String> {
     text.split(|c: char| !c.is_alphanumeric() && c != '\'').filter(|w| !w.is_empty()).map(str::to_lowercase).collect()
 }
 
-/// Which activity a caption names.
+/// Phrases of each activity, as lists of words.
 struct Vocabulary(Vec<Vec<Vec<String>>>);
 
 impl Vocabulary {
@@ -45,7 +49,7 @@ impl Vocabulary {
         Self(activities.iter().map(|activity| activity.words.iter().map(|phrase| words(phrase)).collect()).collect())
     }
 
-    /// The first activity that the sentence has a phrase of.
+    /// The first activity with a phrase in the sentence.
     fn names(&self, sentence: &str) -> Option<usize> {
         let sentence = words(sentence);
         let has =
@@ -53,7 +57,7 @@ impl Vocabulary {
         self.0.iter().position(|phrases| phrases.iter().any(has))
     }
 
-    /// What all captions of an entry name.
+    /// The activity of all captions of an entry; `None` if they differ or one has none.
     fn shown(&self, dataset: &Dataset, entry: &Entry) -> Option<usize> {
         let mut named = entry.captions.iter().map(|caption| self.names(&dataset.captions[*caption].text));
         let first = named.next()??;
@@ -72,25 +76,25 @@ fn by_activity(dataset: &Dataset, vocabulary: &Vocabulary, split: Split) -> Vec<
     found
 }
 
-/// A motion that is asked for.
+/// A motion to be generated.
 struct Asked {
     activity: usize,
     caption: usize,
     length: usize,
 }
 
-/// A motion that was drawn.
+/// A motion that was generated.
 struct Drawn {
     asked: Asked,
     taken: usize,
     rows: Vec<f32>,
 }
 
-/// The settings, with what is computed by them.
+/// The settings, with methods for the computed values.
 struct Recognition<'a>(&'a EvaluateRecognition);
 
 impl Recognition<'_> {
-    /// The classifier, and how much there is of each activity to learn from.
+    /// Trains the classifier on clips of the train split.
     fn taught(
         &self,
         cx: &dyn AttemptContext,
@@ -124,7 +128,7 @@ impl Recognition<'_> {
     }
 }
 
-/// What the classifier sees of rows in the data's own scale.
+/// Describes rows in the data's own scale for the classifier.
 fn described(dataset: &Dataset, rows: &[f32]) -> Vec<f64> {
     let mut rows = rows.to_vec();
     dataset.normalise(&mut rows);
@@ -195,7 +199,7 @@ impl Plain for EvaluateRecognition {
     }
 }
 
-/// Real clips of the split: by activity how many there are and how many are taken for what they are; and the skating of all.
+/// Real clips of the split: their number and that of correct predictions by activity, and the skating of all.
 struct Real {
     clips: Vec<usize>,
     right: Vec<usize>,
@@ -240,7 +244,7 @@ impl Recognition<'_> {
         metrics
     }
 
-    /// The first motion of each activity that is to be seen.
+    /// Draws the first motion of each activity with `sheet: true`.
     fn sheet(&self, dataset: &Dataset, drawn: &[Drawn]) -> Result<Option<Vec<u8>>, StageError> {
         let skeleton = dataset.skeleton();
         let seen = self.0.activities.iter().enumerate().filter(|(_, activity)| activity.sheet);

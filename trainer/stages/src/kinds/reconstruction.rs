@@ -1,14 +1,14 @@
-//! `evaluate.reconstruction`: what a VAE or a tokenizer loses, clip by clip.
+//! `evaluate.reconstruction`: errors of a VAE or a tokenizer, clip by clip.
 //!
-//! Each clip is its entry's first frames, as many as are a multiple of the unit length; it is encoded and decoded alone, so no
-//! number depends on the sharding. Metrics without a prefix are of a sample z of the posterior, as every later stage uses it; `mu_` of the
-//! posterior's mean (a tokenizer has none, and no sample: it decodes what it encodes); `clip_mean_` of no network at all: the clip's own
-//! mean feature vector, held; `real_` of the clip itself.
-//! `millimetres_per_unit` says what a unit of the data was taken for in all that ends in `_mm`.
-//! Of a tokenizer also, as means over its codebooks, the share of codes in `used` and the `perplexity` of all clips' codes. With an evaluator
-//! also `fid`, of the reconstructions against the clips, each embedded alone; the papers' is of crops of at most 196 frames, drawn anew in
-//! each of 20 repeats.
-//! Definitions: [`evaluation::reconstruction`](crate::evaluation::reconstruction).
+//! Each clip is its entry's first frames, the largest multiple of the unit length. It is encoded and decoded alone, so
+//! no number depends on the sharding. Metrics without a prefix are those of a sample z of the posterior, as every later
+//! stage uses it. `mu_` are those of the posterior's mean. A tokenizer has neither sample nor mean: it decodes its
+//! tokens. `clip_mean_` are those without a network: the clip's own mean feature vector, repeated. `real_` are those of
+//! the clip itself. `millimetres_per_unit` is the conversion from the data's unit in all metrics that end in `_mm`. A
+//! tokenizer also has, as means over its codebooks, the share of codes in `used` and the `perplexity` of all clips'
+//! codes. With an evaluator there is also `fid`, of the reconstructions against the clips, each embedded alone. The
+//! papers' FID is on crops of at most 196 frames, drawn again in each of 20 repeats. Definitions:
+//! [`evaluation::reconstruction`](crate::evaluation::reconstruction).
 
 use std::collections::BTreeMap;
 
@@ -28,33 +28,33 @@ use crate::evaluation::joints::time_mean;
 use crate::evaluation::reconstruction::{ClipErrors, real_skating, summary};
 use crate::evaluator::TrainedEvaluator;
 
-/// Below this many clips a dimension, FID's covariances say little.
+/// Clips per dimension below which FID's covariances are unreliable.
 const FEW: usize = 5;
-/// Where a shard's embeddings are: `real` and `made` `[clips, width]`.
+/// File of a shard's embeddings: `real` and `made` `[clips, width]`.
 const EMBEDDINGS_FILE: &str = "embeddings.safetensors";
 
-/// Errors of the three guesses at one clip.
+/// Errors of the three reconstructions of one clip.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Row {
     entry: String,
     sample: ClipErrors,
-    /// Of a VAE alone.
+    /// Errors of the posterior's mean; `None` for a tokenizer.
     mu: Option<ClipErrors>,
     clip_mean: ClipErrors,
-    /// Skating ratio of the clip.
+    /// Skating ratio of the original clip.
     real_skating: f64,
 }
 
-/// What a shard knows.
+/// Results of a shard.
 #[derive(Debug, Serialize, Deserialize)]
 struct Rows {
     format: DataFormat,
     rows: Vec<Row>,
-    /// How often each codebook's codes were taken; none of a VAE.
+    /// Number of uses of each code, by codebook; empty for a VAE.
     codes: Vec<Vec<u64>>,
 }
 
-/// Embeddings of clips and of what was made of them, one after the other.
+/// Embeddings of clips and of their reconstructions, one after the other.
 #[derive(Default)]
 struct Embedded {
     real: Vec<f32>,
@@ -74,7 +74,7 @@ impl Embedded {
         tensors.with("made", rows(&self.made), self.made.clone()).to_bytes()
     }
 
-    /// Of all shards.
+    /// Merges the embeddings of all shards.
     fn gather(cx: &dyn AttemptContext, shards: &[Digest]) -> Result<Self, StageError> {
         let mut all = Self::default();
         for digest in shards {
@@ -92,7 +92,7 @@ impl Embedded {
     }
 }
 
-/// The evaluator that FID is taken with, if one is named.
+/// Opens the evaluator for FID, if the stage has one.
 fn evaluator(cx: &dyn AttemptContext, name: &str) -> Result<Option<(Digest, TrainedEvaluator)>, StageError> {
     if name.is_empty() {
         return Ok(None);

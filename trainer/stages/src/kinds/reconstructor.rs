@@ -1,4 +1,4 @@
-//! What makes something of real motion that is measured against it: a VAE or a tokenizer, either with a flow decoder.
+//! Reconstruction of real motion by a VAE or a tokenizer, either with a flow decoder.
 
 use motion::Stream;
 use protocol::ArtifactKind;
@@ -11,7 +11,7 @@ use crate::flow_decoder::FlowDecoder;
 use crate::networks::Autoencoder;
 use crate::tokenizer::TrainedTokenizer;
 
-/// Encodes clips and decodes them again.
+/// Encodes and decodes clips.
 #[expect(clippy::large_enum_variant, reason = "there is one of it")]
 pub(super) enum Reconstructor {
     Vae(Autoencoder, Option<FlowDecoder>),
@@ -19,8 +19,8 @@ pub(super) enum Reconstructor {
 }
 
 impl Reconstructor {
-    /// Opens the inputs `vae` or `tokenizer`, and `decoder`, of which those are read that the stage has. A flow decoder makes `steps`, or as many
-    /// as it was trained with for 0.
+    /// Opens those of the inputs `vae`, `tokenizer` and `decoder` that the stage has. A flow decoder makes `steps`
+    /// steps; 0 means its own number.
     pub(super) fn read(cx: &dyn AttemptContext, steps: usize) -> Result<Self, StageError> {
         let blobs = cx.blobs();
         let has = |field: &str| cx.task().inputs.contains_key(field);
@@ -42,7 +42,7 @@ impl Reconstructor {
         Ok(Self::Tokenizer(tokenizer, decoder(&Role::TOKENIZER, digest)?))
     }
 
-    /// Refuses data of another format than it was trained on.
+    /// Refuses data of another format than the training data.
     pub(super) fn check_format(&self, format: DataFormat) -> Result<(), StageError> {
         match self {
             Self::Vae(vae, _) => vae.check_format(format),
@@ -50,7 +50,7 @@ impl Reconstructor {
         }
     }
 
-    /// Refuses a clip, called `id`, of fewer frames than a token stands for.
+    /// Refuses a clip `id` with fewer frames than one token.
     pub(super) fn check_frames(&self, id: &str, frames: usize) -> Result<(), StageError> {
         match self {
             Self::Tokenizer(tokenizer, _) if frames < tokenizer.unit() => Err(StageError::Input(format!(
@@ -61,7 +61,7 @@ impl Reconstructor {
         }
     }
 
-    /// Mean and standard deviation of its training data.
+    /// Mean and standard deviation of the training data.
     pub(super) fn statistics(&self) -> (&[f32], &[f32]) {
         match self {
             Self::Vae(vae, _) => (&vae.meta().mean, &vae.meta().std),
@@ -83,7 +83,8 @@ impl Reconstructor {
         }
     }
 
-    /// What later stages see of normalised rows `[frames, D]`: a sample of the posterior decoded, or the clip's tokens decoded.
+    /// Reconstructs normalised rows `[frames, D]` as later stages receive them: a decoded sample of the posterior, or
+    /// the decoded tokens.
     pub(super) fn sample(&self, truth: &[f32], frames: usize, stream: &mut Stream) -> Vec<f32> {
         match self {
             Self::Vae(vae, decoder) => {
@@ -97,7 +98,7 @@ impl Reconstructor {
         }
     }
 
-    /// As [`sample`](Self::sample), and what a VAE makes of the posterior's mean. Adds to `codes` those that were taken.
+    /// Like [`sample`](Self::sample), with the decoded mean of a VAE's posterior. Adds the used codes to `codes`.
     pub(super) fn guesses(
         &self,
         truth: &[f32],
@@ -122,7 +123,7 @@ impl Reconstructor {
         }
     }
 
-    /// A count for each code of each codebook.
+    /// Zero counts for each code of each codebook.
     pub(super) fn no_codes(&self) -> Vec<Vec<u64>> {
         match self {
             Self::Vae(..) => Vec::new(),

@@ -1,10 +1,12 @@
-//! `data.features`: a folder of recordings as a dataset.
+//! `data.features`: converts a folder of recordings to a dataset.
 //!
-//! A shard reads a part of the folder's clips, in the order of their ids; the merge divides them, computes the statistics and draws a sheet. What becomes of a clip is a
-//! function of its file alone, so the dataset does not depend on how the work was cut.
+//! A shard reads a part of the folder's clips, in the order of their ids. The merge divides them into splits, computes
+//! the statistics and draws a sheet. The result for a clip depends on its file alone, so the dataset does not depend on
+//! the division into shards.
 //!
-//! Files besides the dataset's: `report.txt` (how files were read, what was left out and why), `contact-sheet.png`, and `evaluator-mean.npy` and `evaluator-std.npy`, the statistics in
-//! the form that the published evaluators take.
+//! Files besides the dataset's: `report.txt` (the interpretation of files, and the reasons for those left out),
+//! `contact-sheet.png`, and `evaluator-mean.npy` and `evaluator-std.npy`, the statistics in the form of the published
+//! evaluators.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -26,30 +28,30 @@ use super::encode::shard_range;
 use crate::artifacts::{self, Draft, Tensors, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
 
-/// A shard's features, all clips one after the other.
+/// File of a shard's features, all clips one after the other.
 const FEATURES_FILE: &str = "features.safetensors";
-/// What else is known of a shard's clips.
+/// File of the other data of a shard's clips.
 const CLIPS_FILE: &str = "clips.json";
-/// The picture of some of the clips.
+/// File of the picture of some clips.
 const SHEET_FILE: &str = "contact-sheet.png";
-/// Motions and poses on it.
+/// Number of motions and poses on the sheet.
 const SHEET: (usize, usize) = (24, 10);
-/// Letters of a caption there.
+/// Length of a caption on the sheet, in letters.
 const TITLE: usize = 60;
 
 /// Meta of a shard.
 #[derive(Debug, Serialize, Deserialize)]
 struct ShardMeta {
-    /// Index of its first file.
+    /// Index of the shard's first file.
     first: usize,
     files: usize,
 }
 
-/// What became of one file.
+/// Result of reading one file.
 #[derive(Debug, Serialize, Deserialize)]
 struct File {
     id: String,
-    /// Clips without their features, or what is wrong.
+    /// Clips without their features, or the error.
     read: Result<FromFile, String>,
 }
 
@@ -115,7 +117,7 @@ impl Map for DataFeatures {
     }
 }
 
-/// Adds a shard's clips, with their features, and files that are broken.
+/// Adds a shard's clips with their features, and its broken files.
 fn collect(
     cx: &mut dyn AttemptContext,
     manifest: &protocol::Manifest,
@@ -151,7 +153,7 @@ fn collect(
     Ok(())
 }
 
-/// What is said of files that cannot be read.
+/// Messages about files that cannot be read.
 struct Broken<'a> {
     count: usize,
     broken: &'a [String],
@@ -204,7 +206,7 @@ fn recipe(settings: &DataFeatures) -> Result<Recipe, StageError> {
     })
 }
 
-/// The sheet and the evaluators' statistics.
+/// The sheet, and the statistics for evaluators.
 fn extras(dataset: &Dataset) -> Result<Vec<Extra>, StageError> {
     let skeleton = dataset.skeleton();
     let fault = |e: std::io::Error| StageError::Fault(e.to_string());

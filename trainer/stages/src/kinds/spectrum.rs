@@ -1,7 +1,9 @@
-//! `evaluate.spectrum`: which frequencies of a motion settle when it is denoised. Source: Free-T2M (Chen et al., 2025, figure 4).
+//! `evaluate.spectrum`: the order in which a motion's frequencies settle during denoising. Source: Free-T2M (Chen et
+//! al., 2025, figure 4).
 //!
-//! Entries' captions and lengths are drawn as keyed by (seed, entry). In every step of the sampler the clean motion that the model predicts is taken,
-//! decoded where it is a latent, and its energy by band of frequencies is compared with that of the entry's real crop and with the motion that comes out.
+//! Captions and lengths of entries are drawn, keyed by (seed, entry). In every step of the sampler the model's
+//! prediction of the clean motion is decoded if it is a latent. Its energy by frequency band is compared with that of
+//! the entry's real crop and with that of the final motion.
 //!
 //! Departs: the figure shows one clip's spectrum; here it is a mean over motions, in numbers.
 
@@ -19,11 +21,11 @@ use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::spectrum::Bands;
 use crate::generator::Batch;
 
-/// Sums over motions of one step.
+/// Sums over motions of one sampler step.
 #[derive(Debug, Clone, Default)]
 struct Step {
     energy: Vec<f64>,
-    /// Energy of the difference from the last step's prediction.
+    /// Energy of the difference from the last step's prediction, by band.
     off: Vec<f64>,
 }
 

@@ -1,16 +1,18 @@
-//! `evaluate.t2m`: the papers' metrics, in an evaluator's space. Source: Guo et al. (text-to-motion) and MotionLCM's protocol.
+//! `evaluate.t2m`: the papers' metrics, in an evaluator's space. Source: Guo et al. (text-to-motion) and MotionLCM's
+//! protocol.
 //!
-//! A repeat draws a caption and a crop for every entry of the split, and a motion for the caption: of the crop's length, or as long as a length
-//! estimator draws. Measured are R-precision in pools and MM-Dist against the captions, FID against the crops, Diversity, MultiModality over more
-//! motions for some captions, and the skating ratio. `real` measures the crops themselves, FID against a second draw of captions and crops, and
-//! `fid_halves` of one half of the clips against the other: how far two sets of other clips are apart, at half the count; a `vae`
-//! or a `tokenizer` what it makes of the crops, FID against these.
+//! A repeat draws a caption and a crop for every entry of the split, and generates a motion for the caption, of the
+//! crop's length or of a length estimator's. The metrics are R-precision in pools and MM-Dist against the captions, FID
+//! against the crops, Diversity, MultiModality over more motions for some captions, and the skating ratio. `real`
+//! measures the crops themselves, and FID against a second draw of captions and crops. It adds `fid_halves`, one half
+//! of the clips against the other: the distance of two sets of other clips, at half the count. A `vae` or a `tokenizer`
+//! measures its reconstructions of the crops, and FID against these.
 //!
-//! All draws are keyed by (seed, repeat, entry) and not by the stage's name, so that two models of a run are compared on the same captions, lengths
-//! and noise. Motions are made in blocks that are cut from the entry's number alone, and blocks are dealt to shards in turn: what a motion is computed
-//! together with does not depend on the number of shards.
+//! All draws are keyed by (seed, repeat, entry) and not by the stage's name, so that two models of a run are compared
+//! on the same captions, lengths and noise. Motions are made in blocks that depend only on the entry's number, and
+//! shards take blocks in turn. So a motion's batch does not depend on the number of shards.
 //!
-//! Departs: Diversity takes as many pairs as there are entries where there are fewer than 300.
+//! Departs: Diversity uses as many pairs as there are entries if there are fewer than 300.
 
 mod maker;
 mod measure;
@@ -33,7 +35,7 @@ use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluation::interval::Interval;
 use crate::evaluation::spread;
 
-/// Below this many motions a dimension, FID's covariances say little.
+/// Motions per dimension below which FID's covariances are unreliable.
 const FEW: usize = 5;
 
 impl Map for EvaluateT2m {
@@ -44,7 +46,7 @@ impl Map for EvaluateT2m {
             Source::Generated(generated) => Some(Maker::new(generated)),
             Source::Real | Source::Reconstructed(_) => None,
         };
-        // Of either part every `of`-th, since they cost differently.
+        // Every `of`-th unit of either part, since the parts have different costs.
         let mine = |part: Part| -> Vec<Unit> {
             let all = plan.units().into_iter().filter(|u| u.part == part).enumerate();
             all.filter(|(i, _)| i % of == index).map(|(_, unit)| unit).collect()
@@ -185,7 +187,7 @@ impl Map for EvaluateT2m {
     }
 }
 
-/// What a reader must know of an FID of so few motions.
+/// A warning if FID is unreliable with so few motions.
 fn few(samples: usize, width: usize) -> Option<String> {
     let text = format!(
         "FID is taken of {samples} motions in {width} dimensions; it is then larger than of many, and compares only with FIDs of as many motions in \

@@ -1,7 +1,8 @@
-//! `text.embed`: captions as vectors, once and for all stages, with the encoder that made them.
+//! `text.embed`: embeds captions as vectors, once for all stages, with the encoder as an artifact.
 //!
-//! Every text is embedded once, however many captions have it, and alone, so that the bits do not depend on how the work was cut. A shard reads
-//! the encoder's folder for itself and says which encoder it found; the merge uploads the encoder and refuses shards of another.
+//! Every text is embedded once, for all captions that have it, and alone, so that the bits do not depend on the
+//! division into shards. A shard reads the encoder's folder itself and records the encoder's digest. The merge uploads
+//! the encoder and refuses shards of another.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -16,19 +17,19 @@ use crate::artifacts::{self, Draft, EMBEDDINGS_FILE, EmbeddingsMeta, Tensors, to
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::text::{Named, TextEncoderMeta};
 
-/// Texts after which progress is told.
+/// Number of texts between progress reports.
 const BLOCK: usize = 16;
 
 /// Meta of one shard.
 #[derive(Debug, Serialize, Deserialize)]
 struct ShardMeta {
-    /// The encoder that was in the folder.
+    /// Digest of the encoder in the folder.
     encoder: Digest,
-    /// The first of its texts.
+    /// Index of the shard's first text.
     first: usize,
 }
 
-/// Every text once, the empty one first, and the text of each caption.
+/// All different texts, the empty one first, and the index of each caption's text.
 fn texts(cx: &dyn AttemptContext) -> Result<(Vec<String>, Vec<usize>), StageError> {
     let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
     let captions = artifacts::captions(&*cx.blobs(), &manifest)?;

@@ -1,6 +1,6 @@
-//! Examples of what draws tokens: a clip's ids, one of its captions, and keyed draws about them.
+//! Examples for token generators: a clip's ids, one of its captions, and their keyed draws.
 //!
-//! With probability 1/3 a clip misses its first or its last token, as T2M-GPT, MMM and, in frames, MoMask have it.
+//! With probability 1/3 a clip loses its first or its last token, as in T2M-GPT, MMM and, in frames, MoMask.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use motion::Stream;
@@ -14,12 +14,12 @@ use crate::train::{Order, Pick};
 pub(super) struct TokenData {
     pub(super) tokens: Tokens,
     pub(super) embeddings: Embeddings,
-    /// Entries of the split that have tokens.
+    /// Entries of the split with tokens.
     pub(super) train: Vec<usize>,
     pub(super) order: Order,
     pub(super) seed: Seed,
     pub(super) purpose: String,
-    /// Tokens of the longest example.
+    /// Number of tokens of the longest example.
     pub(super) longest: usize,
 }
 
@@ -32,7 +32,7 @@ impl TokenData {
         self.order.batch(step, |_| 0)
     }
 
-    /// Ids `[tokens, Q]` of the clip at a place, at most the longest.
+    /// Ids `[tokens, Q]` of the clip at a place, cut to the longest.
     pub(super) fn ids(&self, pick: Pick) -> &[i64] {
         let (q, mut draw) = (self.tokens.meta.quantizers, self.stream("clip", pick));
         let all = self.tokens.of(self.train[pick.example]);
@@ -51,13 +51,13 @@ impl TokenData {
         self.ids(pick).iter().skip(layer).step_by(self.tokens.meta.quantizers).map(|id| *id as usize).collect()
     }
 
-    /// The caption of the clip at a place, by number.
+    /// Index of the caption of the clip at a place.
     pub(super) fn caption(&self, pick: Pick) -> usize {
         let captions = &self.tokens.meta.captions[self.train[pick.example]];
         captions[self.stream("caption", pick).below(captions.len())]
     }
 
-    /// Caption embeddings [B, C]; that of a clip is zeros with probability `drop`.
+    /// Caption embeddings [B, C]; a row is zero with probability `drop`.
     pub(super) fn text(&self, picks: &[Pick], drop: f64, what: &str, device: &Device) -> Tensor<2> {
         let width = self.embeddings.meta.dim;
         let mut values = Vec::with_capacity(picks.len() * width);
@@ -71,7 +71,7 @@ impl TokenData {
     }
 }
 
-/// So many uniform draws.
+/// Makes `count` uniform draws.
 pub(super) fn uniforms(draw: &mut Stream, count: usize) -> Vec<f32> {
     (0..count).map(|_| draw.uniform() as f32).collect()
 }

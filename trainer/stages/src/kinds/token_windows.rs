@@ -1,4 +1,4 @@
-//! Windows of motion, as tokenizers and what decodes their tokens are trained on.
+//! Windows of motion for training tokenizers and decoders of their tokens.
 
 use motion::Stream;
 use motion::dataset::Dataset;
@@ -10,17 +10,17 @@ use crate::artifacts;
 use crate::context::{AttemptContext, StageError};
 use crate::train::Pick;
 
-/// Windows of the training split's entries, of one length. Entries that are shorter are left out.
+/// Windows of one length from the training split's entries. Shorter entries are left out.
 pub(super) struct TokenWindows {
     pub(super) dataset: Dataset,
     pub(super) seed: Seed,
-    /// The stage's name, which keys draws.
+    /// The stage's name, which keys the draws.
     pub(super) purpose: String,
     frames: usize,
     of: WindowsOf,
-    /// Entries that are long enough.
+    /// Entries of at least the window's length.
     train: Vec<usize>,
-    /// Windows of the entries before each, and of all.
+    /// Cumulative number of windows: before each entry, and in total.
     firsts: Vec<usize>,
 }
 
@@ -47,7 +47,7 @@ impl TokenWindows {
         Ok(Self { dataset, seed: cx.task().seed, purpose: cx.task().name.to_string(), frames, of, train, firsts })
     }
 
-    /// Examples of an epoch.
+    /// Number of examples of an epoch.
     pub(super) fn examples(&self) -> usize {
         match self.of {
             WindowsOf::Clips => self.train.len(),

@@ -1,15 +1,16 @@
 //! `train.tokenizer`: a VQ-VAE (T2M-GPT, MMM) or a residual one (MoMask) on windows of motion.
 //!
-//! `L = SL1(x', x) + 0.5 SL1(positions) + 0.02 commitment` by default; the gradient passes once for every active codebook. Codebooks are
-//! buffers: each slice gives counts, sums and the rows that codes may be replaced by, all of which are added on the gradients' tree, and the
-//! hook after a step moves codes by them. So they have the same bits for any number of members.
+//! `L = SL1(x', x) + 0.5 SL1(positions) + 0.02 commitment` by default; the gradient passes once for every active
+//! codebook. Codebooks are buffers. Each slice returns counts, sums and candidate rows that may replace codes. They are
+//! added on the gradients' tree, and the hook after a step moves codes by them. So codebooks have the same bits for any
+//! number of members.
 //!
-//! The first step begins with codes of its own batch, as published. They follow from the first parameters and the batch alone, so that every
-//! member computes them for itself: [`VqObjective::first_books`].
+//! The first step starts with codes from its own batch, as published. They depend only on the initial parameters and
+//! the batch, so every member computes them itself: [`VqObjective::first_books`].
 //!
-//! Departs: the perplexity recorded is a mean over slices; entries shorter than a window are left out, of the others the last window counts
-//! too; drawn codes, tiling noise and dropout are keyed; first codes come of a pass without dropout, and of all layers, also those that the
-//! first step leaves out.
+//! Departs: the recorded perplexity is a mean over slices. Entries shorter than a window are left out, and the last
+//! window of the others is included. Drawn codes, tiling noise and dropout are keyed. Initial codes come from a pass
+//! without dropout, for all layers, including those that the first step leaves out.
 
 use std::borrow::Cow;
 use std::rc::Rc;
@@ -34,7 +35,7 @@ use crate::train::{
 };
 use crate::warm_start::WarmStart;
 
-/// Frames that one token stands for.
+/// Frames per token.
 const UNIT: usize = 4;
 
 struct VqObjective {
@@ -43,15 +44,15 @@ struct VqObjective {
     order: Order,
     network: Tokenizer,
     books: Vec<Vec<f32>>,
-    /// Codebooks that training was told to begin with, by layer.
+    /// Initial codebooks from `init`, by layer.
     given: Vec<Option<Vec<f32>>>,
-    /// What the first step begins with.
+    /// Codebooks of the first step.
     first: Option<Rc<Vec<Vec<f32>>>>,
     dropout_seed: u64,
     device: Device,
 }
 
-/// Name of layer `q`'s buffer or sum.
+/// Name of the buffer or sum `what` of layer `q`.
 fn of(what: &str, q: usize) -> String {
     format!("{what}.{q}")
 }
@@ -61,17 +62,17 @@ impl VqObjective {
         self.settings.window / UNIT
     }
 
-    /// Rows of a whole batch.
+    /// Number of rows of a whole batch.
     fn rows(&self) -> usize {
         self.settings.training.batch.global * self.tokens()
     }
 
-    /// Rows of a batch that codes may be replaced by.
+    /// Number of a batch's candidate rows that may replace codes.
     fn spare(&self) -> usize {
         self.settings.codes.min(self.rows())
     }
 
-    /// Layers that step `step` trains: the same for every slice.
+    /// Number of layers that step `step` trains, equal for every slice.
     fn active(&self, step: u64) -> usize {
         let quantizers = self.settings.quantizers;
         let mut draw = self.stream("layers", 0, step);
@@ -82,7 +83,7 @@ impl VqObjective {
         }
     }
 
-    /// Draws of one kind.
+    /// The generator for one kind of draw.
     fn stream(&self, what: &str, step: u64, index: u64) -> Stream {
         Stream::new(self.windows.seed, &format!("{}/{what}", self.windows.purpose), step, index)
     }
@@ -95,7 +96,7 @@ impl VqObjective {
         Tensor::from_data(TensorData::new(rows, shape), &self.device)
     }
 
-    /// Quantises the rows of `picks`; `books` gives a layer's codes.
+    /// Quantises the rows of `picks`; `books` returns a layer's codes.
     fn pass<'a>(
         &self,
         rows: Vec<f32>,
@@ -114,8 +115,8 @@ impl VqObjective {
         Pass::through(rows, dim, active, &plain, books, if self.settings.drawn { Some(&mut uniforms) } else { None })
     }
 
-    /// The codebooks that the first step begins with: those that were given, else rows of its batch, each layer's out of what those before
-    /// it leave over.
+    /// The codebooks of the first step: the given ones, otherwise rows of its batch. Each layer's rows are the
+    /// residuals of the layers before it.
     fn first_books(&mut self) -> Rc<Vec<Vec<f32>>> {
         if let Some(first) = &self.first {
             return Rc::clone(first);
@@ -140,7 +141,7 @@ impl VqObjective {
         books
     }
 
-    /// For each place among the rows that codes may be replaced by, the row of the batch that stands there.
+    /// The batch's row for each candidate that may replace a code.
     fn spare_rows(&self, step: u64) -> Vec<usize> {
         let spare = self.spare();
         match self.settings.resets {
@@ -157,7 +158,7 @@ impl VqObjective {
         }
     }
 
-    /// What a slice gives for the codebooks, in the order of [`Objective::sums`].
+    /// A slice's statistics for the codebooks, in the order of [`Objective::sums`].
     fn statistics(&self, pass: &Pass, step: u64, first_row: usize) -> Vec<Vec<f32>> {
         let (codes, dim) = (self.settings.codes, self.settings.code_dim);
         let places = self.spare_rows(step);
@@ -165,7 +166,7 @@ impl VqObjective {
         for (q, layer) in pass.layers.iter().enumerate() {
             let (counts, totals) = layer.statistics(codes, dim);
             for (place, row) in places.iter().enumerate() {
-                // Each slice puts its rows where they belong; all others add zeros there.
+                // Each slice writes its own candidates; all others add zeros there.
                 if let Some(at) = row.checked_sub(first_row).filter(|at| *at < layer.codes.len()) {
                     sums[3 * q][place * dim..(place + 1) * dim].copy_from_slice(&layer.rows[at * dim..(at + 1) * dim]);
                 }
@@ -260,7 +261,7 @@ impl Objective for VqObjective {
     }
 
     fn after(&mut self, after: &mut AfterStep<'_>) -> Result<(), StageError> {
-        // The network is still that which the step was computed with.
+        // The network is still the one of this step.
         let first = (after.step == 0).then(|| self.first_books());
         let (codes, dim) = (self.settings.codes, self.settings.code_dim);
         let active = self.active(after.step);

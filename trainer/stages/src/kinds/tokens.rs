@@ -1,11 +1,14 @@
-//! `train.tokens`: a network that draws token ids for captions. Source: T2M-GPT (Zhang et al., CVPR 2023), MoMask (Guo et al., CVPR 2024),
-//! MMM (Pinyoanuntapong et al., CVPR 2024), whose objective is in `mmm`.
+//! `train.tokens`: a network that draws token ids for captions. Source: T2M-GPT (Zhang et al., CVPR 2023), MoMask (Guo
+//! et al., CVPR 2024), MMM (Pinyoanuntapong et al., CVPR 2024), whose objective is in `mmm`.
 //!
-//! Autoregressive: cross-entropy over tokens and end, on inputs of which a share is replaced by random codes. Masked: cross-entropy over a share of the first layer's tokens that a cosine of a uniform draw gives,
-//! and, for the layers above, over all tokens of a drawn layer given those below it. Its two networks are two groups of one training.
+//! Autoregressive: cross-entropy over tokens and end, with a share of the inputs replaced by random codes. Masked:
+//! cross-entropy over a share of the first layer's tokens, the cosine of a uniform draw. The layers above have
+//! cross-entropy over all tokens of a drawn layer, given those below it. The two networks are two groups of one
+//! training.
 //!
-//! Departs: both of MoMask's networks are trained on one batch, the one of the residual layers not from another stage; clips are shortened by
-//! a token where MoMask shortens the motion before it is encoded; its padded positions count up to `longest`, as its 49 do.
+//! Departs: both of MoMask's networks are trained on one batch, and the residual network is not from another stage.
+//! Clips are shortened by a token, where MoMask shortens the motion before it is encoded. Padded positions extend to
+//! `longest`, like MoMask's to 49.
 
 use std::collections::BTreeMap;
 
@@ -75,7 +78,7 @@ impl Objective for Autoregressive {
     }
 }
 
-/// What the network of the residual layers is asked, of one clip.
+/// A training example of one clip for the residual network.
 struct Asked {
     layer: usize,
     below: Vec<Vec<usize>>,
@@ -94,7 +97,7 @@ struct Masked {
 }
 
 impl Masked {
-    /// The clip at a place as the first layer's network sees it: padded tokens, their number, and what is asked.
+    /// The clip at a place as the first layer's network reads it: padded tokens, their number, and the masked example.
     fn example(&self, pick: Pick) -> (Vec<usize>, usize, masked::Example) {
         let n = self.settings.longest;
         let mut tokens = self.data.layer(pick, 0);
@@ -110,7 +113,7 @@ impl Masked {
     }
 
     fn first_loss(&self, picks: &[Pick], all: &[Pick], drop: &mut Dropout) -> Tensor<1> {
-        // The mean is over all that is asked in the batch, which every slice counts for itself.
+        // The mean is over all masked tokens of the batch, which every slice counts itself.
         let asked = |pick: &Pick| self.example(*pick).2.asked.iter().filter(|asked| **asked).count();
         let count = all.iter().map(asked).sum::<usize>().max(1) as f32;
         let (mut input, mut targets, mut weights, mut lengths) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
@@ -182,7 +185,7 @@ impl Objective for Masked {
         let all = self.data.batch(step);
         let picks = &all[range];
         let mut dropout = Dropout::new(self.settings.network.dropout, self.dropout_seed, step, slice as u64);
-        // The weights divide by what the whole batch asks.
+        // The weights divide by the number in the whole batch.
         let mut losses = Losses::new(1);
         let first = self.first_loss(picks, &all, &mut dropout);
         losses.add("first", first.clone(), 1.0);
@@ -196,7 +199,7 @@ impl Objective for Masked {
     }
 }
 
-/// What the stage reads.
+/// The inputs of the stage.
 struct Inputs {
     data: TokenData,
     meta: GeneratorMeta,
@@ -263,7 +266,7 @@ fn prefixed(prefix: &str, entries: &[Entry]) -> Vec<Entry> {
     entries.iter().map(|e| Entry { name: format!("{prefix}{}", e.name), shape: e.shape.clone() }).collect()
 }
 
-/// Uploads what was trained, under names that say of which network it is.
+/// Uploads the trained networks, each under a prefix of its own.
 fn add_weights(draft: &mut Draft, state: &TrainState) -> Result<(), StageError> {
     let prefixes: &[&str] = if state.groups[0].name == "model" { &[""] } else { &[MASKED_PREFIX, RESIDUAL_PREFIX] };
     let entries: Vec<Vec<Entry>> =

@@ -1,8 +1,9 @@
-//! `train.vae`: the motion VAE. Source: MLD (arXiv:2212.04048) and MotionLCM v2: smooth-L1 on normalised features and on joints in metres, KL
-//! as a mean over all elements.
+//! `train.vae`: the motion VAE. Source: MLD (arXiv:2212.04048) and MotionLCM v2: smooth L1 on normalised features and
+//! on joints in metres, KL as a mean over all elements.
 //!
-//! Ours: an optional first phase on short windows, a term on the speed of feet, terms on joints and feet that may join late, other paths, and batches
-//! of similar length. The unmasked loss of v1 counts padding up to the longest clip of a slice, not of the batch.
+//! Ours: an optional first phase on short windows, a term on the speed of feet, changed paths, and batches of similar
+//! length. Terms on joints and feet may start later. The unmasked loss of v1 counts padding up to the longest clip of a
+//! slice, not of the batch.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use models::kernels::Dropout;
@@ -20,7 +21,7 @@ use crate::train::{GroupPlan, Losses, Objective, Order, Pick, SliceResult, Train
 use crate::warm_start::WarmStart;
 use crate::weights;
 
-/// Batches that are sorted by length together.
+/// Number of batches that are sorted by length together.
 const POOL: usize = 4;
 
 struct VaeObjective {
@@ -38,7 +39,7 @@ struct VaeObjective {
 }
 
 impl VaeObjective {
-    /// Steps that train on windows.
+    /// Number of steps that train on windows.
     fn window_steps(&self) -> u64 {
         self.share(self.settings.windows.until)
     }
@@ -60,7 +61,7 @@ impl VaeObjective {
         }
     }
 
-    /// The slice's places, cuts, and the examples of its whole batch.
+    /// The phase, the slice's places, and the number of examples in its batch.
     fn pick(&mut self, step: u64, slice: usize) -> (u64, Vec<Pick>, usize) {
         let (phase, local) = match step.checked_sub(self.window_steps()) {
             None => (0, step),
@@ -116,7 +117,7 @@ impl Objective for VaeObjective {
         let posterior = self.network.encode(rows.clone(), &lengths, &mut dropout);
         let decoded = self.network.decode(posterior.sample(noise), &lengths, frames, &mut dropout);
 
-        // Early in training the root drift drowns the posture; the terms on joints may join later.
+        // Early in training the root drift dominates the posture; the terms on joints may start later.
         let mut recipe = VaeRecipe::from(self.settings.loss.clone());
         if step < self.share(self.settings.loss.joint_from) {
             recipe.weights.joint = 0.0;
@@ -133,7 +134,7 @@ impl Objective for VaeObjective {
         ];
         for (name, term) in named {
             if let Some(term) = term {
-                // Its weight is in it.
+                // The weight is already applied.
                 losses.add(name, term, 1.0);
             }
         }

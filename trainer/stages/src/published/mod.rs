@@ -1,12 +1,13 @@
-//! Weights that others have published: files of torch or of safetensors, the networks in them, and what of a file is left out.
+//! Published weights: torch or safetensors files, the networks in them, and the unused rest of a file.
 //!
-//! The file is somebody else's. Nothing in a pickle is run, an archive is not unpacked if that makes more of it than it is, and no network is made
-//! before each of its tensors was found in the file with its shape: sizes are read off shapes, and the names and shapes of a network of these sizes
-//! need no memory ([`Init::shapes`](models::networks::Init::shapes)).
+//! The file is not trusted. No code of a pickle is executed, and an archive that would grow beyond its own length is
+//! not unpacked. No network is created before all of its tensors were found in the file with their shapes. Sizes are
+//! derived from shapes, and names and shapes of a network need no memory
+//! ([`Init::shapes`](models::networks::Init::shapes)).
 //!
-//! Files of one network differ in what stands before its names: torch files in the key of a dict (`state_dict`, `vq_model`), and in the module's
-//! name in whatever class was saved (`vae.`, `vqvae.`). Our own exports have the part's role there. Each network knows the beginnings that are in use
-//! and a name that it has in all of them.
+//! Files of one network differ in the prefix of its names. In torch files it is the key of a dict (`state_dict`,
+//! `vq_model`) and the module's name inside the saved class (`vae.`, `vqvae.`). Our own exports have the part's role as
+//! prefix. Each network lists the prefixes in use, and a name that all variants have.
 
 pub mod sizes;
 
@@ -18,13 +19,13 @@ use text_models::{StoredTensor, Weights};
 
 use crate::context::StageError;
 
-/// Tensors in a file; an optimizer's state triples those of a large network, which has a thousand.
+/// Largest number of tensors in a file; an optimizer's state triples the thousand of a large network.
 const TENSORS: usize = 20_000;
-/// Names in an error.
+/// Largest number of names in an error.
 const SHOWN: usize = 20;
 
-/// What networks have in their files and never read, or fill with numbers that follow from its size: tables of positions, masks of causality,
-/// counters. All begin or end like this.
+/// Prefixes and suffixes of tensors that networks never read or compute from their size: tables of positions, causal
+/// masks, counters.
 const CONSTANTS: [&str; 6] = [
     "position_enc.pe",
     "sequence_pos_encoder.pe",
@@ -33,10 +34,10 @@ const CONSTANTS: [&str; 6] = [
     "pos_embed.embed",
     "time_mlp.0.pe",
 ];
-/// What is of another network although it stands among its names, and counters that are no floats.
+/// Names of another network inside a network's own names, and counters that are no floats.
 const FOREIGN: [&str; 2] = ["trans_base.vqvae.", ".num_batches_tracked"];
 
-/// A file with weights, of which nothing but names and shapes is read yet.
+/// A file of weights, with only names and shapes read so far.
 #[derive(Debug)]
 pub struct Checkpoint {
     file: PathBuf,
@@ -47,26 +48,26 @@ pub struct Checkpoint {
 #[derive(Debug, Clone)]
 pub struct Found<'a> {
     checkpoint: &'a Checkpoint,
-    /// What stands before its names.
+    /// Prefix of the network's names.
     prefix: String,
 }
 
-/// A network's values, and what else its file has.
+/// A network's values, and its constants.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Taken {
-    /// In the order of the network's entries.
+    /// Values in the order of the network's entries.
     pub values: Vec<f32>,
-    /// What the published network has besides, and ours needs not: names, shapes, values.
+    /// Tensors of the published network that ours does not need: names, shapes, values.
     pub constants: Vec<(Entry, Vec<f32>)>,
-    /// The names in the file that were read.
+    /// Names in the file that were read.
     pub read: BTreeSet<String>,
 }
 
 impl Checkpoint {
-    /// Reads names and shapes.
+    /// Reads names and shapes of a file.
     ///
     /// # Errors
-    /// Why the file is neither torch's nor safetensors, or promises more than it holds.
+    /// If the file is neither torch's nor safetensors, or declares more data than it holds.
     pub fn open(file: &Path) -> Result<Self, StageError> {
         let weights = Weights::open_file(file).map_err(|e| StageError::Input(e.to_string()))?;
         let found = Self { file: file.to_owned(), weights };
@@ -77,10 +78,10 @@ impl Checkpoint {
         Ok(found)
     }
 
-    /// The network called `what` that has the tensor `marker`, whose names begin in one of `places`.
+    /// Finds the network `what` by its tensor `marker`, with one of the prefixes `places`.
     ///
     /// # Errors
-    /// If there is none; the message lists those that the file has.
+    /// If there is none; the message lists the networks in the file.
     pub fn network(&self, what: &str, places: &[&str], marker: &str) -> Result<Found<'_>, StageError> {
         self.find(places, marker).ok_or_else(|| {
             let groups: Vec<String> = self.groups(|_| true).into_keys().take(SHOWN).collect();
@@ -90,14 +91,14 @@ impl Checkpoint {
         })
     }
 
-    /// As [`network`](Self::network), if there is one.
+    /// Like [`network`](Self::network), or `None` if the file has no such network.
     pub fn find(&self, places: &[&str], marker: &str) -> Option<Found<'_>> {
         let is_there = |place: &&&str| self.weights.tensors().contains_key(&format!("{place}{marker}"));
         let place = places.iter().find(is_there)?;
         Some(Found { checkpoint: self, prefix: (*place).to_owned() })
     }
 
-    /// What of the file was not `read`, in a few words: `t2m_textencoder (19)`; nothing if that is nothing.
+    /// Summarises the names that are not in `read`, such as `t2m_textencoder (19)`; `None` if all were read.
     pub fn left_out(&self, read: &BTreeSet<String>) -> Option<String> {
         let groups = self.groups(|name| !read.contains(name));
         let words: Vec<String> = groups.iter().map(|(group, count)| format!("`{group}` ({count})")).collect();
@@ -106,12 +107,12 @@ impl Checkpoint {
         (shown > 0).then(|| format!("{}{more}", words[..shown].join(", ")))
     }
 
-    /// An error that names the file.
+    /// Makes an error that names the file.
     pub fn refuse(&self, what: impl std::fmt::Display) -> StageError {
         StageError::Input(format!("{}: {what}", self.file.display()))
     }
 
-    /// Tensors by the first word of their names, or the first two where the first is the dict of all.
+    /// Counts tensors by the first word of their names, or by the first two words inside a dict that holds everything.
     fn groups(&self, counts: impl Fn(&str) -> bool) -> BTreeMap<String, usize> {
         let mut groups = BTreeMap::new();
         let names = self.weights.tensors().keys().chain(self.weights.others().keys());
@@ -125,7 +126,7 @@ impl Checkpoint {
 }
 
 impl Found<'_> {
-    /// What stands before its names.
+    /// Prefix of the network's names.
     pub fn prefix(&self) -> &str {
         &self.prefix
     }
@@ -134,7 +135,7 @@ impl Found<'_> {
         self.checkpoint.weights.tensors().get(&format!("{}{name}", self.prefix))
     }
 
-    /// Whether it has a tensor.
+    /// Returns true if the network has a tensor `name`.
     pub fn has(&self, name: &str) -> bool {
         self.tensor(name).is_some()
     }
@@ -142,10 +143,10 @@ impl Found<'_> {
     /// The length of an axis of a tensor.
     ///
     /// # Errors
-    /// If it has no such tensor, or that has fewer axes or holds nothing.
+    /// If there is no such tensor, or it has fewer axes or no elements.
     pub fn dim(&self, name: &str, axis: usize) -> Result<usize, StageError> {
         let shape = self.tensor(name).map(|tensor| &tensor.shape[..]).unwrap_or_default();
-        // With an axis of 0 the others cost nothing, and may be any number.
+        // With an axis of 0 the other axes cost nothing and may be any number.
         if shape.contains(&0) {
             return Err(self.refuse(format!("`{}{name}` has shape {shape:?}, which holds nothing", self.prefix)));
         }
@@ -153,7 +154,7 @@ impl Found<'_> {
         shape.get(axis).copied().ok_or_else(missing)
     }
 
-    /// How many entries the list `stem` has: `stem.0.`, `stem.1.` and so on.
+    /// Number of entries of the list `stem`: `stem.0.`, `stem.1.` and so on.
     pub fn count(&self, stem: &str) -> usize {
         let has = |i: &usize| {
             let begin = format!("{}{stem}.{i}.", self.prefix);
@@ -163,15 +164,16 @@ impl Found<'_> {
         (0..TENSORS).take_while(has).count()
     }
 
-    /// An error that names the file.
+    /// Makes an error that names the file.
     pub fn refuse(&self, what: impl std::fmt::Display) -> StageError {
         self.checkpoint.refuse(what)
     }
 
-    /// The values of `entries`, each read under its name or the one that `alias` gives.
+    /// Reads the values of `entries`, each under its own name or the one that `alias` returns.
     ///
     /// # Errors
-    /// All tensors that are missing, have another shape, or are there although the network has none of that name; values that are not finite.
+    /// All missing tensors, those with another shape, and those in the file that the network lacks; values that are not
+    /// finite.
     pub fn take(&self, entries: &[Entry], alias: &dyn Fn(&str) -> String) -> Result<Taken, StageError> {
         let names: Vec<String> = entries.iter().map(|entry| alias(&entry.name)).collect();
         let mut wrong = Vec::new();
@@ -226,7 +228,7 @@ impl Found<'_> {
         let values_of = |name: &str, tensor: &StoredTensor| {
             tensor.values().map_err(|e| self.refuse(format!("`{}{name}`: {e}", self.prefix)))
         };
-        // All of them are there, so this is no more than the file.
+        // All of them are in the file, so this is at most its size.
         let mut values = Vec::with_capacity(entries.iter().map(Entry::len).sum());
         for name in names {
             let Some(tensor) = self.tensor(name) else { continue };

@@ -1,7 +1,7 @@
-//! Sizes of published networks, read off the shapes of their weights. Where they stand in files is said beside them.
+//! Sizes of published networks, derived from the shapes of their weights, and the places of networks in files.
 //!
-//! A size is read off a tensor that holds as many numbers, and every other tensor of the network is held against the sizes before anything is
-//! made of them.
+//! A size comes from a tensor with that many elements along an axis. Every other tensor of the network is compared with
+//! the sizes before anything is allocated.
 
 use models::networks::{
     DenoiserConfig, GptConfig, MdmConfig, MmmConfig, MomaskConfig, Projection, TimeFeatures, TrajectoryConfig,
@@ -15,36 +15,36 @@ use crate::context::StageError;
 
 /// Added to variances in layer norms.
 const NORM_EPS: f64 = 1e-5;
-/// Levels of every published tokenizer, and what each shortens by.
+/// Number of levels of every published tokenizer; each halves the frames.
 const LEVELS: usize = 2;
 const STRIDE: usize = 2;
-/// Most blocks of a network one after the other, and most codebooks.
+/// Largest number of a network's consecutive blocks, and of codebooks.
 const BLOCKS: usize = 255;
-/// Most blocks of a tokenizer's level.
+/// Largest number of residual blocks in a tokenizer's level.
 const DEPTH: usize = 16;
 
 type Result<T> = std::result::Result<T, StageError>;
 
-/// MLD's and MotionLCM's VAE.
+/// Finds MLD's or MotionLCM's VAE.
 pub fn vae(file: &Checkpoint) -> Result<Found<'_>> {
     file.network("VAE", &VAE, VAE_MARKER)
 }
 
-/// The same, if there is one.
+/// Like [`vae`], or `None` if the file has none.
 pub fn find_vae(file: &Checkpoint) -> Option<Found<'_>> {
-    // Without anything before them these are names of others too.
+    // Without a prefix other networks have these names too.
     file.find(&VAE[..2], VAE_MARKER)
 }
 
 const VAE: [&str; 4] = ["state_dict.vae.", "vae.", "state_dict.", ""];
 const VAE_MARKER: &str = "query_pos_decoder.pe";
 
-/// MLD's and MotionLCM's denoiser.
+/// Finds MLD's or MotionLCM's denoiser.
 pub fn denoiser(file: &Checkpoint) -> Result<Found<'_>> {
     file.network("denoiser", &DENOISER, DENOISER_MARKER)
 }
 
-/// The same, if there is one.
+/// Like [`denoiser`], or `None` if the file has none.
 pub fn find_denoiser(file: &Checkpoint) -> Option<Found<'_>> {
     file.find(&DENOISER[..2], DENOISER_MARKER)
 }
@@ -52,23 +52,23 @@ pub fn find_denoiser(file: &Checkpoint) -> Option<Found<'_>> {
 const DENOISER: [&str; 4] = ["state_dict.denoiser.", "denoiser.", "state_dict.", ""];
 const DENOISER_MARKER: &str = "time_embedding.linear_1.weight";
 
-/// MotionLCM's ControlNet.
+/// Finds MotionLCM's ControlNet.
 pub fn controlnet(file: &Checkpoint) -> Result<Found<'_>> {
     file.network("ControlNet", &["state_dict.controlnet.", "controlnet."], "controlnet_cond_embedding.0.weight")
 }
 
-/// MotionLCM's trajectory encoder.
+/// Finds MotionLCM's trajectory encoder.
 pub fn trajectory_encoder(file: &Checkpoint) -> Result<Found<'_>> {
     file.network("trajectory encoder", &["state_dict.traj_encoder.", "traj_encoder."], "skel_embedding.weight")
 }
 
-/// The tokenizer of T2M-GPT, MMM and MoMask.
+/// Finds the tokenizer of T2M-GPT, MMM or MoMask.
 pub fn tokenizer(file: &Checkpoint) -> Result<Found<'_>> {
     let places = ["vq_model.", "net.vqvae.", "net.", "vqvae.", "tokenizer.", ""];
     file.network("tokenizer", &places, "encoder.model.0.weight")
 }
 
-/// MoMask's masked transformer.
+/// Finds MoMask's masked transformer.
 pub fn masked(file: &Checkpoint) -> Result<Found<'_>> {
     file.network(
         "masked transformer",
@@ -77,32 +77,32 @@ pub fn masked(file: &Checkpoint) -> Result<Found<'_>> {
     )
 }
 
-/// MoMask's residual transformer.
+/// Finds MoMask's residual transformer.
 pub fn residual(file: &Checkpoint) -> Result<Found<'_>> {
     file.network("residual transformer", &["res_transformer.", "res.", "generator.res.", ""], "quant_emb.weight")
 }
 
-/// T2M-GPT's transformer.
+/// Finds T2M-GPT's transformer.
 pub fn gpt(file: &Checkpoint) -> Result<Found<'_>> {
     file.network("transformer of T2M-GPT", &["trans.", "generator.", ""], "trans_base.tok_emb.weight")
 }
 
-/// MMM's transformer.
+/// Finds MMM's transformer.
 pub fn mmm(file: &Checkpoint) -> Result<Found<'_>> {
     file.network("transformer of MMM", &["trans.", "generator.", ""], "trans_base.learn_tok_emb.weight")
 }
 
-/// MDM, the average of its weights first.
+/// Finds MDM, preferring the average of its weights.
 pub fn mdm(file: &Checkpoint) -> Result<Found<'_>> {
     file.network("MDM", &["model_avg.", "model.", "state_dict.", "denoiser.", ""], "embed_timestep.time_embed.0.weight")
 }
 
-/// DisCoRD's U-Net.
+/// Finds DisCoRD's U-Net.
 pub fn unet(file: &Checkpoint) -> Result<Found<'_>> {
     file.network("U-Net of DisCoRD", &["", "state_dict.", "model.", "decoder."], "net.init_proj.weight")
 }
 
-/// Entries of a list of blocks, which may be no more than any network has.
+/// Number of entries in a list of blocks. Refuses more than any network has.
 fn listed(found: &Found<'_>, stem: &str) -> Result<usize> {
     let count = found.count(stem);
     if count > BLOCKS {
@@ -120,7 +120,7 @@ fn stack(found: &Found<'_>, stem: &str) -> Result<(usize, usize, usize)> {
     ))
 }
 
-/// The same of blocks one after the other.
+/// Width, layers and feed-forward width of consecutive blocks.
 fn blocks(found: &Found<'_>, stem: &str) -> Result<(usize, usize, usize)> {
     Ok((
         found.dim(&format!("{stem}.0.self_attn.in_proj_weight"), 1)?,
@@ -137,19 +137,19 @@ fn divided(found: &Found<'_>, width: usize, heads: usize) -> Result<usize> {
     Err(found.refuse(format!("it is {width} wide, which {heads} attention heads do not divide; set `heads`")))
 }
 
-/// A number that is left when `less` is taken away.
+/// An axis of a tensor minus `less`. Refuses a result below 1.
 fn without(found: &Found<'_>, name: &str, axis: usize, less: usize) -> Result<usize> {
     let all = found.dim(name, axis)?;
     let few = || found.refuse(format!("`{name}` has {all} rows; expected more than {less}"));
     all.checked_sub(less).filter(|rest| *rest > 0).ok_or_else(few)
 }
 
-/// Of a VAE.
+/// Sizes of a VAE.
 pub fn of_vae(found: &Found<'_>, heads: usize) -> Result<VaeConfig> {
     let (width, layers, feed_forward) = stack(found, "encoder")?;
     let projection = found.has("latent_pre.weight");
     let tokens = found.dim("global_motion_token", 0)?;
-    // Each latent token has a mean and a deviation, and they stand before the frames.
+    // Each latent token has a mean and a deviation, and they precede the frames.
     let most = 2 * limits::LATENT_TOKENS;
     if !tokens.is_multiple_of(2) || tokens as u64 > most {
         return Err(
@@ -169,14 +169,16 @@ pub fn of_vae(found: &Found<'_>, heads: usize) -> Result<VaeConfig> {
     })
 }
 
-/// Of a denoiser of latents of `tokens` tokens, which its weights do not say; the ReLU is left open.
+/// Sizes of a denoiser of latents of `tokens` tokens, which the weights do not show. The ReLU is assumed without
+/// projections.
 pub fn of_denoiser(found: &Found<'_>, tokens: usize, heads: usize) -> Result<DenoiserConfig> {
     let (width, layers, feed_forward) = stack(found, "encoder")?;
     let projection = found.has("latent_pre.weight");
     let guided = "time_embedding.cond_proj.weight";
     let guidance_dim = if found.has(guided) { Some(found.dim(guided, 1)?) } else { None };
     let time_dim = found.dim(DENOISER_MARKER, 1)?;
-    // Pairs of a sine and a cosine; between the frequencies of two pairs there is a step.
+    // Pairs of a sine and a cosine; the guidance has at least two pairs, since its frequencies divide by their number
+    // less one.
     for (what, dim, least) in [("time", time_dim, 2), ("guidance", guidance_dim.unwrap_or(4), 4)] {
         if dim < least || !dim.is_multiple_of(2) {
             return Err(found.refuse(format!("its {what} is {dim} numbers; expected an even number, at least {least}")));
@@ -198,7 +200,7 @@ pub fn of_denoiser(found: &Found<'_>, tokens: usize, heads: usize) -> Result<Den
     })
 }
 
-/// Of a trajectory encoder.
+/// Sizes of a trajectory encoder.
 pub fn of_trajectory(found: &Found<'_>, heads: usize) -> Result<TrajectoryConfig> {
     let (width, layers, feed_forward) = stack(found, "encoder")?;
     let projection = found.has("latent_proj.weight");
@@ -221,7 +223,7 @@ pub fn of_trajectory(found: &Found<'_>, heads: usize) -> Result<TrajectoryConfig
     })
 }
 
-/// Sizes as settings have them.
+/// Sizes in the form of settings.
 pub fn network(width: usize, layers: usize, heads: usize, feed_forward: usize) -> Network {
     Network { width, layers, heads, feed_forward, positions: Positions::Uniform, ..Network::default() }
 }
@@ -231,21 +233,21 @@ pub fn network(width: usize, layers: usize, heads: usize, feed_forward: usize) -
 pub struct TokenizerSizes {
     /// Features per frame.
     pub features: usize,
-    /// Codes of a codebook.
+    /// Number of codes of a codebook.
     pub codes: usize,
     /// Width of a code.
     pub code_dim: usize,
-    /// Codebooks.
+    /// Number of codebooks.
     pub quantizers: usize,
     /// Width of the convolutions.
     pub width: usize,
-    /// Residual blocks of a level.
+    /// Number of residual blocks per level.
     pub depth: usize,
-    /// Whether the only codebook has no number in its name (T2M-GPT, MMM).
+    /// True if the only codebook has no number in its name (T2M-GPT, MMM).
     pub single: bool,
 }
 
-/// Of a tokenizer.
+/// Sizes of a tokenizer.
 pub fn of_tokenizer(found: &Found<'_>) -> Result<TokenizerSizes> {
     let single = found.has("quantizer.codebook");
     let first = if single { "quantizer.codebook" } else { "quantizer.layers.0.codebook" };
@@ -270,7 +272,7 @@ pub fn of_tokenizer(found: &Found<'_>) -> Result<TokenizerSizes> {
     })
 }
 
-/// Of MoMask's masked transformer; how many codebooks there are it does not say.
+/// Sizes of MoMask's masked transformer; its weights do not show the number of codebooks.
 pub fn of_masked(found: &Found<'_>, quantizers: usize, heads: usize) -> Result<MomaskConfig> {
     let (width, layers, feed_forward) = blocks(found, "seqTransEncoder.layers")?;
     Ok(MomaskConfig {
@@ -285,7 +287,7 @@ pub fn of_masked(found: &Found<'_>, quantizers: usize, heads: usize) -> Result<M
     })
 }
 
-/// Of MoMask's residual transformer, with shared weights as published.
+/// Sizes of MoMask's residual transformer, with shared weights as published.
 pub fn of_residual(found: &Found<'_>, heads: usize) -> Result<MomaskConfig> {
     if found.has("output_proj_bias") {
         return Err(found
@@ -308,7 +310,7 @@ pub fn of_residual(found: &Found<'_>, heads: usize) -> Result<MomaskConfig> {
     })
 }
 
-/// Positions of T2M-GPT or MMM, the caption's and the end's counted: its tables' rows.
+/// Number of positions of T2M-GPT or MMM, including caption and end, from the rows of the tables.
 fn positions(found: &Found<'_>, longest: usize) -> Result<usize> {
     let table =
         ["trans_base.pos_embed.embed", "trans_base.pos_embedding.weight"].into_iter().find(|name| found.has(name));
@@ -319,7 +321,7 @@ fn positions(found: &Found<'_>, longest: usize) -> Result<usize> {
     Ok(block)
 }
 
-/// Feed-forward width over the width.
+/// Feed-forward width as a multiple of the width.
 fn rate(found: &Found<'_>, name: &str, width: usize) -> Result<usize> {
     let wide = found.dim(name, 0)?;
     if !wide.is_multiple_of(width) {
@@ -328,7 +330,7 @@ fn rate(found: &Found<'_>, name: &str, width: usize) -> Result<usize> {
     Ok(wide / width)
 }
 
-/// Of T2M-GPT's transformer; `longest` tokens where the file has no table of positions.
+/// Sizes of T2M-GPT's transformer; `longest` tokens if the file has no table of positions.
 pub fn of_gpt(found: &Found<'_>, longest: usize, heads: usize) -> Result<GptConfig> {
     let width = found.dim("trans_base.blocks.0.attn.key.weight", 0)?;
     Ok(GptConfig {
@@ -342,7 +344,7 @@ pub fn of_gpt(found: &Found<'_>, longest: usize, heads: usize) -> Result<GptConf
     })
 }
 
-/// Of MMM's transformer.
+/// Sizes of MMM's transformer.
 pub fn of_mmm(found: &Found<'_>, longest: usize, heads: usize) -> Result<MmmConfig> {
     let width = found.dim("trans_head.blocks.0.attn.key.weight", 0)?;
     let layers = listed(found, "trans_head.blocks")?;
@@ -359,7 +361,7 @@ pub fn of_mmm(found: &Found<'_>, longest: usize, heads: usize) -> Result<MmmConf
     })
 }
 
-/// Of MDM.
+/// Sizes of MDM's transformer.
 pub fn of_mdm(found: &Found<'_>, heads: usize) -> Result<MdmConfig> {
     let (width, layers, feed_forward) = blocks(found, "seqTransEncoder.layers")?;
     if !width.is_multiple_of(2) {
@@ -376,7 +378,7 @@ pub fn of_mdm(found: &Found<'_>, heads: usize) -> Result<MdmConfig> {
     })
 }
 
-/// Of DisCoRD's U-Net, of two levels as published; `attention` is the heads and their width, if it has any.
+/// Sizes of DisCoRD's U-Net, of two levels as published; `attention` is its heads and their width, if it has any.
 pub fn of_unet(found: &Found<'_>, attention: (usize, usize)) -> Result<UnetConfig> {
     let projection = "net.condition_projection";
     let features = found.dim("net.final_conv.weight", 0)?;

@@ -1,4 +1,4 @@
-//! A model that knows one long motion and draws what comes next in it: a stream of its segments is that motion.
+//! A model that stores one long motion and generates its next frames: a stream of its segments equals that motion.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -16,9 +16,9 @@ const FRAMES: usize = 400;
 
 #[derive(Debug, Default)]
 struct Said {
-    /// Frames that the stream has.
+    /// Number of frames that the stream has.
     given: usize,
-    /// What was told of the last segment.
+    /// Hints of the last segment.
     hints: Vec<Hint>,
 }
 
@@ -53,7 +53,7 @@ fn body() -> &'static Skeleton {
 }
 
 impl Scripted {
-    /// Frames of the motion from `overlap` before what the stream has.
+    /// Frames of the motion, starting `overlap` frames before the stream's end.
     fn next(&self, overlap: usize, frames: usize) -> Vec<f32> {
         let start = self.said.borrow().given - overlap;
         self.rows[start * body().features..(start + frames) * body().features].to_vec()
@@ -85,7 +85,7 @@ impl MotionGenerator for Scripted {
         let hints = batch.control.map(|control| control.hints.to_vec()).unwrap_or_default();
         let told =
             hints.iter().flat_map(Hint::iter).map(|(frame, ..)| frame).collect::<std::collections::BTreeSet<_>>();
-        // Waypoints of the tests are not in the frames that are told.
+        // Waypoints of the tests are outside the overlap.
         let overlap = (0..).take_while(|frame| told.contains(frame)).count();
         self.said.borrow_mut().hints = hints;
         let overlap = if self.control.is_some() { overlap } else { self.said.borrow().given.min(1) };
@@ -115,7 +115,7 @@ impl Infilling for Scripted {
     }
 }
 
-/// A long motion, a stream of it, and what the model heard.
+/// A long motion, a stream of it, and the model's record of its inputs.
 fn scripted(joining: Joining) -> (Vec<f32>, Generator, MotionStream, Rc<RefCell<Said>>) {
     let mut rows = vec![0.0; FRAMES * body().features];
     let mut draw = Stream::new(Seed(1), "script", 0, 0);
@@ -152,7 +152,8 @@ fn ask(frames: Option<usize>) -> Ask {
     Ask { caption: "a person walks".into(), frames, waypoints: vec![] }
 }
 
-/// Laid down by one frame, a segment does not know how fast the stream's end moved, and fades from a guess; behind the fade it is where it should be.
+/// Checks frames against the motion. A segment placed by one frame does not have the stream's velocity, and fades from
+/// a guess; after the fade it must agree.
 fn assert_near(found: &[f64], expected: &[f32], joining: Joining, junctions: &[usize]) {
     let fades = |t: usize| joining == Joining::Placement && junctions.iter().any(|at| (*at..at + BLEND).contains(&t));
     for (i, (a, b)) in found.iter().zip(expected).enumerate().filter(|(i, _)| !fades(i / 66)) {
@@ -170,7 +171,7 @@ fn segments_of_one_motion_are_that_motion() {
         let (rows, generator, mut stream, said) = scripted(joining);
         let whole = recover_joints(&rows, body());
         let (mut all, mut junctions) = (Vec::new(), Vec::new());
-        // The last two are longer than the model draws at once, and as long as it likes.
+        // The last two requests: longer than the model generates at once, and the model's own length.
         for (frames, overlap) in [Some(40), Some(33), Some(60), Some(39), None].into_iter().zip(overlaps) {
             let segment = stream.draw(&generator, &ask(frames)).unwrap();
             assert_eq!((segment.frames, segment.overlap), (frames.unwrap_or(80 - overlap), overlap), "{joining:?}");
@@ -180,7 +181,7 @@ fn segments_of_one_motion_are_that_motion() {
             said.borrow_mut().given += segment.frames;
         }
         assert_near(&all, &whole, joining, &junctions);
-        // What was told of the last segment are the six joints of the frames before it, from the origin, facing z.
+        // The targets of the last segment are the six joints of the frames before it, from the origin, facing z.
         if joining == Joining::Control {
             let start = said.borrow().given - 60 - 20;
             let local = recover_joints(&rows[start * body().features..][..80 * body().features], body());
@@ -205,7 +206,7 @@ fn what_is_taken_back_is_drawn_anew() {
         let segment = stream.draw(&generator, &ask(Some(40))).unwrap();
         all.extend(segment.joints);
         assert_near(&all, &recover_joints(&rows, body()), joining, &[27]);
-        // Hardly anything is left to go on from.
+        // Hardly any frames are left to continue from.
         stream.cut(0);
         stream.cut(0);
         assert!(stream.draw(&generator, &ask(Some(10))).is_ok());
@@ -238,14 +239,14 @@ fn a_difference_fades() {
     for joining in [Joining::Control, Joining::Placement] {
         let (rows, generator, mut stream, said) = scripted(joining);
         let first = stream.draw(&generator, &ask(Some(40))).unwrap();
-        // As if it had forgotten where it was.
+        // Makes the model continue at another frame of its motion.
         said.borrow_mut().given = 200;
         let second = stream.draw(&generator, &ask(Some(40))).unwrap();
         assert!(second.offset > 0.1, "{}", second.offset);
         let far = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
         let (last, new) = (&first.joints[39 * 66..], &second.joints[..66]);
         assert!(far(last, new) < 0.5 * second.offset, "{} of {}", far(last, new), second.offset);
-        // Behind the fade it is the other motion, as it lies in the world.
+        // After the fade it is the other motion, placed in the world.
         let own = recover_joints(&rows[199 * body().features..][..41 * body().features], body());
         let own: Vec<f64> = own.into_iter().map(f64::from).collect();
         let distance = |joints: &[f64], t: usize| {
@@ -253,7 +254,7 @@ fn a_difference_fades() {
             (0..3).map(|axis| (at(21, axis) - at(0, axis)).powi(2)).sum::<f64>().sqrt()
         };
         assert!((distance(&second.joints, 30) - distance(&own, 31)).abs() < 1e-3);
-        // The root goes as it does there, from where the stream stood: nothing of the way is made up for.
+        // The root moves as in the other motion, starting at the stream's place: no distance is made up for.
         let way = |joints: &[f64], t: usize, to: usize| {
             let root = |t: usize, axis: usize| joints[t * 66 + axis];
             (root(to, 0) - root(t, 0)).hypot(root(to, 2) - root(t, 2))

@@ -1,4 +1,4 @@
-//! An attempt at a stage whose world is memory, and what came of it.
+//! An attempt at a stage with a world in memory, and its results.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -11,7 +11,7 @@ use protocol::{Digest, Manifest};
 
 use crate::context::{AttemptContext, ContextError, Outcome};
 
-/// Locks, whether or not another thread panicked while it held the lock: the panic is reported where it happened.
+/// Locks even if another thread panicked with the lock held: the panic is reported where it happened.
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
@@ -23,7 +23,7 @@ pub struct MemoryBlobs {
 }
 
 impl MemoryBlobs {
-    /// Bytes of all blobs together.
+    /// Total number of bytes of all blobs.
     pub fn total_bytes(&self) -> usize {
         lock(&self.blobs).values().map(|b| b.len()).sum()
     }
@@ -41,35 +41,35 @@ impl Blobs for MemoryBlobs {
     }
 }
 
-/// What an attempt told the world.
+/// Reports of an attempt.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Told {
-    /// Log lines.
+    /// Lines of the user's log.
     pub log: Vec<String>,
-    /// Values by step: step, name, value.
+    /// Recorded values: step, name, value.
     pub records: Vec<(u64, String, f64)>,
     /// The last progress: done, total, unit.
     pub progress: Option<(u64, u64, String)>,
 }
 
-/// An attempt whose world is memory.
+/// An attempt context with a world in memory.
 #[derive(Debug)]
 pub struct MemoryAttempt {
     task: StageTask,
     device: Device,
     blobs: Arc<MemoryBlobs>,
     stop: Arc<AtomicBool>,
-    /// What it was told.
+    /// Reports of the attempt so far.
     pub told: Told,
 }
 
 impl MemoryAttempt {
-    /// An attempt at `task` that computes on `device`.
+    /// Creates an attempt at `task` that computes on `device`.
     pub fn new(task: StageTask, device: Device, blobs: Arc<MemoryBlobs>) -> Self {
         Self { task, device, blobs, stop: Arc::default(), told: Told::default() }
     }
 
-    /// Makes [`AttemptContext::interrupted`] true once set.
+    /// A flag that makes [`AttemptContext::interrupted`] true once set.
     pub fn stop_switch(&self) -> Arc<AtomicBool> {
         Arc::clone(&self.stop)
     }
@@ -125,17 +125,17 @@ impl AttemptContext for MemoryAttempt {
     }
 }
 
-/// What a stage gave.
+/// Result of a stage.
 #[derive(Debug, Clone)]
 pub struct Ran {
-    /// How it ended.
+    /// Outcome of the stage.
     pub outcome: Outcome,
-    /// What it told: of a map stage its merge, of a gang its last leader.
+    /// Reports: those of a map stage's merge, or of a gang's last leader.
     pub told: Told,
 }
 
 impl Ran {
-    /// The output's manifest.
+    /// Digest of the output's manifest.
     ///
     /// # Panics
     /// If the stage yielded.
@@ -146,7 +146,7 @@ impl Ran {
         }
     }
 
-    /// The final values.
+    /// Final metrics of the stage.
     ///
     /// # Panics
     /// If the stage yielded.

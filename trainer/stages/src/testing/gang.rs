@@ -1,7 +1,7 @@
 //! A gang of threads around one lock.
 //!
-//! A change of membership starts a new generation; a member that waits in an older one is told to regroup. Contributions of an
-//! unfinished step are dropped with their generation, a finished sum stays readable.
+//! A change of membership starts a new generation; a member that waits in an older one must regroup. Contributions to
+//! an unfinished step are dropped with their generation; a finished sum stays readable.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -16,18 +16,18 @@ use super::attempt::{MemoryAttempt, Ran, Told, lock};
 use crate::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Outcome, Rendezvous, StageError};
 use crate::train::tree_sum;
 
-/// Who leaves or joins a gang, and when. Members are numbered from 0; the lowest alive leads.
+/// Losses and joins of a gang's members. Members are numbered from 0; the lowest alive member leads.
 #[derive(Debug, Clone, Default)]
 pub struct Script {
-    /// Member and step: it is lost when it would contribute to that step.
+    /// Member and step: the member is lost when it would contribute to that step.
     pub lost: Vec<(usize, u64)>,
-    /// Member and step: it is lost when it commits the checkpoint of that step.
+    /// Member and step: the member is lost when it commits the checkpoint of that step.
     pub lost_saving: Vec<(usize, u64)>,
-    /// Members that had only initialised themselves: the one whose state they take over is lost while it arrives, once.
+    /// Members that only initialised themselves: the peer whose state they adopt is lost during the transfer, once.
     pub lost_donating: Vec<usize>,
-    /// Member and step: it starts once that step is summed. Its number is above those of the first members.
+    /// Member and step: the member starts once that step is summed. Its number is above those of the first members.
     pub joins: Vec<(usize, u64)>,
-    /// All members are told to stop after applying this step.
+    /// All members must stop after applying this step.
     pub drain: Option<u64>,
 }
 
@@ -41,7 +41,7 @@ struct State {
     slices: BTreeMap<usize, Vec<f32>>,
     summed: Option<(u64, Arc<Vec<f32>>)>,
     checkpoints: Vec<(u64, Manifest)>,
-    /// Some member's thread has ended: nobody joins any more.
+    /// Some member's thread has ended; no further member joins.
     over: bool,
 }
 
@@ -69,7 +69,7 @@ struct Member {
     gang: Arc<Gang>,
     generation: u64,
     members: Vec<usize>,
-    /// It came to the last rendezvous with a state.
+    /// True if the member had a state at the last rendezvous.
     has_own: bool,
     lost_at: Option<u64>,
     lost_saving: Option<u64>,
@@ -87,13 +87,13 @@ impl Member {
     }
 }
 
-/// What a member runs.
+/// The code that a member runs.
 pub type Body<'a> = dyn Fn(&mut dyn GangContext) -> Result<Outcome, StageError> + Sync + 'a;
 
-/// How a member's thread ended: who, with what (`None` if it never became a member), and what it told.
+/// End of a member's thread: its number, its result (`None` if it never became a member), and its reports.
 type Ended = (usize, Option<Result<Outcome, StageError>>, Told);
 
-/// Runs `body` with `count` members; `saved` are its checkpoints, old and new.
+/// Runs `body` with `count` members; `saved` holds its checkpoints, old and new.
 pub(super) fn run(
     attempt: impl Fn() -> MemoryAttempt,
     count: usize,
@@ -156,13 +156,13 @@ pub(super) fn run(
     *saved = std::mem::take(&mut lock(&gang.state).checkpoints);
     let ends_early =
         |me: usize| script.lost.iter().chain(&script.lost_saving).chain(&script.joins).any(|(who, _)| *who == me);
-    // Members that hold their state hear that it is over once the leader has reported.
+    // Holding members learn that the stage is over once the leader has reported.
     let reported = results.iter().any(|(_, result, _)| matches!(result, Some(Ok(_))));
     let mut ran: Option<Ran> = None;
     for (me, result, told) in results {
         match result {
             Some(Ok(outcome)) => {
-                // The lowest that is left led at the end and reports; the others must agree with it on how it ended.
+                // The lowest remaining member led at the end and reports; the others must have the same outcome.
                 if let Some(leader) = &ran {
                     let agree = std::mem::discriminant(&leader.outcome) == std::mem::discriminant(&outcome);
                     assert!(agree, "member {me} ended with {outcome:?}, the leader with {:?}", leader.outcome);
@@ -178,7 +178,7 @@ pub(super) fn run(
     ran.ok_or_else(|| StageError::Fault("every member of the gang was lost".into()))
 }
 
-/// Waits until `step` is summed, then becomes a member. False if the stage ended before.
+/// Waits until `step` is summed, then becomes a member. Returns false if the stage ended before.
 fn join(member: &mut Member, step: u64) -> bool {
     let mut state = lock(&member.gang.state);
     while !state.over && state.summed.as_ref().is_none_or(|(at, _)| *at < step) {
@@ -233,7 +233,7 @@ impl GangContext for Member {
         let gang = Arc::clone(&self.gang);
         let mut state = lock(&gang.state);
         loop {
-            // Only one that joined after the last step can find it so.
+            // Only a member that joined after the last step can see this.
             if state.over || !state.members.contains(&self.me) {
                 return Err(ContextError::GrantEnded("the gang went on without this member".into()));
             }
@@ -280,7 +280,7 @@ impl GangContext for Member {
         }
         let Some(donated) = state.donated.as_ref().filter(|_| state.generation == self.generation) else {
             if !self.has_own {
-                // As far as it came.
+                // The part that arrived before the loss.
                 into.iter_mut().for_each(|piece| piece.fill(0xff));
             }
             return Ok(Adopted::Cut);
@@ -392,7 +392,7 @@ mod tests {
         assert_eq!(tree_sum(&parts[..1]), parts[0]);
     }
 
-    /// A loop without a network: its state is a number that each step maps to another, and the steps done.
+    /// A loop without a network: its state is a number that each step maps to another, and the step count.
     fn body(cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
         let fault = |e: serde_json::Error| StageError::Fault(e.to_string());
         let saved = cx.latest_checkpoint()?;

@@ -1,4 +1,4 @@
-//! The importer of evaluators on the bytes of a file: what `tests/hostile.rs` and `fuzz/` run.
+//! The importer of evaluators on arbitrary bytes, for `tests/hostile.rs` and `fuzz/`.
 
 use std::fs;
 use std::path::PathBuf;
@@ -11,10 +11,10 @@ use super::Bench;
 use crate::context::StageError;
 use crate::words::{WORD_WIDTH, Words};
 
-/// Runs what is called `name`: whether the bytes were accepted.
+/// Runs the function `name`, and returns true if it accepted the bytes.
 ///
 /// # Panics
-/// If there is no such function, or it breaks on the bytes.
+/// If there is no such function, or it fails on the bytes in another way than refusing them.
 pub fn run(name: &str, bytes: &[u8]) -> bool {
     match name {
         "evaluator" => evaluator(bytes),
@@ -30,7 +30,7 @@ pub(super) fn folder(name: &str) -> PathBuf {
     folder
 }
 
-/// A weak point of ours, rather than of the file.
+/// True if the bytes were accepted, false if refused. A fault of ours panics.
 pub(super) fn accepted<T>(result: Result<T, StageError>) -> bool {
     if let Err(error @ StageError::Fault(_)) = &result {
         panic!("{error}");
@@ -38,10 +38,10 @@ pub(super) fn accepted<T>(result: Result<T, StageError>) -> bool {
     result.is_ok()
 }
 
-/// `import.evaluator` of weights: a torch file if the first byte is even, safetensors if it is odd.
+/// Runs `import.evaluator` on weights: a torch file if the first byte is even, safetensors if it is odd.
 ///
 /// # Panics
-/// If it breaks on them.
+/// If it fails in another way than refusing them.
 pub fn evaluator(bytes: &[u8]) -> bool {
     let Some((which, bytes)) = bytes.split_first() else { return false };
     let root = folder("evaluator");
@@ -55,7 +55,7 @@ pub fn evaluator(bytes: &[u8]) -> bool {
     }
     let names = ["finest.tar", "finest.safetensors"];
     let (here, other) = if which % 2 == 0 { (names[0], names[1]) } else { (names[1], names[0]) };
-    // There is none the first time.
+    // There is no such file the first time.
     let _ = fs::remove_file(root.join(other));
     fs::write(root.join(here), bytes).expect("a file of ours");
     let path = root.display().to_string();
@@ -64,10 +64,10 @@ pub fn evaluator(bytes: &[u8]) -> bool {
     accepted(bench.run("evaluator", &StageSettings::ImportEvaluator(settings), &[]))
 }
 
-/// The pickled index of a vocabulary of four words.
+/// Reads the bytes as the pickled index of a vocabulary of four words.
 ///
 /// # Panics
-/// If the reader breaks on it.
+/// If the reader fails in another way than refusing them.
 pub fn vocabulary(bytes: &[u8]) -> bool {
     let root = folder("words");
     let vectors = root.join("our_vab_data.npy");

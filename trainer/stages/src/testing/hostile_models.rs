@@ -1,7 +1,7 @@
-//! `import.model` on the bytes of a file, for every part: what `tests/hostile.rs` and `fuzz/` run, and small networks to begin with.
+//! `import.model` on arbitrary bytes for every part, for `tests/hostile.rs` and `fuzz/`, and small networks as seeds.
 //!
-//! Shapes decide what is made of a file, and a changed file hardly has any that agree with its length. So bytes are also taken as a list of names and
-//! shapes, of which a file of zeros is made that holds what it says.
+//! Shapes decide the use of a file, and a mutated file hardly ever has shapes that agree with its length. So bytes are
+//! also read as a list of names and shapes, from which a file of zeros with that content is made.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -38,7 +38,7 @@ use crate::networks::Autoencoder;
 use crate::text;
 use crate::tokenizer::{TokenizerMeta, TrainedTokenizer};
 
-/// All parts, in the order of the byte that says which is imported.
+/// All parts, in the order of the byte that selects one.
 pub const PARTS: [ImportedPart; 10] = [
     ImportedPart::Vae,
     ImportedPart::Mld,
@@ -52,12 +52,12 @@ pub const PARTS: [ImportedPart; 10] = [
     ImportedPart::Discord,
 ];
 
-/// What the bytes behind the first two are.
+/// Form of the bytes after the first two.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Form {
-    /// A file of torch.
+    /// A torch file.
     Torch,
-    /// A file of safetensors.
+    /// A safetensors file.
     Safetensors,
     /// Lines of an element's type, a name and a shape.
     List,
@@ -65,18 +65,18 @@ pub enum Form {
 
 const FORMS: [Form; 3] = [Form::Torch, Form::Safetensors, Form::List];
 
-/// Features of a frame, and joints.
+/// Number of features of a frame, and of joints.
 const FEATURES: usize = 263;
 const JOINTS: usize = 22;
-/// Width of everything that may have any.
+/// Width of every layer whose width is free.
 const WIDTH: usize = 4;
-/// Frames of what is encoded and drawn.
+/// Number of frames that are encoded and generated.
 const FRAMES: usize = 12;
-/// Codebooks of MoMask's tokenizer.
+/// Number of codebooks of MoMask's tokenizer.
 const BOOKS: usize = 3;
-/// Bytes of zeros behind a list.
+/// Largest number of zero bytes after a list.
 const ZEROS: usize = 4 << 20;
-/// Bytes of what was imported, after which all is forgotten.
+/// Bytes of imported artifacts after which all are dropped.
 const KEPT: usize = 32 << 20;
 
 /// Tensors by name: their shapes and numbers.
@@ -92,7 +92,7 @@ fn add<M: Module>(all: &mut Named, prefix: &str, network: &M) {
     }
 }
 
-/// A VAE, and a denoiser of its latents: a student's if `guidance` is embedded.
+/// A VAE, and a denoiser of its latents, which is a student's if it embeds `guidance`.
 fn latent_diffusion(all: &mut Named, guidance: Option<usize>) -> DenoiserConfig {
     let device = Device::flex();
     let mut init = Init::new(Seed(0), "small", Positions::Uniform, &device);
@@ -217,10 +217,10 @@ pub fn small(part: ImportedPart) -> Named {
     all
 }
 
-/// Tensors as bytes for [`model`].
+/// Serialises tensors as bytes for [`model`].
 ///
 /// # Panics
-/// If they cannot be written.
+/// If they cannot be serialised.
 pub fn marked(part: ImportedPart, form: Form, all: &Named) -> Vec<u8> {
     let bytes: BTreeMap<&String, Vec<u8>> =
         all.iter().map(|(name, (_, values))| (name, values.iter().flat_map(|v| v.to_le_bytes()).collect())).collect();
@@ -244,7 +244,7 @@ pub fn marked(part: ImportedPart, form: Form, all: &Named) -> Vec<u8> {
             .concat()
         }
         Form::List => {
-            // Those of what the part is used with are no zeros.
+            // Parts that the network is used with do not have zero weights.
             let others: &[&str] = match part {
                 ImportedPart::Mld | ImportedPart::Lcm => &["vae."],
                 ImportedPart::Control => &["vae.", "denoiser."],
@@ -267,7 +267,7 @@ fn list(all: &Named) -> String {
     })
 }
 
-/// The header of the safetensors that a list describes, and how long they are.
+/// The safetensors header that a list describes, and the length of the tensors.
 fn described(lines: &str) -> (String, u64) {
     let (mut header, mut end) = (serde_json::Map::new(), 0_u64);
     for line in lines.lines() {
@@ -291,17 +291,17 @@ fn header(lines: &str) -> String {
     described(lines).0
 }
 
-/// What parts read besides their files.
+/// Inputs of the parts besides their files.
 struct World {
     bench: Bench,
     text: Digest,
     vae: Digest,
     lcm: Digest,
-    /// Tokenizers of one codebook and of [`BOOKS`].
+    /// Tokenizers with one codebook and with [`BOOKS`].
     tokenizers: [Digest; 2],
 }
 
-/// A folder with statistics that change nothing.
+/// A folder of statistics that normalise nothing.
 fn statistics() -> String {
     let folder = folder("statistics");
     for (name, count, value) in [
@@ -371,7 +371,7 @@ impl World {
         }
     }
 
-    /// Opens what was imported and puts it to use, as the stages and commands do.
+    /// Opens the imported artifact and uses it, as the stages and commands do.
     fn open(&self, part: ImportedPart, digest: Digest) -> Result<(), StageError> {
         let (blobs, device) = (self.bench.blobs(), self.bench.device());
         let manifest = self.bench.manifest(digest)?;
@@ -398,11 +398,11 @@ impl World {
             _ => {
                 let generator = Generator::load(&manifest, &*blobs, &device)?;
                 let frames = generator.longest().min(FRAMES);
-                // As few steps as it has samplers for.
+                // The smallest number of steps with a sampler.
                 let few = Sampler { steps: 2, ..generator.sampler() };
                 let sampler = if generator.check_sampler(&few).is_ok() { few } else { generator.sampler() };
                 let drawn = generator.generate("a person walks", Some(frames), Some(&sampler), Seed(0));
-                // Weights may lead anywhere, also to where no motion is; only a fault would be ours.
+                // Arbitrary weights may lead to values that are no motion; only a fault of ours is an error.
                 accepted(drawn);
             }
         }
@@ -414,17 +414,17 @@ thread_local! {
     static WORLD: RefCell<Option<World>> = const { RefCell::new(None) };
 }
 
-/// `import.model`: the first byte says of which part, the second in which [`Form`] the others are.
+/// Runs `import.model`: the first byte selects the part, the second the [`Form`] of the others.
 ///
 /// # Panics
-/// If it breaks on them, or if what it makes cannot be opened.
+/// If it fails in another way than refusing them, or if its result cannot be opened.
 pub fn model(bytes: &[u8]) -> bool {
     let [part, form, content @ ..] = bytes else { return false };
     let part = PARTS[usize::from(*part) % PARTS.len()];
     let form = FORMS[usize::from(*form) % FORMS.len()];
     let made = (form == Form::List).then(|| {
         let (header, length) = described(&String::from_utf8_lossy(content));
-        // A list of more than there is to be is the file of one that lies.
+        // A list of more than the limit gives a file that is shorter than it declares.
         let zeros = usize::try_from(length).ok().filter(|length| *length <= ZEROS).unwrap_or_default();
         [&(header.len() as u64).to_le_bytes()[..], header.as_bytes(), &vec![0; zeros]].concat()
     });

@@ -1,7 +1,8 @@
 //! CLIP's text tower as an encoder.
 //!
-//! A caption's vector is the state of its end token, projected or not, never normalised; what pads behind it makes no difference. Its words are
-//! the states of all positions after the last norm, those of the padding among them: so MMM and StableMoFusion read them.
+//! A caption's vector is the state of its end token, projected or not, never normalised; padding after it has no
+//! effect. Its word vectors are the states of all positions after the last norm, including padding, as MMM and
+//! StableMoFusion read them.
 
 use std::sync::Arc;
 
@@ -31,7 +32,7 @@ impl std::fmt::Debug for Clip {
     }
 }
 
-/// Makes the network and reads its weights.
+/// Creates the network and loads its weights.
 pub(super) fn open(published: Published, device: &Device) -> Result<Box<dyn TextEncoder>, StageError> {
     let Network::Clip(sizes) = &published.captions.meta.description.network else {
         return Err(StageError::Input("the text encoder `clip` has the network of another".into()));

@@ -1,19 +1,19 @@
-//! What every text encoder does, and what its manifest says.
+//! The interface of text encoders, and the common part of their manifests.
 
 use serde::{Deserialize, Serialize};
 
 use crate::context::StageError;
 
-/// Meta of an artifact of kind `text-encoder`, as far as all encoders share it.
+/// The part of an artifact's meta, of kind `text-encoder`, that all encoders share.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TextEncoderMeta {
-    /// Which one: a name in the table of [`open`](super::open).
+    /// Name of the encoder in the table of [`open`](super::open).
     pub encoder: String,
     /// Width of a caption's vector.
     pub dim: usize,
 }
 
-/// Turns captions into vectors. What a caption becomes depends on it alone, to the bit, not on those beside it.
+/// Embeds captions as vectors. A caption's result depends on it alone, to the bit, not on other captions of the batch.
 pub trait TextEncoder: std::fmt::Debug {
     /// Width of a caption's vector.
     fn dim(&self) -> usize;
@@ -23,9 +23,10 @@ pub trait TextEncoder: std::fmt::Debug {
         self.dim()
     }
 
-    /// A vector for each caption, `[captions, dim]`. That of the empty one is the null condition of classifier-free guidance.
+    /// A vector for each caption, `[captions, dim]`. The empty caption's is the null condition of classifier-free
+    /// guidance.
     fn pooled(&self, captions: &[&str]) -> Result<Vec<f32>, StageError>;
 
-    /// A vector for each token of each caption, `[tokens, token_dim]` a caption; at least one.
+    /// A vector for each token of each caption, `[tokens, token_dim]` per caption; at least one.
     fn tokens(&self, captions: &[&str]) -> Result<Vec<Vec<f32>>, StageError>;
 }

@@ -1,8 +1,9 @@
-//! Text encoders: how captions become what a generator is conditioned on.
+//! Text encoders: they embed captions as conditions for a generator.
 //!
-//! An encoder is an artifact of kind `text-encoder`. Caption embeddings hold the one that made them as their part `text`, a model that was
-//! trained on them holds it too, and so a model is always drawn with the encoder that it was trained with, weights and all. To add one: an
-//! implementation of [`TextEncoder`], a line in the table of [`open`], and its word in [`protocol::stage::TextEncoder`].
+//! An encoder is an artifact of kind `text-encoder`. Caption embeddings have their encoder as the part `text`, and so
+//! has a model trained on them. So a model always generates with the encoder of its training, including its weights. To
+//! add one: an implementation of [`TextEncoder`], a line in the table of [`open`], and its name in
+//! [`protocol::stage::TextEncoder`].
 
 mod clip;
 mod encoder;
@@ -25,7 +26,7 @@ use hashed::Hashed;
 use published::{Published, Source};
 pub use remembered::forget;
 
-/// Opens an encoder of a manifest.
+/// Opens an encoder from its manifest.
 type Open = fn(&Manifest, &dyn Blobs, &Device) -> Result<Box<dyn TextEncoder>, StageError>;
 
 /// Every encoder by its name in manifests.
@@ -36,7 +37,7 @@ const ENCODERS: [(&str, Open); 4] = [
     ("sentence-t5", |manifest, blobs, device| t5::open(Published::of_artifact(manifest, blobs)?, device)),
 ];
 
-/// The encoder of an artifact of kind `text-encoder`.
+/// Opens the encoder of an artifact of kind `text-encoder`.
 pub fn open(manifest: &Manifest, blobs: &dyn Blobs, device: &Device) -> Result<Box<dyn TextEncoder>, StageError> {
     artifacts::expect("the text encoder", manifest, ArtifactKind::TextEncoder)?;
     let meta: TextEncoderMeta = artifacts::meta(manifest, "the text encoder")?;
@@ -56,10 +57,11 @@ pub fn open(manifest: &Manifest, blobs: &dyn Blobs, device: &Device) -> Result<B
     Ok(encoder)
 }
 
-/// Refuses an encoder whose captions and tokens have vectors of two widths: of a network that reads both with one.
+/// Refuses an encoder with different widths of captions' and tokens' vectors, for a network that has one width for
+/// both.
 ///
 /// # Errors
-/// Both widths.
+/// If the widths differ; the message has both.
 pub fn expect_one_width(encoder: &dyn TextEncoder) -> Result<(), StageError> {
     let (pooled, tokens) = (encoder.dim(), encoder.token_dim());
     if pooled == tokens {
@@ -77,33 +79,33 @@ pub fn built_in() -> Manifest {
     Manifest::new(ArtifactKind::TextEncoder, meta)
 }
 
-/// The encoder that settings name, before it is an artifact.
+/// The encoder of a stage's settings, before it is an artifact.
 #[derive(Debug)]
 pub struct Named(Option<Source>);
 
 impl Named {
-    /// Reads its folder, if it has one.
+    /// Reads the encoder's folder, if it has one.
     ///
     /// # Errors
-    /// Which file is missing or not what it should be.
+    /// If a file is missing or invalid.
     pub fn open(settings: &TextEmbed) -> Result<Self, StageError> {
         Ok(Self(Source::open(settings)?))
     }
 
-    /// Of all that captions' vectors depend on.
+    /// Digest of everything that captions' vectors depend on.
     pub fn digest(&self) -> Digest {
         self.0.as_ref().map_or_else(|| built_in().digest(), Source::digest)
     }
 
-    /// Tensors that are in its folder and not read, in a line.
+    /// Summary of the tensors in the folder that are not read.
     pub fn skipped(&self) -> Option<String> {
         self.0.as_ref().and_then(Source::skipped)
     }
 
-    /// Uploads it.
+    /// Uploads the encoder as an artifact.
     ///
     /// # Errors
-    /// If the store says no.
+    /// If the store refuses it.
     pub fn upload(&self, cx: &mut dyn AttemptContext) -> Result<Manifest, StageError> {
         if let Some(source) = &self.0 {
             return source.upload(cx);
@@ -113,7 +115,7 @@ impl Named {
         Ok(manifest)
     }
 
-    /// Makes it ready to embed.
+    /// Loads the encoder so that it can embed.
     ///
     /// # Errors
     /// If its files are broken.
@@ -159,7 +161,7 @@ mod tests {
         assert!(refused.contains("Vae"), "{refused}");
     }
 
-    /// Every word of the settings has an encoder.
+    /// Every encoder that settings can name is in the table.
     #[test]
     fn every_choice_is_in_the_table() {
         for choice in [Choice::Hashed, Choice::Clip, Choice::T5, Choice::SentenceT5] {

@@ -1,7 +1,8 @@
-//! What published encoders share: their folder as settings name it, their artifact, and weights on their way into a network.
+//! Common part of the published encoders: their folder as named in settings, their artifact, and loading their weights.
 //!
-//! The artifact has `tokenizer.json` and `model.safetensors`, the weights in the type that they were published in, without those of other towers.
-//! Its meta holds the rest, so that it is opened where its folder is not. Everything is computed in f32.
+//! The artifact has `tokenizer.json` and `model.safetensors`, with the weights in their published type, without those
+//! of other towers. Its meta holds everything else, so that it can be opened without its folder. Everything is computed
+//! in f32.
 
 use std::cell::RefCell;
 use std::path::Path;
@@ -24,26 +25,26 @@ use super::remembered::Remembered;
 use crate::artifacts::{self, Draft, MODEL_FILE, to_meta};
 use crate::context::{AttemptContext, ContextError, StageError};
 
-/// Where its tokenizer is.
+/// File of the tokenizer.
 const TOKENIZER_FILE: &str = "tokenizer.json";
 
-/// Numbers of remembered vectors, and of remembered words: 64 MB and 256 MB.
+/// Limits of the cached vectors and words, in numbers: 64 MB and 256 MB.
 const REMEMBERED: (usize, usize) = (16 << 20, 64 << 20);
 
 /// Meta of a published encoder.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct PublishedMeta {
-    /// Its name in the table of encoders.
+    /// Name in the table of encoders.
     pub(super) encoder: String,
     /// Width of a caption's vector.
     pub(super) dim: usize,
-    /// Which vector of CLIP's that is.
+    /// The vector of CLIP to use.
     pub(super) output: ClipOutput,
-    /// Sizes, and how captions become ids.
+    /// Sizes of the network, and the rules for converting captions to ids.
     pub(super) description: Description,
 }
 
-/// The pieces of a file, one after the other.
+/// A file in pieces.
 #[derive(Debug)]
 struct Pieces(Vec<Vec<u8>>);
 
@@ -69,11 +70,11 @@ impl ReadAt for Pieces {
     }
 }
 
-/// A file of an artifact.
+/// A file of an artifact as a reader.
 #[derive(Debug)]
 struct Stored {
     blob: Box<dyn Blob>,
-    /// Why it could not be read, so that a lost connection is not taken for a broken file.
+    /// The error of the store, so that a lost connection is not reported as a broken file.
     refused: Rc<RefCell<Option<BlobError>>>,
 }
 
@@ -91,17 +92,17 @@ impl ReadAt for Stored {
     }
 }
 
-/// Captions as the ids that a network reads.
+/// Conversion of captions to the network's ids.
 #[derive(Debug)]
 pub(super) struct Captions {
-    /// What the encoder is.
+    /// Meta of the encoder.
     pub(super) meta: PublishedMeta,
     tokenizer: Tokenizer,
     key: String,
 }
 
 impl Captions {
-    /// The vectors of captions that this encoder made on `device` in this process, and their words.
+    /// The caches of this encoder's vectors on `device` in this process: of captions, and of their words.
     pub(super) fn remembered(&self, device: &Device) -> (Arc<Remembered>, Arc<Remembered>) {
         let of = |what: &str, most| Remembered::shared(format!("{what} {} {device:?}", self.key), most);
         (of("vectors", REMEMBERED.0), of("words", REMEMBERED.1))
@@ -119,7 +120,7 @@ impl Captions {
     }
 }
 
-/// A published encoder whose network is not made yet.
+/// A published encoder whose network is not created yet.
 pub(super) struct Published {
     pub(super) captions: Captions,
     weights: WeightsFile<Box<dyn ReadAt>>,
@@ -127,7 +128,7 @@ pub(super) struct Published {
 }
 
 impl Published {
-    /// `key` says all that captions' vectors depend on.
+    /// Creates it; `key` must contain everything that captions' vectors depend on.
     fn new(
         key: String,
         meta: PublishedMeta,
@@ -142,14 +143,14 @@ impl Published {
         let opened = WeightsFile::open(weights(Rc::clone(&refused)));
         let said = |what: String| refusal(&refused, &meta.encoder, &what);
         let weights = opened.map_err(said)?;
-        // Before a network of these sizes is made.
+        // Checked before a network of these sizes is created.
         weights.holds(&network.tensors(), "").map_err(corrupt)?;
         let dense: Vec<TensorSpec> = head.iter().flat_map(|head| head.tensors(network.width())).collect();
         weights.holds(&dense, text_models::DENSE).map_err(corrupt)?;
         Ok(Self { captions: Captions { meta, tokenizer, key }, weights, refused })
     }
 
-    /// That of an artifact.
+    /// Opens the encoder of an artifact.
     pub(super) fn of_artifact(manifest: &Manifest, blobs: &dyn Blobs) -> Result<Self, StageError> {
         let meta: PublishedMeta = artifacts::meta(manifest, "the text encoder")?;
         let tokenizer_json = artifacts::file(blobs, manifest, TOKENIZER_FILE)?;
@@ -157,7 +158,7 @@ impl Published {
         Self::new(manifest.digest().hex(), meta, &tokenizer_json, |refused| Box::new(Stored { blob, refused }))
     }
 
-    /// `blank` with the weights whose names have `prefix` before them.
+    /// Loads into `blank` the weights whose names have `prefix`.
     pub(super) fn filled<M: Module>(&self, blank: M, prefix: &str) -> Result<M, StageError> {
         let mut entries = flat::layout(&blank).into_iter();
         let filled = flat::replace(blank, |values| {
@@ -167,13 +168,13 @@ impl Published {
         filled.map_err(|what| refusal(&self.refused, &self.captions.meta.encoder, &what))
     }
 
-    /// Sizes as the network's own settings have them, whose keys are the published ones.
+    /// Converts sizes to the network's own settings, which have the published keys.
     pub(super) fn sizes<T: serde::de::DeserializeOwned>(&self, sizes: &impl Serialize) -> Result<T, StageError> {
         serde_json::from_value(to_meta(sizes)).map_err(|e| corrupt(&self.captions.meta.encoder, &e.to_string()))
     }
 }
 
-/// What is wrong with files or captions of the user's.
+/// The error for the user's files or captions.
 fn unfit(error: EncoderError) -> StageError {
     StageError::Input(error.to_string())
 }
@@ -182,12 +183,12 @@ fn corrupt(encoder: &str, what: &str) -> StageError {
     StageError::Context(ContextError::Corrupt(format!("the text encoder `{encoder}`: {what}")))
 }
 
-/// What the store said, or else what is wrong with what it gave.
+/// The store's error, or else an error for the encoder's file.
 fn refusal(refused: &RefCell<Option<BlobError>>, encoder: &str, what: &str) -> StageError {
     refused.take().map_or_else(|| corrupt(encoder, what), artifacts::blob_error)
 }
 
-/// The encoder in a folder, as settings name it.
+/// The encoder in a folder that settings name.
 #[derive(Debug)]
 pub(super) struct Source {
     meta: PublishedMeta,
@@ -196,10 +197,10 @@ pub(super) struct Source {
 }
 
 impl Source {
-    /// Reads the folder that `settings` name; none if the encoder is built in.
+    /// Reads the folder that `settings` name; `None` if the encoder is built in.
     ///
     /// # Errors
-    /// Which file is missing or not what it should be.
+    /// If a file is missing or invalid.
     pub(super) fn open(settings: &TextEmbed) -> Result<Option<Self>, StageError> {
         let kind = match settings.encoder {
             Choice::Hashed => return Ok(None),
@@ -229,20 +230,20 @@ impl Source {
         Ok(Some(Self { meta, folder, weights }))
     }
 
-    /// Of all that captions' vectors depend on.
+    /// Digest of everything that captions' vectors depend on.
     pub(super) fn digest(&self) -> Digest {
         self.folder.digest(&self.weights)
     }
 
-    /// Tensors that are in the folder and not of the encoder, in a line.
+    /// Summary of the tensors in the folder that are not the encoder's.
     pub(super) fn skipped(&self) -> Option<String> {
         self.folder.skipped_line()
     }
 
-    /// Uploads the encoder's files, and the manifest around them.
+    /// Uploads the encoder's files and their manifest.
     ///
     /// # Errors
-    /// If the store says no.
+    /// If the store refuses them.
     pub(super) fn upload(&self, cx: &mut dyn AttemptContext) -> Result<Manifest, StageError> {
         let mut draft = Draft::new(cx, ArtifactKind::TextEncoder, to_meta(&self.meta));
         draft.add(TOKENIZER_FILE, self.folder.tokenizer_json.clone())?;
@@ -253,7 +254,7 @@ impl Source {
         Ok(manifest)
     }
 
-    /// The name of the encoder, and what is needed to make it.
+    /// Converts to a published encoder, ready to create its network.
     pub(super) fn into_published(self) -> Result<Published, StageError> {
         let key = format!("{} {:?}", self.digest().hex(), self.meta.output);
         let Self { meta, folder, weights } = self;

@@ -1,4 +1,5 @@
-//! Vectors of captions that were computed lately: training meets a caption many times, and an encoder costs more than what reads it.
+//! A cache of captions' vectors: training uses a caption many times, and an encoder costs more than the network that
+//! reads its vectors.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -6,14 +7,14 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use crate::context::StageError;
 
-/// Of the encoders that this process opened lately, the last one at the end. What an encoder makes of a caption is the same for ever, so that
-/// stages and shards of one process share it.
+/// Caches of the encoders that this process opened, the most recent last. An encoder's result for a caption never
+/// changes, so stages and shards of one process share it.
 static SHARED: Mutex<VecDeque<(String, Arc<Remembered>)>> = Mutex::new(VecDeque::new());
 
-/// How often everything was forgotten.
+/// Number of times that all caches were cleared.
 static FORGOTTEN: AtomicU64 = AtomicU64::new(0);
 
-/// Encoders, those of vectors and those of words counted apart.
+/// Largest number of caches; the vectors and the words of an encoder are two.
 const SHARES: usize = 4;
 
 /// Vectors by caption, at most `most` numbers.
@@ -25,7 +26,7 @@ pub(super) struct Remembered {
 
 #[derive(Debug, Default)]
 struct Known {
-    /// [`FORGOTTEN`] when these were made.
+    /// The value of [`FORGOTTEN`] when these were computed.
     since: u64,
     numbers: usize,
     rows: HashMap<String, Vec<f32>>,
@@ -36,7 +37,7 @@ impl Remembered {
         Self { most, known: Mutex::default() }
     }
 
-    /// What is remembered under `key`, which must say all that the vectors depend on.
+    /// The cache for `key`, which must contain everything that the vectors depend on.
     pub(super) fn shared(key: String, most: usize) -> Arc<Self> {
         let mut shared = SHARED.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((_, known)) = shared.iter().find(|(other, _)| *other == key) {
@@ -50,13 +51,13 @@ impl Remembered {
         new
     }
 
-    /// What `make` makes of a caption, or made of it before. Where there is no more room, all is forgotten.
+    /// The vector of a caption, from the cache or from `make`. A full cache is cleared.
     pub(super) fn of(
         &self,
         caption: &str,
         make: impl FnOnce() -> Result<Vec<f32>, StageError>,
     ) -> Result<Vec<f32>, StageError> {
-        // A panic elsewhere leaves nothing half made: rows are put in whole.
+        // A panic elsewhere leaves no partial rows: rows are inserted whole.
         let lock = || {
             let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
             let since = FORGOTTEN.load(Ordering::Relaxed);
@@ -80,7 +81,7 @@ impl Remembered {
     }
 }
 
-/// Forgets all vectors of this process: before what takes the time of an encoder.
+/// Clears all caches of this process, before measuring the time of an encoder.
 pub fn forget() {
     FORGOTTEN.fetch_add(1, Ordering::Relaxed);
 }

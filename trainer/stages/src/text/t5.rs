@@ -1,7 +1,7 @@
 //! T5's encoder and Sentence-T5 as encoders.
 //!
-//! A caption's words are the states of its tokens, its end among them. Its vector is their mean; of Sentence-T5 that goes through the dense layer
-//! and is divided by its length. A caption is computed alone, so that nothing pads.
+//! A caption's word vectors are the states of its tokens, including its end. Its vector is their mean; for Sentence-T5
+//! this passes the dense layer and is divided by its length. A caption is computed alone, without padding.
 
 use std::sync::Arc;
 
@@ -14,7 +14,7 @@ use super::published::{Captions, Published};
 use super::remembered::Remembered;
 use crate::context::StageError;
 
-/// T5's encoder.
+/// T5's encoder with an optional dense layer.
 struct T5 {
     captions: Captions,
     network: T5Encoder,
@@ -31,7 +31,7 @@ impl std::fmt::Debug for T5 {
     }
 }
 
-/// Makes the network and reads its weights.
+/// Creates the network and loads its weights.
 pub(super) fn open(published: Published, device: &Device) -> Result<Box<dyn TextEncoder>, StageError> {
     let (Network::T5(sizes), head) =
         (&published.captions.meta.description.network, published.captions.meta.description.head.clone())
@@ -59,7 +59,7 @@ pub(super) fn open(published: Published, device: &Device) -> Result<Box<dyn Text
 }
 
 impl T5 {
-    /// States [1, T, H] of a caption's tokens, and T.
+    /// States [1, T, H] of a caption's tokens, and their number T.
     fn states(&self, caption: &str) -> Result<(Tensor<3>, usize), StageError> {
         let ids = self.captions.ids(caption)?;
         Ok((self.network.forward(&ids, &[ids.len()]), ids.len()))

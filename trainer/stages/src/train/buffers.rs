@@ -1,18 +1,18 @@
-//! What a stage carries from step to step besides parameters, and what its slices give besides gradients.
+//! State of a stage besides parameters, and results of its slices besides gradients.
 //!
-//! A slice's sums travel behind its gradients and are added along the same tree, so that they too have the same bits for any number of
-//! members. What a step does to the buffers follows from them, from the step and from keyed draws alone: every member computes it for
-//! itself and gets the same.
+//! A slice's sums follow its gradients in one vector and are added along the same tree. So they too have the same bits
+//! for any number of members. The change of the buffers in a step depends only on the sums, the step and keyed draws:
+//! every member computes it itself with the same result.
 
 use motion::Stream;
 use protocol::{Seed, StageName};
 
-/// A buffer and its first values.
+/// A buffer and its initial values.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BufferPlan {
-    /// Name in a saved state, behind `buffer.`.
+    /// Name in a saved state, after `buffer.`.
     pub name: String,
-    /// First values; their number stays.
+    /// Initial values; their number never changes.
     pub values: Vec<f32>,
 }
 
@@ -24,7 +24,7 @@ pub struct Buffers {
 
 impl Buffers {
     /// # Panics
-    /// If two have one name.
+    /// If two buffers have one name.
     pub(super) fn new(plans: Vec<BufferPlan>) -> Self {
         for (i, plan) in plans.iter().enumerate() {
             assert!(plans[..i].iter().all(|other| other.name != plan.name), "two buffers `{}`", plan.name);
@@ -32,15 +32,15 @@ impl Buffers {
         Self { all: plans }
     }
 
-    /// The values of one.
+    /// The values of a buffer.
     ///
     /// # Panics
-    /// If the objective has not planned one of this name.
+    /// If the objective has not planned a buffer of this name.
     pub fn get(&self, name: &str) -> &[f32] {
         &self.all.iter().find(|buffer| buffer.name == name).unwrap_or_else(|| panic!("no buffer `{name}`")).values
     }
 
-    /// The same, to be changed.
+    /// The values of a buffer, mutable.
     ///
     /// # Panics
     /// As [`get`](Self::get).
@@ -63,21 +63,21 @@ impl Buffers {
     }
 }
 
-/// A tensor that every slice gives, and its number of values.
+/// A tensor that every slice returns, and its number of values.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SumPlan {
     /// Name by which [`AfterStep`] finds it.
     pub name: String,
-    /// Values.
+    /// Number of values.
     pub len: usize,
 }
 
-/// What there is once a step is applied.
+/// Inputs of the hook after a step.
 #[derive(Debug)]
 pub struct AfterStep<'a> {
     /// The step, from 0.
     pub step: u64,
-    /// To be changed.
+    /// Buffers that the hook may change.
     pub buffers: &'a mut Buffers,
     pub(super) sums: Vec<(&'a str, &'a [f32])>,
     pub(super) seed: Seed,
@@ -88,12 +88,13 @@ impl<'a> AfterStep<'a> {
     /// The sum over all slices of the step.
     ///
     /// # Panics
-    /// If the objective has not planned one of this name.
+    /// If the objective has not planned a sum of this name.
     pub fn sum(&self, name: &str) -> &'a [f32] {
         self.sums.iter().find(|(known, _)| *known == name).unwrap_or_else(|| panic!("no sum `{name}`")).1
     }
 
-    /// A generator that is the same on every member: keyed by the run's seed, the stage, the step, `what` and `index`.
+    /// A generator with the same draws on every member: keyed by the run's seed, the stage, the step, `what` and
+    /// `index`.
     pub fn stream(&self, what: &str, index: u64) -> Stream {
         Stream::new(self.seed, &format!("{}/{what}", self.stage), index, self.step)
     }

@@ -1,4 +1,4 @@
-//! A group: parameters that share an optimizer, and the steps that train it.
+//! A group: parameters that share an optimizer, and the steps that train them.
 
 use std::ops::Range;
 
@@ -7,7 +7,7 @@ use models::flat::{Entry, Values};
 use models::optim::{AdamW, LrSchedule, clip_factor, ema, global_norm};
 use models::resident::{Host, Resident};
 
-/// Which steps train a group.
+/// The steps that train a group.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Turns {
     during: Range<u64>,
@@ -16,18 +16,18 @@ pub struct Turns {
 }
 
 impl Turns {
-    /// All of them.
+    /// All steps.
     pub const ALWAYS: Self = Self { during: 0..u64::MAX, every: 1, at: 0 };
-    /// None: the parameters are a frozen part of what is trained, without moments.
+    /// No steps: the group is a frozen part of the model, without moments.
     pub const NEVER: Self = Self { during: 0..0, every: 1, at: 0 };
 
-    /// A phase.
+    /// The steps of one phase.
     pub fn during(steps: Range<u64>) -> Self {
         Self { during: steps, ..Self::ALWAYS }
     }
 
-    /// Of these steps only one in `every`: that which comes `at` steps after the first. Groups with the same `every` and other `at` take
-    /// turns.
+    /// Restricts the steps to one in `every`, starting `at` steps after the first. Groups with the same `every` and
+    /// different `at` take turns.
     ///
     /// # Panics
     /// If `at` is not below `every`.
@@ -37,46 +37,46 @@ impl Turns {
         Self { every, at, ..self }
     }
 
-    /// The number of the update that step `step` is to the group, from 0; `None` if the step does not train it.
+    /// The number of the group's update in step `step`, from 0; `None` if the step does not train the group.
     pub fn turn(&self, step: u64) -> Option<u64> {
         let local = step.checked_sub(self.during.start).filter(|_| step < self.during.end)?;
         (local % self.every == self.at).then_some(local / self.every)
     }
 
-    /// Updates among the first `steps` steps.
+    /// Number of updates among the first `steps` steps.
     pub fn count(&self, steps: u64) -> u64 {
         let local = steps.min(self.during.end).saturating_sub(self.during.start);
         (local + self.every - 1 - self.at) / self.every
     }
 }
 
-/// Gradients are scaled down to a norm.
+/// Limit of a gradient's norm.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Clip {
-    /// The largest norm that is left alone.
+    /// The largest norm that is not scaled down.
     pub norm: f64,
-    /// Groups of one name here are clipped together, by the norm of all of them that the step trains.
+    /// Groups with the same name here are clipped together, by the norm of those that the step trains.
     pub together: &'static str,
 }
 
 /// A moving average of a group's parameters.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Average {
-    /// What is kept of the average in each of its updates.
+    /// Decay of the average in each of its updates.
     pub decay: f64,
-    /// Updates of the parameters between two of the average.
+    /// Number of parameter updates per update of the average.
     pub every: u64,
-    /// The first update takes the parameters as they are.
+    /// The first update copies the parameters.
     pub starts_as_copy: bool,
 }
 
 impl Average {
-    /// After every update, beginning with the parameters' first values.
+    /// An average that is updated after every step and starts from the initial parameters.
     pub fn of(decay: f64) -> Self {
         Self { decay, every: 1, starts_as_copy: false }
     }
 
-    /// What happens to the average after update number `turn` (from 0).
+    /// The change of the average after update number `turn` (from 0).
     fn at(&self, turn: u64) -> Follow {
         let done = turn + 1;
         if self.starts_as_copy && done == self.every {
@@ -92,66 +92,64 @@ impl Average {
 /// One set of parameters with an optimizer of its own.
 #[derive(Debug, Clone)]
 pub struct GroupPlan {
-    /// Short name: `model`, `heads`.
+    /// Short name, such as `model` or `heads`.
     pub name: &'static str,
-    /// Tensors in the buffer.
+    /// Names and shapes of the tensors in the buffer.
     pub entries: Vec<Entry>,
-    /// First values.
+    /// Initial values.
     pub params: Vec<f32>,
-    /// Optimizer.
     pub optimizer: AdamW,
-    /// Learning rate by the group's own updates.
+    /// Learning rate as a function of the group's own updates.
     pub lr: LrSchedule,
     /// Clipping, if any.
     pub clip: Option<Clip>,
-    /// A moving average that is kept beside the parameters.
+    /// Moving average of the parameters, if one is kept.
     pub average: Option<Average>,
-    /// Steps that train it.
+    /// Steps that train the group.
     pub turns: Turns,
 }
 
 impl GroupPlan {
-    /// The group trained by `turns` alone; its schedule spans those among the first `steps` steps.
+    /// Restricts the group's training to `turns`; its schedule spans those among the first `steps` steps.
     #[must_use]
     pub fn taking(self, turns: Turns, steps: u64) -> Self {
         Self { lr: LrSchedule { steps: turns.count(steps), ..self.lr }, turns, ..self }
     }
 }
 
-/// Which values are the newer ones.
+/// Location of the newest values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Newer {
-    /// Host and accelerator have the same.
+    /// Host and accelerator have equal values.
     Nowhere,
-    /// The accelerator's.
+    /// The accelerator has newer values.
     There,
 }
 
-/// What an update does to an average.
+/// Change of an average in an update.
 enum Follow {
     Copy,
     Move(f64),
     Stay,
 }
 
-/// A group in training: flat buffers, on the host or, while training on an accelerator, there; those of the host are then older.
+/// A group in training, as flat buffers. While it trains on an accelerator its newest values are there, and those of
+/// the host are older.
 #[derive(Debug, Clone)]
 pub struct Group {
-    /// Short name.
     pub name: &'static str,
-    /// Tensors in the buffer.
+    /// Names and shapes of the tensors in the buffer.
     pub entries: Vec<Entry>,
-    /// Parameters.
     pub(super) params: Vec<f32>,
-    /// AdamW's first moments; none of a frozen group.
+    /// First moments of AdamW; empty for a frozen group.
     pub(super) m: Vec<f32>,
-    /// AdamW's second moments; none of a frozen group.
+    /// Second moments of AdamW; empty for a frozen group.
     pub(super) v: Vec<f32>,
-    /// Moving average of the parameters, if the plan asks for one.
+    /// Moving average of the parameters, if the plan has one.
     pub(super) average: Option<Vec<f32>>,
-    /// All of that on an accelerator, if training is there, and whether it is newer there.
+    /// The same buffers on an accelerator, if training runs on one, and the location of the newest values.
     resident: Option<(Resident, Newer)>,
-    /// Learning rate by update.
+    /// Learning rate by the group's own updates.
     pub lr: LrSchedule,
     optimizer: AdamW,
     clip: Option<Clip>,
@@ -159,7 +157,7 @@ pub struct Group {
     turns: Turns,
 }
 
-/// By the host's values.
+/// Compares the host's values.
 impl PartialEq for Group {
     fn eq(&self, other: &Self) -> bool {
         let plan = |group: &Self| (group.name, group.lr, group.optimizer, group.clip, group.averaging);
@@ -188,7 +186,7 @@ impl Group {
         }
     }
 
-    /// The number of the update that step `step` is to this group, from 0; `None` if the step does not train it.
+    /// The number of this group's update in step `step`, from 0; `None` if the step does not train it.
     pub fn turn(&self, step: u64) -> Option<u64> {
         self.turns.turn(step)
     }
@@ -218,7 +216,7 @@ impl Group {
         }
     }
 
-    /// The parameters, where they are.
+    /// The parameters, on the device that holds them.
     pub fn trained(&self) -> Values<'_> {
         match &self.resident {
             Some((resident, _)) => Values::Device(resident.params()),
@@ -226,7 +224,7 @@ impl Group {
         }
     }
 
-    /// The parameters as they should be used, where they are: their average if one is kept.
+    /// The result of the training, on the device that holds it: the average if one is kept, else the parameters.
     pub fn averaged(&self) -> Values<'_> {
         match &self.resident {
             Some((resident, _)) => Values::Device(resident.average().unwrap_or(resident.params())),
@@ -234,13 +232,13 @@ impl Group {
         }
     }
 
-    /// Has everything on `device` from now on, with the host's values.
+    /// Copies the host's values to `device`, and trains there from now on.
     pub(super) fn send(&mut self, device: &Device) {
         let resident = Resident::send(&self.host(), device);
         self.resident = Some((resident, Newer::Nowhere));
     }
 
-    /// Brings the host's values up to date.
+    /// Copies newer values of the accelerator to the host.
     pub(super) fn fetch(&mut self) {
         if let Some((resident, _)) = self.resident.take_if(|(_, newer)| *newer == Newer::There) {
             resident.fetch(self.host());
@@ -248,7 +246,7 @@ impl Group {
         }
     }
 
-    /// Whether the host's values are the newest.
+    /// Returns true if the host has the newest values.
     pub(super) fn is_fetched(&self) -> bool {
         self.resident.as_ref().is_none_or(|(_, newer)| *newer == Newer::Nowhere)
     }
@@ -259,14 +257,14 @@ impl Group {
     }
 }
 
-/// What a step does to the groups that it trains.
+/// The gradients of a step for the groups that it trains.
 pub(super) struct Gradients<'a> {
-    /// For each group its update's number, its gradient and the gradient's norm, or `None`.
+    /// For each group its update's number, gradient and gradient norm; `None` if the step does not train it.
     parts: Vec<Option<(u64, &'a [f32], f64)>>,
 }
 
 impl<'a> Gradients<'a> {
-    /// `gradients` has one for each group that step `step` trains, and none for the others.
+    /// Collects one gradient for each group that step `step` trains, and `None` for the others.
     pub(super) fn of(groups: &[Group], step: u64, gradients: Vec<Option<&'a [f32]>>) -> Self {
         let part = |(group, gradient): (&Group, Option<&'a [f32]>)| {
             let gradient = gradient?;
@@ -275,28 +273,28 @@ impl<'a> Gradients<'a> {
         Self { parts: groups.iter().zip(gradients).map(part).collect() }
     }
 
-    /// A norm that is not finite, if there is one.
+    /// Returns a norm that is not finite, if there is one.
     pub(super) fn unbounded(&self) -> Option<f64> {
         self.parts.iter().flatten().map(|(_, _, norm)| *norm).find(|norm| !norm.is_finite())
     }
 
-    /// Norm and learning rate of the first group that the step trains: what stands for the step.
+    /// Norm and learning rate of the first group that the step trains, which represent the step.
     pub(super) fn watched(&self, groups: &[Group]) -> Option<(f64, f64)> {
         groups.iter().zip(&self.parts).find_map(|(group, part)| part.map(|(turn, _, norm)| (norm, group.lr.at(turn))))
     }
 
-    /// The factor of each group, 1 where nothing is clipped.
+    /// The factor of each group's gradient, 1 without clipping.
     fn factors(&self, groups: &[Group]) -> Vec<f64> {
         let norm_of = |name: &str| {
             let same = groups.iter().zip(&self.parts).filter(|(g, _)| g.clip.is_some_and(|c| c.together == name));
             let norms: Vec<f64> = same.filter_map(|(_, part)| part.map(|(_, _, norm)| norm)).collect();
-            // Of one group the norm itself: a root of its square may differ from it.
+            // A single group uses the norm itself: the root of its square may differ.
             if let [only] = norms[..] { only } else { norms.iter().map(|n| n * n).sum::<f64>().sqrt() }
         };
         groups.iter().map(|g| g.clip.map_or(1.0, |clip| clip_factor(norm_of(clip.together), clip.norm))).collect()
     }
 
-    /// Updates the groups.
+    /// Applies the update of every group.
     pub(super) fn apply(self, groups: &mut [Group]) {
         let factors = self.factors(groups);
         for ((group, part), factor) in groups.iter_mut().zip(self.parts).zip(factors) {
@@ -357,7 +355,7 @@ mod tests {
             assert!(found.iter().zip(expected).all(|(f, e)| (f - e).abs() < 1e-6), "{found:?}");
         };
         near(factors(0, Some(b)), [0.2, 0.2, 2.0 / 3.0, 1.0]);
-        // The second does not take part in step 1.
+        // The second group does not take part in step 1.
         near(factors(1, None), [1.0 / 3.0, 1.0 / 3.0, 2.0 / 3.0, 1.0]);
     }
 

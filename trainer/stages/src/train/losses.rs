@@ -2,7 +2,7 @@
 
 use burn::tensor::Tensor;
 
-/// Terms are collected in any order; what is recorded of them, and what is trained on, follows from their names and weights.
+/// Terms may be added in any order. Their names and weights decide the recorded values and the training loss.
 #[derive(Debug)]
 pub struct Losses {
     global: f32,
@@ -11,15 +11,16 @@ pub struct Losses {
 }
 
 impl Losses {
-    /// The whole loss, as it is recorded.
+    /// Name of the total loss in records.
     pub const TOTAL: &'static str = "loss";
 
-    /// Nothing yet, for a slice of a batch of `global` examples.
+    /// Starts without terms, for a slice of a batch of `global` examples.
     pub fn new(global: usize) -> Self {
         Self { global: global as f32, total: None, terms: Vec::new() }
     }
 
-    /// Adds `weight` times `sum`, the term's sum over the slice's examples. What is recorded under `name` is the term without its weight.
+    /// Adds `weight` times `sum`, the term's sum over the slice's examples. The value recorded as `name` is without the
+    /// weight.
     pub fn add(&mut self, name: &'static str, sum: Tensor<1>, weight: f64) {
         let mean = sum / self.global;
         self.note(name, mean.clone().inner().into_scalar::<f32>());
@@ -30,17 +31,18 @@ impl Losses {
         });
     }
 
-    /// Records a value that nothing is trained on; already divided by the batch.
+    /// Records a value that is not part of the loss; it must already be divided by the batch.
     pub fn note(&mut self, name: &'static str, value: f32) {
         self.terms.push((name, value));
     }
 
-    /// What the slice trains on, if there is any term.
+    /// The loss to train on; `None` without terms.
     pub fn total(&self) -> Option<Tensor<1>> {
         self.total.clone()
     }
 
-    /// The values of `names`, in their order: the total for [`TOTAL`](Self::TOTAL), 0 for a term that this slice does not have.
+    /// The values of `names`, in order: the total for [`TOTAL`](Self::TOTAL), 0 for a term that this slice does not
+    /// have.
     pub fn values(&self, names: &[&'static str]) -> Vec<f32> {
         let total = || self.total.as_ref().map_or(0.0, |total| total.clone().inner().into_scalar::<f32>());
         let value = |name: &&'static str| {

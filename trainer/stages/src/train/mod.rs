@@ -1,13 +1,15 @@
-//! The one training loop. A kind that trains brings an [`Objective`] (batch to gradients) and gets back the trained state.
+//! The only training loop. A training kind supplies an [`Objective`] (batch to gradients) and receives the trained
+//! state.
 //!
-//! Not its job: what a loss is, where examples come from, who the other members are.
+//! Not its job: defining a loss, finding examples, choosing the other members.
 //!
-//! The non-obvious idea: everything that training changes is a few flat f32 buffers and a step number ([`TrainState`]). A step reads
-//! them, and applies one sum over all slices of the step; nothing else survives from step to step, so a checkpoint, a peer's copy and
-//! a fresh start are the same thing at different steps.
+//! The non-obvious idea: training changes only a few flat f32 buffers and a step number ([`TrainState`]). A step reads
+//! them and applies one sum over all slices of the step. Nothing else survives from step to step. So a checkpoint, a
+//! peer's copy and a fresh start are the same thing at different steps.
 //!
-//! A [`Group`] is parameters with an optimizer; [`Turns`] say which steps train it, so phases, alternating updates and frozen parts are
-//! plans, not loops. [`Buffers`] are what no optimizer changes: [`Objective::after`] does, from sums over the slices.
+//! A [`Group`] is parameters with an optimizer. Its [`Turns`] select the steps that train it, so phases, alternating
+//! updates and frozen parts are plans, not loops. [`Buffers`] are values that no optimizer changes;
+//! [`Objective::after`] changes them from sums over the slices.
 
 mod buffers;
 mod group;
@@ -36,19 +38,19 @@ pub use order::{Order, Pick};
 pub use state::{RestoreError, TrainState};
 pub use tree::tree_sum;
 
-/// The input that a rung of a sweep goes on from: the checkpoint that the rung before left.
+/// The input of a sweep's rung: the checkpoint of the rung before.
 const STATE_INPUT: &str = protocol::sweep::STATE_OUTPUT;
-/// What every training records besides its own terms.
+/// A value that every training records besides its own terms.
 const GRADIENT_NORM: &str = "gradient_norm";
 const LEARNING_RATE: &str = "lr";
 /// File of a checkpoint.
 pub(crate) const STATE_FILE: &str = "state.safetensors";
 
-/// What one slice of a step gave.
+/// Result of one slice of a step.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct SliceResult {
-    /// For each group the gradient of `sum over the slice's examples of the example's loss, divided by the global batch`. Empty for a group
-    /// that the step does not train.
+    /// For each group the gradient of `sum over the slice's examples of the example's loss, divided by the global
+    /// batch`. Empty for a group that the step does not train.
     pub gradients: Vec<Vec<f32>>,
     /// For each term its sum over the slice's examples, divided by the global batch.
     pub terms: Vec<f32>,
@@ -58,43 +60,44 @@ pub struct SliceResult {
 
 /// The mathematics of one stage: parameters and examples to gradients.
 pub trait Objective {
-    /// What is trained, with its first values. Asked before the first [`load`](Self::load), and maybe once more then.
+    /// The groups with their initial values. Called before the first [`load`](Self::load), and possibly once more then.
     fn groups(&mut self) -> Vec<GroupPlan>;
 
-    /// What is kept besides, and changed by [`after`](Self::after) alone.
+    /// The buffers, which only [`after`](Self::after) changes.
     fn buffers(&mut self) -> Vec<BufferPlan> {
         Vec::new()
     }
 
-    /// Names of the values that every slice gives besides gradients; the first is the loss that is watched.
+    /// Names of the values that every slice returns besides gradients. The first is the loss; training stops if it is
+    /// not finite.
     fn terms(&self) -> Vec<&'static str>;
 
-    /// What every slice gives for [`after`](Self::after).
+    /// Sums that every slice returns for [`after`](Self::after).
     fn sums(&self) -> Vec<SumPlan> {
         Vec::new()
     }
 
-    /// Takes over the parameters and buffers of `state` before the slices of a step.
+    /// Loads the parameters and buffers of `state` before the slices of a step.
     fn load(&mut self, state: &TrainState);
 
     /// Computes slice `slice` of step `step`.
     fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError>;
 
-    /// Computes the slices of step `step` that are this member's, in the order of `slices`. Rows of a batch do not depend on each other, so
-    /// one pass may serve several slices, as long as each one's result has the bits that [`slice`](Self::slice) gives it: who computes
-    /// which slices together differs from gang to gang.
+    /// Computes this member's slices of step `step`, in the order of `slices`. Rows of a batch do not depend on each
+    /// other, so one pass may compute several slices. Each result must have the bits of [`slice`](Self::slice), because
+    /// gangs differ in the slices that a member computes together.
     fn slices(&mut self, step: u64, slices: &[usize]) -> Result<Vec<SliceResult>, StageError> {
         slices.iter().map(|slice| self.slice(step, *slice)).collect()
     }
 
-    /// Changes the buffers once the groups have been updated. Every member does so for itself, and must come to the same bits: what is not
-    /// in `step` must not matter.
+    /// Changes the buffers after the update of the groups. Every member does so itself and must get the same bits, so
+    /// the result may depend only on `_step`.
     fn after(&mut self, _step: &mut AfterStep<'_>) -> Result<(), StageError> {
         Ok(())
     }
 }
 
-/// How training ended, short of an error.
+/// End of a training without an error.
 #[derive(Debug)]
 pub enum Trained {
     /// All steps are applied.
@@ -106,33 +109,34 @@ pub enum Trained {
     },
     /// Stopped between steps, with a checkpoint committed.
     Yielded {
-        /// Steps applied.
+        /// Number of steps applied.
         at: u64,
     },
 }
 
-/// Trains to the last step (of the schedule, or of a rung that stops before), or until told to stop.
+/// Trains to the last step (of the schedule, or of a rung that stops earlier), or until a stop is requested.
 ///
-/// Every member of the gang runs this same loop. What may end the attempt happens between steps, where the state is whole. Rank 0 alone
-/// returns: the others hold their state until what it saved and reported is acknowledged, so that one of them can do the same if it is lost.
+/// Every member of the gang runs this same loop. An attempt can end only between steps, where the state is complete.
+/// Only rank 0 returns. The others hold their state until its save and report are acknowledged, so that one of them can
+/// repeat both if rank 0 is lost.
 ///
 /// # Errors
-/// [`StageError::Diverged`] before the weights change if the loss or the gradient norm is not finite; whatever the context says no
-/// with otherwise.
+/// [`StageError::Diverged`] before the weights change if the loss or the gradient norm is not finite; otherwise any
+/// error from the context.
 pub fn train(
     objective: &mut dyn Objective,
     training: &Training,
     cx: &mut dyn GangContext,
 ) -> Result<Trained, StageError> {
     let (steps, slices) = (training.end().0, training.batch.slices);
-    // Before anything is computed: what is saved is known from the start.
+    // Checked before anything is computed: the content of a save is known from the start.
     let (terms, sums) = (objective.terms(), objective.sums());
     cx.task()
         .checkpoint
         .keep
         .check(terms.iter().copied().chain([GRADIENT_NORM, LEARNING_RATE]))
         .map_err(StageError::Input)?;
-    // Names of other stages say nothing about a state, which the key of the next rung rests on.
+    // The digest excludes names of other stages, which do not affect a state; the key of the next rung depends on it.
     let config = cx.task().settings.digest();
     let accelerator = Some(cx.device()).filter(models::device::is_accelerator);
     let mut state = TrainState::new(objective.groups(), objective.buffers());
@@ -147,7 +151,7 @@ pub fn train(
         if stop || state.step >= steps {
             if cx.leads() {
                 if saved_at != Some(state.step) {
-                    // Publishing may fail or be cut off; the last step should not have to be found again.
+                    // Publishing may fail or be interrupted; the last step should not have to be recomputed.
                     save(&mut state, config, &recent, cx)?;
                 }
                 state.fetch();
@@ -157,7 +161,7 @@ pub fn train(
                     Trained::Finished { state, metrics: recent.means() }
                 });
             }
-            // Until rank 0 has stored the last step, it lives in the members' memory alone.
+            // Until rank 0 has stored the last step, it exists only in the members' memory.
             cx.hold()?;
             stop = false;
             let applied = Some(state.step);
@@ -167,7 +171,7 @@ pub fn train(
             }
             continue;
         }
-        // A regroup may hand us other slices of the same step; what was computed is not computed again.
+        // A regroup may assign other slices of the same step; computed slices are kept.
         let layout = Layout::of(&state, terms.len(), &sums);
         let share = cx.share(slices);
         let missing: Vec<usize> = share.clone().filter(|slice| !done.contains_key(slice)).collect();
@@ -181,7 +185,7 @@ pub fn train(
             Exchange::Regroup => {
                 let applied = Some(state.step);
                 if meet(&mut state, applied, cx)? == Met::Adopted {
-                    // A peer was ahead: these slices are of a step that is over.
+                    // A peer was ahead: these slices belong to a finished step.
                     done.clear();
                     keep(&mut state, accelerator.as_ref());
                     objective.load(&state);
@@ -215,8 +219,8 @@ pub fn train(
     }
 }
 
-/// Brings `state` to where the gang is, or to where the task was left: rank 0 alone reads the checkpoint, or the state that the rung
-/// before left, and the others take it from there. Gives the step that is committed already, if this member read it.
+/// Brings `state` to the gang's position or the task's last one. Only rank 0 reads the checkpoint, or the state of the
+/// rung before; the others adopt it. Returns the step that is already committed, if this member read it.
 fn begin(
     objective: &mut dyn Objective,
     state: &mut TrainState,
@@ -242,14 +246,14 @@ fn begin(
         if met == Met::Spoiled {
             *state = TrainState::new(objective.groups(), objective.buffers());
         }
-        // Nobody has a state if rank 0 was lost before it met the others. Then the next one reads it.
+        // No member has a state if rank 0 was lost before the rendezvous. Then the next rank 0 reads it.
         if applied.is_some() || met == Met::Adopted || !continues {
             return Ok(saved_at);
         }
     }
 }
 
-/// Takes over the state of a checkpoint.
+/// Loads the state of a checkpoint.
 fn restore(state: &mut TrainState, manifest: &protocol::Manifest, cx: &dyn GangContext) -> Result<(), StageError> {
     let saved = crate::artifacts::open(&*cx.blobs(), manifest, STATE_FILE)?;
     state.restore(&*saved).map_err(|error| match error {
@@ -258,18 +262,19 @@ fn restore(state: &mut TrainState, manifest: &protocol::Manifest, cx: &dyn GangC
     })
 }
 
-/// What meeting the others came to.
+/// Result of a rendezvous.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Met {
-    /// This member's state is as it was.
+    /// This member's state is unchanged.
     Kept,
-    /// It is a peer's.
+    /// The state is a peer's.
     Adopted,
-    /// It had only initialised itself, and some of a peer's state came over that before the peer was lost; nobody is ahead any more.
+    /// The member had only initialised itself. A part of a peer's state overwrote that before the peer was lost, and no
+    /// member is ahead any more.
     Spoiled,
 }
 
-/// Meets the others, and takes over a peer's state where one is ahead or this member has none (`applied` is `None`).
+/// Meets the others, and adopts a peer's state if one is ahead or this member has none (`applied` is `None`).
 fn meet(state: &mut TrainState, applied: Option<u64>, cx: &mut dyn GangContext) -> Result<Met, StageError> {
     let mut kept = Met::Kept;
     state.fetch();
@@ -290,14 +295,14 @@ fn meet(state: &mut TrainState, applied: Option<u64>, cx: &mut dyn GangContext) 
     }
 }
 
-/// Values are recorded for every one of the first 2,000 steps of a stage, then for every tenth, and for the last.
+/// True for steps whose values are recorded: the first 2,000 steps of a stage, then every tenth, and the last.
 fn due(step: u64, steps: u64) -> bool {
     step <= 2000 || step.is_multiple_of(10) || step == steps
 }
 
-/// Where in a slice's vector each of its values is: the gradients of the groups that the step trains, the terms, the sums.
+/// Order of the values in a slice's vector: the gradients of the groups that the step trains, the terms, the sums.
 struct Layout {
-    /// For each group its gradient's length, if the step trains it.
+    /// For each group its gradient's length; `None` if the step does not train it.
     gradients: Vec<Option<usize>>,
     terms: usize,
     sums: Vec<usize>,
@@ -313,7 +318,7 @@ impl Layout {
         }
     }
 
-    /// A slice's result as one vector.
+    /// Packs a slice's result into one vector.
     fn pack(&self, result: SliceResult) -> Result<Vec<f32>, StageError> {
         let wanted: Vec<usize> = self.gradients.iter().map(|len| len.unwrap_or(0)).collect();
         let lengths = |parts: &[Vec<f32>]| parts.iter().map(Vec::len).collect::<Vec<_>>();
@@ -364,7 +369,7 @@ struct Applied {
     lr: f64,
 }
 
-/// One optimizer update of every group that the step trains. A step that trains none, because it only gathers sums, has norm and rate 0.
+/// Makes one optimizer update of every group that the step trains. A step that only gathers sums has norm and rate 0.
 fn apply(state: &mut TrainState, layout: &Layout, sum: &[f32]) -> Result<Applied, StageError> {
     let gradients = Gradients::of(&state.groups, state.step, layout.gradients(sum));
     let (norm, lr) = gradients.watched(&state.groups).unwrap_or_default();
@@ -377,7 +382,7 @@ fn apply(state: &mut TrainState, layout: &Layout, sum: &[f32]) -> Result<Applied
     Ok(Applied { norm, lr })
 }
 
-/// Lets the objective change the buffers, after the step before `state.step`.
+/// Calls the objective's hook on the buffers for the step before `state.step`.
 fn hook(
     objective: &mut dyn Objective,
     state: &mut TrainState,
@@ -388,8 +393,8 @@ fn hook(
     objective.after(&mut AfterStep { step, buffers, sums, seed: task.seed, stage: &task.name })
 }
 
-/// Has the groups on the accelerator, if there is one, with the values of the host: parameters, moments and averages come back from there
-/// only for a checkpoint, a peer or the end.
+/// Copies the groups to the accelerator, if there is one. Parameters, moments and averages return from there only for a
+/// checkpoint, a peer or the end.
 fn keep(state: &mut TrainState, accelerator: Option<&Device>) {
     if let Some(device) = accelerator {
         state.keep_on(device);
@@ -419,7 +424,7 @@ fn save(
     Ok(())
 }
 
-/// Means of the newest values.
+/// Running means of the newest values.
 #[derive(Debug, Default)]
 struct Recent {
     rows: std::collections::VecDeque<Vec<(String, f64)>>,

@@ -1,8 +1,8 @@
-//! Which examples make up the batch of a step: a function of (seed, step), never of an iterator.
+//! The examples in a step's batch: a function of (seed, step), never of an iterator.
 //!
-//! Examples are taken in the order of a keyed permutation per epoch. Where they have lengths, a pool of several batches is sorted by
-//! length and cut again, so that a batch, and a slice of it, is little padding and of even cost; the batches of a pool come in a keyed
-//! order. Each place in the sequence of examples has a number, by which everything else about the example is drawn.
+//! Each epoch takes the examples in a keyed permutation. If they have lengths, a pool of several batches is sorted by
+//! length and cut again, so that a batch, and a slice of it, has little padding and even cost. The batches of a pool
+//! are in a keyed order. Each place in the sequence of examples has a number that keys all other draws of the example.
 
 use std::collections::HashMap;
 use std::ops::Range;
@@ -15,7 +15,7 @@ use protocol::Seed;
 pub struct Pick {
     /// Place in the sequence of all examples of the phase; keys every draw about the example.
     pub place: u64,
-    /// Which of the data set's examples.
+    /// Index of the example in the data set.
     pub example: usize,
 }
 
@@ -31,12 +31,12 @@ pub struct Order {
 }
 
 impl Order {
-    /// `batch` examples a step out of `examples`; `pool` batches are sorted by length together.
+    /// Takes `batch` of `examples` examples per step; `pool` batches are sorted by length together.
     pub fn new(seed: Seed, purpose: &str, examples: usize, batch: usize, pool: usize) -> Self {
         Self { seed, purpose: purpose.to_owned(), examples, batch, pool, epochs: HashMap::new() }
     }
 
-    /// Whether several batches are sorted together.
+    /// Returns true if several batches are sorted together.
     pub fn is_pooled(&self) -> bool {
         self.pool > 1
     }
@@ -54,7 +54,7 @@ impl Order {
         Pick { place, example }
     }
 
-    /// The batch of the phase's step `step`, shortest first. `length` gives an example's length at its place.
+    /// The batch of the phase's step `step`, shortest first. `length` returns an example's length at its place.
     pub fn batch(&mut self, step: u64, mut length: impl FnMut(Pick) -> usize) -> Vec<Pick> {
         let (batch, pool) = (self.batch as u64, self.pool as u64);
         let first = step / pool * pool * batch;
@@ -71,7 +71,7 @@ impl Order {
         picks[turn * self.batch..(turn + 1) * self.batch].iter().map(|(_, pick)| *pick).collect()
     }
 
-    /// The part of a batch that is slice `slice` of `slices`.
+    /// The range of slice `slice` of `slices` in a batch.
     pub fn slice(&self, slice: usize, slices: usize) -> Range<usize> {
         self.batch * slice / slices..self.batch * (slice + 1) / slices
     }

@@ -1,4 +1,4 @@
-//! What training changes, and its bytes.
+//! The state that training changes, and its serialisation.
 
 use std::collections::BTreeMap;
 
@@ -14,7 +14,7 @@ use super::group::{Group, GroupPlan};
 /// The largest header of a saved state that is read; ours have some hundred bytes.
 const HEADER_BYTES: u64 = 1 << 20;
 
-/// Why a saved state was not taken over.
+/// A saved state was not loaded.
 #[derive(Debug, thiserror::Error)]
 pub enum RestoreError {
     /// It is not a state of this plan.
@@ -25,20 +25,20 @@ pub enum RestoreError {
     Blob(#[from] BlobError),
 }
 
-/// All that a training stage carries from step to step. Groups may be on an accelerator ([`keep_on`](Self::keep_on)); what is saved, sent to
-/// a peer or published is the host's, which [`fetch`](Self::fetch) brings up to date.
+/// The complete state of a training stage between steps. Groups may be on an accelerator ([`keep_on`](Self::keep_on)).
+/// Saved, sent and published values are the host's, which [`fetch`](Self::fetch) updates.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainState {
-    /// Updates applied.
+    /// Number of updates applied.
     pub step: u64,
     /// Groups in the objective's order.
     pub groups: Vec<Group>,
-    /// What no optimizer changes.
+    /// Values that no optimizer changes.
     pub buffers: Buffers,
 }
 
 impl TrainState {
-    /// The state before the first step.
+    /// Creates the state before the first step.
     ///
     /// # Panics
     /// If two groups or two buffers have one name.
@@ -50,12 +50,12 @@ impl TrainState {
         state
     }
 
-    /// Has the groups on `device` from now on, with the values of the host.
+    /// Copies the groups to `device` and trains there from now on.
     pub fn keep_on(&mut self, device: &Device) {
         self.groups.iter_mut().for_each(|group| group.send(device));
     }
 
-    /// Brings the host's values up to date. Costs nothing where groups are on the host anyway.
+    /// Copies newer values of the accelerator to the host. Costs nothing if groups are on the host anyway.
     pub fn fetch(&mut self) {
         self.groups.iter_mut().for_each(Group::fetch);
     }
@@ -64,7 +64,7 @@ impl TrainState {
         self.groups.iter().all(Group::is_fetched)
     }
 
-    /// All that is saved besides the step, by its name there.
+    /// All saved values besides the step, by name.
     fn values(&self) -> BTreeMap<String, &Vec<f32>> {
         fn of(group: &Group) -> Vec<(String, &Vec<f32>)> {
             let all = [("params", Some(&group.params)), ("m", Some(&group.m)), ("v", Some(&group.v))];
@@ -83,8 +83,9 @@ impl TrainState {
         groups.chain(self.buffers.values_mut())
     }
 
-    /// Begins the bytes of a saved state: safetensors with `step`, and per group `NAME.params`, `NAME.m`, `NAME.v`,
-    /// `NAME.average`, and `buffer.NAME`, in the order and with the alignment of the `safetensors` crate. What follows it is [`Self::saved`]'s.
+    /// Serialises the header of a saved state: safetensors with `step`, and per group `NAME.params`, `NAME.m`,
+    /// `NAME.v`, `NAME.average`, and `buffer.NAME`, in the order and with the alignment of the `safetensors` crate.
+    /// [`Self::saved`] writes the values after it.
     fn header(&self) -> Vec<u8> {
         let mut end = 0;
         let mut info = |dtype, shape: usize, bytes: usize| {
@@ -104,8 +105,8 @@ impl TrainState {
         [&(json.len() as u64).to_le_bytes()[..], &json].concat()
     }
 
-    /// Calls `save` with the bytes of a saved state in pieces, nearly all of which lie where they are: no second copy of a large
-    /// state is made.
+    /// Calls `save` with the bytes of a saved state in pieces. Nearly all pieces borrow the buffers: a large state is
+    /// not copied.
     pub fn saved<T>(&self, save: impl FnOnce(&[&[u8]]) -> T) -> T {
         debug_assert!(self.is_fetched());
         let (header, step) = (self.header(), self.step.to_le_bytes());
@@ -115,11 +116,11 @@ impl TrainState {
         save(&pieces)
     }
 
-    /// Takes over a saved state of the same plan, buffer by buffer.
+    /// Loads a saved state of the same plan, buffer by buffer.
     ///
     /// # Errors
-    /// If a buffer is missing or has another length; nothing is changed then. If the bytes cannot be read; then the state is
-    /// of no use any more.
+    /// If a buffer is missing or has another length; the state is then unchanged. If the bytes cannot be read; the
+    /// state is then unusable.
     pub fn restore(&mut self, saved: &dyn Blob) -> Result<(), RestoreError> {
         let wrong = |text: String| RestoreError::Wrong(text);
         let mut length = [0; 8];
@@ -161,7 +162,7 @@ impl TrainState {
             let at = place(&name, Dtype::F32, values.len())?;
             places.insert(name, at);
         }
-        // A state of a plan that has more would go on without what it lost here.
+        // A state of a plan with more buffers would otherwise silently lose them here.
         if metadata.tensors().len() != places.len() + 1 {
             let strange = |name: &String| name != "step" && !places.contains_key(name);
             let mut strange: Vec<String> = metadata.tensors().into_keys().filter(strange).collect();
@@ -175,8 +176,8 @@ impl TrainState {
         Ok(())
     }
 
-    /// The state as it travels between members of a gang, who have the same plan: `step` (as little-endian bytes), then the buffers as they
-    /// lie in memory. Nothing is copied: with large models that is what takes the time.
+    /// The state as sent between members of a gang, who have the same plan: `step` (as little-endian bytes), then the
+    /// buffers in memory. Nothing is copied, because copying large models dominates the time.
     pub fn pieces<'a>(&'a self, step: &'a [u8; 8]) -> Vec<&'a [u8]> {
         debug_assert!(self.is_fetched());
         let groups = self.groups.iter().flat_map(|group| {
@@ -186,7 +187,7 @@ impl TrainState {
         std::iter::once(step.as_slice()).chain(groups).chain(buffers).collect()
     }
 
-    /// Where [`Self::pieces`] of another member belong; what arrives in `step` is the step.
+    /// The buffers that receive another member's [`Self::pieces`]; `step` receives the step.
     pub fn room<'a>(&'a mut self, step: &'a mut [u8; 8]) -> Vec<&'a mut [u8]> {
         let groups = self.groups.iter_mut().flat_map(|group| {
             let Group { params, m, v, average, .. } = group;
@@ -202,7 +203,7 @@ impl TrainState {
         &self.groups[index].params
     }
 
-    /// The parameters of group `index` as they should be used: their average where one is kept.
+    /// The result of the training of group `index`: the average if one is kept, else the parameters.
     pub fn result(&self, index: usize) -> &[f32] {
         debug_assert!(self.is_fetched());
         let group = &self.groups[index];
@@ -234,7 +235,7 @@ mod tests {
         }
     }
 
-    /// Flex stands in for an accelerator: what is tested is who has the newest values.
+    /// Flex replaces an accelerator: the test checks the location of the newest values.
     #[test]
     fn groups_on_a_device_train_as_on_the_host_and_come_back_for_a_checkpoint() {
         let device = models::device::open(protocol::stage::Backend::Flex, 0).unwrap();
@@ -263,7 +264,7 @@ mod tests {
         assert!(!there.is_fetched() && !near(&host, &there), "the host's are older");
         there.fetch();
         assert!(there.is_fetched() && near(&host, &there), "{host:#?}\n{there:#?}");
-        // What was saved goes on, on the host and on the device.
+        // Training continues from the saved state, on the host and on the device.
         let bytes: Arc<[u8]> = there.saved(|pieces| pieces.concat()).into();
         let mut other = TrainState::new(plans.to_vec(), Vec::new());
         other.restore(&bytes).unwrap();
@@ -305,7 +306,7 @@ mod tests {
         }
         joiner.step = u64::from_le_bytes(step);
         assert_eq!((joiner, rest), (donor.clone(), &[][..]));
-        // What is saved says the same, and lies where it is.
+        // The saved bytes are the same, and nothing is copied.
         let bytes: Arc<[u8]> = donor.saved(|pieces| pieces.concat()).into();
         let lies = |piece: &&&[u8]| donor.values().values().any(|values| values.as_ptr().cast() == piece.as_ptr());
         assert_eq!(donor.saved(|pieces| pieces.iter().filter(lies).count()), donor.values().len());
@@ -313,7 +314,7 @@ mod tests {
         saved.restore(&bytes).unwrap();
         assert_eq!(saved, donor);
 
-        // It is what the crate would have written, and less than all of it is refused.
+        // They are the bytes that the crate would write, and fewer bytes are refused.
         let mut tensors = Tensors::default().with_integers("step", [1], vec![3]);
         for (name, values) in donor.values() {
             tensors = tensors.with(&name, [values.len()], values.clone());

@@ -1,10 +1,10 @@
-//! The fixed tree along which the slices of a step are summed, for a gang that is in one place. A gang over a network sums the
-//! same tree piece by piece (`worker::gang`); its tests hold the two together.
+//! The fixed tree along which the slices of a step are summed, for a gang in one process. A gang over a network sums
+//! the same tree piece by piece (`worker::gang`); its tests compare the two.
 
 /// The sum of `parts` along the fixed tree: a range is split at the largest power of two below its length.
 ///
 /// # Panics
-/// If there are no parts, or parts of several lengths.
+/// If there are no parts, or parts of different lengths.
 pub fn tree_sum(parts: &[Vec<f32>]) -> Vec<f32> {
     if let [only] = parts {
         return only.clone();

@@ -1,4 +1,4 @@
-//! Every kind of stage at sizes at which a step takes a few milliseconds.
+//! Every kind of stage, with sizes for which a step takes a few milliseconds.
 
 use std::collections::BTreeMap;
 
@@ -39,7 +39,8 @@ fn distillation(steps: u64) -> Distillation {
 /// Name, settings and inputs (field, stage).
 pub(crate) type Link = (&'static str, StageSettings, Vec<(&'static str, &'static str)>);
 
-/// Steps of the training stages, in order: vae, mld, lcm, pcm. The length estimator makes as many as the VAE, the control part as the LCM.
+/// Steps of the training stages, in order: vae, mld, lcm, pcm. The length estimator makes as many as the VAE, the
+/// control part as many as the LCM.
 pub(crate) type Steps4 = [u64; 4];
 
 /// The stages in order.
@@ -106,7 +107,8 @@ pub(crate) fn chain(shards: usize, steps: Steps4) -> Vec<Link> {
     ]
 }
 
-/// Every training of `links` once more, beginning with what it gave, of which every tensor fits; how many there are.
+/// Repeats every training of `links`, initialised with its own output, so that every tensor fits. Returns the number of
+/// trainings.
 #[allow(dead_code, reason = "not every test file uses it")]
 pub(crate) fn begin_again(bench: &mut Bench, links: Vec<Link>, outputs: &BTreeMap<&'static str, Digest>) -> usize {
     let mut count = 0;

@@ -1,4 +1,4 @@
-//! Evaluators (`04_evaluator*`).
+//! Import of published evaluators (`04_evaluator*`).
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use stages::evaluator::TrainedEvaluator;
 use crate::fixtures::{Arrays, Gates, device, name};
 use crate::world::{FORWARD, World, blank, format_of, text_of, with_file};
 
-/// An evaluator's file beside statistics that change nothing, in the published layout.
+/// An evaluator's file beside statistics that normalise nothing, in the published layout.
 fn evaluator(world: &mut World, folder: &Path, format: DataFormat) -> Digest {
     let (path, features) = (world.folder.path().join("evaluator"), Skeleton::of(format).features);
     let (model, meta) = (path.join("text_mot_match/model"), path.join("Comp_v6_KLD01/meta"));
@@ -34,7 +34,7 @@ fn evaluators_give_what_they_were_published_with() {
         let imported = evaluator(&mut world, &folder, format_of(width).expect("a format with these features"));
         let manifest = world.manifest(imported);
         let trained = TrainedEvaluator::read(&*world.bench.blobs(), &manifest, &device()).expect("an evaluator");
-        // The network itself: what is measured with it pads motions, as loaders do, where the fixture ends them.
+        // The network itself is compared: measuring pads motions, as loaders do, where the fixture ends them.
         let device = device();
         let fresh = Evaluator::new(&trained.meta().config, &mut blank(&device));
         let network = names::load(fresh, &trained.weights(), "").expect("its own weights");

@@ -1,4 +1,4 @@
-//! Weights out again: the files of a layout, held against those that were imported.
+//! Exports of imported weights, compared with the original files.
 
 use std::collections::BTreeMap;
 use std::io::Write as _;
@@ -12,7 +12,7 @@ use text_models::{StoredTensor, Weights};
 use crate::fixtures::name;
 use crate::world::{World, text_of};
 
-/// The files of a layout, written below `folder`, by name.
+/// Writes the files of a layout below `folder`, and returns them by name.
 pub(crate) fn exported(world: &World, digest: Digest, layout: Layout) -> BTreeMap<&'static str, PathBuf> {
     let (manifest, blobs) = (world.manifest(digest), world.bench.blobs());
     let folder = world.folder.path().join(format!("{}-{}", layout.name(), digest.short()));
@@ -32,10 +32,11 @@ pub(crate) fn exported(world: &World, digest: Digest, layout: Layout) -> BTreeMa
     written
 }
 
-/// Keeps an exported file in the folder `STRIDE_EXPORTS`, if that is set, and notes there what it was imported from: `tests/torch_load.py` reads both.
+/// Copies an exported file to the folder `STRIDE_EXPORTS`, if that is set, with a note of its origin;
+/// `tests/torch_load.py` reads both.
 fn keep(ours: &Path, theirs: &Path, without: &[&str]) {
     let Some(folder) = std::env::var_os("STRIDE_EXPORTS").map(PathBuf::from) else { return };
-    // A layout's folder has the digest of what was exported in its name.
+    // The name of a layout's folder contains the digest of the exported artifact.
     let layout = ours.parent().expect("a folder of a layout");
     let kept = format!("{}-{}", name(layout), name(ours));
     std::fs::create_dir_all(&folder).expect("a folder that was asked for");
@@ -48,7 +49,8 @@ fn keep(ours: &Path, theirs: &Path, without: &[&str]) {
     pairs.write_all(format!("{}\n", row.join("\t")).as_bytes()).expect("a folder that was asked for");
 }
 
-/// Holds an exported file against the one that was imported: the same names and bits, but for names that begin with one of `without`.
+/// Checks an exported file against the imported one: the same names and bits, except for names with a prefix in
+/// `without`.
 pub(crate) fn expect_file(ours: &Path, theirs: &Path, without: &[&str]) {
     keep(ours, theirs, without);
     let open = |path: &Path| Weights::open_file(path).unwrap_or_else(|e| panic!("{e}"));

@@ -27,7 +27,7 @@ fn vaes_give_what_they_were_published_with() {
         let config = json(&folder.join("config.json"));
         let constructor = &config["constructor"];
         let imported = vae(&mut world, &folder.join("weights.ckpt"), constructor).output();
-        // The same under the same names in safetensors.
+        // The same weights under the same names in safetensors.
         assert_eq!(vae(&mut world, &folder.join("weights.safetensors"), constructor).output(), imported);
         let manifest = world.manifest(imported);
         world.expect_bits(&manifest, &folder.join("weights.safetensors"), &str::to_owned);
@@ -58,7 +58,7 @@ fn vaes_give_what_they_were_published_with() {
     }
 }
 
-/// What a student's file and its folder give: the VAE, the model, and the model with its control part.
+/// Imports a student's file and its folder: the VAE, the model, and the model with its control part.
 pub(crate) fn motion_lcm(world: &mut World, folder: &Path, file: &Path) -> (Digest, Digest, Ran) {
     let config = json(&folder.join("config.json"));
     let vae = vae(world, file, &config["vae"]).output();
@@ -137,7 +137,7 @@ fn motion_lcm_and_its_control_part_give_what_they_were_published_with() {
     }
 }
 
-/// What is imported is encoded with, and drawn from.
+/// The imported models encode and generate.
 fn works(world: &mut World, vae: Digest, model: Digest, meta: &DenoiserMeta) {
     let clips = StageSettings::DataSynthetic(DataSynthetic { clips: 12, ..DataSynthetic::default() });
     let data = world.bench.run("dataset", &clips, &[]).expect("the stage runs").output();

@@ -44,7 +44,7 @@ fn mdm_gives_what_it_was_published_with() {
             world.expect_bits(&denoiser, &folder.join("weights.safetensors"), &str::to_owned);
             world.load(Mdm::new(&sizes, &mut blank(&device)), &denoiser, "")
         } else {
-            // No data set has features of this width, and so no stage gives a model of it.
+            // No data set has features of this width, so no stage can make a model of it.
             let refused = world.import(&settings, &[("text", text)]).unwrap_err();
             assert!(refused.contains("set `format`"), "{refused}");
             let network = Mdm::new(&sizes, &mut blank(&device));
@@ -54,7 +54,7 @@ fn mdm_gives_what_it_was_published_with() {
         let masked = settings.mask_frames;
         for case in ["full", "ragged", "single"] {
             let stored = |part: &str| io.get(&format!("{case}/{part}"));
-            // [B, F, 1, T] as [B, T, F].
+            // Converts [B, F, 1, T] to [B, T, F].
             let turned = |array: &Array| {
                 let (batch, features, frames) = (array.shape[0], array.shape[1], array.shape[3]);
                 let at = |b: usize, t: usize, f: usize| array.values[(b * features + f) * frames + t];
@@ -75,7 +75,7 @@ fn mdm_gives_what_it_was_published_with() {
                 &mut Dropout::off(),
             );
             let wanted = turned(stored("output"));
-            // Behind a motion's end there is nothing to be compared where frames are masked.
+            // With masked frames nothing past a motion's end can be compared.
             let width = wanted.shape[2];
             let found = fixtures::values(out);
             for (b, length) in lengths.iter().enumerate() {

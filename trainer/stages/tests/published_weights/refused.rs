@@ -1,4 +1,4 @@
-//! What is refused: networks that are not whole, files that are none, parts of other models.
+//! Refused imports: incomplete networks, invalid files, parts of other models.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -13,7 +13,7 @@ use crate::world::{World, part, size, with_file};
 /// Tensors by name: shape and values.
 type Named = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
-/// Tensors as a safetensors file, some of them changed.
+/// Writes tensors as a safetensors file after `change`.
 fn changed(from: &Path, to: &Path, change: &dyn Fn(&mut Named)) {
     let bytes = std::fs::read(from).expect("a file of the fixture");
     let stored = safetensors::SafeTensors::deserialize(&bytes).expect("safetensors");
@@ -61,7 +61,7 @@ fn what_makes_no_whole_network_is_refused_with_all_that_is_wrong() {
     }
     let nan = refused(&|all| all.get_mut("final_layer.bias").expect("it").1[3] = f32::NAN, &settings);
     assert!(nan.contains("`final_layer.bias`: number 3 of 263 is not finite"), "{nan}");
-    // A wide axis asks for a network that the file does not hold; nothing is made of it.
+    // A wide axis describes a network that the file does not hold; nothing is allocated for it.
     let wide = refused(
         &|all| {
             let huge = (vec![3, 1 << 20], vec![0.0; 3 << 20]);
@@ -122,7 +122,7 @@ fn what_is_of_another_kind_or_of_another_vae_is_refused() {
     let narrow = world.text(12);
     let said = world.import(&settings, &[("vae", vae), ("text", narrow)]).unwrap_err();
     assert!(said.contains("768 numbers a caption, `text` gives 12"), "{said}");
-    // Another VAE of the same size: one number is another.
+    // Another VAE of the same size: one number differs.
     let (from, to) = (folder.join("weights.safetensors"), world.folder.path().join("other.safetensors"));
     changed(&from, &to, &|all| all.get_mut("vae.final_layer.bias").expect("it").1[0] += 1.0);
     let other = {

@@ -68,7 +68,7 @@ fn tokenizers_give_what_they_were_published_with() {
     }
 }
 
-/// Whether a tokenizer has one codebook.
+/// Returns true if a tokenizer has one codebook.
 fn trained_single(manifest: &Manifest) -> bool {
     manifest.meta["quantizers"] == 1
 }

@@ -1,4 +1,5 @@
-//! What the tests of published weights share: stages that import on one worker, and the smaller parts of the fixtures.
+//! Common part of the tests of published weights: stages that import on one worker, and the smaller parts of the
+//! fixtures.
 
 use std::path::{Path, PathBuf};
 
@@ -19,10 +20,10 @@ use stages::text;
 
 use crate::fixtures::{device, folders, shared};
 
-/// One forward pass, as the fixtures' README has it.
+/// Gate of one forward pass, from the fixtures' README.
 pub(crate) const FORWARD: f64 = 3e-6;
 
-/// Folders of fixtures that start with `prefix` and have the file `file`.
+/// Folders of fixtures with the prefix `prefix` that contain the file `file`.
 pub(crate) fn with_file(prefix: &str, file: &str) -> Vec<PathBuf> {
     let Some(root) = shared("parity") else { return Vec::new() };
     let found: Vec<PathBuf> = folders(&root, &[prefix]).into_iter().filter(|f| f.join(file).exists()).collect();
@@ -32,7 +33,7 @@ pub(crate) fn with_file(prefix: &str, file: &str) -> Vec<PathBuf> {
 
 pub(crate) struct World {
     pub(crate) bench: Bench,
-    /// Statistics that a stage reads.
+    /// Folder of the statistics that stages read.
     pub(crate) folder: tempfile::TempDir,
 }
 
@@ -45,7 +46,7 @@ impl World {
         Self { bench: Bench::new(device(), 7, 1), folder: tempfile::tempdir().expect("a test's own files") }
     }
 
-    /// A folder with statistics of `features` features.
+    /// Writes a folder with statistics of `features` features.
     pub(crate) fn statistics(&self, features: usize) -> String {
         let folder = self.folder.path().join(features.to_string());
         std::fs::create_dir_all(&folder).expect("a test's own files");
@@ -55,7 +56,7 @@ impl World {
         text_of(&folder)
     }
 
-    /// Caption embeddings of an encoder that gives `dim` numbers.
+    /// Caption embeddings of an encoder with `dim` numbers.
     pub(crate) fn text(&self, dim: usize) -> Digest {
         let mut encoder = text::built_in();
         encoder.meta["dim"] = dim.into();
@@ -78,19 +79,19 @@ impl World {
         self.bench.manifest(digest).expect("stored")
     }
 
-    /// A part of a model.
+    /// Manifest of a part of a model.
     pub(crate) fn part(&self, model: Digest, role: &Role) -> Manifest {
         let model = Model::read(&self.manifest(model)).expect("a model");
         self.manifest(model.part(role).expect("a part"))
     }
 
-    /// A network with the weights of an artifact.
+    /// Loads the weights of an artifact into a network.
     pub(crate) fn load<M: Module>(&self, network: M, part: &Manifest, prefix: &str) -> M {
         let bytes = artifacts::file(&*self.bench.blobs(), part, MODEL_FILE).expect("its weights");
         names::load(network, &bytes, prefix).expect("they fit")
     }
 
-    /// Holds the file of an artifact against the fixture's own safetensors, name by name, bit by bit.
+    /// Compares the file of an artifact with the fixture's own safetensors, name by name, bit by bit.
     pub(crate) fn expect_bits(&self, part: &Manifest, weights: &Path, theirs: &dyn Fn(&str) -> String) {
         let ours = artifacts::file(&*self.bench.blobs(), part, MODEL_FILE).expect("its weights");
         let stored = std::fs::read(weights).expect("a file of the fixture");
@@ -112,7 +113,7 @@ pub(crate) fn blank(device: &Device) -> Init<'_> {
     Init::blank(device)
 }
 
-/// The settings of a part of a fixture's file.
+/// Settings to import a part of a fixture's file.
 pub(crate) fn part(part: ImportedPart, file: &Path) -> ImportModel {
     ImportModel { part, path: text_of(file), ..ImportModel::default() }
 }
@@ -121,7 +122,7 @@ pub(crate) fn format_of(features: usize) -> Option<DataFormat> {
     [DataFormat::Humanml3d, DataFormat::Kit].into_iter().find(|format| Skeleton::of(*format).features == features)
 }
 
-/// The VAE of a file, with statistics of its own width.
+/// Imports the VAE of a file, with statistics of its own width.
 pub(crate) fn vae(world: &mut World, file: &Path, config: &Value) -> Ran {
     let features = size(config, "nfeats");
     let settings = ImportModel {
@@ -133,7 +134,7 @@ pub(crate) fn vae(world: &mut World, file: &Path, config: &Value) -> Ran {
     world.imported(&text_of(file), &settings, &[])
 }
 
-/// A tokenizer of so many codebooks and codes, whose weights mean nothing.
+/// Stores the manifest of a tokenizer with this number of codebooks and codes, without weights.
 pub(crate) fn stand_in(world: &World, codes: usize, quantizers: usize, code_dim: usize) -> Digest {
     let features = 263;
     let meta = serde_json::json!({

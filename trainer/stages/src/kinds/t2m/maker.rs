@@ -1,4 +1,4 @@
-//! What makes the motions that are measured: a model, or what reconstructs real ones.
+//! Source of the measured motions: a model, or reconstructions of real ones.
 
 use burn::tensor::Device;
 use checkpoint::Blobs;
@@ -15,18 +15,18 @@ use crate::kinds::reconstructor::Reconstructor;
 use crate::length::Lengths;
 use crate::parts::model_error;
 
-/// What the motions come from.
+/// Source of the motions.
 #[expect(clippy::large_enum_variant, reason = "there is one of it")]
 pub(super) enum Source {
     /// The clips themselves.
     Real,
-    /// What a VAE or a tokenizer makes of the clips.
+    /// Reconstructions of the clips by a VAE or a tokenizer.
     Reconstructed(Reconstructor),
-    /// A model.
+    /// Motions of a model.
     Generated(Generated),
 }
 
-/// A model, and what says how long its motions are if not the clips.
+/// A model, and the length estimator if it replaces the clips' lengths.
 pub(super) struct Generated {
     model: Box<dyn MotionGenerator>,
     lengths: Option<Lengths>,
@@ -60,7 +60,7 @@ impl Source {
     }
 }
 
-/// The estimator of the stage that `length` names, which must read what the model's captions are embedded with.
+/// Opens the estimator of the input `length`, and checks that it reads the embeddings of the model's captions.
 fn lengths(
     cx: &dyn AttemptContext,
     model: &Model,
@@ -88,7 +88,7 @@ fn lengths(
     Ok(Some(lengths))
 }
 
-/// A model with the captions that it has embedded so far.
+/// A model with the captions embedded so far.
 pub(super) struct Maker<'a> {
     generated: &'a Generated,
     texts: Texts<'a>,
@@ -99,7 +99,8 @@ impl<'a> Maker<'a> {
         Self { generated, texts: Texts::new(&*generated.model) }
     }
 
-    /// A motion for each draw, in the data's own scale; `seeds(k, b)` is the k-th stream of motion b, 0 for the sampler's start.
+    /// Generates a motion for each draw, in the data's own scale. `seeds(k, b)` is the k-th stream of motion b, 0 for
+    /// the sampler's initial noise.
     pub(super) fn motions(
         &self,
         plan: &Plan<'_>,
@@ -113,8 +114,8 @@ impl<'a> Maker<'a> {
         generator::motions(&*self.generated.model, batch, &plan.settings.sampler, &mut |_| {})
     }
 
-    /// Frames of a motion: those of its crop, or what the length estimator draws for its caption, once a repeat. More motions for one
-    /// caption are all as long.
+    /// The length of a motion: that of its crop, or a draw of the length estimator for its caption, once per repeat.
+    /// All motions for one caption have the same length.
     fn frames(&self, plan: &Plan<'_>, draw: Draw) -> Result<usize, StageError> {
         let Some(lengths) = &self.generated.lengths else { return Ok(draw.len) };
         let model = &*self.generated.model;
@@ -124,7 +125,7 @@ impl<'a> Maker<'a> {
     }
 }
 
-/// What `reconstructor` makes of a crop, in the data's own scale.
+/// Reconstructs a crop with `reconstructor`, in the data's own scale.
 pub(super) fn reconstruct(
     plan: &Plan<'_>,
     reconstructor: &Reconstructor,

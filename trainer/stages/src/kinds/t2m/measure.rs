@@ -1,4 +1,4 @@
-//! The metrics of a repeat, from the embeddings that all shards made.
+//! The metrics of a repeat, from the embeddings of all shards.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -12,7 +12,7 @@ use crate::evaluation::frechet::{Gaussian, to_f64};
 use crate::evaluation::retrieval::{Retrieval, in_groups};
 use crate::evaluation::spread;
 
-/// Everything that the shards made, by unit.
+/// All values of the shards, by unit.
 #[derive(Default)]
 pub(super) struct Gathered {
     text: BTreeMap<Unit, Vec<f64>>,
@@ -66,7 +66,7 @@ pub(super) fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, shards: &[Digest]
     Ok(all)
 }
 
-/// The rows of `values` in the order of `rows`.
+/// Reorders the rows of `values` by `rows`.
 fn reorder(values: &[f64], rows: &[u32], width: usize) -> Vec<f64> {
     rows.iter().flat_map(|row| values[*row as usize * width..(*row as usize + 1) * width].iter().copied()).collect()
 }
@@ -79,7 +79,7 @@ pub(super) fn measure(plan: &Plan<'_>, all: &Gathered, repeat: usize) -> BTreeMa
     };
     let order = |what: &str| plan.order(what, repeat, n);
     let (text, made, real, skating) = (of(&all.text), of(&all.made), of(&all.real), of(&all.skating));
-    // What does not fill a pool stands at the end of its permutation.
+    // Entries that do not fill a pool are at the end of its permutation.
     let pools = order("pools");
     let kept = &pools[..plan.kept()];
     let dealt = if plan.settings.shuffled { order("shuffled") } else { pools.clone() };
@@ -89,7 +89,7 @@ pub(super) fn measure(plan: &Plan<'_>, all: &Gathered, repeat: usize) -> BTreeMa
         let suffix = if i == 0 { String::new() } else { format!("_pool{pool}") };
         retrieval(&mut metrics, &suffix, in_groups(&text, &found_in, width, *pool));
     }
-    // In the order of the entries, so that nothing but `drop_last` changes these.
+    // In the order of the entries, so that only `drop_last` changes these.
     let mut rows = kept.to_vec();
     rows.sort_unstable();
     let (made, real) = (reorder(&made, &rows, width), reorder(&real, &rows, width));

@@ -1,9 +1,10 @@
-//! Captions said otherwise, to see whether a model reads words or meaning. Source: SATO (Chen et al., 2024) and Free-T2M's table 5, whose captions
-//! with exchanged words are published, but not how others are made. Departs: words are exchanged by the table below, which is ours.
+//! Paraphrased captions, to test whether a model depends on words or on meaning. Source: SATO (Chen et al., 2024) and
+//! Free-T2M's table 5. Their captions with exchanged words are published, but not the method. Departs: words are
+//! exchanged by the table below, which is ours.
 
 use motion::Stream;
 
-/// Words that mean the same in a caption; each may stand for any other of its group.
+/// Groups of words with the same meaning in a caption; each may replace any other of its group.
 const GROUPS: &[&[&str]] = &[
     &["person", "man", "someone", "figure", "individual", "human"],
     &["walks", "strolls", "paces", "strides"],
@@ -49,14 +50,14 @@ const GROUPS: &[&[&str]] = &[
     &["looks", "glances", "gazes"],
 ];
 
-/// `caption` with every word that has others of its meaning exchanged for one of them with `probability`. What stands before and after a word, such as
-/// a comma, stays.
+/// Paraphrases `caption`: every word in a group is replaced by another of the group with `probability`. Punctuation
+/// around a word stays.
 pub(super) fn said_otherwise(caption: &str, probability: f64, stream: &mut Stream) -> String {
     let word = |word: &str| {
         let bare = word.trim_matches(|c: char| !c.is_alphanumeric());
         let lower = bare.to_lowercase();
         let Some(group) = GROUPS.iter().find(|group| group.contains(&lower.as_str())) else { return word.to_owned() };
-        // Drawn for each such word, so that a higher probability exchanges the same words and more.
+        // Drawn for each such word, so that a higher probability replaces the same words and more.
         let (share, which) = (stream.uniform(), stream.below(group.len() - 1));
         let others: Vec<&str> = group.iter().copied().filter(|other| *other != lower).collect();
         if share < probability { word.replacen(bare, others[which], 1) } else { word.to_owned() }

@@ -1,4 +1,5 @@
-//! What all shards of an evaluation and its merge agree on: clips, captions, crops, and which of them a repeat leaves out.
+//! The common plan of an evaluation's shards and merge: clips, captions, crops, and the entries that a repeat leaves
+//! out.
 
 use motion::Stream;
 use motion::dataset::{Caption, Dataset, crop};
@@ -13,18 +14,18 @@ use crate::context::{AttemptContext, StageError};
 use crate::evaluator::TrainedEvaluator;
 use crate::kinds::{no_entries, word};
 
-/// Motions computed together.
+/// Number of motions computed together.
 pub(super) const BLOCK: usize = 32;
-/// Where a shard's embeddings are.
+/// File of a shard's embeddings.
 pub(super) const EMBEDDINGS_FILE: &str = "embeddings.safetensors";
 
-/// What a unit of work makes.
+/// Kinds of work units.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum Part {
     /// A block of the split's entries.
     Entries,
-    /// More motions for one caption.
+    /// Additional motions for one caption.
     Many,
 }
 
@@ -41,9 +42,9 @@ pub(super) struct Draw {
     pub(super) entry: usize,
     pub(super) caption: usize,
     pub(super) start: usize,
-    /// Frames of the crop.
+    /// Number of frames of the crop.
     pub(super) len: usize,
-    /// Number of the entry in its split, and the repeat: what else is drawn for this motion is keyed by these.
+    /// Number of the entry in its split, and the repeat: they key the other draws of this motion.
     pub(super) number: usize,
     pub(super) repeat: usize,
 }
@@ -55,9 +56,9 @@ pub(super) struct Plan<'a> {
     pub(super) entries: Vec<usize>,
     pub(super) trained: TrainedEvaluator,
     pub(super) evaluator: Digest,
-    /// What they are of.
+    /// The split of the entries.
     pub(super) split: Split,
-    /// What a model is told instead of each of the dataset's captions; none if it is told those.
+    /// Paraphrased captions for the model; empty if it gets the dataset's.
     told: Vec<String>,
 }
 
@@ -107,7 +108,7 @@ impl<'a> Plan<'a> {
         Ok(Self { settings, seed, dataset, entries, split: taken, trained, evaluator, told })
     }
 
-    /// What a model is told for a caption.
+    /// The text that a model gets for a caption.
     pub(super) fn told(&self, caption: usize) -> &str {
         self.told.get(caption).unwrap_or(&self.dataset.captions[caption].text)
     }
@@ -121,13 +122,14 @@ impl<'a> Plan<'a> {
         permutation(self.seed, &format!("evaluate.t2m/{what}"), repeat as u64, count)
     }
 
-    /// Entries that a repeat measures.
+    /// Number of entries that a repeat measures.
     pub(super) fn kept(&self) -> usize {
         let n = self.entries.len();
         if self.settings.drop_last { n - n % self.settings.first_pool() } else { n }
     }
 
-    /// A caption and a crop of entry number `i` of the split, for the motions (`main`) or for real ones to compare with.
+    /// Draws a caption and a crop of entry number `i` of the split, for the motions (`main`) or for real ones to
+    /// compare with.
     pub(super) fn draw(&self, repeat: usize, i: usize, main: bool) -> Draw {
         let entry = &self.dataset.entries[self.entries[i]];
         let mut stream = self.stream(if main { "entry" } else { "other" }, repeat, i);
@@ -136,7 +138,7 @@ impl<'a> Plan<'a> {
         Draw { entry: self.entries[i], caption, start, len, number: i, repeat }
     }
 
-    /// Entries whose captions MultiModality is taken over; none unless a model draws.
+    /// Entries whose captions MultiModality uses; none for motions that are not a model's.
     pub(super) fn many(&self, repeat: usize) -> Vec<usize> {
         if !self.settings.generates() {
             return Vec::new();
@@ -153,7 +155,7 @@ impl<'a> Plan<'a> {
             .collect()
     }
 
-    /// Entries, by number in the split, of a block.
+    /// Entries of a block, by number in the split.
     pub(super) fn block(&self, block: usize) -> std::ops::Range<usize> {
         block * BLOCK..((block + 1) * BLOCK).min(self.entries.len())
     }
