@@ -1,9 +1,11 @@
-//! Joints in arrays: `.npy` as HumanML3D's `joints` and `new_joints`, `.npz` as tools around AMASS write them.
+//! Joints in arrays: `.npy` as in HumanML3D's `joints` and `new_joints`, `.npz` as written by tools around AMASS.
 //!
-//! An array is `[T, J, 3]` or `[T, 3 J]`. J is 21 (KIT-ML), or at least 22, of which the first 22 are taken: SMPL, SMPL-H and SMPL-X begin alike. An `.npz` holds one of [`KEYS`]
-//! and may say its rate in one of [`RATES`]. AMASS's own files hold body parameters instead of joints, which only its body model can place.
+//! An array is `[T, J, 3]` or `[T, 3 J]`. J is 21 (KIT-ML), or at least 22; then the first 22 are used, because SMPL,
+//! SMPL-H and SMPL-X have the same first joints. An `.npz` holds one of [`KEYS`] and may state its rate in one of
+//! [`RATES`]. AMASS's own files hold body parameters instead of joints; converting those needs AMASS's body model.
 //!
-//! Memory is bounded before it is taken: a file has at most [`limits::CLIP_BYTES`], and no more than that is unpacked of a member.
+//! Limits apply before memory is allocated: a file has at most [`limits::CLIP_BYTES`], and no more than that is
+//! unpacked from a member.
 
 use std::io::{Cursor, Read as _};
 use std::path::Path;
@@ -12,34 +14,34 @@ use motion::files;
 use motion::npy::{self, Array};
 use protocol::limits;
 
-/// Names of joint arrays in an `.npz`, the first of which that is there is read.
+/// Names of joint arrays in an `.npz`, in order of preference.
 pub const KEYS: [&str; 7] = ["joints", "Jtr", "joints3d", "positions", "new_joints", "keypoints3d", "arr_0"];
-/// Names of its frame rate.
+/// Names of the frame rate in an `.npz`.
 pub const RATES: [&str; 4] = ["mocap_framerate", "mocap_frame_rate", "framerate", "fps"];
-/// Members of an archive.
+/// Largest number of members of an archive.
 const MEMBERS: usize = 1_000;
 
-/// Joints as they lay in a file.
+/// Joints as stored in a file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Joints {
-    /// `[T, joints, 3]`.
+    /// Positions of shape `[T, joints, 3]`.
     pub data: Vec<f32>,
-    /// 21 or 22.
+    /// Number of joints, 21 or 22.
     pub joints: usize,
-    /// Frames per second, if the file says.
+    /// Frames per second, if the file states them.
     pub rate: Option<f64>,
 }
 
 /// Reads a `.npy` or `.npz` of joints.
 ///
 /// # Errors
-/// In words, with the file.
+/// A message that names the file.
 pub fn read(file: &Path) -> Result<Joints, String> {
     let bytes = files::read(file, limits::CLIP_BYTES).map_err(|e| format!("{}: {e}", file.display()))?;
     parse(file, &bytes)
 }
 
-/// Reads a file's bytes; `file` only names it in errors.
+/// Reads joints from a file's bytes; `file` is only its name in errors.
 ///
 /// # Errors
 /// As [`read`].
@@ -74,7 +76,7 @@ pub fn parse(file: &Path, bytes: &[u8]) -> Result<Joints, String> {
     joints(file, array, rate)
 }
 
-/// A member's bytes, unpacked.
+/// Unpacks a member's bytes.
 fn member(file: &Path, archive: &mut zip::ZipArchive<Cursor<&[u8]>>, key: &str) -> Result<Vec<u8>, String> {
     let fail = |what: String| format!("{}: array `{key}`: {what}", file.display());
     let member = archive.by_name(&format!("{key}.npy")).map_err(|e| fail(e.to_string()))?;
@@ -86,7 +88,7 @@ fn member(file: &Path, archive: &mut zip::ZipArchive<Cursor<&[u8]>>, key: &str) 
     Ok(bytes)
 }
 
-/// A number alone, as a float or a whole number of 32 or 64 bits.
+/// Reads a single number, a float or an integer of 32 or 64 bits.
 fn rate(file: &Path, bytes: &[u8]) -> Result<f64, String> {
     let whole = |descr: &[u8]| bytes.windows(descr.len()).take(limits::ARRAY_HEADER_BYTES).any(|part| part == descr);
     let value = if whole(b"'<i8'") {
@@ -186,7 +188,7 @@ mod tests {
 
     #[test]
     fn a_bomb_is_not_unpacked() {
-        // 80 MB of zeros are 80 kB here.
+        // 80 MB of zeros are 80 kB in the archive.
         let bomb = archive(&[("joints", vec![0; 80 << 20])]);
         assert!(bomb.len() < 1 << 20);
         assert!(read_bytes(&bomb).unwrap_err().contains("unpacks to more than"));

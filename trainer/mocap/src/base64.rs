@@ -1,8 +1,8 @@
-//! Base64 of RFC 4648, with padding: bytes inside of a text.
+//! Base64 of RFC 4648, with padding, for bytes inside text.
 
 const LETTERS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
 
-/// `bytes` as text.
+/// Encodes `bytes` as text.
 pub(crate) fn encode(bytes: &[u8]) -> String {
     let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
     for group in bytes.chunks(3) {

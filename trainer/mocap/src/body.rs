@@ -1,10 +1,11 @@
-//! What of a skeleton is drawn or animated: which joint follows which, on which side it is, how fast its frames come, how long its unit is.
+//! The skeleton of a drawing or animation: parents and sides of joints, frame rate, and unit of length.
 //!
-//! A [`motion::Skeleton`] is one of the two that features are defined for; a body is any, such as that of a recording with fingers.
+//! A [`motion::Skeleton`] is one of the two that features are defined for; a body may be any skeleton, such as that of
+//! a recording with fingers.
 
 use motion::Skeleton;
 
-/// Which colour a bone has.
+/// Side of the body, which selects a bone's colour.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Side {
     /// Neither left nor right.
@@ -49,12 +50,12 @@ impl Body {
         }
     }
 
-    /// J.
+    /// Number of joints J.
     pub fn joints(&self) -> usize {
         self.parents.len()
     }
 
-    /// The bones, each as the joint where it begins and the one where it ends.
+    /// The bones, each as its start joint and its end joint.
     pub fn bones(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
         self.parents
             .iter()

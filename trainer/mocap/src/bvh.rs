@@ -1,6 +1,7 @@
 //! BVH: a skeleton as nested joints, and a row of channel values for each frame.
 //!
-//! The format has no standard; what is read here is what the common programs write. The file is UTF-8 text of two parts.
+//! The format has no standard; the reader accepts the files of the common programs. The file is UTF-8 text of two
+//! parts.
 //!
 //! ```text
 //! HIERARCHY
@@ -11,15 +12,17 @@
 //! (T lines with a number for each channel, joints in the order of the file)
 //! ```
 //!
-//! Blanks, tabs, blank lines and line ends (LF, CRLF) separate words, and braces need none around them. A name is the rest of
-//! its line up to a brace, so it may contain blanks. Words of the grammar are read in any case.
+//! Blanks, tabs, blank lines and line ends (LF, CRLF) separate words; braces need none around them. A name is the rest
+//! of its line up to a brace, so it may contain blanks. Words of the grammar are read in any case.
 //!
-//! Meaning, in column vectors and degrees: a joint's rotation is the product of its rotation channels in their order, so that `Zrotation Xrotation
-//! Yrotation` is Rz Rx Ry. A position channel replaces that component of `OFFSET`, for any joint, and is in the parent's frame wherever it stands in
-//! the list. The file says nothing of unit and axes; see [`crate::detect`].
+//! Meaning, in column vectors and degrees: a joint's rotation is the product of its rotation channels in their order,
+//! so that `Zrotation Xrotation Yrotation` is Rz Rx Ry. A position channel replaces that component of `OFFSET`, for any
+//! joint. It is in the parent's frame, independent of its place in the list. The file has neither unit nor axes; see
+//! [`crate::detect`].
 //!
-//! What is refused is said with file and line. Limits, all checked before memory is taken: [`MAX_BYTES`], [`MAX_NODES`], [`MAX_DEPTH`], [`MAX_VALUES`], [`MAX_SECONDS`]. A number of frames in a
-//! file is a claim; rows are stored as they are read.
+//! Errors name file and line. All limits are checked before memory is allocated: [`MAX_BYTES`], [`MAX_NODES`],
+//! [`MAX_DEPTH`], [`MAX_VALUES`], [`MAX_SECONDS`]. A file's number of frames is not trusted; rows are stored as they
+//! are read.
 
 mod parse;
 mod write;
@@ -31,34 +34,34 @@ use std::path::{Path, PathBuf};
 use motion::files;
 use motion::quaternion::{self as quat, Quat, Vec3};
 
-/// Bytes of a file that is read.
+/// Largest size of a file, in bytes.
 pub const MAX_BYTES: u64 = 256 << 20;
-/// Joints and end sites of a file.
+/// Largest number of joints and end sites of a file.
 pub const MAX_NODES: usize = 4_096;
-/// Joints inside one another.
+/// Largest nesting of joints.
 pub const MAX_DEPTH: usize = 512;
-/// Frames times channels, and frames times nodes.
+/// Largest product of frames and channels, and of frames and nodes.
 pub const MAX_VALUES: usize = 16 << 20;
-/// Seconds that a recording lasts: what it takes at another rate follows from them.
+/// Longest duration of a recording in seconds; it limits the memory of a resampled recording.
 pub const MAX_SECONDS: f64 = 3600.0;
 
-/// Why a file is not read.
+/// A file that cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum BvhError {
-    /// The file system refused.
+    /// The file system reported an error.
     #[error("{}: {source}", file.display())]
     Io {
         file: PathBuf,
-        /// What it said.
+        /// Error of the file system.
         source: std::io::Error,
     },
-    /// The text is no BVH, or beyond a limit.
+    /// The text is not BVH, or exceeds a limit.
     #[error("{}:{line}: {what}", file.display())]
     Text {
         file: PathBuf,
-        /// From 1.
+        /// Line number, from 1.
         line: usize,
-        /// What was found, and what was expected.
+        /// The text found, and the text expected.
         what: String,
     },
 }
@@ -66,14 +69,14 @@ pub enum BvhError {
 /// One of a joint's degrees of freedom.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Channel {
-    /// The offset along axis 0, 1 or 2, in place of the rest offset's component.
+    /// Offset along axis 0, 1 or 2, which replaces the component of the rest offset.
     Position(usize),
-    /// A rotation about axis 0, 1 or 2, in degrees.
+    /// Rotation about axis 0, 1 or 2, in degrees.
     Rotation(usize),
 }
 
 impl Channel {
-    /// All six, by the name that files use.
+    /// All six channels with their names in files.
     pub const NAMES: [(&'static str, Channel); 6] = [
         ("Xposition", Channel::Position(0)),
         ("Yposition", Channel::Position(1)),
@@ -83,53 +86,53 @@ impl Channel {
         ("Zrotation", Channel::Rotation(2)),
     ];
 
-    /// As in a file.
+    /// Name in files.
     pub fn name(self) -> &'static str {
         Self::NAMES.iter().find(|(_, channel)| *channel == self).map_or("", |(name, _)| name)
     }
 }
 
-/// A joint, or the end of one.
+/// A joint, or an end site.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Node {
-    /// Of an end site: its joint's name and `_end`.
+    /// Name of the joint. An end site has its joint's name and `_end`.
     pub name: String,
     /// Index of the parent, which is smaller than the node's own; `None` for the root.
     pub parent: Option<usize>,
-    /// From the parent, in the parent's frame, when no position channel says otherwise.
+    /// Offset from the parent, in the parent's frame, for components without a position channel.
     pub offset: Vec3,
-    /// In the order of a row. An end site has none.
+    /// Channels in the order of a row; empty for an end site.
     pub channels: Vec<Channel>,
-    /// Whether it is an `End Site`.
+    /// True for an `End Site`.
     pub end: bool,
 }
 
-/// A file.
+/// A recording in BVH.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Bvh {
-    /// In the order of the file: parents before children.
+    /// Nodes in the order of the file: parents before children.
     pub nodes: Vec<Node>,
     /// Seconds between frames, as written.
     pub frame_time: f64,
     /// Frames per second: a usual rate whose frame time rounds to the written digits, else `1 / frame_time`.
     pub rate: f64,
-    /// T.
+    /// Number of frames T.
     pub frames: usize,
-    /// `[T, channels]`, channels of all nodes in order.
+    /// Values `[T, channels]`, channels of all nodes in order.
     pub values: Vec<f64>,
 }
 
 impl Bvh {
-    /// Reads a file.
+    /// Reads a BVH file.
     ///
     /// # Errors
-    /// With file and line.
+    /// The defect, with file and line.
     pub fn read(file: &Path) -> Result<Self, BvhError> {
         let bytes = files::read(file, MAX_BYTES).map_err(|source| BvhError::Io { file: file.into(), source })?;
         Self::parse(file, &bytes)
     }
 
-    /// Numbers in a row.
+    /// Number of values in a row.
     pub fn channels(&self) -> usize {
         self.nodes.iter().map(|node| node.channels.len()).sum()
     }
@@ -154,7 +157,7 @@ impl Bvh {
         pose
     }
 
-    /// Where every node is in a frame, `[nodes, 3]`, in the file's unit and axes.
+    /// Position of every node in a frame, `[nodes, 3]`, in the file's unit and axes.
     pub fn placed(&self, frame: usize) -> Vec<f64> {
         let mut global: Vec<(Vec3, Quat)> = Vec::with_capacity(self.nodes.len());
         for (node, (offset, rotation)) in self.nodes.iter().zip(self.pose(frame)) {
@@ -166,7 +169,7 @@ impl Bvh {
         global.iter().flat_map(|(at, _)| *at).collect()
     }
 
-    /// Where every node is when nothing is rotated and the root lies at its offset, `[nodes, 3]`.
+    /// Position of every node without rotation and with the root at its offset, `[nodes, 3]`.
     pub fn rest(&self) -> Vec<f64> {
         let mut at: Vec<Vec3> = Vec::with_capacity(self.nodes.len());
         for node in &self.nodes {
@@ -185,7 +188,8 @@ fn unit_axis(axis: usize) -> Vec3 {
     [0, 1, 2].map(|k| if k == axis { 1.0 } else { 0.0 })
 }
 
-/// Frame rates that recordings have. A frame time is printed with few digits, so the rate is the usual one that rounds to it.
+/// Usual frame rates of recordings. A frame time is printed with few digits, so the rate is the usual one that rounds
+/// to it.
 const USUAL_RATES: [f64; 32] = [
     5.0,
     6.0,
@@ -221,7 +225,7 @@ const USUAL_RATES: [f64; 32] = [
     500.0,
 ];
 
-/// The rate of a frame time whose last written digit stands for `digit` seconds.
+/// The rate for a frame time whose last written digit is worth `digit` seconds.
 fn nominal_rate(frame_time: f64, digit: f64) -> f64 {
     let apart = |rate: &f64| (1.0 / rate - frame_time).abs();
     let nearest = USUAL_RATES.into_iter().min_by(|a, b| apart(a).total_cmp(&apart(b)));

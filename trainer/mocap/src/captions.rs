@@ -1,10 +1,12 @@
 //! Captions of clips: text beside them, or a table in CSV or JSON.
 //!
-//! A line of text is a sentence, or `sentence#tokens#from#to` as in HumanML3D's `texts`. A sentence alone describes the whole clip, and gets its tokens from the small
-//! dictionary of the synthetic clips; words that it does not know have the tag `X`, which evaluators read as OTHER.
+//! A line of text is a sentence, or `sentence#tokens#from#to` as in HumanML3D's `texts`. A sentence alone describes the
+//! whole clip. Its tokens come from the small dictionary of the synthetic clips; unknown words have the tag `X`, which
+//! evaluators read as OTHER.
 //!
-//! A CSV has a row of names first: [`CLIP`], [`CAPTION`], and optionally [`FROM`], [`TO`] (seconds) and [`SOURCE`], the recording that a clip is a part of. JSON is
-//! `{"clip": "sentence" or ["sentence", ...]}`, or a list of objects with the same names.
+//! A CSV starts with a row of names: [`CLIP`], [`CAPTION`], and optionally [`FROM`], [`TO`] (seconds) and [`SOURCE`],
+//! the recording that a clip belongs to. JSON is `{"clip": "sentence" or ["sentence", ...]}`, or a list of objects with
+//! the same names.
 
 use std::path::Path;
 
@@ -13,33 +15,34 @@ use motion::text::{self, Caption};
 use protocol::excerpt;
 use serde_json::Value;
 
-/// Names of the column that says which clip.
+/// Names of the column with the clip.
 pub const CLIP: [&str; 8] = ["clip", "id", "name", "new_name", "file", "filename", "path", "motion"];
 /// Names of the column with a sentence.
 pub const CAPTION: [&str; 5] = ["caption", "captions", "text", "sentence", "description"];
-/// Seconds at which the described part begins.
+/// Names of the column with the start of the described part, in seconds.
 pub const FROM: [&str; 3] = ["from", "from_s", "f_tag"];
-/// Seconds at which it ends.
+/// Names of the column with its end, in seconds.
 pub const TO: [&str; 3] = ["to", "to_s", "to_tag"];
-/// Names of the column that says which recording a clip is cut from.
+/// Names of the column with the recording that a clip is cut from.
 pub const SOURCE: [&str; 3] = ["source", "source_path", "take"];
 
-/// Bytes of a sentence with its tokens: half of what a line of captions may have, since its mirror image may be nearly twice as long.
+/// Largest size in bytes of a sentence with its tokens: half the limit of a caption's line, since its mirrored sentence
+/// may be nearly twice as long.
 const SENTENCE_BYTES: usize = protocol::limits::CAPTION_BYTES / 2;
 
 /// A row of a table.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Row {
-    /// As written, perhaps with folders and ending.
+    /// The clip as written, possibly with folders and extension.
     pub clip: String,
     pub captions: Vec<Caption>,
     pub source: Option<String>,
 }
 
-/// A sentence as a caption of a whole clip.
+/// Makes a caption of a whole clip from a sentence.
 ///
 /// # Errors
-/// Nothing in it, or a `#`, which separates fields where captions are stored.
+/// If the sentence is empty or contains a `#`, which separates fields of stored captions.
 pub fn sentence(text: &str) -> Result<Caption, String> {
     let text: String = text.split_whitespace().collect::<Vec<_>>().join(" ");
     if text.is_empty() {
@@ -59,10 +62,10 @@ pub fn sentence(text: &str) -> Result<Caption, String> {
     }
 }
 
-/// The captions of a text file.
+/// Reads the captions of a text file.
 ///
 /// # Errors
-/// All lines that are none, with file and line.
+/// All invalid lines, with file and line.
 pub fn of_text(file: &Path, content: &str) -> Result<Vec<Caption>, String> {
     if content.contains('#') {
         let texts = text::parse_file(file, content)
@@ -73,10 +76,10 @@ pub fn of_text(file: &Path, content: &str) -> Result<Vec<Caption>, String> {
     lines.map(|(i, line)| sentence(line).map_err(|e| format!("{}:{}: {e}", file.display(), i + 1))).collect()
 }
 
-/// The rows of a table, CSV or JSON by its first character.
+/// Reads the rows of a table, CSV or JSON by its first character.
 ///
 /// # Errors
-/// With file and line or entry.
+/// The defect, with file and line or entry.
 pub fn of_table(file: &Path, content: &str) -> Result<Vec<Row>, String> {
     let content = content.strip_prefix('\u{feff}').unwrap_or(content);
     let rows = if content.trim_start().starts_with(['{', '[']) { of_json(content) } else { of_csv(content) };
@@ -131,7 +134,8 @@ fn timed(caption: Caption, from_s: f64, to_s: f64) -> Result<Caption, String> {
     Err(format!("a part from {from_s} s to {to_s} s"))
 }
 
-/// Records with the line each begins at. Fields are separated by commas; in quotes they may hold commas, line ends and doubled quotes.
+/// Splits records, each with its first line number. Commas separate fields; fields in quotes may hold commas, line ends
+/// and doubled quotes.
 fn csv_records(content: &str) -> Result<Vec<(usize, Vec<String>)>, String> {
     let mut records = vec![];
     let (mut fields, mut field): (Vec<String>, String) = (vec![], String::new());
@@ -208,10 +212,11 @@ fn of_json(content: &str) -> Result<Vec<Row>, String> {
     }
 }
 
-/// The caption of the mirrored clip: words for sides and turning directions exchanged, in the sentence and its tokens.
+/// The caption of the mirrored clip: words for sides and turning directions are exchanged in the sentence and its
+/// tokens.
 ///
-/// Source: the published set's `M` clips swap `left` and `right`, `clockwise` and `counterclockwise`. Departs: other spellings of the same are swapped too, and a
-/// capital stays one.
+/// Source: the published set's `M` clips swap `left` and `right`, `clockwise` and `counterclockwise`. Departs: other
+/// spellings are swapped too, and capitals are kept.
 pub fn mirrored(caption: &Caption) -> Caption {
     let tokens = caption.tokens.iter().map(|token| swap_words(token)).collect();
     Caption { text: swap_words(&caption.text), tokens, ..caption.clone() }
@@ -231,7 +236,7 @@ fn swap_words(text: &str) -> String {
         ("rightwards", "leftwards"),
         ("anticlockwise", "clockwise"),
     ];
-    // Two words for one direction, joined so that they are one.
+    // Joins two words for one direction to a single word.
     let mut joined = text.to_owned();
     for (from, to) in [
         ("counter-clockwise", "counterclockwise"),

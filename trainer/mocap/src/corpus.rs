@@ -1,8 +1,9 @@
-//! Recordings to a dataset: joints, features, mirrored twins, splits and statistics.
+//! Converts recordings to a dataset: joints, features, mirrored twins, splits and statistics.
 //!
-//! Source of the steps: the published HumanML3D procedure (20 fps, uniform skeleton, features, `M` clips, Mean and Std over all clips of all splits). KIT-ML: 12.5 fps and
-//! 21 joints, made of the 22 as `kit_joints` says. Departs: clips that are too long for the loaders are cut into equal parts instead of left out, and a split
-//! takes whole recordings, so that no part and no mirrored twin of a test clip is trained on.
+//! Source of the steps: the published HumanML3D procedure (20 fps, uniform skeleton, features, `M` clips, Mean and Std
+//! over all clips of all splits). KIT-ML has 12.5 fps and 21 joints, computed from the 22 by `kit_joints`. Departs:
+//! clips that are too long for the loaders are cut into equal parts instead of being left out. A split takes whole
+//! recordings, so that no part and no mirrored twin of a test clip is in the training data.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -25,19 +26,19 @@ use crate::detect::{Up, detect};
 use crate::listing::ClipFile;
 use crate::take::{Reading, Take, resample};
 
-/// How recordings become clips.
+/// Settings of the conversion.
 #[derive(Debug, Clone)]
 pub struct Recipe {
     pub format: DataFormat,
-    /// Joint map, unit and axis; what is `None` is found out for each file.
+    /// Joint map, unit and axis; fields that are `None` are detected for each file.
     pub reading: Reading,
-    /// Frames per second of arrays that do not say it; `None` is 20 for 22 joints and 12.5 for KIT-ML's 21, as in the published sets.
+    /// Frame rate of arrays without one; `None` is 20 for 22 joints and 12.5 for KIT-ML's 21, as in the published sets.
     pub rate: Option<f64>,
     /// Bone lengths `[J]` of the uniform skeleton; `None` is the format's own.
     pub target: Option<Vec<f64>>,
-    /// Adds the mirrored twin of every clip.
+    /// Adds a mirrored twin of every clip.
     pub mirror: bool,
-    /// Whether clips that are too long are cut; else they are left out.
+    /// Cuts clips that are too long; otherwise they are left out.
     pub cut: bool,
 }
 
@@ -45,32 +46,33 @@ pub struct Recipe {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Made {
     pub id: String,
-    /// The recording that it is a part of.
+    /// The recording that the clip belongs to.
     pub source: String,
     pub listed: Option<Split>,
     pub captions: Vec<Caption>,
     pub frames: usize,
-    /// `[frames, D]`; stored apart.
+    /// Rows `[frames, D]`, stored separately.
     #[serde(skip)]
     pub features: Vec<f32>,
 }
 
-/// What a file gave.
+/// Result of one file.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct FromFile {
     pub clips: Vec<Made>,
-    /// How it was read.
+    /// The interpretation of the file.
     pub said: String,
-    /// The axis that was up in it.
+    /// The upward axis of the file.
     pub up: String,
-    /// Why it, or a part of it, gave no clip by the rules.
+    /// Reasons for leaving out the file or a part of it.
     pub left_out: Vec<String>,
 }
 
-/// Reads the joints of a file, `[T, J, 3]` of the format's skeleton at its rate; and how it was read, with the axis that was up.
+/// Reads the joints of a file, `[T, J, 3]` of the format's skeleton at its rate. Also returns the interpretation of the
+/// file, and its upward axis.
 ///
 /// # Errors
-/// In words, with the file.
+/// A message that names the file.
 pub fn joints(file: &Path, recipe: &Recipe) -> Result<(Vec<f32>, String, Up), String> {
     let skeleton = Skeleton::of(recipe.format);
     let is_bvh = file.extension().is_some_and(|e| e.eq_ignore_ascii_case("bvh"));
@@ -99,7 +101,7 @@ pub fn joints(file: &Path, recipe: &Recipe) -> Result<(Vec<f32>, String, Up), St
     Ok((joints.into_iter().map(|v| v as f32).collect(), take.said + &rate, take.up))
 }
 
-/// Arrays are taken as they are in `.npy`, metres and y up, unless told otherwise; `.npz` have either axis up.
+/// Reads arrays unchanged from `.npy`, as metres and y up by default; the axis of `.npz` is detected.
 fn of_array(file: &Path, recipe: &Recipe) -> Result<(Take, usize), String> {
     let found = arrays::read(file)?;
     let format = if found.joints == 21 { DataFormat::Kit } else { DataFormat::Humanml3d };
@@ -133,7 +135,8 @@ fn of_array(file: &Path, recipe: &Recipe) -> Result<(Take, usize), String> {
     Ok((Take { joints, rate, up, said }, 3 * found.joints))
 }
 
-/// The 21 joints of KIT-ML's skeleton, of the 22 `[22, 3]`: hip centre, spine, arms and legs with right before left, and a midfoot two fifths from the ankle to the foot.
+/// The 21 joints of KIT-ML's skeleton from the 22 `[22, 3]`: hip centre, spine, arms and legs with right before left.
+/// The midfoot is two fifths of the way from the ankle to the foot.
 fn kit_joints(frame: &[f64]) -> Vec<f64> {
     let at = |j: usize| -> Vec3 { [frame[3 * j], frame[3 * j + 1], frame[3 * j + 2]] };
     let between = |a: usize, b: usize, part: f64| quat::add(at(a), quat::scale(quat::sub(at(b), at(a)), part));
@@ -144,10 +147,10 @@ fn kit_joints(frame: &[f64]) -> Vec<f64> {
     body.into_iter().chain(arm(1)).chain(arm(0)).chain(leg(1)).chain(leg(0)).flatten().collect()
 }
 
-/// The clips of a file: its parts, and the mirrored twin of each.
+/// Makes the clips of a file: its parts, and the mirrored twin of each.
 ///
 /// # Errors
-/// A file that is broken, or whose figure has no features, in words.
+/// If the file is broken, or its figure has no features.
 pub fn clips_of(file: &ClipFile, recipe: &Recipe) -> Result<FromFile, String> {
     let skeleton = Skeleton::of(recipe.format);
     let (joints, said, up) = joints(&file.path, recipe)?;
@@ -159,7 +162,7 @@ pub fn clips_of(file: &ClipFile, recipe: &Recipe) -> Result<FromFile, String> {
             .push(format!("{}: {frames} frames at {} fps, needs {}", file.id, skeleton.fps, skeleton.min_frames));
         return Ok(made);
     }
-    // The longest length that an example may have.
+    // The largest length of an example.
     let most = skeleton.max_frames - skeleton.unit;
     let parts = if frames < skeleton.max_frames { 1 } else { frames.div_ceil(most) };
     if parts > 1 && !recipe.cut {
@@ -168,7 +171,7 @@ pub fn clips_of(file: &ClipFile, recipe: &Recipe) -> Result<FromFile, String> {
     }
     for part in 0..parts {
         let (start, end) = (frames * part / parts, frames * (part + 1) / parts);
-        // The frame behind the last gives velocities.
+        // The frame after the last supplies velocities.
         let part_joints = &joints[start * width..(end + 1) * width];
         let id = if parts == 1 { file.id.clone() } else { format!("{}-{}", file.id, part + 1) };
         let captions =
@@ -196,7 +199,8 @@ pub fn clips_of(file: &ClipFile, recipe: &Recipe) -> Result<FromFile, String> {
     Ok(made)
 }
 
-/// Captions of a part of a recording. One that describes all of it is every part's; others move with the part, and end where it ends.
+/// Captions of a part of a recording. A caption of the whole recording applies to every part; others are shifted and
+/// cut to the part.
 fn captions_within(captions: &[Caption], from: f64, to: f64, cut: bool) -> Vec<Caption> {
     let within = |caption: &Caption| {
         if !cut || caption.is_whole() {
@@ -208,30 +212,30 @@ fn captions_within(captions: &[Caption], from: f64, to: f64, cut: bool) -> Vec<C
     captions.iter().filter_map(within).collect()
 }
 
-/// How clips are divided.
+/// Division of clips into splits.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Division {
-    /// By the folder's lists.
+    /// By the folder's own lists.
     Lists,
-    /// Whole recordings, drawn by their names.
+    /// Whole recordings, assigned by draws that their names key.
     Sources {
         seed: Seed,
-        /// Shares of the clips.
+        /// Share of validation clips.
         val: f64,
         test: f64,
     },
 }
 
-/// What became of a folder.
+/// Report on a folder.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Report {
-    /// Files by how they were read, with one of them.
+    /// Number of files by interpretation, with an example of each.
     pub read: BTreeMap<String, (usize, String)>,
-    /// Files by the axis that was up, with one of them.
+    /// Number of files by upward axis, with an example of each.
     pub axes: BTreeMap<String, (usize, String)>,
     pub left_out: Vec<String>,
     pub notes: Vec<String>,
-    /// Recordings and clips of each split.
+    /// Number of recordings and clips of each split.
     pub splits: BTreeMap<Split, (usize, usize)>,
 }
 
@@ -252,14 +256,14 @@ impl fmt::Display for Report {
 }
 
 impl Report {
-    /// Counts a file, and passes on what was left out of it.
+    /// Counts a file, and adds its omissions.
     pub fn add(&mut self, id: &str, file: &FromFile) {
         self.read.entry(file.said.clone()).or_insert_with(|| (0, id.to_owned())).0 += 1;
         self.axes.entry(file.up.clone()).or_insert_with(|| (0, id.to_owned())).0 += 1;
         self.left_out.extend(file.left_out.iter().cloned());
     }
 
-    /// Says so if some files were read with another axis up than most: a figure that lies is easily taken for one that stands.
+    /// Reports files whose axis differs from that of most files: a lying figure is easily mistaken for a standing one.
     pub fn compare_axes(&mut self) {
         let most = self.axes.iter().max_by_key(|(_, (files, _))| *files).map(|(axis, _)| axis.clone());
         let Some(most) = most else { return };
@@ -270,10 +274,11 @@ impl Report {
     }
 }
 
-/// Makes a dataset of clips. Their order is kept; entries are sorted by split. By the loaders' rules a caption with times is an entry of its own if its frames are enough.
+/// Makes a dataset of clips. Their order is kept; entries are sorted by split. As in the loaders, a caption with times
+/// is an entry of its own if it has enough frames.
 ///
 /// # Errors
-/// Clips of one recording in two lists, clips in none, or nothing to train on.
+/// If clips of one recording are in two lists, clips are in no list, or the training split is empty.
 pub fn assemble(
     format: DataFormat,
     made: Vec<Made>,
@@ -344,7 +349,7 @@ pub fn assemble(
     Ok(dataset)
 }
 
-/// The split of each clip.
+/// Assigns a split to each clip.
 fn divide(made: &[Made], division: Division) -> Result<Vec<Option<Split>>, String> {
     let Division::Sources { seed, val, test } = division else {
         let mut of: BTreeMap<&str, (Split, &str)> = BTreeMap::new();
@@ -364,7 +369,7 @@ fn divide(made: &[Made], division: Division) -> Result<Vec<Option<Split>>, Strin
     for clip in made {
         *counts.entry(&clip.source).or_default() += 1;
     }
-    // Each recording draws by its name, so that a new one among them moves few others.
+    // Each recording's draw is keyed by its name, so that an additional one moves few others.
     let mut order: Vec<(u64, &str)> = counts
         .keys()
         .map(|source| (Stream::new(seed, &format!("mocap/split/{source}"), 0, 0).bits(), *source))
@@ -386,7 +391,8 @@ fn divide(made: &[Made], division: Division) -> Result<Vec<Option<Split>>, Strin
     Ok(made.iter().map(|clip| splits.get(clip.source.as_str()).copied()).collect())
 }
 
-/// The scales of the published evaluators: those of the set, with turn, velocity and height of the root and the contacts divided by 25, so that they weigh more.
+/// The scales of the published evaluators: those of the set, with turn, velocity and height of the root and the
+/// contacts divided by 25, which increases their weight.
 ///
 /// Source: the text-to-motion evaluators' `feat_bias`; the published files have ratios of 24.9 to 25.3.
 pub fn evaluator_std(skeleton: &Skeleton, std: &[f32]) -> Vec<f32> {
@@ -399,7 +405,7 @@ pub fn evaluator_std(skeleton: &Skeleton, std: &[f32]) -> Vec<f32> {
     std
 }
 
-/// How many of a folder's clips a listing shows in a picture, evenly spread.
+/// Evenly spread indices of at most `most` of `count` clips, for a picture.
 pub fn spread(count: usize, most: usize) -> Vec<usize> {
     let shown = count.min(most);
     (0..shown).map(|i| i * count / shown.max(1)).collect()
@@ -408,7 +414,7 @@ pub fn spread(count: usize, most: usize) -> Vec<usize> {
 /// Reads a table of bone lengths: `.npy` of offsets `[J, 3]` or lengths `[J]`.
 ///
 /// # Errors
-/// In words, with the file.
+/// A message that names the file.
 pub fn read_target(file: &Path, skeleton: &Skeleton) -> Result<Vec<f64>, String> {
     let array = motion::npy::read_any_float(file).map_err(|e| e.to_string())?;
     let joints = skeleton.joints;

@@ -1,26 +1,26 @@
-//! What a file does not say: its unit and its upward axis.
+//! Detection of a file's unit and upward axis.
 //!
-//! The unit is the one in which thigh and shank together come nearest to a grown person's 82 cm; those that files are written in are a factor of two apart at least, so
-//! that short and tall people do not matter, but a small child or a giant has to be told about. Up is where the neck is from the
-//! ankles on average; the rest pose may correct that ([`crate::take::read`]).
+//! The unit is the one in which thigh and shank together are nearest to an adult's 82 cm. The units in use differ by a
+//! factor of at least two, so body height does not matter; a small child or a giant needs an explicit unit. Up is the
+//! mean direction from the ankles to the neck; the rest pose may correct it ([`crate::take::read`]).
 
 use std::fmt;
 
 use motion::quaternion::{self as quat, Vec3};
 
-/// Thigh and shank of a grown person, metres.
+/// Thigh and shank of an adult, metres.
 const LEG_METRES: f64 = 0.82;
-/// The least part of the mean way from ankles to neck that lies along one axis, for a figure that stands.
+/// Smallest share of the mean vector from ankles to neck along one axis for a standing figure.
 const UPRIGHT: f64 = 0.7;
 
-/// Units that files are written in, with their length in metres.
+/// Units of files, with their length in metres.
 pub const UNITS: [(&str, f64); 6] = [
     ("metre", 1.0),
     ("centimetre", 0.01),
     ("millimetre", 0.001),
     ("inch", 0.0254),
     ("foot", 0.3048),
-    // The unit of the CMU database's own files: 1/0.45 inch.
+    // The unit of the CMU database's own files, 1/0.45 inch.
     ("cmu", 0.0254 / 0.45),
 ];
 
@@ -36,16 +36,16 @@ pub enum Up {
 }
 
 impl Up {
-    /// All, by the word for each.
+    /// All axes with their names.
     pub const WORDS: [(&'static str, Up); 6] =
         [("x", Up::X), ("y", Up::Y), ("z", Up::Z), ("-x", Up::NegativeX), ("-y", Up::NegativeY), ("-z", Up::NegativeZ)];
 
-    /// The axis of a word such as `z` or `-y`.
+    /// Parses an axis such as `z` or `-y`.
     pub fn parse(word: &str) -> Option<Self> {
         Self::WORDS.iter().find(|(name, _)| name.eq_ignore_ascii_case(word)).map(|(_, up)| *up)
     }
 
-    /// A vector of the file with y up, by a rotation: left and right stay what they are.
+    /// Rotates a vector of the file to y up; left and right are kept.
     pub fn to_y(self, [x, y, z]: Vec3) -> Vec3 {
         match self {
             Up::Y => [x, y, z],
@@ -64,21 +64,21 @@ impl fmt::Display for Up {
     }
 }
 
-/// What was found.
+/// Detected unit and axis.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Detected {
     /// Name in [`UNITS`].
     pub unit: &'static str,
-    /// Its length.
+    /// Length of the unit in metres.
     pub metres_per_unit: f64,
     /// Thigh and shank in the file's unit.
     pub leg: f64,
     pub up: Up,
-    /// Whether the figure stands along that axis clearly; else `up` is a guess.
+    /// True if the figure clearly stands along that axis; otherwise `up` is a guess.
     pub sure_of_up: bool,
 }
 
-/// Looks at frames of the 22 joints in the file's unit and axes.
+/// Detects from frames of the 22 joints in the file's unit and axes.
 pub fn detect<'a>(frames: impl Iterator<Item = &'a [Vec3]>) -> Detected {
     let (mut leg, mut way, mut count) = (0.0, [0.0; 3], 0.0_f64);
     for joints in frames {

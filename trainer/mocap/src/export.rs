@@ -1,8 +1,8 @@
-//! Motions to files, in the form that a file's name ends in, and motions of arrays back.
+//! Writes motions to files, in the form of the file's extension, and reads motions from arrays.
 //!
-//! `.html` and `.png` hold several motions, all others one. `.bvh` (centimetres) and `.glb` (metres) have constant bone lengths, so joints of a figure whose bones change lie where
-//! directions and mean lengths lead; [`Written`] says how far off. `.npy` has features where there are some, else positions. `.mp4` is made by an `ffmpeg` on the
-//! machine.
+//! `.html` and `.png` hold several motions, all others one. `.bvh` (centimetres) and `.glb` (metres) have constant bone
+//! lengths. If a figure's bones change, its joints are placed by directions and mean lengths; [`Written`] reports the
+//! error. `.npy` has features if there are some, else positions. `.mp4` needs an `ffmpeg` on the machine.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter};
@@ -25,16 +25,16 @@ use crate::plant::plant;
 use crate::rotations::{Rig, RigError};
 use crate::take::{self, Reading, Take};
 
-/// Poses of one motion on a sheet.
+/// Number of poses of one motion on a sheet.
 const POSES: usize = 10;
 
-/// Motions on a sheet of poses, whose picture is in memory: 70 MB.
+/// Largest number of motions on a sheet of poses, whose picture is in memory: 70 MB.
 const MOST_ROWS: usize = 100;
 
-/// What makes videos.
+/// Program that encodes videos.
 const ENCODER: &str = "ffmpeg";
 
-/// What a file can be.
+/// Form of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Form {
     /// A skeleton and its rotations, for animation programs.
@@ -45,16 +45,16 @@ pub enum Form {
     Gif,
     /// A sheet of poses.
     Png,
-    /// A page to look at motions from all sides.
+    /// A page that shows motions from all sides.
     Html,
-    /// An array.
+    /// An array of features or positions.
     Npy,
-    /// A video.
+    /// A video, encoded by ffmpeg.
     Mp4,
 }
 
 impl Form {
-    /// All, by the endings of their names.
+    /// All forms with their extensions.
     pub const ALL: [(&'static str, Form); 7] = [
         ("bvh", Form::Bvh),
         ("glb", Form::Glb),
@@ -65,80 +65,80 @@ impl Form {
         ("mp4", Form::Mp4),
     ];
 
-    /// The form of a file by its name.
+    /// The form of a file, from the extension of its name.
     ///
     /// # Errors
-    /// Another ending, with those that there are.
+    /// Another extension; the message lists the known ones.
     pub fn of(path: &Path) -> Result<Self, ExportError> {
         let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default().to_lowercase();
         let found = Self::ALL.iter().find(|(word, _)| *word == ending);
         found.map(|(_, form)| *form).ok_or_else(|| ExportError::Ending(path.into()))
     }
 
-    /// Whether a file holds several motions.
+    /// Returns true if a file can hold several motions.
     pub fn holds_several(self) -> bool {
         matches!(self, Self::Png | Self::Html)
     }
 }
 
-/// Why a file is not read or written.
+/// A motion that cannot be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum ExportError {
-    /// The name says no form.
+    /// The extension of the name is unknown.
     #[error(
         "cannot write `{}`: expected a name that ends in .bvh, .glb, .gif, .png, .html, .npy or .mp4",
         .0.display()
     )]
     Ending(PathBuf),
-    /// A form of one motion, and several motions or none; a sheet of too many.
+    /// A form of one motion with several or none, or a sheet with too many.
     #[error("cannot write `{}`: {count} motions, expected {expected}", file.display())]
     Count {
         file: PathBuf,
-        /// Motions given.
+        /// Number of motions given.
         count: usize,
-        /// How many it takes.
+        /// Numbers that the form accepts.
         expected: &'static str,
     },
-    /// The file system, or what draws.
+    /// An error of the file system or of the drawing.
     #[error("cannot write `{}`: {source}", file.display())]
     Io { file: PathBuf, source: io::Error },
-    /// Joints that have no rotations.
+    /// The joints have no rotations.
     #[error("cannot write `{}`: {source}", file.display())]
     Rig { file: PathBuf, source: RigError },
-    /// A motion that has no animation.
+    /// The motion has no animation.
     #[error("cannot write `{}`: {source}", file.display())]
     Glb { file: PathBuf, source: GlbError },
-    /// Motions that make no page.
+    /// The motions cannot be put on a page.
     #[error("cannot write `{}`: {source}", file.display())]
     Page { file: PathBuf, source: PageError },
-    /// There is no encoder of video.
+    /// No video encoder was found.
     #[error("cannot write `{}`: there is no program `{program}` on this machine; install it, or write a .gif", file.display())]
     NoEncoder {
         file: PathBuf,
-        /// What was looked for.
+        /// Name of the program.
         program: String,
     },
-    /// The encoder of video failed.
+    /// The video encoder failed.
     #[error("cannot write `{}`: ffmpeg failed: {said}", file.display())]
     Encoder {
         file: PathBuf,
-        /// The end of what it said.
+        /// End of its error output.
         said: String,
     },
-    /// An array that is no motion.
+    /// The array is not a motion.
     #[error(transparent)]
     Npy(#[from] NpyError),
-    /// A recording that does not read.
+    /// The recording cannot be parsed.
     #[error(transparent)]
     Bvh(#[from] BvhError),
-    /// A recording whose joints are not found.
+    /// The joints of the recording were not found.
     #[error("{}: {source}", file.display())]
     Map { file: PathBuf, source: MapError },
-    /// An array of another shape, numbers that are not finite, or a name that says no form that is read.
+    /// An array of another shape, values that are not finite, or an unknown extension.
     #[error("{}: {what}", file.display())]
     Array {
         file: PathBuf,
-        /// What was found, and what was expected.
+        /// The content found, and the content expected.
         what: String,
     },
 }
@@ -146,37 +146,38 @@ pub enum ExportError {
 /// A motion to write.
 #[derive(Debug, Clone)]
 pub struct Motion {
-    /// What it is, such as the sentence that it was drawn for.
+    /// Description of the motion, such as its prompt.
     pub caption: String,
-    /// Where it is from, such as model and seed.
+    /// Origin of the motion, such as model and seed.
     pub note: String,
-    /// Whose joints these are.
+    /// Skeleton of the joints.
     pub skeleton: &'static Skeleton,
     /// Positions `[T, J, 3]` in the skeleton's unit.
     pub joints: Vec<f32>,
-    /// Features `[L, D]` in the data's scale, where there are some.
+    /// Features `[L, D]` in the data's scale, if the motion has them.
     pub features: Option<Vec<f32>>,
-    /// What it was told.
+    /// Waypoints of the motion.
     pub waypoints: Vec<Waypoint>,
-    /// Frames that stayed, where a part of a motion was drawn anew.
+    /// Frames that were kept when a part of the motion was regenerated.
     pub kept: Vec<Range<usize>>,
 }
 
 /// A file that was written.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Written {
-    /// Its name.
+    /// Path of the file.
     pub path: PathBuf,
-    /// How far the joints of its skeleton are from the motion's at most, in metres; `None` for a form that has positions.
+    /// Largest distance of a joint from the motion's, in metres; `None` for a form that stores positions.
     pub off_metres: Option<f64>,
 }
 
 impl Motion {
-    /// Reads a file: an array as [`Motion::read_npy`] does, or a recording in BVH, mapped to the 22 joints of HumanML3D and sampled at its 20 frames per second. `reading` is what a user
-    /// says of a recording; the note says how it was read.
+    /// Reads a file: an array like [`Motion::read_npy`], or a recording in BVH, mapped to the 22 joints of HumanML3D
+    /// and sampled at its 20 frames per second. `reading` holds the user's settings for recordings; the note describes
+    /// the interpretation.
     ///
     /// # Errors
-    /// A file that is neither, or broken.
+    /// If the file is neither, or broken.
     pub fn read(file: &Path, reading: &Reading) -> Result<Self, ExportError> {
         match Form::of(file) {
             Ok(Form::Npy) => Self::read_npy(file),
@@ -196,7 +197,7 @@ impl Motion {
         }
     }
 
-    /// A motion of a file, by whose name it goes.
+    /// Makes a motion named after its file.
     fn of(file: &Path, skeleton: &'static Skeleton, joints: Vec<f32>, features: Option<Vec<f32>>) -> Self {
         let caption = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         Self { caption, note: String::new(), skeleton, joints, features, waypoints: Vec::new(), kept: Vec::new() }
@@ -205,7 +206,7 @@ impl Motion {
     /// Reads an array: features `[L, 263]` or `[L, 251]`, or positions `[T, 22, 3]` or `[T, 21, 3]`.
     ///
     /// # Errors
-    /// A file that is no array, of another shape, or with numbers that are not finite.
+    /// If the file is no array, has another shape, or has values that are not finite.
     pub fn read_npy(file: &Path) -> Result<Self, ExportError> {
         let array = npy::read_any_float(file)?;
         let refuse = |what: String| ExportError::Array { file: file.into(), what };
@@ -232,21 +233,21 @@ impl Motion {
         Ok(Self::of(file, skeleton, joints, features))
     }
 
-    /// The motion with its standing feet in their places; see [`plant`](crate::plant). It has positions alone.
+    /// Fixes standing feet in place; see [`plant`](crate::plant). The result has only positions.
     #[must_use]
     pub fn planted(self) -> Self {
         Self { joints: plant(&self.joints, self.skeleton), features: None, ..self }
     }
 
-    /// T.
+    /// Number of frames T.
     pub fn frames(&self) -> usize {
         self.joints.len() / (3 * self.skeleton.joints)
     }
 
-    /// Writes it alone.
+    /// Writes the motion alone to a file.
     ///
     /// # Errors
-    /// A motion that the form cannot hold, or a file that refuses.
+    /// If the form cannot hold the motion, or the file cannot be written.
     pub fn write(&self, path: &Path) -> Result<Written, ExportError> {
         let form = Form::of(path)?;
         let io = |source| ExportError::Io { file: path.into(), source };
@@ -283,11 +284,11 @@ impl Motion {
         Ok(Written { path: path.into(), off_metres })
     }
 
-    /// Writes a video through `program`, which is called as ffmpeg is.
+    /// Encodes a video with `program`, which has the arguments of ffmpeg.
     fn mp4(&self, path: &Path, program: &str) -> Result<(), ExportError> {
         let io = |source| ExportError::Io { file: path.into(), source };
         let [width, height] = draw::FILM;
-        // A name that begins with a dash, or that looks like a protocol, is a file all the same.
+        // A name that starts with a dash, or resembles a protocol, is still a file.
         let mut name = std::ffi::OsString::from("file:");
         name.push(path);
         let mut encoder = Command::new(program);
@@ -311,7 +312,7 @@ impl Motion {
         })?;
         let stdin = encoder.stdin.take().ok_or_else(|| io(io::Error::other("the encoder has no input")))?;
         let (drawn, output) = std::thread::scope(|scope| {
-            // Beside what it says, so that neither waits for the other.
+            // Parallel to reading its output, so that neither waits for the other.
             let draws = scope.spawn(|| {
                 draw::rgb_along_to(&self.joints, self.skeleton, &self.caption, &self.waypoints, BufWriter::new(stdin))
             });
@@ -331,7 +332,7 @@ impl Motion {
 /// Writes motions on one page or sheet, in sections with a title each.
 ///
 /// # Errors
-/// A form that holds one motion, too many of them, or a file that refuses.
+/// If the form holds one motion, there are too many, or the file cannot be written.
 pub fn write_all(title: &str, sections: &[(String, Vec<&Motion>)], path: &Path) -> Result<Written, ExportError> {
     let form = Form::of(path)?;
     let motions = || sections.iter().flat_map(|(_, motions)| motions.iter().copied());
@@ -374,7 +375,7 @@ pub fn write_all(title: &str, sections: &[(String, Vec<&Motion>)], path: &Path) 
     Ok(Written { path: path.into(), off_metres: None })
 }
 
-/// Files that a known number of motions go to: one for each motion, or one for all, as their forms want it.
+/// Output files for a known number of motions: one per motion, or one for all, depending on their forms.
 #[derive(Debug, Clone)]
 pub struct Outs {
     alone: Vec<PathBuf>,
@@ -383,10 +384,10 @@ pub struct Outs {
 }
 
 impl Outs {
-    /// Looks at the names before anything is drawn, and whether a video can be made here.
+    /// Checks the names before anything is drawn, and the encoder if a video is requested.
     ///
     /// # Errors
-    /// A name that says no form, more motions than a form holds, no encoder of video.
+    /// An unknown extension, more motions than a form holds, or a missing video encoder.
     pub fn new(paths: &[PathBuf], count: usize) -> Result<Self, ExportError> {
         let mut outs = Self { alone: Vec::new(), together: Vec::new(), count };
         for path in paths {
@@ -407,12 +408,12 @@ impl Outs {
         Ok(outs)
     }
 
-    /// Whether nothing is to be written.
+    /// Returns true if there are no output files.
     pub fn is_empty(&self) -> bool {
         self.alone.is_empty() && self.together.is_empty()
     }
 
-    /// Whether motions are needed again when all of them are drawn.
+    /// Returns true if a file needs all motions together at the end.
     pub fn wants_all(&self) -> bool {
         !self.together.is_empty()
     }
@@ -425,7 +426,7 @@ impl Outs {
         self.alone.iter().map(|path| motion.write(&numbered(path, number, self.count))).collect()
     }
 
-    /// Writes the files of all motions.
+    /// Writes the files that hold all motions.
     ///
     /// # Errors
     /// As [`write_all`].
@@ -434,21 +435,21 @@ impl Outs {
     }
 }
 
-/// Whether a program can be started.
+/// Returns true if a program can be started.
 fn is_here(program: &str) -> bool {
     let mut command = Command::new(program);
     command.arg("-version").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
     command.status().is_ok()
 }
 
-/// A motion on a page, with its body of those that the page has.
+/// A motion as a panel of the page, with its body from the page's list.
 fn panel<'a>(motion: &'a Motion, bodies: &'a [(&Skeleton, Body)]) -> Option<Panel<'a>> {
     let (_, body) = bodies.iter().find(|(skeleton, _)| *skeleton == motion.skeleton)?;
     let Motion { caption, note, joints, waypoints, .. } = motion;
     Some(Panel { caption: caption.clone(), note: note.clone(), body, joints, waypoints })
 }
 
-/// The name of the file of one of several motions: `walk.bvh` becomes `walk-03.bvh`.
+/// The file name of one of several motions: `walk.bvh` becomes `walk-03.bvh`.
 pub fn numbered(path: &Path, number: usize, count: usize) -> PathBuf {
     if count < 2 {
         return path.into();

@@ -1,15 +1,16 @@
-//! Motions as binary glTF: a skeleton that moves, with a figure of its own so that every viewer shows something.
+//! Motions as binary glTF: a moving skeleton with a figure, so that every viewer shows something.
 //!
-//! Source: the glTF 2.0 specification (Khronos, ISO/IEC 12113:2022). The file is one scene with a node for each node of the [`Rig`], a skin over them, a mesh that follows
-//! it, and one animation: the root's translation and the rotation of every node that turns, sampled at the motion's frames, linear in between. Metres, y up,
-//! facing +z in the rest pose, as glTF wants it.
+//! Source: the glTF 2.0 specification (Khronos, ISO/IEC 12113:2022). The file is one scene with a node for each node of
+//! the [`Rig`], a skin over them, a mesh that follows it, and one animation. The animation has the root's translation
+//! and the rotation of every rotating node, sampled at the motion's frames, linear in between. Metres, y up, facing +z
+//! in the rest pose, as glTF requires.
 //!
-//! The mesh has a spindle for each bone and a ball for the head, each bound to the one node that it moves with; three materials tell left and right. The
-//! rest pose stands on the floor at the origin.
+//! The mesh has a spindle for each bone and a ball for the head, each bound to the one node that it moves with. Three
+//! materials distinguish left and right. The rest pose is on the floor at the origin.
 //!
-//! Layout: a header, a chunk of JSON filled up with blanks, a chunk of bytes filled up with zeros. Every accessor has a view of its own, which begins at a multiple of four; so
-//! no view needs a stride. Quaternions are (x, y, z, w) and of unit length in f32, and from frame to frame of the same sign, so that what lies between two
-//! frames takes the short way.
+//! Layout: a header, a chunk of JSON padded with blanks, a chunk of bytes padded with zeros. Every accessor has a view
+//! of its own that starts at a multiple of four, so no view needs a stride. Quaternions are (x, y, z, w) and of unit
+//! length in f32. Their sign is continuous from frame to frame, so that interpolation takes the short way.
 
 use motion::quaternion::{self as quat, Vec3};
 use protocol::printable;
@@ -22,12 +23,12 @@ const FLOAT: u32 = 5126;
 const UNSIGNED_SHORT: u32 = 5123;
 const ARRAY_BUFFER: u32 = 34962;
 
-/// Nodes of a rig: joints are numbered in 16 bits.
+/// Largest number of nodes of a rig: joints are numbered in 16 bits.
 const MOST_NODES: usize = 4_096;
-/// Frames times nodes: half a GiB of rotations.
+/// Largest product of frames and nodes: half a GiB of rotations.
 const MOST_ROTATIONS: usize = 32 << 20;
 
-/// Metres: where the singles of the file still tell a bone's ends apart by centimetres, and sums of bones stay finite.
+/// Largest distance in metres: f32 still separates a bone's ends by centimetres there, and sums of bones stay finite.
 const FARTHEST: f64 = 1e5;
 
 /// Colours of the three sides, sRGB, as in the drawings.
@@ -37,39 +38,39 @@ const COLOURS: [(Side, &str, [u8; 3]); 3] = [
     (Side::Right, "right", [214, 84, 48]),
 ];
 
-/// Thickness of a bone in metres, at most, and as a part of its length.
+/// Largest thickness of a bone in metres, and as a share of its length.
 const THICK: f64 = 0.035;
 const THICK_PART: f64 = 0.16;
 /// Radius of the head, metres.
 const HEAD: f64 = 0.105;
 
-/// Why there is no file.
+/// A motion that cannot be written as glTF.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum GlbError {
-    /// Nothing to animate, or more than a skin has room for.
+    /// Nothing to animate, or more than a skin can hold.
     #[error(
         "{nodes} nodes in {frames} frames; expected at least one frame, 1 to {MOST_NODES} nodes and at most {MOST_ROTATIONS} rotations"
     )]
     Size {
-        /// Nodes of the rig.
+        /// Number of nodes of the rig.
         nodes: usize,
-        /// T.
+        /// Number of frames T.
         frames: usize,
     },
-    /// Times of frames must differ in f32.
+    /// Times of frames must be distinct in f32.
     #[error("{frames} frames at {fps} frames per second have no times that single precision tells apart")]
     Times {
-        /// T.
+        /// Number of frames T.
         frames: usize,
         /// Frames per second.
         fps: f64,
     },
-    /// A position or rotation is not finite, or so far away that no figure could be drawn there.
+    /// A position or rotation is not finite, or too far away to be drawn.
     #[error("the motion holds a number that is not finite, or a position farther than {FARTHEST} m")]
     NotFinite,
 }
 
-/// The side that a joint's name tells.
+/// The side in a joint's name.
 fn side(name: &str) -> Side {
     let name = name.to_lowercase();
     match (name.contains("left"), name.contains("right")) {
@@ -79,10 +80,10 @@ fn side(name: &str) -> Side {
     }
 }
 
-/// A motion as the bytes of a `.glb` file. `name` is the animation's name, such as the sentence that it was drawn for.
+/// Serialises a motion as a `.glb` file. `name` is the animation's name, such as its prompt.
 ///
 /// # Errors
-/// Nothing to animate, numbers that are not finite, frames too close in time.
+/// If there is nothing to animate, values are not finite, or frames are too close in time.
 pub fn to_bytes(rig: &Rig, fps: f64, metres_per_unit: f64, name: &str) -> Result<Vec<u8>, GlbError> {
     let (nodes, frames) = (rig.nodes.len(), rig.frames());
     if nodes == 0 || nodes > MOST_NODES || frames == 0 || nodes * frames > MOST_ROTATIONS {
@@ -134,7 +135,7 @@ pub fn to_bytes(rig: &Rig, fps: f64, metres_per_unit: f64, name: &str) -> Result
         "scene": 0,
         "animations": [{"name": printable(name), "channels": channels, "samplers": samplers}],
     });
-    // A skeleton without a bone has nothing to show.
+    // A skeleton without bones has no mesh.
     if !primitives.is_empty() {
         roots.push(nodes);
         described.push(json!({"name": "figure", "mesh": 0, "skin": 0}));
@@ -148,7 +149,7 @@ pub fn to_bytes(rig: &Rig, fps: f64, metres_per_unit: f64, name: &str) -> Result
     Ok(file.finish(document))
 }
 
-/// A node in the rest pose. The root stands where the feet are on the floor.
+/// A node in the rest pose. The root is placed so that the feet are on the floor.
 fn node(nodes: &[RigNode], i: usize, rest: &[Vec3]) -> Value {
     let children: Vec<usize> = (0..nodes.len()).filter(|child| nodes[*child].parent == Some(i)).collect();
     let at = nodes[i].parent.map_or(rest[i], |parent| quat::sub(rest[i], rest[parent]));
@@ -159,7 +160,7 @@ fn node(nodes: &[RigNode], i: usize, rest: &[Vec3]) -> Value {
     value
 }
 
-/// Where the nodes are when nothing is rotated, metres, the lowest on the floor.
+/// Positions of the nodes without rotation, metres, the lowest on the floor.
 fn rest_pose(nodes: &[RigNode], metres_per_unit: f64) -> Vec<Vec3> {
     let mut rest: Vec<Vec3> = Vec::with_capacity(nodes.len());
     for node in nodes {
@@ -171,13 +172,13 @@ fn rest_pose(nodes: &[RigNode], metres_per_unit: f64) -> Vec<Vec3> {
     rest.iter().map(|at| [at[0], at[1] - lowest, at[2]]).collect()
 }
 
-/// The matrix that takes the rest pose to a joint's own frame, column by column: nothing is rotated at rest.
+/// The matrix from the rest pose to a joint's own frame, by column; there is no rotation at rest.
 fn inverse_bind(at: Vec3) -> [f32; 16] {
     let [x, y, z] = at.map(|v| -v as f32);
     [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, x, y, z, 1.0]
 }
 
-/// The value of an sRGB channel in linear light.
+/// Converts an sRGB channel to linear light.
 fn linear(channel: u8) -> f64 {
     let c = f64::from(channel) / 255.0;
     if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
@@ -207,7 +208,7 @@ fn animation(rig: &Rig, times: &[f32], metres_per_unit: f64, file: &mut File) ->
     (channels, samplers)
 }
 
-/// Triangles, each corner with a normal and the node that it moves with.
+/// Triangles; each corner has a normal and the node that it moves with.
 #[derive(Debug, Default)]
 struct Shape {
     positions: Vec<f32>,
@@ -222,7 +223,7 @@ impl Shape {
         self.joints.push(u16::try_from(joint).expect("fewer nodes than MOST_NODES"));
     }
 
-    /// A spindle from `a` to `b`, thickest near `a`.
+    /// Adds a spindle from `a` to `b`, thickest near `a`.
     fn spindle(&mut self, a: Vec3, b: Vec3, joint: usize) {
         let along = quat::sub(b, a);
         let length = quat::norm(along);
@@ -238,7 +239,7 @@ impl Shape {
         let ring = [u, v, quat::scale(u, -1.0), quat::scale(v, -1.0)].map(|r| quat::add(waist, quat::scale(r, radius)));
         for k in 0..4 {
             let (p, q) = (ring[k], ring[(k + 1) % 4]);
-            // Counter-clockwise seen from outside: the ring turns from u to v about the axis.
+            // Counter-clockwise from outside: the ring turns from u to v about the axis.
             self.flat([b, p, q], joint);
             self.flat([a, q, p], joint);
         }
@@ -250,7 +251,7 @@ impl Shape {
         corners.iter().for_each(|at| self.corner(*at, normal, joint));
     }
 
-    /// A ball: the octahedron, its faces divided twice.
+    /// Adds a ball: the octahedron with its faces divided twice.
     fn ball(&mut self, centre: Vec3, radius: f64, joint: usize) {
         let mut faces: Vec<[Vec3; 3]> = Vec::new();
         for sign in 0..8 {
@@ -272,7 +273,7 @@ impl Shape {
     }
 }
 
-/// The bones of one side in the rest pose, and in the middle the head.
+/// The bones of one side in the rest pose; the middle also has the head.
 fn figure(rig: &Rig, rest: &[Vec3], metres_per_unit: f64, wanted: Side) -> Shape {
     let mut shape = Shape::default();
     for (i, node) in rig.nodes.iter().enumerate() {
@@ -291,7 +292,7 @@ fn figure(rig: &Rig, rest: &[Vec3], metres_per_unit: f64, wanted: Side) -> Shape
     shape
 }
 
-/// A file in the making.
+/// A file in progress.
 #[derive(Debug, Default)]
 struct File {
     bytes: Vec<u8>,
@@ -300,7 +301,7 @@ struct File {
 }
 
 impl File {
-    /// A view of its own for `bytes`; what comes next begins at a multiple of four.
+    /// Adds a view for `bytes`; the next one starts at a multiple of four.
     fn view(&mut self, bytes: impl Iterator<Item = u8>, target: Option<u32>) -> usize {
         let begin = self.bytes.len();
         self.bytes.extend(bytes);
@@ -313,10 +314,10 @@ impl File {
         self.views.len() - 1
     }
 
-    /// An accessor of elements of `width` numbers, with their bounds.
+    /// Adds an accessor of elements of `width` numbers, with their bounds.
     fn floats(&mut self, values: &[f32], width: usize, kind: &str, target: Option<u32>) -> usize {
         let bound = |k: usize, pick: fn(f32, f32) -> f32| {
-            // As doubles, so that the text has every digit of the single.
+            // As doubles, so that the text has every digit of the f32.
             f64::from(values.iter().skip(k).step_by(width).copied().reduce(pick).unwrap_or_default())
         };
         let bounds = |pick: fn(f32, f32) -> f32| (0..width).map(|k| bound(k, pick)).collect::<Vec<_>>();
@@ -332,7 +333,7 @@ impl File {
         self.accessors.len() - 1
     }
 
-    /// An accessor of the one node that each corner follows; the three others have no weight.
+    /// Adds an accessor of the node that each corner follows; the three others have no weight.
     fn joints(&mut self, joints: &[u16]) -> usize {
         let four = joints.iter().flat_map(|joint| [*joint, 0, 0, 0]);
         let view = self.view(four.flat_map(u16::to_le_bytes), Some(ARRAY_BUFFER));
@@ -345,7 +346,7 @@ impl File {
         self.accessors.len() - 1
     }
 
-    /// Header and both chunks.
+    /// Assembles header and both chunks.
     fn finish(self, mut document: Value) -> Vec<u8> {
         document["accessors"] = json!(self.accessors);
         document["bufferViews"] = json!(self.views);

@@ -1,14 +1,16 @@
-//! Motions on one page: a viewer that is one file, needs no network and no program but a browser.
+//! A viewer for motions as one HTML file, which needs only a browser and no network.
 //!
-//! What is drawn: each motion as a figure on a floor, seen from a point that a drag moves, all on one time line that plays, stops and is scrubbed;
-//! its caption above, left bones blue and right ones orange, the waypoints that it was told. `page.html#t=1.5` opens at that second, stopped.
+//! Each motion is a figure on a floor with a draggable camera. All figures share one time line that plays, stops and
+//! can be scrubbed. The caption is above; left bones are blue and right ones orange; waypoints of the motion are shown.
+//! `page.html#t=1.5` opens at that second, stopped.
 //!
-//! Layout of the file: captions and notes stand in it as text. Positions stand in a block of JSON: per motion the bytes of `T x J x 3` numbers of 16 bits
-//! (little-endian, base64), `step` and `origin`; a coordinate is `origin + step * number` metres. `step` is [`STEP`], or as much larger as a motion
-//! needs that is wider than 6.5 m, so that a coordinate is at most half a step off.
+//! Layout of the file: captions and notes are text. Positions are in a block of JSON: per motion the bytes of `T x J x
+//! 3` numbers of 16 bits (little-endian, base64), `step` and `origin`; a coordinate is `origin + step * number` metres.
+//! `step` is [`STEP`], or larger for a motion wider than 6.5 m. So the error of a coordinate is at most half a step.
 //!
-//! Captions come from people and files that nobody vouches for. They are escaped, control characters and marks that turn the reading direction are shown as their
-//! numbers, and the page's policy lets no script and no style run but the two that its digests name, and lets nothing be fetched.
+//! Captions come from untrusted users and files. They are escaped; control characters and marks that change the reading
+//! direction are shown as their numbers. The page's policy allows only the script and the style with the given digests,
+//! and no requests.
 
 use std::io::{self, Write};
 
@@ -26,94 +28,94 @@ const CONTROLS: &str = include_str!("html/controls.html");
 /// Metres between neighbouring numbers.
 pub const STEP: f64 = 1e-4;
 
-/// Motions on a page.
+/// Largest number of motions on a page.
 pub const MOST_PANELS: usize = 512;
 
-/// Coordinates on a page: 40 MB of text.
+/// Largest number of coordinates on a page: 40 MB of text.
 pub const MOST_COORDINATES: usize = 15_000_000;
 
-/// Metres beyond which a coordinate is a mistake.
+/// Coordinates beyond this distance in metres are a mistake.
 const FARTHEST: f64 = 1e4;
 
 /// A motion on the page.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Panel<'a> {
-    /// Above it, such as the sentence that it was drawn for; left out where page or section have it as their title.
+    /// Text above the motion, such as its prompt; left out if it equals the title of page or section.
     pub caption: String,
-    /// In small letters, such as model and seed.
+    /// Text in small letters, such as model and seed.
     pub note: String,
-    /// Whose joints these are.
+    /// Body of the joints.
     pub body: &'a Body,
     /// Positions `[T, J, 3]` in the body's unit.
     pub joints: &'a [f32],
-    /// What the motion was told, in metres.
+    /// Waypoints of the motion, in metres.
     pub waypoints: &'a [Waypoint],
 }
 
-/// Motions that belong together, side by side.
+/// A group of motions, side by side.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Section<'a> {
-    /// Above them; may be empty.
+    /// Title above the motions; may be empty.
     pub title: String,
-    /// In reading order.
+    /// Motions in reading order.
     pub panels: Vec<Panel<'a>>,
 }
 
-/// A page.
+/// A page of the viewer.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Page<'a> {
-    /// Its heading.
+    /// Heading of the page.
     pub title: String,
-    /// From top to bottom.
+    /// Sections from top to bottom.
     pub sections: Vec<Section<'a>>,
 }
 
-/// Why a page cannot be made.
+/// A page that cannot be made.
 #[derive(Debug, thiserror::Error)]
 pub enum PageError {
     /// There is nothing to show.
     #[error("a page without motions; give at least one")]
     Empty,
-    /// Too much for one page.
+    /// More than one page can hold.
     #[error(
         "{panels} motions with {coordinates} coordinates; a page takes at most {MOST_PANELS} with {MOST_COORDINATES}"
     )]
     TooMuch {
-        /// Motions.
+        /// Number of motions.
         panels: usize,
-        /// Their coordinates.
+        /// Number of their coordinates.
         coordinates: usize,
     },
-    /// Not a whole number of frames, or none.
+    /// The array is not a whole number of frames, or empty.
     #[error("motion {panel} has {values} coordinates, expected frames of {joints} joints x 3")]
     Shape {
-        /// Which one, from 1.
+        /// Number of the motion, from 1.
         panel: usize,
-        /// Coordinates.
+        /// Number of coordinates.
         values: usize,
-        /// J.
+        /// Number of joints J.
         joints: usize,
     },
-    /// NaN, infinity, or farther away than any motion goes.
+    /// A value is not finite, or too far away.
     #[error("frame {frame} of motion {panel} has a coordinate of {value} m; expected less than 10 km")]
     NotFinite {
-        /// Which one, from 1.
+        /// Number of the motion, from 1.
         panel: usize,
-        /// Which frame, from 0.
+        /// Number of the frame, from 0.
         frame: usize,
-        /// What it is.
+        /// The invalid value.
         value: f64,
     },
-    /// The file refused.
+    /// The file cannot be written.
     #[error(transparent)]
     Io(#[from] io::Error),
 }
 
 impl Page<'_> {
-    /// Writes the page.
+    /// Writes the page as one HTML file.
     ///
     /// # Errors
-    /// Joints that are no motion, more than a page takes, or a file that refuses.
+    /// If joints are no motion, exceed the limits of a page, or the file cannot be written.
     pub fn write(&self, mut out: impl Write) -> Result<(), PageError> {
         let panels = || self.sections.iter().flat_map(|section| &section.panels);
         let (count, coordinates) = (panels().count(), panels().map(|panel| panel.joints.len()).sum());
@@ -134,7 +136,7 @@ impl Page<'_> {
             motions.push(motion(i + 1, panel, body)?);
         }
         let data = json!({"bodies": bodies.into_iter().map(describe).collect::<Vec<_>>(), "motions": motions});
-        // No `<` is left, so nothing in the block can end it.
+        // Every `<` is escaped, so that nothing in the block can end it.
         let data = data.to_string().replace('<', "\\u003c");
         self.head(&mut out)?;
         self.figures(&mut out)?;
@@ -171,7 +173,7 @@ impl Page<'_> {
             }
             writeln!(out, "<div class=\"row\">")?;
             for panel in &section.panels {
-                // What stands above already is not said again.
+                // Text that is already above is not repeated.
                 let said = panel.caption == self.title || panel.caption == section.title;
                 let (caption, note) = (if said { String::new() } else { text(&panel.caption) }, text(&panel.note));
                 let (frames, fps) = (panel.joints.len() / (3 * panel.body.joints()), panel.body.fps);
@@ -189,7 +191,7 @@ impl Page<'_> {
     }
 }
 
-/// Text of somebody else inside of an element.
+/// Escapes untrusted text for an element.
 fn text(untrusted: &str) -> String {
     let mut escaped = String::with_capacity(untrusted.len());
     for c in printable(untrusted).chars() {
@@ -205,7 +207,7 @@ fn text(untrusted: &str) -> String {
     escaped
 }
 
-/// A body as the script reads it.
+/// A body in the script's form.
 fn describe(body: &Body) -> Value {
     let letter = |side: &Side| match side {
         Side::Middle => 'm',
@@ -219,7 +221,7 @@ fn describe(body: &Body) -> Value {
     })
 }
 
-/// Positions in steps, and what the motion was told.
+/// Positions in steps, and the waypoints of the motion.
 fn motion(number: usize, panel: &Panel<'_>, body: usize) -> Result<Value, PageError> {
     let Panel { joints, body: Body { fps, metres_per_unit, .. }, .. } = panel;
     let width = 3 * panel.body.joints();

@@ -1,4 +1,4 @@
-//! Which nodes of a file are the 22 joints of HumanML3D.
+//! Joint maps: the nodes of a file that are the 22 joints of HumanML3D.
 //!
 //! A map is YAML: for each joint a node's name, or a point between nodes for skeletons that lack the joint.
 //!
@@ -11,7 +11,8 @@
 //!   # ... all 22
 //! ```
 //!
-//! A name is looked up as it is written, else by its [`key`], which leaves out prefixes, case and how the side is spelt. Maps that ship are in [`SHIPPED`].
+//! A name matches as written, else by its [`key`], which ignores prefixes, case and the spelling of the side.
+//! [`SHIPPED`] holds the built-in maps.
 
 mod propose;
 
@@ -29,7 +30,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::bvh::Bvh;
 
-/// The maps that ship, by name.
+/// The built-in maps by name.
 pub const SHIPPED: [(&str, &str); 6] = [
     ("cmu", include_str!("../maps/cmu.yaml")),
     ("lafan1", include_str!("../maps/lafan1.yaml")),
@@ -39,45 +40,45 @@ pub const SHIPPED: [(&str, &str); 6] = [
     ("smpl", include_str!("../maps/smpl.yaml")),
 ];
 
-/// Bytes of a map's file.
+/// Largest size of a map's file, in bytes.
 const MAP_BYTES: u64 = 64 << 10;
 
-/// Why there is no map, or it does not fit a file.
+/// There is no map, or it does not fit a file.
 #[derive(Debug, thiserror::Error)]
 pub enum MapError {
-    /// The file system refused.
+    /// The file system reported an error.
     #[error("{}: {source}", file.display())]
     Io {
         file: PathBuf,
-        /// What it said.
+        /// Error of the file system.
         source: std::io::Error,
     },
-    /// The text is no map.
+    /// The text is not a map.
     #[error("{}:{what}", file.display())]
     Text {
         file: PathBuf,
         /// Place and mistake.
         what: String,
     },
-    /// No map of that name ships.
+    /// No built-in map has that name.
     #[error("no joint map `{name}` ships (there are {}), and no such file is there", shipped_names())]
     Unknown { name: String },
-    /// The file has no node of a name.
+    /// The file has no such node, or several.
     #[error("joint map `{map}`: `{joint}` is to be `{node}`, {problem}")]
     Node {
         map: String,
         joint: String,
-        /// Looked for.
+        /// Name in the map.
         node: String,
-        /// What the file has instead.
+        /// Reason that the file cannot supply it.
         problem: String,
     },
-    /// Neither a shipped map nor the shape of the skeleton fits.
+    /// Neither a built-in map nor the shape of the skeleton fits.
     #[error(
         "no shipped joint map fits the names of this skeleton, and its shape is no figure's ({what}); write a map and name its file"
     )]
     None {
-        /// What the shape lacks.
+        /// Missing property of the shape.
         what: String,
     },
 }
@@ -86,64 +87,64 @@ fn shipped_names() -> String {
     SHIPPED.map(|(name, _)| name).join(", ")
 }
 
-/// Where a joint comes from.
+/// Source of a joint's position.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Source {
-    /// A node.
+    /// Position of a node.
     Node(String),
-    /// A part of the way from one node to another.
+    /// A point between two nodes.
     Along(Along),
     /// The middle of two nodes, moved towards a third.
     Between(Between),
 }
 
-/// `{from: Chest, towards: Neck, fraction: 0.25}`.
+/// A point on the way between two nodes: `{from: Chest, towards: Neck, fraction: 0.25}`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Along {
-    /// Where the way begins.
+    /// Node at the start of the way.
     pub from: String,
-    /// Where it ends.
+    /// Node at the end of the way.
     pub towards: String,
-    /// 0 is the beginning, 1 the end.
+    /// Share of the way, from 0 (start) to 1 (end).
     pub fraction: f64,
 }
 
-/// `{between: [LeftUpLeg, RightUpLeg], towards: Spine, metres: 0.08}`.
+/// A moved middle: `{between: [LeftUpLeg, RightUpLeg], towards: Spine, metres: 0.08}`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Between {
     /// The two nodes.
     pub between: [String; 2],
-    /// Where to move from their middle.
+    /// Node towards which the middle is moved.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub towards: Option<String>,
-    /// How far.
+    /// Distance of the move.
     #[serde(default)]
     pub metres: f64,
 }
 
-/// Which nodes the 22 joints are.
+/// The sources of the 22 joints.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct JointMap {
-    /// For messages.
+    /// Name of the map in messages.
     pub name: String,
-    /// By joint of HumanML3D; all of them.
+    /// Source of each joint of HumanML3D.
     pub joints: BTreeMap<String, Source>,
 }
 
 /// A map that was found for a file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Proposal {
-    /// In the file's own names.
+    /// The map in the file's own names.
     pub map: JointMap,
-    /// The shipped map whose names the file has; `None` if the skeleton's shape decided.
+    /// The built-in map whose names the file has; `None` if the skeleton's shape decided.
     pub shipped: Option<&'static str>,
 }
 
-/// A map with the nodes of a file in place of names.
+/// A map resolved to the nodes of a file.
 #[derive(Debug, Clone)]
 pub struct Places(Vec<Place>);
 
@@ -155,10 +156,10 @@ enum Place {
 }
 
 impl JointMap {
-    /// A shipped map by its name, or a map of a file.
+    /// Loads a built-in map by its name, or a map from a file.
     ///
     /// # Errors
-    /// Neither is there, or the file is no map.
+    /// If neither exists, or the file is not a map.
     pub fn load(name: &str) -> Result<Self, MapError> {
         if let Some((name, text)) = SHIPPED.iter().find(|(shipped, _)| *shipped == name) {
             return Self::parse(Path::new(name), text);
@@ -171,10 +172,10 @@ impl JointMap {
         }
     }
 
-    /// Reads a map; `file` only names it in errors.
+    /// Parses a map; `file` is only its name in errors.
     ///
     /// # Errors
-    /// YAML that is no map, joints that are missing or do not exist.
+    /// YAML that is not a map, missing joints, or unknown ones.
     pub fn parse(file: &Path, text: &str) -> Result<Self, MapError> {
         let fail = |what: String| MapError::Text { file: file.into(), what };
         let value = yaml_as_json(text).map_err(|mistakes| fail(mistakes.join("; ")))?;
@@ -199,7 +200,7 @@ impl JointMap {
         Ok(map)
     }
 
-    /// YAML that [`JointMap::parse`] reads.
+    /// Serialises as YAML that [`JointMap::parse`] reads.
     pub fn to_yaml(&self) -> String {
         let quote = |text: &str| serde_json::Value::from(text).to_string();
         let mut text = format!("name: {}\njoints:\n", quote(&self.name));
@@ -224,7 +225,7 @@ impl JointMap {
         text
     }
 
-    /// The same map in the names that a file has.
+    /// The same map with the names of a file.
     fn renamed(&self, bvh: &Bvh) -> Result<Self, MapError> {
         let mut joints = self.joints.clone();
         for (joint, source) in &mut joints {
@@ -235,10 +236,10 @@ impl JointMap {
         Ok(Self { name: self.name.clone(), joints })
     }
 
-    /// The nodes of a file.
+    /// Finds the nodes of a file.
     ///
     /// # Errors
-    /// A node that the file has not, or has twice.
+    /// A node that is missing from the file, or ambiguous.
     pub fn resolve(&self, bvh: &Bvh) -> Result<Places, MapError> {
         let place = |joint: &&str| {
             let find = |node: &String| self.find(bvh, joint, node);
@@ -293,7 +294,7 @@ impl Source {
 }
 
 impl Places {
-    /// The 22 joints of a frame of nodes `[nodes, 3]`.
+    /// Computes the 22 joints from a frame of nodes `[nodes, 3]`.
     pub fn joints(&self, frame: &[f64], metres_per_unit: f64) -> Vec<Vec3> {
         let at = |i: usize| [frame[3 * i], frame[3 * i + 1], frame[3 * i + 2]];
         let place = |place: &Place| match place {
@@ -311,12 +312,13 @@ impl Places {
     }
 }
 
-/// The names that a map has.
+/// Names of the joints of a map.
 pub fn joint_names() -> &'static [&'static str] {
     Skeleton::of(DataFormat::Humanml3d).names
 }
 
-/// A name without namespace, case and separators, its side first: `mixamorig:LeftUpLeg`, `left_up_leg` and `UpLeg.L` are one.
+/// Normalises a name, without namespace, case and separators, its side first: `mixamorig:LeftUpLeg`, `left_up_leg` and
+/// `UpLeg.L` are equal.
 pub fn key(name: &str) -> String {
     let bare = name.rsplit(':').next().unwrap_or(name);
     let mut words: Vec<String> = vec![];

@@ -1,4 +1,4 @@
-//! Motion of other programs: recordings in, animations out. No tensors, no stages.
+//! Exchange of motion with other programs: recordings in, animations out. No tensors, no stages.
 
 pub mod arrays;
 mod base64;

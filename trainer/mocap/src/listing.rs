@@ -1,8 +1,10 @@
-//! What a folder of recordings holds: clips, their captions, and which recording each is a part of.
+//! Listing of a folder of recordings: clips, their captions, and the recording of each.
 //!
-//! Clips are the `.bvh`, `.npy` and `.npz` files of the folder and below it, or of its `joints/` (else `new_joints/`) alone if it has one, as a HumanML3D folder does. A clip's id is its path without the
-//! ending, folders joined by `_`. Captions come from `texts/ID.txt`, from the file of the same name with the ending `.txt`, and from tables: the given one, else
-//! `captions.csv` or `captions.json`. A table, or `index.csv`, may name each clip's source; a file without one is a recording of its own.
+//! Clips are the `.bvh`, `.npy` and `.npz` files of the folder and below it. A folder with `joints/` (else
+//! `new_joints/`), such as a HumanML3D folder, has only the clips there. A clip's id is its path without the extension,
+//! folders joined by `_`. Captions come from `texts/ID.txt`, from the file of the same name with the extension `.txt`,
+//! and from tables: the given one, else `captions.csv` or `captions.json`. A table, or `index.csv`, may name each
+//! clip's source; a file without one is a recording of its own.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -15,37 +17,37 @@ use protocol::limits;
 
 use crate::captions;
 
-/// Endings of clips.
+/// Extensions of clips.
 const ENDINGS: [&str; 3] = ["bvh", "npy", "npz"];
-/// Arrays of a HumanML3D folder that are no clips.
+/// Arrays of a HumanML3D folder that are not clips.
 const NO_CLIPS: [&str; 4] = ["Mean", "Std", "mean", "std"];
-/// Mistakes that are shown.
+/// Largest number of mistakes shown.
 const SHOWN: usize = 40;
 
-/// A clip before it is read.
+/// A clip that is not read yet.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ClipFile {
     pub id: String,
     pub path: PathBuf,
-    /// The recording that it is a part of.
+    /// The recording that the clip belongs to.
     pub source: String,
     pub captions: Vec<Caption>,
-    /// By the folder's own lists, if it has them.
+    /// Split in the folder's own lists, if it has them.
     pub listed: Option<Split>,
 }
 
-/// A folder's clips.
+/// The clips of a folder.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Listing {
-    /// Sorted by id.
+    /// Clips sorted by id.
     pub clips: Vec<ClipFile>,
-    /// What was passed over, for people.
+    /// Messages about skipped files.
     pub notes: Vec<String>,
-    /// Whether the folder has `train.txt`, `val.txt` and `test.txt`.
+    /// True if the folder has `train.txt`, `val.txt` and `test.txt`.
     pub has_lists: bool,
 }
 
-/// Everything that is wrong with a folder.
+/// All mistakes of a folder.
 #[derive(Debug)]
 pub struct ListError {
     pub folder: PathBuf,
@@ -67,7 +69,7 @@ impl fmt::Display for ListError {
 
 impl std::error::Error for ListError {}
 
-/// Looks through a folder; `table` is a file of captions, relative to the working directory.
+/// Lists a folder; `table` is a file of captions, relative to the working directory.
 ///
 /// # Errors
 /// All mistakes of the folder together.
@@ -128,7 +130,7 @@ pub fn list(folder: &Path, table: Option<&Path>) -> Result<Listing, ListError> {
     }
 }
 
-/// The path without ending, folders joined by `_`.
+/// The path without extension, folders joined by `_`.
 fn id_of(path: &Path) -> String {
     let parts = path.with_extension("");
     parts.iter().map(|part| part.to_string_lossy()).collect::<Vec<_>>().join("_")
@@ -142,7 +144,7 @@ fn read_text(file: &Path, most: u64) -> Result<Option<String>, String> {
     }
 }
 
-/// The captions in a file of the clip's own.
+/// Reads the captions in a clip's own file.
 fn texts(folder: &Path, clip: &mut ClipFile) -> Result<(), String> {
     for file in [folder.join("texts").join(format!("{}.txt", clip.id)), clip.path.with_extension("txt")] {
         if let Some(text) = read_text(&file, limits::CAPTIONS_BYTES)? {
@@ -161,7 +163,8 @@ fn tables(folder: &Path, table: Option<&Path>) -> Vec<(PathBuf, bool)> {
     own.into_iter().chain([(folder.join("index.csv"), false)]).collect()
 }
 
-/// Gives each row's captions and source to its clip, which it names by id, by path, or by file name if that is one clip's alone.
+/// Adds each row's captions and source to its clip, which the row names by id, by path, or by a file name that is
+/// unique.
 fn apply(
     file: &Path,
     rows: Vec<captions::Row>,
@@ -218,7 +221,7 @@ fn apply(
     }
 }
 
-/// Reads the folder's own lists, if all three are there.
+/// Reads the folder's own lists. Returns false if one of the three is missing.
 fn lists(folder: &Path, clips: &mut BTreeMap<String, ClipFile>, problems: &mut Vec<String>) -> bool {
     let mut texts = vec![];
     for split in Split::ALL {

@@ -1,26 +1,28 @@
-//! Feet that stand stay where they stand.
+//! Keeps standing feet in place.
 //!
-//! Generated figures let a standing foot slide. A foot stands here while its ball (the joint behind the ankle) is low and slow for a tenth of a second at least. It is moved, floor-wise, to
-//! the mean of its places in that time, the ankle with it; before and after the shift fades over a fifth of a second. The knee follows so that thigh and shank keep their lengths in every frame and bend the way that
-//! they did; hips and all above stay. A foot that slides farther than 15 cm either way is not standing but gliding, and is left alone; one that the leg does not reach is moved as far as the leg
-//! goes.
+//! Generated figures let a standing foot slide. A foot counts as standing while its ball (the joint after the ankle) is
+//! low and slow for at least a tenth of a second. It is moved horizontally to the mean of its places in that time, the
+//! ankle with it. Before and after, the shift fades over a fifth of a second. The knee follows so that thigh and shank
+//! keep their lengths in every frame and the direction of their bend; hips and everything above are unchanged. A foot
+//! that slides more than 15 cm either way is gliding and is left alone. A foot out of the leg's reach is moved to the
+//! limit of the leg.
 //!
 //! The thresholds are our choice: a walking foot swings at 2 m/s and more, and a sliding one seldom exceeds .5 m/s.
 
 use motion::Skeleton;
 use motion::quaternion::{self as quat, Vec3};
 
-/// Metres a second below which a ball stands.
+/// Speed in metres per second below which a ball may stand.
 const SLOW: f64 = 0.5;
-/// Metres above its usual lowest height, likewise.
+/// Height in metres above its usual lowest height below which a ball may stand.
 const LOW: f64 = 0.05;
-/// Seconds that a foot stands at least.
+/// Shortest time in seconds that a foot stands.
 const SHORTEST: f64 = 0.1;
-/// Seconds in which a shift comes and goes.
+/// Time in seconds in which a shift fades.
 const FADE: f64 = 0.2;
-/// Metres that a foot is moved at most.
+/// Largest shift of a foot, in metres.
 const FARTHEST: f64 = 0.15;
-/// The part of a leg's full length that it is never longer than, so that it always has a bend.
+/// Largest share of a leg's full length, so that the leg always has a bend.
 const REACH: f64 = 0.9995;
 
 /// Joints of a leg.
@@ -28,11 +30,12 @@ struct Leg<'a> {
     hip: usize,
     knee: usize,
     ankle: usize,
-    /// The ball, and what is behind it.
+    /// The ball, and the joints after it.
     foot: &'a [usize],
 }
 
-/// Joints `[T, J, 3]` with standing feet in their places. Joints that are not finite, or no whole frames, come back as they are.
+/// Moves standing feet of joints `[T, J, 3]` in place. Values that are not finite, or no whole frames, are returned
+/// unchanged.
 pub fn plant(joints: &[f32], skeleton: &Skeleton) -> Vec<f32> {
     let width = 3 * skeleton.joints;
     if joints.is_empty() || !joints.len().is_multiple_of(width) || !joints.iter().all(|v| v.is_finite()) {
@@ -76,7 +79,7 @@ fn plant_leg(frames: &mut [Vec<Vec3>], leg: &Leg<'_>, skeleton: &Skeleton) {
             *sum = [0, 1].map(|k| sum[k] + smooth * shift[k]);
         }
     }
-    // The way the knee points, for frames in which the leg is straight.
+    // Direction of the knee, for frames with a straight leg.
     let mut before = None;
     for (frame, [x, z]) in frames.iter_mut().zip(shifts) {
         if x != 0.0 || z != 0.0 {
@@ -87,7 +90,7 @@ fn plant_leg(frames: &mut [Vec<Vec3>], leg: &Leg<'_>, skeleton: &Skeleton) {
     }
 }
 
-/// Frames in which a ball stands.
+/// Ranges of frames in which a ball stands.
 fn standing(ball: &[Vec3], skeleton: &Skeleton) -> Vec<std::ops::Range<usize>> {
     let unit = skeleton.metres_per_unit;
     let mut heights: Vec<f64> = ball.iter().map(|p| p[1] * unit).collect();
@@ -111,7 +114,7 @@ fn standing(ball: &[Vec3], skeleton: &Skeleton) -> Vec<std::ops::Range<usize>> {
     spans
 }
 
-/// Moves a foot, and lets the knee follow. Gives the way that the knee points.
+/// Moves a foot and its knee. Returns the direction of the knee.
 fn bend(frame: &mut [Vec3], leg: &Leg<'_>, shift: Vec3, ahead: Vec3) -> Option<Vec3> {
     let Leg { hip, knee, ankle, foot } = *leg;
     let thigh = quat::norm(quat::sub(frame[knee], frame[hip]));
@@ -122,7 +125,7 @@ fn bend(frame: &mut [Vec3], leg: &Leg<'_>, shift: Vec3, ahead: Vec3) -> Option<V
         return None;
     }
     let to = quat::scale(way, 1.0 / length);
-    // Never straighter than it was, or than a leg with a bend is.
+    // Never straighter than before, or than the limit of a bent leg.
     let was = quat::norm(quat::sub(frame[ankle], frame[hip]));
     let length = length.min((REACH * (thigh + shank)).max(was)).max((thigh - shank).abs());
     let across = |v: Vec3| quat::sub(v, quat::scale(to, quat::dot(v, to)));
@@ -156,7 +159,7 @@ mod tests {
         (0..3).map(|k| f64::from(frame[3 * a + k] - frame[3 * b + k]).powi(2)).sum::<f64>().sqrt()
     }
 
-    /// Mean floor-wise speed of both balls while they stand in `of`, m/s.
+    /// Mean horizontal speed of both balls while they stand in `of`, m/s.
     fn slide(joints: &[f32], of: &[f32], skeleton: &Skeleton) -> (f64, usize) {
         let (mut sum, mut count) = (0.0, 0);
         for ball in [skeleton.left_foot[1], skeleton.right_foot[1]] {

@@ -1,13 +1,14 @@
-//! Sentences of a file, each with the length that its motion should have.
+//! Sentences of a file, each with the length of its motion.
 //!
-//! Two forms, a sentence a line, blank lines left out:
+//! There are two forms, one sentence per line; blank lines are ignored:
 //!
-//! - text: `a person walks`, or with a length behind the last `#`, `a person walks#120` in frames, `a person walks#4.5s` in seconds (MoMask's
-//!   files have frames too, and `#NA` for no length);
-//! - JSON lines: `{"caption": "a person walks", "seconds": 4.5}` or with `frames`; or a sentence alone, `"a person walks"`.
+//! - text: `a person walks`, or with a length after the last `#`, `a person walks#120` in frames, `a person walks#4.5s`
+//!   in seconds (MoMask's files have frames too, and `#NA` for no length);
+//! - JSON lines: `{"caption": "a person walks", "seconds": 4.5}` or with `frames`; or a sentence alone, `"a person
+//!   walks"`.
 //!
-//! A file whose name ends in `.jsonl`, `.ndjson` or `.json` holds JSON lines, one in `.txt` text. Of any other, and of what is piped in, the first line decides: JSON begins with `{` or
-//! `"`.
+//! The extensions `.jsonl`, `.ndjson` and `.json` mean JSON lines, `.txt` means text. For any other file, and for
+//! standard input, the first line decides: JSON starts with `{` or `"`.
 
 use std::fmt;
 use std::io::Read;
@@ -17,28 +18,28 @@ use std::str::FromStr;
 use motion::files;
 use serde::Deserialize;
 
-/// Bytes of a file.
+/// Largest size of a file, in bytes.
 const MOST_BYTES: u64 = 4 << 20;
-/// Bytes of a sentence.
+/// Largest size of a sentence, in bytes.
 const MOST_CAPTION: usize = 8 << 10;
-/// Sentences of a file.
+/// Largest number of sentences in a file.
 pub const MOST: usize = 1_000;
-/// Mistakes that are shown of one file.
+/// Largest number of mistakes shown for one file.
 const MOST_MISTAKES: usize = 20;
-/// Seconds that no motion lasts.
+/// Upper limit of a length, in seconds.
 const LONGEST: f64 = 3600.0;
 
-/// How long a motion should be.
+/// Length of a motion.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Length {
-    /// In frames.
+    /// Length in frames.
     Frames(usize),
-    /// In seconds.
+    /// Length in seconds.
     Seconds(f64),
 }
 
 impl Length {
-    /// Frames at `fps`, at least one.
+    /// Converts to frames at `fps`, at least one.
     pub fn frames(self, fps: f64) -> usize {
         match self {
             Self::Frames(frames) => frames,
@@ -56,7 +57,7 @@ impl Length {
     }
 
     fn of_frames(value: usize) -> Result<Self, String> {
-        // As many as an hour has at 1,000 frames a second; each model says what its own limit is.
+        // An hour at 1,000 frames a second; each model has its own lower limit.
         if (1..=3_600_000).contains(&value) {
             Ok(Self::Frames(value))
         } else {
@@ -81,16 +82,16 @@ impl FromStr for Length {
 /// A sentence and its length.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Request {
-    /// What the motion should be.
+    /// Description of the motion.
     pub caption: String,
-    /// How long, if the file says so.
+    /// Length of the motion, if the file states it.
     pub length: Option<Length>,
 }
 
-/// What is wrong with a file of sentences.
+/// All mistakes in a file of sentences.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub struct RequestError {
-    /// The mistakes, each with its line.
+    /// Mistakes, each with its line.
     mistakes: Vec<String>,
 }
 
@@ -109,7 +110,7 @@ impl From<String> for RequestError {
 /// Reads a file, or standard input for `-`.
 ///
 /// # Errors
-/// Every line that is none, a file that is not there or too long.
+/// All invalid lines, or a file that is missing or too long.
 pub fn read(file: &Path) -> Result<Vec<Request>, RequestError> {
     let stdin = file == Path::new("-");
     let name = if stdin { "standard input".to_owned() } else { file.display().to_string() };
@@ -134,10 +135,10 @@ pub fn read(file: &Path) -> Result<Vec<Request>, RequestError> {
     parse(&name, &text, json)
 }
 
-/// Reads the lines of a text; `name` only names it in errors.
+/// Parses the lines of a text; `name` is only its name in errors.
 ///
 /// # Errors
-/// Every line that is none, and a text without lines.
+/// All invalid lines, or a text without lines.
 pub fn parse(name: &str, text: &str, json: bool) -> Result<Vec<Request>, RequestError> {
     let lines = text.trim_start_matches('\u{feff}').lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
     let (mut requests, mut mistakes) = (Vec::new(), Vec::new());

@@ -1,37 +1,40 @@
-//! Joints to rotations of a rigid skeleton, and back.
+//! Conversion of joints to rotations of a rigid skeleton, and back.
 //!
-//! The features' rotations are no pose of a skeleton: every chain starts anew from the heading. Animation formats want a tree in which a joint turns all
-//! that is attached to it. [`Rig::fit`] makes one: bone lengths are constant, the root moves, and all else turns.
+//! The features' rotations are not a pose of a skeleton: every chain starts again from the heading. Animation formats
+//! need a tree in which a joint rotates everything attached to it. [`Rig::fit`] computes one: bone lengths are
+//! constant, the root moves and all other joints rotate.
 //!
-//! A joint with one child points its bone at it by the shortest rotation from the rest pose, so limbs have no twist of their own: joints do not show any. A joint with
-//! several children (pelvis, chest) takes the frame of them: x from the right child to the left one, y as near as can be to the middle one. If these children
-//! do not keep their places in that frame (a generated figure's hips are not rigid), the child gets a *pivot*: a node without length between
-//! both, which turns that one bone. With pivots every motion of constant bone lengths comes back to rounding; without need there are none. A pivot is named
-//! after its child, `left_collar_pivot`.
+//! A joint with one child points its bone at it by the shortest rotation from the rest pose, so limbs have no twist of
+//! their own: joints do not show any. A joint with several children (pelvis, chest) uses the frame of them: x from the
+//! right child to the left one, y as near as possible to the middle one. If these children do not keep their places in
+//! that frame (a generated figure's hips are not rigid), the child gets a *pivot*. This is a node of zero length
+//! between both, which rotates that one bone. With pivots every motion of constant bone lengths is reproduced up to
+//! rounding; a pivot is added only if needed. It is named after its child, `left_collar_pivot`.
 //!
-//! Bone lengths of a motion where they change are their means over time, and joints are where directions and mean lengths lead: [`Rig::error`] says how far off.
+//! Changing bone lengths are replaced by their means over time, and joints are placed by directions and mean lengths:
+//! [`Rig::error`] is the resulting distance.
 //!
-//! The rest pose is a T-pose facing +z, left at +x; the children of pelvis and chest rest where they are on average.
+//! The rest pose is a T-pose facing +z, left at +x; the children of pelvis and chest rest at their average places.
 
 use motion::Skeleton;
 use motion::quaternion::{self as quat, Quat, Vec3};
 
 use crate::bvh::{self, Bvh, Channel};
 
-/// A child that leaves its place by less, in metres, needs no pivot.
+/// Largest displacement of a child, in metres, that needs no pivot.
 const RIGID_METRES: f64 = 1e-4;
-/// Length of the bone that is drawn at the end of a limb, as a part of the bone before it.
+/// Length of the bone drawn at the end of a limb, as a share of the bone before it.
 const END: f64 = 0.5;
 
-/// Joints that are no motion of a skeleton.
+/// The joints are not a motion of a skeleton.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum RigError {
     /// The array is not a whole number of frames, or empty.
     #[error("{values} joint coordinates, expected frames of {joints} joints x 3")]
     Shape {
-        /// Values in the array.
+        /// Number of values in the array.
         values: usize,
-        /// J.
+        /// Number of joints J.
         joints: usize,
     },
     /// NaN or infinity among the joints.
@@ -42,34 +45,34 @@ pub enum RigError {
 /// A joint of the tree, or a pivot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RigNode {
-    /// The joint's name in [`Skeleton::names`], or the child's and `_pivot`.
+    /// Name of the joint in [`Skeleton::names`], or the child's name and `_pivot`.
     pub name: String,
     /// Index of the joint; `None` for a pivot.
     pub joint: Option<usize>,
     /// Index of a node before this one; `None` for the root.
     pub parent: Option<usize>,
-    /// From the parent in the rest pose, where nothing is rotated; zero for the root. In the joints' unit.
+    /// Offset from the parent in the rest pose, without rotation, in the joints' unit; zero for the root.
     pub offset: Vec3,
 }
 
 /// A motion as rotations of a rigid skeleton.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Rig {
-    /// Parents before children.
+    /// Nodes, parents before children.
     pub nodes: Vec<RigNode>,
-    /// Where the root is, `[T]`.
+    /// Positions of the root, `[T]`.
     pub roots: Vec<Vec3>,
-    /// Rotation of each node relative to its parent, `[T, nodes]`; from frame to frame the same sign of the quaternion.
+    /// Rotation of each node relative to its parent, `[T, nodes]`; the quaternion's sign is continuous over frames.
     pub local: Vec<Quat>,
-    /// The largest distance of a joint from where it was given, in the joints' unit.
+    /// Largest distance of a joint from its given position, in the joints' unit.
     pub error: f64,
 }
 
 impl Rig {
-    /// Fits joints `[T, J, 3]` of a skeleton, y up.
+    /// Fits a rig to joints `[T, J, 3]` of a skeleton, y up.
     ///
     /// # Errors
-    /// Another shape, or numbers that are not finite.
+    /// If the shape does not match, or values are not finite.
     pub fn fit(joints: &[f32], skeleton: &Skeleton) -> Result<Self, RigError> {
         let width = 3 * skeleton.joints;
         if joints.is_empty() || !joints.len().is_multiple_of(width) {
@@ -93,7 +96,7 @@ impl Rig {
         Ok(rig)
     }
 
-    /// T.
+    /// Number of frames T.
     pub fn frames(&self) -> usize {
         self.roots.len()
     }
@@ -130,19 +133,20 @@ impl Rig {
         positions
     }
 
-    /// Nodes that no other one is attached to, with the offset of what may be drawn at their end.
+    /// Nodes without children, with the offset of a bone that may be drawn at their end.
     pub fn ends(&self) -> Vec<(usize, Vec3)> {
         let leaf = |i: &usize| self.nodes.iter().all(|node| node.parent != Some(*i));
         (0..self.nodes.len()).filter(leaf).map(|i| (i, quat::scale(self.nodes[i].offset, END))).collect()
     }
 
-    /// The motion as a file with lengths multiplied by `units` (100 writes metres as centimetres) at `rate` frames per second. The root has positions, all others
-    /// rotations alone, and leaves an end site of half their bone.
+    /// Converts the motion to BVH with lengths multiplied by `units` (100 writes metres as centimetres) at `rate`
+    /// frames per second. The root has positions; all other nodes have only rotations. A leaf has an end site of half
+    /// its bone.
     pub fn to_bvh(&self, rate: f64, units: f64) -> Bvh {
         let order = self.depth_first();
         let ends = self.ends();
         let mut nodes: Vec<bvh::Node> = vec![];
-        // Where a node of ours lies among those of the file, which has end sites in between.
+        // Index of a node of ours in the file, which has end sites in between.
         let mut written = vec![0; self.nodes.len()];
         for i in &order {
             let node = &self.nodes[*i];
@@ -184,7 +188,7 @@ impl Rig {
         Bvh { nodes, frame_time: 1.0 / rate, rate, frames: self.frames(), values }
     }
 
-    /// The nodes in the order of nested braces.
+    /// The nodes in depth-first order, as of nested braces.
     fn depth_first(&self) -> Vec<usize> {
         let mut order = Vec::with_capacity(self.nodes.len());
         let mut next = vec![0];
@@ -196,7 +200,7 @@ impl Rig {
     }
 }
 
-/// What a fit needs to know of a motion.
+/// Properties of a motion that a fit uses.
 struct Fit<'a> {
     frames: &'a [Vec<Vec3>],
     skeleton: &'a Skeleton,
@@ -205,7 +209,7 @@ struct Fit<'a> {
     rest: Vec<Vec3>,
     /// Frames of joints with several children, `[T]` each; empty for others.
     bodies: Vec<Vec<Quat>>,
-    /// Whether a joint is attached by a pivot.
+    /// True for a joint that is attached by a pivot.
     pivoted: Vec<bool>,
 }
 
@@ -287,7 +291,8 @@ impl<'a> Fit<'a> {
         Rig { nodes, roots, local, error: 0.0 }
     }
 
-    /// Rotation of a node relative to its parent's, `outer`; `None` where joints coincide, so that the one before may stay.
+    /// Rotation of a node relative to its parent's, `outer`. `None` if joints coincide, so that the previous rotation
+    /// can be kept.
     fn rotation(&self, t: usize, nodes: &[RigNode], i: usize, outer: Quat) -> Option<Quat> {
         let towards = |joint: usize| {
             let bone = quat::sub(self.frames[t][joint], self.frames[t][self.skeleton.parents[joint]]);
@@ -304,13 +309,13 @@ impl<'a> Fit<'a> {
     }
 }
 
-/// How far `v` is off the direction of `place`, measured at its length.
+/// Distance of `v` from the direction of `place`, measured at its length.
 fn off_direction(v: Vec3, place: Vec3) -> f64 {
     let lengths = quat::norm(v) * quat::norm(place);
     if lengths < 1e-18 { 0.0 } else { quat::norm(quat::sub(quat::scale(v, quat::norm(place) / quat::norm(v)), place)) }
 }
 
-/// The direction of the bone that ends in a joint, in a T-pose.
+/// Direction in a T-pose of the bone that ends in a joint.
 fn rest_direction(skeleton: &Skeleton, joint: usize) -> Vec3 {
     let arm = skeleton.names[joint].contains("shoulder")
         || skeleton.names[joint].contains("elbow")
@@ -346,7 +351,7 @@ fn body_frames(frames: &[Vec<Vec3>], skeleton: &Skeleton, joint: usize, children
 
 /// The rotation whose matrix has these orthonormal columns.
 fn from_columns(x: Vec3, y: Vec3, z: Vec3) -> Quat {
-    // The largest of the four parts is computed first, so that nothing is divided by a small number.
+    // The largest of the four components is computed first, so that no division is by a small number.
     let trace = x[0] + y[1] + z[2];
     let parts = [trace, x[0], y[1], z[2]];
     let largest = (1..4).fold(0, |best, i| if parts[i] > parts[best] { i } else { best });
@@ -359,7 +364,8 @@ fn from_columns(x: Vec3, y: Vec3, z: Vec3) -> Quat {
     quat::normalise(q)
 }
 
-/// The shortest rotation from the direction of `a` to that of `b`; for opposite directions a half turn about an axis across. `None` if one of them has no length.
+/// The shortest rotation from the direction of `a` to that of `b`; for opposite directions a half turn about a
+/// perpendicular axis. `None` if one of them has no length.
 fn shortest(a: Vec3, b: Vec3) -> Option<Quat> {
     let (la, lb) = (quat::norm(a), quat::norm(b));
     if la < 1e-9 || lb < 1e-9 {
@@ -372,7 +378,7 @@ fn shortest(a: Vec3, b: Vec3) -> Option<Quat> {
         let axis = quat::unit(quat::cross(a, axis));
         return Some([0.0, axis[0], axis[1], axis[2]]);
     }
-    // Through the direction halfway: exact to rounding also for angles near a half turn.
+    // Through the direction halfway: exact up to rounding also for angles near a half turn.
     let half = quat::unit(half);
     let axis = quat::cross(a, half);
     Some(quat::normalise([quat::dot(a, half), axis[0], axis[1], axis[2]]))
@@ -388,7 +394,7 @@ mod tests {
 
     use super::*;
 
-    /// A figure whose bones keep their lengths and wander: rigid at pelvis and chest, or each bone by itself.
+    /// A figure whose bones keep their lengths and drift: rigid at pelvis and chest, or each bone separately.
     fn wander(skeleton: &Skeleton, frames: usize, rigid: bool, change: f64) -> Vec<f32> {
         let scale = 0.25 / skeleton.metres_per_unit;
         let mut joints = vec![];
@@ -427,7 +433,7 @@ mod tests {
                 println!("{format:?}, rigid {rigid}: {metres:.1e} m, {pivots} pivots");
                 assert!(metres < 1e-6, "{metres}");
                 assert_eq!(pivots > 0, !rigid);
-                // In centimetres through text.
+                // In centimetres, through the text form.
                 let units = 100.0 * skeleton.metres_per_unit;
                 let text = rig.to_bvh(skeleton.fps, units).to_text();
                 let back = Bvh::parse(Path::new("x.bvh"), text.as_bytes()).unwrap();

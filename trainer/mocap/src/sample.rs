@@ -1,4 +1,4 @@
-//! A folder of synthetic clips as recordings, to try the way from one's own mocap with.
+//! A folder of synthetic clips as recordings, to try the import of one's own mocap.
 
 use std::fs;
 use std::io;
@@ -11,11 +11,11 @@ use protocol::stage::DataSynthetic;
 
 use crate::rotations::Rig;
 
-/// Writes `clips` synthetic clips as `000000.bvh` (centimetres, 20 fps, joints named as HumanML3D's) with their sentences in `000000.txt`. Gives the largest distance of a joint in a
-/// file's motion from the clip's, in metres.
+/// Writes `clips` synthetic clips as `000000.bvh` (centimetres, 20 fps, joints named as HumanML3D's) with their
+/// sentences in `000000.txt`. Returns the largest distance of a joint in a file's motion from the clip's, in metres.
 ///
 /// # Errors
-/// What the file system says, or a clip that is no motion, which would be a fault of ours.
+/// The error of the file system, or a clip that is no motion, which is an internal fault.
 pub fn write_bvh_folder(folder: &Path, clips: usize, seed: Seed) -> io::Result<f64> {
     fs::create_dir_all(folder)?;
     let dataset = synthetic::generate(&DataSynthetic { clips, val: 0.0, test: 0.0, mirror: false }, seed);

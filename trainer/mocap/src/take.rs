@@ -6,10 +6,10 @@ use crate::bvh::Bvh;
 use crate::detect::{Detected, Up, detect};
 use crate::joint_map::{JointMap, MapError};
 
-/// Frames that unit and axis are detected from.
+/// Number of frames used to detect unit and axis.
 const LOOKED_AT: usize = 200;
 
-/// What a user says of files; what is `None` is found out.
+/// The user's settings for reading files; fields that are `None` are detected.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Reading {
     pub map: Option<JointMap>,
@@ -17,32 +17,32 @@ pub struct Reading {
     pub up: Option<Up>,
 }
 
-/// A recording.
+/// A recording converted to HumanML3D's joints.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Take {
-    /// `[T, J, 3]`, metres, y up, the left at +x of whom faces +z.
+    /// Joints `[T, J, 3]`, metres, y up; left is at +x for a body that faces +z.
     pub joints: Vec<f64>,
     /// Frames per second.
     pub rate: f64,
-    /// The axis that was up in the file.
+    /// The upward axis of the file.
     pub up: Up,
-    /// How the file was read, for people; the same for files of one kind.
+    /// The interpretation of the file, for users; equal for files of one kind.
     pub said: String,
 }
 
-/// How a file was read.
+/// Interpretation of a file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Read {
     pub map: JointMap,
-    /// The shipped map that was proposed; `None` for a user's or one by shape.
+    /// The built-in map that was proposed; `None` for a user's map or one by shape.
     pub shipped: Option<&'static str>,
-    /// What was found out, whether used or not.
+    /// Detected unit and axis, used or not.
     pub detected: Detected,
     pub metres_per_unit: f64,
     pub up: Up,
 }
 
-/// Finds out how to read a file, or takes a user's word for it.
+/// Detects the interpretation of a file, except for the user's settings.
 ///
 /// # Errors
 /// No map fits.
@@ -60,8 +60,8 @@ pub fn read(bvh: &Bvh, reading: &Reading) -> Result<Read, MapError> {
         (0..bvh.frames).step_by(step).map(|frame| places.joints(&bvh.placed(frame), 1.0)).collect();
     let mut detected = detect(frames.iter().map(Vec::as_slice));
     let rest = detect(std::iter::once(places.joints(&bvh.rest(), 1.0).as_slice()));
-    // Who crawls or lies looks like somebody who stands along another axis. A rest pose that stands along y or z knows better; others, whose bones all lie along
-    // one axis, do not.
+    // A crawling or lying body resembles a body that stands along another axis. A rest pose that stands along y or z
+    // decides then. Rest poses with all bones along one axis do not.
     if rest.sure_of_up && matches!(rest.up, Up::Y | Up::Z) && rest.up != detected.up {
         detected.up = rest.up;
         detected.sure_of_up = false;
@@ -72,7 +72,7 @@ pub fn read(bvh: &Bvh, reading: &Reading) -> Result<Read, MapError> {
 }
 
 impl Take {
-    /// The joints of a file at its own rate.
+    /// Reads the joints of a file at its own rate.
     ///
     /// # Errors
     /// No map fits, or the given one does not.
@@ -89,7 +89,7 @@ impl Take {
 }
 
 impl Read {
-    /// Without what differs between recordings of one program.
+    /// Summary without properties that differ between recordings of one program.
     fn in_short(&self) -> String {
         let unit = self.detected.unit;
         let unit = if self.metres_per_unit == self.detected.metres_per_unit {
@@ -126,7 +126,8 @@ impl std::fmt::Display for Read {
     }
 }
 
-/// Frames `[T, width]` at another rate: frame k is what was at k / `to` seconds, in between by the line through its neighbours. Nothing is made up behind the last frame.
+/// Resamples frames `[T, width]`: frame k is at k / `to` seconds, interpolated linearly between its neighbours. Nothing
+/// is extrapolated after the last frame.
 pub fn resample(joints: &[f64], width: usize, from: f64, to: f64) -> Vec<f64> {
     let frames: Vec<&[f64]> = joints.chunks_exact(width).collect();
     let Some(last) = frames.len().checked_sub(1) else { return vec![] };

@@ -1,8 +1,9 @@
-//! The viewer in a real browser: two times give two pictures that differ in the figures, in the clock and its slider, and nowhere else; nothing but the file is
-//! asked for; it plays by itself.
+//! The viewer in a real browser. Two times give two pictures that differ in the figures, in the clock and its slider,
+//! and nowhere else. The page requests nothing but the file, and it plays by itself.
 //!
-//! Wants Chromium or Chrome (on Debian `apt-get install chromium`), or a path to one in `STRIDE_BROWSER`, and says loudly that it skips where there is none. The
-//! browser is spoken to in the DevTools protocol through two named pipes, JSON with a zero behind each message.
+//! The test needs Chromium or Chrome (on Debian `apt-get install chromium`), or a path to one in `STRIDE_BROWSER`;
+//! without one it prints that it skips. It uses the DevTools protocol through two named pipes, JSON with a zero after
+//! each message.
 
 mod base64;
 
@@ -22,14 +23,14 @@ use serde_json::{Value, json};
 
 use self::base64::decoded;
 
-/// Until the browser answers.
+/// Time limit for an answer of the browser.
 const PATIENCE: Duration = Duration::from_secs(90);
-/// Pixels of the window.
+/// Size of the window in pixels.
 const WINDOW: [usize; 2] = [900, 1200];
-/// Resolves once what was asked for is drawn.
+/// Resolves once the requested frame is drawn.
 const DRAWN: &str = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => requestAnimationFrame(() => done(1)))))";
 
-/// A browser of this machine.
+/// Finds a browser on this machine.
 fn program() -> Option<PathBuf> {
     if let Some(told) = std::env::var_os("STRIDE_BROWSER") {
         return Some(told.into());
@@ -39,7 +40,7 @@ fn program() -> Option<PathBuf> {
     names.iter().flat_map(|name| folders.iter().map(move |folder| folder.join(name))).find(|path| path.is_file())
 }
 
-/// A browser that listens.
+/// A running browser.
 struct Browser {
     process: Child,
     input: File,
@@ -65,7 +66,7 @@ impl Browser {
         let open =
             |name: &str| OpenOptions::new().read(true).write(true).open(folder.join(name)).expect("a pipe of ours");
         let (input, mut output) = (open("in"), open("out"));
-        // The protocol wants descriptors 3 and 4. The sandbox wants rights that containers lack, and the page is ours.
+        // The protocol uses descriptors 3 and 4. The sandbox needs rights that containers lack, and the page is ours.
         let line = "exec \"$0\" --headless=new --no-sandbox --disable-gpu --no-first-run --disable-dev-shm-usage --hide-scrollbars \
                     --user-data-dir=\"$1/profile\" --remote-debugging-pipe about:blank 3<\"$1/in\" 4>\"$1/out\"";
         let mut command = Command::new("sh");
@@ -139,7 +140,7 @@ impl Browser {
     /// The window's pixels at a time, `[height, width, 3]`.
     fn picture(&mut self, seconds: f64) -> Vec<u8> {
         self.evaluate(&format!("location.hash = '#t={seconds}'"));
-        // The address changes first, and the page hears of it.
+        // The address changes first, and the page is notified.
         let clock = format!("{seconds:.2} of ");
         let since = Instant::now();
         while !self
@@ -160,7 +161,7 @@ impl Browser {
         pixels.chunks_exact(channels).flat_map(|pixel| pixel[..3].iter().copied()).collect()
     }
 
-    /// Left, top, right and bottom of what a selector finds.
+    /// Left, top, right and bottom of the elements of a selector.
     fn places(&mut self, selector: &str) -> Vec<[f64; 4]> {
         let rectangle = "(e) => { const r = e.getBoundingClientRect(); return [r.left, r.top, r.right, r.bottom]; }";
         let found = self.evaluate(&format!("[...document.querySelectorAll('{selector}')].map({rectangle})"));
@@ -168,7 +169,7 @@ impl Browser {
     }
 }
 
-/// A page with a figure that moves beside one that stands.
+/// A page with a moving figure beside a standing one.
 fn page(file: &Path) {
     let dataset = synthetic::generate(&DataSynthetic { clips: 1, ..DataSynthetic::default() }, Seed(3));
     let joints = features::recover_joints(&dataset.clips[0].features, dataset.skeleton());
@@ -204,7 +205,7 @@ fn a_figure_moves_and_nothing_else_does() {
     let [moves, stands] = canvases[..] else { panic!("two figures, not {canvases:?}") };
     let controls = browser.places("#time, #clock");
     assert!(controls.iter().all(|place| place[3] <= WINDOW[1] as f64), "all is in the window: {controls:?}");
-    // The first picture may be of a button that is still being drawn.
+    // The first picture may show a button that is still being drawn.
     browser.picture(1.0);
     let (one, other) = (browser.picture(0.5), browser.picture(1.5));
     assert!(one == browser.picture(0.5), "a time has one picture");
@@ -229,7 +230,7 @@ fn a_figure_moves_and_nothing_else_does() {
     assert!(in_controls > 0, "the clock goes");
     assert!(elsewhere.is_empty(), "{} pixels differ elsewhere, such as {:?}", elsewhere.len(), elsewhere.first());
 
-    // Two figures have two colours at least: a blank page would move as little as it draws.
+    // Two figures have at least two colours: a blank page would also have no other differences.
     let colours: std::collections::BTreeSet<&[u8]> = one.chunks_exact(3).collect();
     assert!(colours.len() > 20, "{} colours", colours.len());
 
@@ -244,7 +245,7 @@ fn a_figure_moves_and_nothing_else_does() {
 
     let asked = browser.events.iter().filter(|event| event["method"] == "Network.requestWillBeSent");
     let asked: Vec<&str> = asked.filter_map(|event| event["params"]["request"]["url"].as_str()).collect();
-    // The empty icon stands in the page itself.
+    // The empty icon is inside the page itself.
     let others: Vec<&&str> =
         asked.iter().filter(|asked| !url.starts_with(**asked) && !asked.starts_with("data:")).collect();
     assert!(others.is_empty() && asked.iter().any(|asked| url.starts_with(*asked)), "{asked:?}");

@@ -1,4 +1,4 @@
-//! Folders of recordings to datasets, held against the published procedure's files.
+//! Conversion of folders of recordings to datasets, compared with the files of the published procedure.
 
 mod shared;
 
@@ -23,7 +23,7 @@ fn target(folder: &Path, format: DataFormat) -> Option<Vec<f64>> {
     Some(read_target(&folder.join("tgt_offsets.npy"), Skeleton::of(format)).expect("well formed"))
 }
 
-/// All clips of a folder, in order.
+/// Makes all clips of a folder, in order.
 fn make(listing: &Listing, recipe: &Recipe) -> (Vec<Made>, Report) {
     let mut report = Report::default();
     let part = listing.clips.len().div_ceil(4).max(1);
@@ -61,7 +61,7 @@ fn the_mini_sets_are_made_again() {
         assert!(error <= tolerance, "{part}: {error:.1e}");
         assert!(report.left_out.is_empty() && made.len() == listing.clips.len());
 
-        // By the folder's lists it is the dataset that the folder opens as.
+        // With the folder's lists the result equals the opened folder.
         let dataset = assemble(format, made.clone(), Division::Lists, &mut report).unwrap();
         let (opened, _) = Dataset::open(&folder, format).unwrap();
         let by_id = |dataset: &Dataset| -> BTreeMap<(Split, String), (usize, usize, Vec<String>)> {
@@ -76,7 +76,7 @@ fn the_mini_sets_are_made_again() {
         println!("{part}: Mean {:.1e}, Std {:.1e} from the stored ones", errors[0], errors[1]);
         assert!(errors[0] < 1e-4 * unit && errors[1] < 1e-5 * unit, "{errors:?}");
 
-        // By recordings no take is in two splits, whatever the seed; and the shares are about what was asked for.
+        // No recording is in two splits, for any seed; the shares are about the requested ones.
         for seed in [Seed(1), Seed(2)] {
             let division = Division::Sources { seed, val: 0.1, test: 0.2 };
             let mut report = Report::default();
@@ -153,11 +153,11 @@ fn the_evaluators_scales_follow_from_the_published_ones() {
     assert!(off < 0.02, "{off}");
 }
 
-/// Files of ours in, features out: as good as those of the clips themselves.
+/// Files of ours give features as good as those of the clips themselves.
 #[test]
 fn a_folder_of_bvh_gives_the_features_of_its_clips() {
     let out = tempfile::tempdir().unwrap();
-    // One of them crawls.
+    // One of the clips crawls.
     let error = write_bvh_folder(out.path(), 12, Seed(5)).unwrap();
     assert!(error <= 1e-3, "{error}");
     let listing = list(out.path(), None).unwrap();
@@ -171,7 +171,7 @@ fn a_folder_of_bvh_gives_the_features_of_its_clips() {
         let expected = clips.features(entry);
         let width = clips.skeleton().features;
         assert_eq!((made.frames + 1, made.captions.len()), (entry.len, entry.captions.len()));
-        // Heading features differ at the end, where the smoothing sees a frame less; positions do not care.
+        // Heading features differ at the end, where the smoothing has a frame less; positions are not affected.
         let heights = |rows: &[f32]| rows.chunks(width).map(|row| row[3]).collect::<Vec<_>>();
         let off = worst(heights(&made.features).iter().map(|v| f64::from(*v)), &heights(expected)[..made.frames]);
         assert!(off < 2e-3, "{}: {off}", made.id);
@@ -207,7 +207,7 @@ fn long_takes_are_cut_and_short_ones_left_out() {
     assert!(report.left_out.iter().any(|s| s.contains("bare: no caption")), "{report}");
     let uncut = Recipe { cut: false, ..recipe(DataFormat::Humanml3d, None) };
     assert!(make(&listing, &uncut).0.is_empty());
-    // The same takes as 21 joints of KIT-ML, whose target skeleton has to be given.
+    // The same recordings as 21 joints of KIT-ML, whose target skeleton must be given.
     let kit = recipe(DataFormat::Kit, None);
     let error = clips_of(&listing.clips[1], &kit).unwrap_err();
     assert!(error.contains("not public"), "{error}");

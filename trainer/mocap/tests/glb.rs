@@ -1,4 +1,5 @@
-//! A `.glb` file as a reader of its own finds it: the rules of the specification that a validator checks, and joints where the rig has them.
+//! A `.glb` file read by an independent reader: it follows the specification's rules that a validator checks, and its
+//! joints are the rig's.
 
 use std::collections::BTreeSet;
 
@@ -22,7 +23,7 @@ fn list(value: &Value) -> &[Value] {
     value.as_array().map_or(&[], Vec::as_slice)
 }
 
-/// A file taken apart.
+/// A parsed file.
 struct Gltf {
     document: Value,
     bytes: Vec<u8>,
@@ -42,7 +43,7 @@ impl Gltf {
         Self { document, bytes: rest[8..].to_vec() }
     }
 
-    /// The numbers of an accessor, and how many an element has.
+    /// The values of an accessor, and the number per element.
     fn numbers(&self, accessor: usize) -> (Vec<f64>, usize) {
         let accessor = &self.document["accessors"][accessor];
         let view = &self.document["bufferViews"][index(&accessor["bufferView"])];
@@ -70,7 +71,7 @@ impl Gltf {
         (values, width)
     }
 
-    /// What holds for every file.
+    /// Checks the rules for every file.
     fn check(&self) {
         let document = &self.document;
         assert_eq!(document["asset"]["version"], "2.0");
@@ -171,7 +172,7 @@ impl Gltf {
         assert_eq!(list(&animation["samplers"]).len(), targets.len());
     }
 
-    /// Where each node is in frame `t`.
+    /// Position of each node in frame `t`.
     fn pose(&self, t: usize) -> Vec<quat::Vec3> {
         let nodes = list(&self.document["nodes"]);
         let mut local: Vec<(quat::Vec3, quat::Quat)> = nodes

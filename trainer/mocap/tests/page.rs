@@ -1,4 +1,4 @@
-//! The viewer's page: complete, closed to what captions hold, and its positions where they were.
+//! The viewer's page: complete, safe against captions, and with exact positions.
 
 mod base64;
 
@@ -25,7 +25,7 @@ fn page(caption: &str, body: &Body, joints: &[f32], waypoints: &[Waypoint]) -> R
     Ok(String::from_utf8(bytes).expect("well formed"))
 }
 
-/// What stands between two marks.
+/// The text between two marks.
 fn between<'a>(text: &'a str, from: &str, to: &str) -> &'a str {
     let (_, rest) = text.split_once(from).unwrap_or_else(|| panic!("no `{from}`"));
     rest.split_once(to).unwrap_or_else(|| panic!("no `{to}`")).0

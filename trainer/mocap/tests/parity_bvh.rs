@@ -1,4 +1,4 @@
-//! The BVH fixtures: every `10_bvh*` folder, whatever its files and sizes are.
+//! The BVH fixtures: every `10_bvh*` folder, with any files and sizes.
 
 mod shared;
 
@@ -23,7 +23,7 @@ fn read(file: &Path) -> Bvh {
     Bvh::read(file).unwrap_or_else(|e| panic!("{e}"))
 }
 
-/// The largest extent of the first frame along an axis: tolerances are relative to it.
+/// The largest extent of the first frame along an axis, the scale of tolerances.
 fn height(positions: &[f64], nodes: usize) -> f64 {
     let of = |axis: usize| {
         let values = || positions[..3 * nodes].iter().skip(axis).step_by(3).copied();
@@ -60,7 +60,7 @@ fn positions_of_every_node_and_frame() {
             let error = worst(positions, &load(&folder.join(name.replace(".bvh", "_positions.npy"))).data) / height;
             println!("{name}: {error:.1e} of the height {height:.2}");
             assert!(error <= 1e-5, "{name}: {error:.1e}");
-            // Written and read again: six decimals of angles.
+            // Written and read again; angles have six decimals.
             let again = Bvh::parse(Path::new(name), bvh.to_text().as_bytes()).unwrap();
             let given: Vec<f32> = bvh.positions().iter().map(|v| *v as f32).collect();
             let error = worst(again.positions(), &given) / height;
@@ -164,7 +164,7 @@ fn five_spellings_end_in_the_same_joints() {
     }
 }
 
-/// The same files under names that say nothing.
+/// The same files with meaningless names.
 #[test]
 fn a_skeleton_without_known_names_is_mapped_by_its_shape() {
     for folder in folders() {
@@ -180,7 +180,7 @@ fn a_skeleton_without_known_names_is_mapped_by_its_shape() {
             let map = JointMap::parse(Path::new("proposed.yaml"), &proposal.map.to_yaml()).unwrap();
             let found = joints22(&bvh, Some(map));
             let expected: Vec<f32> = expected.iter().map(|v| *v as f32).collect();
-            // Spines of two joints have no third one to find; all else is exact.
+            // Spines of two joints have no third joint; all other joints are exact.
             let off = worst(found, &expected);
             println!("{name}: {off:.1e} m");
             assert!(off < 0.1, "{name}: {off} m, {}", proposal.map.to_yaml());

@@ -1,9 +1,9 @@
 //! A dataset: clips, captions, and the entries that examples are drawn from.
 //!
 //! An entry is a clip, or the part of a clip that one time-tagged caption describes, in one split. Features are stored
-//! as they are in the files; a caller that needs the network's scale calls [`Dataset::normalise`] on a copy.
+//! as in the files; a caller that needs the network's scale calls [`Dataset::normalise`] on a copy.
 //!
-//! Reading a folder is in [`open`](Dataset::open), the artifact's files in [`Dataset::to_files`].
+//! [`open`](Dataset::open) reads a folder, and [`Dataset::to_files`] writes the artifact's files.
 
 mod open;
 mod pack;
@@ -24,23 +24,23 @@ use crate::random::Stream;
 use crate::skeleton::Skeleton;
 pub use crate::text::Caption;
 
-/// Which of the three lists an entry stands in.
+/// The list that contains an entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Split {
-    /// `train.txt`.
+    /// Entries of `train.txt`.
     Train,
-    /// `val.txt`.
+    /// Entries of `val.txt`.
     Val,
-    /// `test.txt`.
+    /// Entries of `test.txt`.
     Test,
 }
 
 impl Split {
-    /// All three, in the order in which entries are stored.
+    /// All three splits, in the order in which entries are stored.
     pub const ALL: [Split; 3] = [Split::Train, Split::Val, Split::Test];
 
-    /// `train`, `val` or `test`.
+    /// The name in settings: `train`, `val` or `test`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Train => "train",
@@ -69,41 +69,40 @@ impl fmt::Display for Split {
 pub struct Clip {
     /// Name of its files.
     pub id: String,
-    /// L.
+    /// Number of frames L.
     pub frames: usize,
     /// `[L, D]`, not normalised.
     pub features: Floats,
 }
 
-/// What one example is cropped from.
+/// The frames that an example is cropped from.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Entry {
     /// The clip's id; a part of a clip is `<id>@<first frame>-<frame after the last>`.
     pub id: String,
     /// Index into [`Dataset::clips`].
     pub clip: usize,
-    /// First frame.
     pub start: usize,
-    /// Frames.
+    /// Number of frames.
     pub len: usize,
     /// Indices into [`Dataset::captions`]; at least one.
     pub captions: Vec<usize>,
-    /// Where it is listed.
+    /// The split that lists the clip.
     pub split: Split,
 }
 
 /// Clips, captions and entries of one folder.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Dataset {
-    /// Which skeleton and rules.
+    /// The format, which decides skeleton and rules.
     pub format: DataFormat,
     /// Mean of each feature, `[D]`.
     pub mean: Vec<f32>,
     /// Scale of each feature, `[D]`, positive.
     pub std: Vec<f32>,
-    /// The motions.
+    /// Clips that the entries refer to.
     pub clips: Vec<Clip>,
-    /// The sentences.
+    /// Captions that the entries refer to.
     pub captions: Vec<Caption>,
     /// Train entries, then validation, then test; inside a split in the order of its list.
     pub entries: Vec<Entry>,
@@ -121,12 +120,12 @@ impl Dataset {
         &self.clips[entry.clip].features[entry.start * width..(entry.start + entry.len) * width]
     }
 
-    /// Indices of the entries of a split.
+    /// Indices of the entries of a split, in order.
     pub fn entries_of(&self, split: protocol::stage::Split) -> Vec<usize> {
         (0..self.entries.len()).filter(|i| self.entries[*i].split.is_in(split)).collect()
     }
 
-    /// `(x - mean) / std` on rows of D values.
+    /// Computes `(x - mean) / std` on rows of D values, in place.
     pub fn normalise(&self, rows: &mut [f32]) {
         for row in rows.chunks_exact_mut(self.mean.len()) {
             for ((value, mean), std) in row.iter_mut().zip(&self.mean).zip(&self.std) {
@@ -145,8 +144,8 @@ impl Dataset {
     }
 }
 
-/// The published crop: with probability 2/3 the longest multiple of the unit length, else one unit less; random start.
-/// Returns first frame and frames.
+/// Draws the published crop: with probability 2/3 the longest multiple of the unit length, else one unit less; random
+/// start. Returns first frame and length.
 pub fn crop(stream: &mut Stream, len: usize, skeleton: &Skeleton) -> (usize, usize) {
     let unit = skeleton.unit;
     let shorter = stream.below(3) == 2;
@@ -155,8 +154,8 @@ pub fn crop(stream: &mut Stream, len: usize, skeleton: &Skeleton) -> (usize, usi
     (stream.below(len - wanted + 1), wanted)
 }
 
-/// A random window for training on short pieces: a multiple of the unit length in `[min, max]`, at most `len`, at a
-/// random start. An entry shorter than `min` gives its longest multiple. Returns first frame and frames.
+/// Draws a random window for training on short pieces: a multiple of the unit length in `[min, max]`, at most `len`, at
+/// a random start. An entry shorter than `min` gives its longest multiple. Returns first frame and length.
 pub fn window(stream: &mut Stream, min: usize, max: usize, len: usize, skeleton: &Skeleton) -> (usize, usize) {
     let unit = skeleton.unit;
     let most = (max.min(len) / unit).max(1);

@@ -1,7 +1,7 @@
 //! Pictures of motion: an animated stick figure, and a sheet of poses over time.
 //!
-//! A small rasteriser of our own: orthographic projection from a 3/4 view, anti-aliased thick lines, a built-in 5x7 font.
-//! Joints are `[T, J, 3]` in the skeleton's units with y up.
+//! A small rasteriser of our own: orthographic projection from a 3/4 view, anti-aliased thick lines, a built-in 5x7
+//! font. Joints are `[T, J, 3]` in the skeleton's units with y up.
 
 mod colours;
 mod font;
@@ -19,11 +19,11 @@ use raster::{Canvas, Colour};
 use crate::skeleton::Skeleton;
 pub use crate::waypoints::Waypoint;
 
-/// Where the picture is seen from: turned about the vertical and tipped down, radians.
+/// Camera angle about the vertical, radians.
 const TURN: f64 = -0.65;
 const TIP: f64 = 0.26;
 
-/// A view of the world: pixels a metre and the point that lies at `centre`.
+/// A view of the world: pixels per metre and the point shown at `centre`.
 struct View {
     scale: f64,
     centre: [f64; 2],
@@ -42,7 +42,7 @@ impl View {
     }
 }
 
-/// Joints of frame `t` in metres.
+/// Converts joints of frame `t` to metres.
 fn frame(joints: &[f32], skeleton: &Skeleton, t: usize) -> Vec<[f64; 3]> {
     let width = 3 * skeleton.joints;
     let metres = |v: f32| f64::from(v) * skeleton.metres_per_unit;
@@ -102,7 +102,7 @@ fn ground(canvas: &mut Canvas, view: &View, reach: f64) {
     }
 }
 
-/// What was told: a line through each joint's waypoints, and the waypoints, those of frames to come lighter.
+/// Draws a line through each joint's waypoints, and the waypoints; those of later frames are lighter.
 fn told(canvas: &mut Canvas, view: &View, waypoints: &[Waypoint], t: usize) {
     let place = |w: &Waypoint| view.project(w.position.map(f64::from)).0;
     for pair in waypoints.windows(2).filter(|pair| pair[0].joint == pair[1].joint) {
@@ -117,7 +117,7 @@ fn told(canvas: &mut Canvas, view: &View, waypoints: &[Waypoint], t: usize) {
 /// Width and height of a film in pixels.
 pub const FILM: [usize; 2] = [400, 400];
 
-/// Draws every frame of a motion, the camera following the root, `title` above.
+/// Draws every frame of a motion, with the camera following the root and `title` above.
 fn film(
     joints: &[f32],
     skeleton: &Skeleton,
@@ -154,10 +154,10 @@ fn film(
     Ok(())
 }
 
-/// Writes the frames of a film one after another, [`FILM`] pixels of red, green and blue each, for an encoder of video.
+/// Writes the frames of a film one after another for a video encoder, [`FILM`] pixels of red, green and blue each.
 ///
 /// # Errors
-/// When `out` refuses, or the joints are not a whole number of frames.
+/// If `out` fails, or the joints are not a whole number of frames.
 pub fn rgb_along_to(
     joints: &[f32],
     skeleton: &Skeleton,
@@ -168,15 +168,15 @@ pub fn rgb_along_to(
     film(joints, skeleton, title, waypoints, |canvas, _| out.write_all(canvas.bytes()))
 }
 
-/// Writes an animated GIF: the motion at its own speed, the camera following the root, `title` above.
+/// Writes an animated GIF: the motion at its own speed, with the camera following the root and `title` above.
 ///
 /// # Errors
-/// When `out` refuses, or the joints are not a whole number of frames.
+/// If `out` fails, or the joints are not a whole number of frames.
 pub fn gif_to(joints: &[f32], skeleton: &Skeleton, title: &str, out: impl Write) -> io::Result<()> {
     gif_along_to(joints, skeleton, title, &[], out)
 }
 
-/// As [`gif_to`], with the waypoints that the motion was told.
+/// Like [`gif_to`], with the waypoints of the motion.
 ///
 /// # Errors
 /// As [`gif_to`].
@@ -195,22 +195,22 @@ pub fn gif_along_to(
     encoder.set_repeat(gif::Repeat::Infinite).map_err(failed)?;
     film(joints, skeleton, title, waypoints, |canvas, t| {
         let mut image = gif::Frame::from_indexed_pixels(width, height, palette.indices(canvas), None);
-        // Hundredths of a second; rounded over the whole clip, so that its length is right.
+        // Hundredths of a second, rounded over the whole clip, so that its length is right.
         let ends = |t: usize| (t as f64 * 100.0 / skeleton.fps).round() as u16;
         image.delay = if t + 1 == frames { 60 } else { ends(t + 1).wrapping_sub(ends(t)) };
         encoder.write_frame(&image).map_err(failed)
     })
 }
 
-/// [`gif_to`] a file.
+/// Writes an animated GIF with [`gif_to`] to a file.
 ///
 /// # Errors
-/// When the file cannot be written, or the joints are not a whole number of frames.
+/// If the file cannot be written, or the joints are not a whole number of frames.
 pub fn gif(joints: &[f32], skeleton: &Skeleton, title: &str, path: &Path) -> io::Result<()> {
     gif_along(joints, skeleton, title, &[], path)
 }
 
-/// [`gif_along_to`] a file.
+/// Writes an animated GIF with [`gif_along_to`] to a file.
 ///
 /// # Errors
 /// As [`gif`].
@@ -226,7 +226,7 @@ pub fn gif_along(
     file.flush()
 }
 
-/// The camera's course: the root's, averaged over a second.
+/// Course of the camera: the root's, averaged over a second.
 fn follow(path: &[[f64; 3]], t: usize, axis: usize) -> f64 {
     let near = &path[t.saturating_sub(10)..(t + 11).min(path.len())];
     near.iter().map(|p| p[axis]).sum::<f64>() / near.len() as f64
@@ -241,10 +241,10 @@ fn frames_of(joints: &[f32], skeleton: &Skeleton) -> io::Result<usize> {
     Ok(joints.len() / width)
 }
 
-/// Writes a PNG with one row a motion: its name, and `poses` poses spread over its time, side by side.
+/// Writes a PNG with one row per motion: its name, and `poses` poses spread over its time, side by side.
 ///
 /// # Errors
-/// When `out` refuses, or a motion is not a whole number of frames.
+/// If `out` fails, or a motion is not a whole number of frames.
 pub fn strip_png_to(
     motions: &[(String, Vec<f32>)],
     poses: usize,
@@ -254,17 +254,17 @@ pub fn strip_png_to(
     strip_png_along_to(motions, poses, skeleton, Given::default(), out)
 }
 
-/// What motions were drawn from besides words.
+/// Inputs of generated motions besides the text.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Given<'a> {
-    /// Places that the first motion was told.
+    /// Waypoints of the first motion.
     pub waypoints: &'a [Waypoint],
-    /// Frames that stayed when a part of a motion was drawn anew; none of a motion that is drawn whole.
+    /// Frames that were kept when a part of a motion was regenerated; empty for a motion generated as a whole.
     pub kept: &'a [Range<usize>],
 }
 
-/// As [`strip_png_to`]; poses of frames that were kept are pale, and a line below each row says from when to when. Below all, if there are waypoints,
-/// the first motion from above with the waypoints that it was told.
+/// Like [`strip_png_to`]. Poses of kept frames are pale, and a line below each row marks their time. With waypoints,
+/// the first motion and its waypoints are shown from above at the bottom.
 ///
 /// # Errors
 /// As [`strip_png_to`].
@@ -317,10 +317,10 @@ pub fn strip_png_along_to(
     encoder.write_header().and_then(|mut w| w.write_image_data(canvas.bytes())).map_err(failed)
 }
 
-/// Pixels from pose to pose of a sheet.
+/// Pixels between the poses of a sheet.
 const CELL: usize = 110;
 
-/// Above `bottom`, which frames of a row were kept and which were drawn; nothing if none were kept.
+/// Draws a line above `bottom` that marks the kept and the generated frames of a row; nothing without kept frames.
 fn timeline(canvas: &mut Canvas, bottom: f64, (frames, poses): (usize, usize), kept: &[Range<usize>]) {
     if kept.is_empty() {
         return;
@@ -338,15 +338,15 @@ fn timeline(canvas: &mut Canvas, bottom: f64, (frames, poses): (usize, usize), k
     }
 }
 
-/// [`strip_png_to`] a file.
+/// Writes a PNG with [`strip_png_to`] to a file.
 ///
 /// # Errors
-/// When the file cannot be written, or a motion is not a whole number of frames.
+/// If the file cannot be written, or a motion is not a whole number of frames.
 pub fn strip_png(motions: &[(String, Vec<f32>)], poses: usize, skeleton: &Skeleton, path: &Path) -> io::Result<()> {
     strip_png_along(motions, poses, skeleton, Given::default(), path)
 }
 
-/// [`strip_png_along_to`] a file.
+/// Writes a PNG with [`strip_png_along_to`] to a file.
 ///
 /// # Errors
 /// As [`strip_png`].

@@ -1,14 +1,14 @@
-//! Joints to feature rows: the HumanML3D feature definition.
+//! Conversion of joints to feature rows: the HumanML3D feature definition.
 //!
 //! Source: Guo et al., "Generating Diverse and Natural 3D Human Motions from Text" (CVPR 2022) and its published
 //! feature code. Steps: uniform skeleton, floor, origin, facing +z ([`place`]), then heading, rotations, positions,
-//! velocities and contacts ([`rows`]). The way back is in `recover`.
+//! velocities and contacts ([`rows`]). The inverse is in `recover`.
 //!
-//! Two oddities of the published data are part of the definition. The heading comes from (right - left shoulder)
-//! *minus* (right - left hip), smoothed over time and forced to the identity in frame 0. And every kinematic chain starts
-//! from the heading, also the arms, not from the rotation of the joint that they are attached to.
+//! Two oddities of the published data are part of the definition. The heading is computed from (right - left shoulder)
+//! *minus* (right - left hip), smoothed over time and forced to the identity in frame 0. Every kinematic chain starts
+//! from the heading, also the arms, and not from the rotation of the joint that they are attached to.
 //!
-//! Departs: f64 throughout, where the published code mixes f32 and f64 (worst difference over 301 clips: 2.2e-4, in
+//! Departs: f64 throughout, where the published code mixes f32 and f64 (largest difference over 301 clips: 2.2e-4, in
 //! rotations of nearly opposite bones).
 //!
 //! Arrays: joints `[T, J, 3]`, rotations `[T, J]`, rows `[T - 1, D]`.
@@ -23,21 +23,21 @@ use crate::skeleton::Skeleton;
 /// Standard deviation, in frames, of the filter over the facing direction.
 const HEADING_SIGMA: f64 = 20.0;
 
-/// Joints without features.
+/// The joints cannot be converted to features.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum FeatureError {
     /// The array is not a whole number of frames.
     #[error("{values} joint coordinates, expected a multiple of {joints} joints x 3")]
     Shape {
-        /// Values in the array.
+        /// Number of values in the array.
         values: usize,
-        /// J.
+        /// Number of joints J.
         joints: usize,
     },
     /// Velocities need a second frame.
     #[error("{frames} frame(s), expected at least 2: the last frame only gives velocities")]
     TooFewFrames {
-        /// T.
+        /// Number of frames T.
         frames: usize,
     },
     /// NaN or infinity among the joints.
@@ -55,25 +55,25 @@ pub enum FeatureError {
     /// The table of bone lengths has another size.
     #[error("{found} bone lengths, expected {expected}")]
     Target {
-        /// Lengths given.
+        /// Number of lengths given.
         found: usize,
-        /// J.
+        /// Number of joints J.
         expected: usize,
     },
 }
 
-/// Feature rows `[T - 1, D]` of joints `[T, J, 3]` in the format's units, y up.
+/// Computes feature rows `[T - 1, D]` of joints `[T, J, 3]` in the format's units, y up.
 ///
-/// `target` are the bone lengths `[J]` of the uniform skeleton, `None` for the format's own
-/// ([`Skeleton::bone_lengths`]; KIT-ML's are not public and must be given).
+/// `target` is the bone lengths `[J]` of the uniform skeleton, `None` for the format's own
+/// ([`Skeleton::bone_lengths`]). Those of KIT-ML are not public and must be given.
 pub fn extract(joints: &[f32], skeleton: &Skeleton, target: Option<&[f64]>) -> Result<Vec<f32>, FeatureError> {
     extract_with(joints, skeleton, target, Turns::Published)
 }
 
-/// How the turn feature treats a body that turns past the direction opposite to that of frame 0.
+/// Treatment of a body that turns past the direction opposite to that of frame 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Turns {
-    /// As in the published data: the quaternion changes sign there, and the turn of that one frame with it, so the
+    /// As in the published data: the quaternion changes sign there, and so does the turn of that one frame. The
     /// recovered motion bends by twice that turn.
     #[default]
     Published,
@@ -81,7 +81,7 @@ pub enum Turns {
     Continuous,
 }
 
-/// [`extract`] with a choice of how turns past the opposite direction are written.
+/// Like [`extract`], with a choice for turns past the opposite direction.
 pub fn extract_with(
     joints: &[f32],
     skeleton: &Skeleton,
@@ -112,12 +112,12 @@ pub fn extract_with(
     }
 }
 
-/// Joint `j` of a frame.
+/// Position of joint `j` in a frame.
 pub(crate) fn joint(frame: &[f64], j: usize) -> Vec3 {
     [frame[3 * j], frame[3 * j + 1], frame[3 * j + 2]]
 }
 
-/// The same motion with the bone lengths `target`, and the factor of its root path: the ratio of the leg lengths.
+/// The same motion with the bone lengths `target`, and the factor on its root path, the ratio of the leg lengths.
 pub fn uniform_skeleton(joints: &[f64], skeleton: &Skeleton, target: &[f64]) -> (Vec<f64>, f64) {
     let width = 3 * skeleton.joints;
     let source = skeleton.lengths_of_pose(&joints[..width]);
@@ -128,7 +128,8 @@ pub fn uniform_skeleton(joints: &[f64], skeleton: &Skeleton, target: &[f64]) -> 
     (forward_kinematics(&rotations, &roots, skeleton, target), factor)
 }
 
-/// The motion on the floor (its lowest point at y = 0), with the root of frame 0 above the origin, facing +z there.
+/// Puts the motion on the floor (its lowest point at y = 0), with the root of frame 0 above the origin, facing +z
+/// there.
 pub fn place(joints: &[f64], skeleton: &Skeleton) -> Vec<f64> {
     let floor = joints.iter().skip(1).step_by(3).copied().fold(f64::INFINITY, f64::min);
     let origin = [joints[0], floor, joints[2]];
@@ -162,7 +163,7 @@ pub fn inverse_kinematics(joints: &[f64], skeleton: &Skeleton, smooth: bool) -> 
     rotations
 }
 
-/// Joints `[T, J, 3]` of rotations in the form of [`inverse_kinematics`], root positions and bone lengths.
+/// Computes joints `[T, J, 3]` from rotations as of [`inverse_kinematics`], root positions and bone lengths.
 pub fn forward_kinematics(rotations: &[Quat], roots: &[Vec3], skeleton: &Skeleton, lengths: &[f64]) -> Vec<f64> {
     let mut joints = vec![0.0; roots.len() * skeleton.joints * 3];
     let frames = joints.chunks_exact_mut(3 * skeleton.joints).zip(rotations.chunks_exact(skeleton.joints));
@@ -187,7 +188,7 @@ pub fn headings(joints: &[f64], skeleton: &Skeleton, smooth: bool) -> Vec<Quat> 
         .chunks_exact(3 * skeleton.joints)
         .map(|frame| {
             let [r_hip, l_hip, r_shoulder, l_shoulder] = skeleton.face.map(|j| joint(frame, j));
-            // The hips have the other sign than the shoulders: the published data was made so.
+            // The hips have the opposite sign of the shoulders, as in the published data.
             let across = quat::add(quat::sub(l_hip, r_hip), quat::sub(r_shoulder, l_shoulder));
             quat::cross([0.0, 1.0, 0.0], quat::unit(across))
         })
@@ -202,7 +203,7 @@ pub fn headings(joints: &[f64], skeleton: &Skeleton, smooth: bool) -> Vec<Quat> 
     headings
 }
 
-/// A Gaussian filter over time that repeats the values at both ends; the kernel ends at four standard deviations.
+/// A Gaussian filter over time that repeats the values at both ends; the kernel covers four standard deviations.
 pub fn gaussian_filter<const N: usize>(track: &[[f64; N]], sigma: f64) -> Vec<[f64; N]> {
     let radius = (4.0 * sigma + 0.5) as i64;
     let weights: Vec<f64> = (-radius..=radius).map(|k| (-0.5 * (k as f64 / sigma).powi(2)).exp()).collect();
@@ -233,7 +234,7 @@ pub fn local_positions(placed: &[f64], headings: &[Quat], skeleton: &Skeleton) -
         .collect()
 }
 
-/// Feature rows `[T - 1, D]` of a motion as [`place`] gives it. Undefined values are NaN.
+/// Feature rows `[T - 1, D]` of a motion from [`place`]. Undefined values are NaN.
 pub fn rows(placed: &[f64], skeleton: &Skeleton, turns: Turns) -> Vec<f32> {
     let width = 3 * skeleton.joints;
     let frames: Vec<&[f64]> = placed.chunks_exact(width).collect();

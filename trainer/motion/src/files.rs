@@ -1,7 +1,7 @@
-//! Reading files of folders that somebody else filled.
+//! Reads files of folders with untrusted content.
 //!
-//! What bears a file's name there may be a pipe, which waits for its writer for ever, a device, a folder, or far larger than what it should
-//! hold. So a file is looked at before it is opened, opened without waiting, looked at again, and read up to a limit.
+//! A path there may be a named pipe, which would block forever, a device, a folder, or a far larger file than expected.
+//! So a file is checked before it is opened, opened without blocking, checked again, and read up to a limit.
 
 use std::fs::{self, File, FileType, OpenOptions};
 use std::io::{self, Read};
@@ -11,13 +11,13 @@ use std::path::{Path, PathBuf};
 use protocol::{Digest, limits};
 use sha2::{Digest as _, Sha256};
 
-/// Opens a regular file, or what a symbolic link to one leads to. Gives its length too.
+/// Opens a regular file, or the target of a symbolic link to one. Returns the file and its length.
 ///
 /// # Errors
-/// What it is instead, without the path.
+/// If the path is something else; the message says what, without the path.
 pub fn open(path: &Path) -> io::Result<(File, u64)> {
     expect_file(fs::metadata(path)?.file_type())?;
-    // It may have become something else in between.
+    // The path may have been replaced in between.
     let file = OpenOptions::new().read(true).custom_flags(libc::O_NONBLOCK | libc::O_NOCTTY).open(path)?;
     let found = file.metadata()?;
     expect_file(found.file_type())?;
@@ -27,7 +27,7 @@ pub fn open(path: &Path) -> io::Result<(File, u64)> {
 /// Reads a regular file of at most `limit` bytes.
 ///
 /// # Errors
-/// What it is instead, or how large, without the path.
+/// If the path is something else, or the file is too large; the message says what, without the path.
 pub fn read(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
     let (file, length) = open(path)?;
     let mut bytes = Vec::with_capacity(usize::try_from(length.min(limit)).unwrap_or_default());
@@ -41,10 +41,10 @@ pub fn read(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// The digest of a regular file's content.
+/// Digest of a regular file's content.
 ///
 /// # Errors
-/// What it is instead, without the path.
+/// If the path is something else; the message says what, without the path.
 pub fn digest(path: &Path) -> io::Result<Digest> {
     let (mut file, _) = open(path)?;
     let mut hasher = Sha256::new();
@@ -69,11 +69,11 @@ fn expect_file(found: FileType) -> io::Result<()> {
     Err(io::Error::new(io::ErrorKind::InvalidInput, format!("is {what}; expected a file")))
 }
 
-/// The files in `root` and below it, sorted. A symbolic link counts as what it leads to; what is neither file nor folder is an error, and so
-/// is a folder that is met twice, for a circle of links has no end and a fan of them no useful one.
+/// Lists the files in `root` and below it, sorted. Symbolic links are followed. Anything else than a file or folder is
+/// an error. So is a folder that appears twice: a cycle of links never ends, and a fan of them multiplies the files.
 ///
 /// # Errors
-/// What stands in the way, with its path.
+/// The obstacle, with its path.
 pub fn tree(root: &Path) -> io::Result<Vec<PathBuf>> {
     let named = |path: &Path, error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", path.display()));
     let refuse = |path: &Path, what: String| {
@@ -159,7 +159,7 @@ mod tests {
         fs::write(at("a/b/file"), b"x").unwrap();
         symlink(at("a/b/file"), at("linked file")).unwrap();
         assert_eq!(tree(folder.path()).unwrap(), [at("a/b/file"), at("linked file")]);
-        // A circle, and a fan that doubles at each level.
+        // A cycle, and a fan that doubles at each level.
         symlink(folder.path(), at("a/b/up")).unwrap();
         let said = tree(folder.path()).unwrap_err().to_string();
         assert!(said.contains("up") && said.contains("was read already"), "{said}");

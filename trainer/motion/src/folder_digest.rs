@@ -1,10 +1,10 @@
-//! The digest of a dataset folder's content: what decides whether it has to be opened again.
+//! The digest of a dataset folder's content; a changed digest means that the folder must be opened again.
 //!
-//! It covers the files that [`Dataset::open`](crate::Dataset::open) reads and nothing else: the three lists, the two
-//! statistics, and the features and texts of every listed clip. A listed clip without a file counts as such, because it
-//! would be skipped. Times and permissions do not count. One pass over the bytes, nothing is parsed or checked.
+//! It covers exactly the files that [`Dataset::open`](crate::Dataset::open) reads: the three lists, the two statistics,
+//! and the features and texts of every listed clip. The absence of a listed clip's file counts, because the clip would
+//! be skipped. Times and permissions do not count. One pass over the bytes; nothing is parsed or checked.
 //!
-//! The digest is that of a text with one line a file in this order, `<path>\0<sha256 of the content, or "absent">`.
+//! The digest is that of a text with one line per file in this order, `<path>\0<sha256 of the content, or "absent">`.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -16,7 +16,7 @@ use protocol::{Digest, limits};
 use crate::dataset::{MANY_PROBLEMS, OpenError, Problem, ProblemKind, Split, is_clip_id};
 use crate::files;
 
-/// The digest of what is in the folder `path`; all that is missing or unreadable at once otherwise.
+/// Digest of the content of folder `path`, or all missing and unreadable files together.
 pub fn folder_digest(path: &Path, format: DataFormat) -> Result<Digest, OpenError> {
     let mut problems = vec![];
     if !path.is_dir() {
@@ -62,10 +62,10 @@ pub fn folder_digest(path: &Path, format: DataFormat) -> Result<Digest, OpenErro
     }
 }
 
-/// The digest of a file, or of all files in a folder and below it by their paths. Times and permissions do not count.
+/// Digest of a file, or of all files in a folder and below it by their paths. Times and permissions do not count.
 ///
 /// # Errors
-/// What stands in the way, with its path.
+/// The obstacle, with its path.
 pub fn files_digest(path: &Path) -> std::io::Result<Digest> {
     if !path.is_dir() {
         return files::digest(path);

@@ -1,23 +1,26 @@
 //! Root paths on which standing feet do not slide.
 //!
-//! A feature row says apart how far the root moves and how the pose moves under it. In generated rows the two agree roughly, and so feet slide. Here the
-//! root's displacement `v` of each step is that of least squares between what the row says, `v_0`, and what each ankle and ball asks for that touches the
-//! ground: `min_v LOOSE |v - v_0|^2 + sum_f c_f^2 |v + u_f|^2`, where `u_f` is the foot's displacement in a body that stays, and `c_f` the row's own contact.
-//! The correction is smoothed over five steps, so that the root does not jerk where feet change. Poses, turns, heights and contacts stay; the path becomes as
-//! long as the feet have walked. What touches the ground nowhere, as in a jump, keeps its path.
+//! A feature row holds the motion of the root and that of the pose separately. In generated rows the two agree only
+//! roughly, so feet slide. Here the root's displacement `v` of each step is a least-squares compromise between the
+//! row's own, `v_0`, and that of each ankle and ball that touches the ground: `min_v LOOSE |v - v_0|^2 + sum_f c_f^2 |v
+//! + u_f|^2`. `u_f` is the foot's displacement in a body that stays, and `c_f` the row's own contact. The correction is
+//! smoothed over five steps, so that the root does not jerk when feet change. Poses, turns, heights and contacts stay;
+//! the path gets the length that the feet walked. Steps without contact, as in a jump, keep their path.
 //!
-//! Ours, in a closed form; that contacts decide where the root goes is usual in inertial capture (Yi et al., TransPose, SIGGRAPH 2021).
+//! Ours, in a closed form; in inertial capture contacts usually decide the root's path (Yi et al., TransPose, SIGGRAPH
+//! 2021).
 
 use crate::features;
 use crate::quaternion::{self as quat, Vec3};
 use crate::skeleton::Skeleton;
 
-/// What the row's own displacement weighs beside a foot's that surely stands.
+/// Weight of the row's own displacement, relative to a foot in certain contact.
 const LOOSE: f64 = 0.1;
-/// What corrections are smoothed with: a binomial filter, whose deviation is one step.
+/// Weights that smooth corrections: a binomial filter with a deviation of one step.
 const SMOOTH: [f64; 5] = [1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0];
 
-/// Lets the root of `rows`, `[L, D]`, which must not be normalised, go where standing feet let it. The last row leads nowhere and is left as it is.
+/// Corrects the root of `rows` `[L, D]`, which must not be normalised, by the standing feet. The last row has no next
+/// frame and is unchanged.
 pub fn hold(rows: &mut [f32], skeleton: &Skeleton) {
     let corrections = corrections(rows, skeleton);
     if corrections.iter().flatten().all(|v| *v == 0.0) {
@@ -25,7 +28,7 @@ pub fn hold(rows: &mut [f32], skeleton: &Skeleton) {
     }
     let steps = corrections.len();
     let reach = SMOOTH.len() / 2;
-    // Beyond the ends the correction goes on as it is there.
+    // The correction is constant beyond the ends.
     let smooth = |t: usize, axis: usize| -> f64 {
         let near = SMOOTH.iter().enumerate();
         near.map(|(k, weight)| weight * corrections[(t + k).saturating_sub(reach).min(steps - 1)][axis]).sum()
@@ -39,7 +42,7 @@ pub fn hold(rows: &mut [f32], skeleton: &Skeleton) {
     features::follow_path(rows, skeleton);
 }
 
-/// What each step's displacement should change by, in the heading frame that it leads to.
+/// Correction of each step's displacement, in the heading frame of the next frame.
 fn corrections(rows: &[f32], skeleton: &Skeleton) -> Vec<[f64; 2]> {
     let layout = skeleton.layout();
     let rows: Vec<&[f32]> = rows.chunks_exact(skeleton.features).collect();
@@ -50,7 +53,7 @@ fn corrections(rows: &[f32], skeleton: &Skeleton) -> Vec<[f64; 2]> {
     };
     let step = |pair: &[&[f32]]| {
         let (from, to) = (pair[0], pair[1]);
-        // The turn feature is the angle of the quaternion already.
+        // The turn feature is already the angle of the quaternion.
         let (sin, cos) = f64::from(from[layout.yaw.start]).sin_cos();
         let turn = [cos, 0.0, sin, 0.0];
         let said = [f64::from(from[layout.root_velocity.start]), f64::from(from[layout.root_velocity.start + 1])];
@@ -75,7 +78,7 @@ mod tests {
     use super::*;
     use crate::synthetic;
 
-    /// Mean floor-wise speed of what touches the ground, m/s.
+    /// Mean horizontal speed of feet in contact with the ground, m/s.
     fn slides(rows: &[f32], skeleton: &Skeleton) -> f64 {
         let joints = features::recover_joints_wide(rows, skeleton);
         let frames: Vec<&[f64]> = joints.chunks_exact(3 * skeleton.joints).collect();

@@ -1,7 +1,7 @@
 //! Motion data without tensors: folders, features, skeletons, captions, synthetic clips, drawings, keyed randomness.
 //!
-//! Not its job: Burn, training, anything that is asynchronous. Everything here works on plain slices, so that the
-//! numbers can be checked against the published files without a backend.
+//! Not its job: Burn, training, asynchronous code. Everything here works on plain slices, so that the numbers can be
+//! compared with the published files without a backend.
 //!
 //! Shapes: `T` raw frames, `L = T - 1` feature frames, `J` joints, `D` feature width (263 or 251). All arrays are
 //! row-major and frame-major.

@@ -1,7 +1,7 @@
-//! Reading and writing `.npy` files of f32, with errors that say which file and what was expected.
+//! Reads and writes `.npy` files of f32, with errors that name the file and the expected content.
 //!
-//! A thin layer over `npyz`: it adds the checks on type, order and size that make a truncated or foreign file a clear
-//! message instead of wrong numbers.
+//! A thin layer over `npyz`: its checks on type, order and size report a truncated or foreign file instead of returning
+//! wrong numbers.
 
 use std::fs;
 use std::io::{Error, ErrorKind, Write as _};
@@ -12,39 +12,39 @@ use protocol::limits;
 
 use crate::files;
 
-/// An array as it lay in the file, row-major.
+/// An array of a file, row-major.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Array {
     /// Length of each axis.
     pub shape: Vec<usize>,
-    /// The numbers.
+    /// Values of all elements.
     pub data: Vec<f32>,
 }
 
-/// Why a `.npy` file could not be read or written.
+/// A `.npy` file could not be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum NpyError {
-    /// The file system refused.
+    /// The file system reported an error.
     #[error("{}: {source}", file.display())]
     Io {
         file: PathBuf,
-        /// What it said.
+        /// Error of the file system.
         source: std::io::Error,
     },
     /// The header is not that of a `.npy` file.
     #[error("{}: not a .npy file ({source})", file.display())]
     Header {
         file: PathBuf,
-        /// What is wrong with it.
+        /// Defect of the header.
         source: std::io::Error,
     },
-    /// The element type is another.
+    /// The element type is not the expected one.
     #[error("{}: holds {found}, expected {expected}; save it with numpy.save(..., x.astype(numpy.float32))", file.display())]
     Type {
         file: PathBuf,
         /// Type in the header.
         found: String,
-        /// What is read here.
+        /// Types that can be read here.
         expected: &'static str,
     },
     /// The array is column-major.
@@ -57,15 +57,15 @@ pub enum NpyError {
         file: PathBuf,
         /// Shape in the header.
         shape: Vec<u64>,
-        /// Bytes that this shape takes.
+        /// Number of bytes of this shape.
         expected: u64,
-        /// Bytes that follow the header.
+        /// Number of bytes after the header.
         found: u64,
     },
 }
 
 impl NpyError {
-    /// Whether the file is simply not there.
+    /// Returns true if the file does not exist.
     pub fn is_missing(&self) -> bool {
         matches!(self, Self::Io { source, .. } if source.kind() == std::io::ErrorKind::NotFound)
     }
@@ -77,13 +77,13 @@ pub fn read(file: &Path) -> Result<Array, NpyError> {
     parse(file, &bytes, false)
 }
 
-/// Reads an f32 or f64 array; f64 is rounded. For statistics, which published sets store either way.
+/// Reads an f32 or f64 array, rounding f64. For statistics, which published sets store in either type.
 pub fn read_any_float(file: &Path) -> Result<Array, NpyError> {
     let bytes = files::read(file, limits::ARRAY_BYTES).map_err(|source| NpyError::Io { file: file.into(), source })?;
     parse(file, &bytes, true)
 }
 
-/// Reads an array from bytes; `file` only names it in errors.
+/// Reads an array from bytes; `file` is only its name in errors.
 pub fn parse(file: &Path, bytes: &[u8], allow_f64: bool) -> Result<Array, NpyError> {
     let header_error = |source| NpyError::Header { file: file.into(), source };
     check_header(bytes).map_err(|what| header_error(Error::new(ErrorKind::InvalidData, what)))?;
@@ -118,10 +118,11 @@ pub fn parse(file: &Path, bytes: &[u8], allow_f64: bool) -> Result<Array, NpyErr
     Ok(Array { shape, data: data.map_err(header_error)? })
 }
 
-/// Brackets in one another; those of a plain array are a mapping and the tuple in it.
+/// Largest nesting of brackets; the header of a plain array has a mapping and a tuple in it.
 const DEPTH: usize = 4;
 
-/// What the header's reader takes on trust: how long it is, for which it makes room, how deep it is, and a shape, whose axes it multiplies.
+/// Checks the header before its reader trusts it: the length, for which it allocates, the nesting, and the shape, whose
+/// axes it multiplies.
 fn check_header(bytes: &[u8]) -> Result<(), String> {
     let [b'\x93', b'N', b'U', b'M', b'P', b'Y', major, _, rest @ ..] = bytes else {
         return Err("it does not begin as one".into());
@@ -136,7 +137,7 @@ fn check_header(bytes: &[u8]) -> Result<(), String> {
         return Err(format!("a header of {length} bytes, expected at most {}", limits::ARRAY_HEADER_BYTES));
     }
     let header = rest.get(..length as usize).ok_or("its header is cut off")?;
-    // Its reader takes twice as long for each level.
+    // The reader's time doubles with each level.
     let mut depth = 0_usize;
     for byte in header {
         match byte {
@@ -160,7 +161,7 @@ fn check_header(bytes: &[u8]) -> Result<(), String> {
     Ok(())
 }
 
-/// An f32 array as the bytes of a `.npy` file.
+/// Serialises an f32 array as a `.npy` file.
 pub fn to_bytes(shape: &[usize], data: &[f32]) -> std::io::Result<Vec<u8>> {
     let shape: Vec<u64> = shape.iter().map(|n| *n as u64).collect();
     let mut bytes = Vec::with_capacity(128 + 4 * data.len());
@@ -195,7 +196,7 @@ mod tests {
         assert!(matches!(parse(file, b"hello", false), Err(NpyError::Header { .. })));
     }
 
-    /// A file of `version` whose header is `header` and says that it has `length` bytes.
+    /// A file of `version` with the header `header`, which declares `length` bytes.
     fn with_header(version: u8, length: u32, header: &[u8], data: &[u8]) -> Vec<u8> {
         let mut bytes = b"\x93NUMPY".to_vec();
         bytes.extend([version, 0]);
@@ -227,14 +228,14 @@ mod tests {
         refuse(&shaped("(4611686018427387904, 4)", b""), "more elements than can be counted");
         refuse(&shaped("(0xffffffffffffffff, 2)", b""), "not made of numbers");
         refuse(&shaped(&format!("({most},)"), b""), "truncated");
-        // Axes of zero ask for nothing, whatever the others are.
+        // An axis of zero has no elements, for any other axes.
         assert_eq!(parse(file, &shaped("(0, 9000000000)", b""), false).unwrap().data, [0.0; 0]);
         let nested = "(".repeat(900);
         assert!(parse(file, &with_header(1, 900, nested.as_bytes(), b""), false).is_err());
     }
 
     proptest::proptest! {
-        /// Any answer will do, but no panic and no more memory than the file has.
+        /// Arbitrary bytes must not cause a panic, nor use more memory than the file has.
         #[test]
         fn no_bytes_break_the_reader(
             bytes in proptest::collection::vec(proptest::prelude::any::<u8>(), 0..300),

@@ -1,9 +1,9 @@
-//! Motion along other paths: an augmentation for small data. Source: ours; the shape and the length of a path say little about the poses of those who
-//! walk it, so one recording can stand for the same gait along others.
+//! Motion along changed paths: an augmentation for small data. Source: ours. Poses depend little on the shape and
+//! length of a path, so one recording can represent the same gait along others.
 //!
-//! The root turns by a smooth curvature times the way it makes, and makes a longer or a shorter way; what stands still is left alone. Positions and
-//! rotations in the heading frame, heights and contacts stay; the turn and the displacements of joints follow the new path, as if the features had been
-//! taken of it. Feet slide by what the way was stretched.
+//! The root gets an additional smooth curvature times its way, and a longer or shorter way; a standing body is not
+//! changed. Positions and rotations in the heading frame, heights and contacts stay. The turn and the displacements of
+//! joints follow the new path, as if the features were computed from it. Feet slide by the stretching of the way.
 
 use protocol::stage::Augment;
 
@@ -11,24 +11,25 @@ use crate::features;
 use crate::random::Stream;
 use crate::skeleton::Skeleton;
 
-/// Fastest turn that is added, radians a second: tighter curves are no longer walked.
+/// Fastest additional turn, radians per second; a body does not walk along tighter curves.
 const FASTEST: f64 = 2.0;
-/// Shortest and longest period of the part of the curvature that alternates, seconds.
+/// Shortest and longest period of the alternating part of the curvature, seconds.
 const PERIODS: (f64, f64) = (2.0, 8.0);
-/// Least and largest factor of the way.
+/// Smallest and largest factor of the way.
 const PACES: (f64, f64) = (0.5, 1.5);
 
-/// How a path is changed.
+/// A change of a path.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Change {
-    /// What each row turns beside its own turn, radians.
+    /// Additional turn of each row, radians.
     turns: Vec<f64>,
-    /// What the way of each row is multiplied by.
+    /// Factor of the way of each row.
     pace: f64,
 }
 
 impl Change {
-    /// Draws one for `rows`, `[L, D]`, which must not be normalised. Half of the curvature's variance is constant over the motion, half alternates.
+    /// Draws a change for `rows` `[L, D]`, which must not be normalised. Half of the curvature's variance is constant
+    /// over the motion, half alternates.
     pub fn draw(rows: &[f32], skeleton: &Skeleton, augment: &Augment, draw: &mut Stream) -> Self {
         let spread = augment.bend * std::f64::consts::FRAC_1_SQRT_2;
         let (constant, alternating) = (f64::from(draw.normal()) * spread, f64::from(draw.normal()) * spread);
@@ -38,14 +39,14 @@ impl Change {
         let turn = |(t, row): (usize, &[f32])| {
             let (x, z) = (f64::from(row[1]), f64::from(row[2]));
             let way = (x * x + z * z).sqrt() * pace * skeleton.metres_per_unit;
-            // A triangle wave of variance 1: the same on every machine, as the sine of the system's library is not.
+            // A triangle wave of variance 1: equal on every machine, unlike the sine of a system's library.
             let wave = (2.0 * ((t as f64 / period + phase).fract() * 2.0 - 1.0).abs() - 1.0) * 3.0_f64.sqrt();
             (way * (constant + alternating * wave)).clamp(-most, most)
         };
         Self { turns: rows.chunks_exact(skeleton.features).enumerate().map(turn).collect(), pace }
     }
 
-    /// Makes `rows` follow the changed path. The last row leads nowhere and is left as it is.
+    /// Applies the change to `rows`. The last row has no next frame and is unchanged.
     ///
     /// # Panics
     /// If it was drawn for another number of rows.
@@ -61,7 +62,7 @@ impl Change {
     }
 }
 
-/// Changes the path of `rows` as `augment` asks, or does nothing where it asks for nothing.
+/// Changes the path of `rows` by the settings `augment`; does nothing if they are off.
 pub fn augment(rows: &mut [f32], skeleton: &Skeleton, augment: &Augment, draw: &mut Stream) {
     if !augment.is_none() {
         Change::draw(rows, skeleton, augment, draw).apply(rows, skeleton);
@@ -126,7 +127,7 @@ mod tests {
             assert_eq!(a[1..layout.velocities.start], b[1..layout.velocities.start]);
             assert_eq!(a[layout.contacts.clone()], b[layout.contacts.clone()]);
         }
-        // What moved between two frames, seen in the earlier one's heading.
+        // Displacements between two frames, in the heading of the earlier one.
         let joints = recover_joints_wide(&bent, skeleton);
         let heading = features::root_path(&bent, skeleton)[40].0;
         let at = |t: usize, j: usize| -> Vec3 { std::array::from_fn(|axis| joints[t * 66 + 3 * j + axis]) };

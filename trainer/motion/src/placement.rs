@@ -1,34 +1,36 @@
-//! Where a clip lies in the world, and how its joints are carried over into the next clip.
+//! Placement of a clip in the world, and the transition of its joints into the next clip.
 //!
-//! A clip of HumanML3D's features begins above the origin and faces z, whatever was before it. A longer motion is made of clips, each placed where
-//! the one before it stands: turned about the vertical and shifted on the floor. Heights stay.
+//! A clip of HumanML3D's features starts above the origin and faces z, for any clip before it. A longer motion consists
+//! of clips, each placed at the end of the one before it: turned about the vertical and shifted on the floor. Heights
+//! stay.
 //!
-//! [`Fade`] takes away what two clips still differ by where they meet. Source of the idea: inertialization (Bollo, "Inertialization: High-Performance
-//! Animation Transitions in Gears of War", GDC 2018), a quintic of each coordinate's offset that begins with its value, velocity and acceleration and
-//! ends at rest. Departs: the three are given by the last three frames before the junction, so that differences of frames stay continuous and not
-//! only derivatives; there is no clamp on the way that an offset takes.
+//! [`Fade`] removes the remaining difference of two clips at their junction. Source of the idea: inertialization
+//! (Bollo, "Inertialization: High-Performance Animation Transitions in Gears of War", GDC 2018), a quintic of each
+//! coordinate's offset that starts with its value, velocity and acceleration and ends at rest. Departs: the last three
+//! frames before the junction define the three. So differences of frames stay continuous and not only derivatives. The
+//! offset on the way is not clamped.
 
 use crate::quaternion::{self as quat, Quat, Vec3};
 
 /// A turn about the vertical and a shift on the floor.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Placement {
-    /// Half the turn from the world to the clip, radians, as the yaw features sum up.
+    /// Half the turn from the world to the clip, radians, like the sum of the yaw features.
     angle: f64,
     x: f64,
     z: f64,
 }
 
 impl Placement {
-    /// Of a clip that begins at frame `(heading, root)` of a clip that is placed here, both as [`root_path`](crate::features::root_path) gives
-    /// them.
+    /// The placement of a clip that starts at frame `(heading, root)` of a clip with this placement, both from
+    /// [`root_path`](crate::features::root_path).
     #[must_use]
     pub fn of_frame(self, heading: Quat, root: Vec3) -> Self {
         let [x, _, z] = self.to_world(root);
         Self { angle: self.angle + heading[2].atan2(heading[0]), x, z }
     }
 
-    /// Of a clip whose frame `(heading, root)` lies as a clip does that begins here: it faces the same way, and its root is above the same point.
+    /// The placement in which frame `(heading, root)` of a clip has this placement's heading and ground point.
     #[must_use]
     pub fn with_frame(self, heading: Quat, root: Vec3) -> Self {
         let turned = Self { angle: self.angle - heading[2].atan2(heading[0]), x: 0.0, z: 0.0 };
@@ -36,19 +38,19 @@ impl Placement {
         Self { x: self.x - x, z: self.z - z, ..turned }
     }
 
-    /// With its origin below `point` of the world.
+    /// The placement with its origin below `point` of the world.
     #[must_use]
     pub fn below(self, point: Vec3) -> Self {
         Self { x: point[0], z: point[2], ..self }
     }
 
-    /// A point of the clip, in the world.
+    /// Converts a point of the clip to the world.
     pub fn to_world(self, point: Vec3) -> Vec3 {
         let turned = quat::rotate(quat::inverse(self.turn()), point);
         [turned[0] + self.x, turned[1], turned[2] + self.z]
     }
 
-    /// A point of the world, in the clip.
+    /// Converts a point of the world to the clip.
     pub fn to_clip(self, point: Vec3) -> Vec3 {
         quat::rotate(self.turn(), [point[0] - self.x, point[1], point[2] - self.z])
     }
@@ -59,23 +61,24 @@ impl Placement {
     }
 }
 
-/// Frames before a junction whose offsets count.
+/// Number of frames before a junction whose offsets count.
 pub const BEFORE: usize = 3;
 
-/// The way in which offsets go to zero in so many frames.
+/// Weights by which offsets fade to zero over a number of frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Fade {
     frames: usize,
 }
 
 impl Fade {
-    /// Over `frames`, after which nothing is left.
+    /// A fade over `frames` frames, with zero offset after them.
     pub fn over(frames: usize) -> Self {
         Self { frames }
     }
 
-    /// What is left of each of the offsets 0, 1 and 2 frames before the junction, `k` frames behind it (the first frame has k = 1): the value at
-    /// k of the quintic through those three and through zero at the end of the fade and the two frames that follow. 0 from there on.
+    /// The remaining share of each of the offsets 0, 1 and 2 frames before the junction, `k` frames after it (the first
+    /// frame has k = 1). It is the value at k of the quintic through those three, and through zero at the end of the
+    /// fade and the two frames that follow. After that it is 0.
     pub fn weights(self, k: usize) -> [f64; BEFORE] {
         if k > self.frames {
             return [0.0; BEFORE];
@@ -99,7 +102,7 @@ mod tests {
     use crate::features::{recover_joints_wide, root_path};
     use crate::{Skeleton, Stream};
 
-    /// A body that walks in bends.
+    /// A body that walks in curves.
     fn rows(frames: usize) -> Vec<f32> {
         let skeleton = Skeleton::of(DataFormat::Humanml3d);
         let mut draw = Stream::new(Seed(5), "placement", 0, 0);
@@ -129,7 +132,7 @@ mod tests {
                 assert!((back[axis] - local[axis]).abs() < 1e-9);
             }
         }
-        // And again: the placement of a frame of a placed clip.
+        // The placement of a frame of a placed clip.
         let (heading, root) = root_path(&rows[at * skeleton.features..], skeleton)[3];
         let twice = place.of_frame(heading, root);
         let (heading, root) = root_path(&rows, skeleton)[at + 3];

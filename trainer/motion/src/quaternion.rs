@@ -1,7 +1,7 @@
 //! Quaternions `(w, x, y, z)` and 6D rotations, in f64.
 //!
 //! Conventions of the HumanML3D feature definition: Hamilton product, conjugate as inverse, and a 6D rotation is the
-//! first column of the matrix, then the second. The published code computes in f32; results differ by rounding only.
+//! first column of the matrix, then the second. The published code computes in f32; results differ only by rounding.
 
 /// A quaternion `(w, x, y, z)`.
 pub type Quat = [f64; 4];
@@ -9,7 +9,7 @@ pub type Quat = [f64; 4];
 /// A vector `(x, y, z)`.
 pub type Vec3 = [f64; 3];
 
-/// No rotation.
+/// The identity rotation, `(1, 0, 0, 0)`.
 pub const IDENTITY: Quat = [1.0, 0.0, 0.0, 0.0];
 
 /// Sum of two vectors.
@@ -27,17 +27,17 @@ pub fn scale(a: Vec3, s: f64) -> Vec3 {
     a.map(|v| v * s)
 }
 
-/// Scalar product.
+/// Scalar product of two vectors.
 pub fn dot(a: Vec3, b: Vec3) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// Vector product.
+/// Vector product `a x b`.
 pub fn cross(a: Vec3, b: Vec3) -> Vec3 {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
-/// Length.
+/// Euclidean length of a vector.
 pub fn norm(a: Vec3) -> f64 {
     dot(a, a).sqrt()
 }
@@ -47,7 +47,7 @@ pub fn unit(a: Vec3) -> Vec3 {
     scale(a, 1.0 / norm(a))
 }
 
-/// Hamilton product: first `b`, then `a`.
+/// Hamilton product: applies `b`, then `a`.
 pub fn mul(a: Quat, b: Quat) -> Quat {
     [
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
@@ -62,7 +62,7 @@ pub fn inverse(q: Quat) -> Quat {
     [q[0], -q[1], -q[2], -q[3]]
 }
 
-/// `v` rotated by `q`.
+/// Rotates `v` by `q`.
 pub fn rotate(q: Quat, v: Vec3) -> Vec3 {
     let u = [q[1], q[2], q[3]];
     let once = cross(u, v);
@@ -76,7 +76,7 @@ pub fn between(a: Vec3, b: Vec3) -> Quat {
     normalise([(dot(a, a) * dot(b, b)).sqrt() + dot(a, b), axis[0], axis[1], axis[2]])
 }
 
-/// The unit quaternion of the same direction.
+/// Scales to a unit quaternion of the same direction.
 pub fn normalise(q: Quat) -> Quat {
     let length = q.iter().map(|v| v * v).sum::<f64>().sqrt();
     q.map(|v| v / length)
@@ -114,18 +114,18 @@ pub fn matrix_from_6d(c: [f64; 6]) -> [Vec3; 3] {
     [0, 1, 2].map(|k| [x[k], y[k], z[k]])
 }
 
-/// Matrix product.
+/// Product of two matrices, given as rows.
 pub fn matmul(a: [Vec3; 3], b: [Vec3; 3]) -> [Vec3; 3] {
     a.map(|row| [0, 1, 2].map(|k| row[0] * b[0][k] + row[1] * b[1][k] + row[2] * b[2][k]))
 }
 
-/// Matrix times vector.
+/// Product of a matrix and a vector.
 pub fn apply(m: [Vec3; 3], v: Vec3) -> Vec3 {
     m.map(|row| dot(row, v))
 }
 
-/// Makes a track of quaternions continuous: of `q` and `-q`, which are the same rotation, each frame takes the one
-/// nearer to the frame before.
+/// Makes a track of quaternions continuous: of `q` and `-q`, the same rotation, each frame gets the one nearer to the
+/// frame before.
 pub fn make_continuous(track: &mut [Quat]) {
     for t in 1..track.len() {
         let (before, now) = (track[t - 1], track[t]);

@@ -1,11 +1,12 @@
-//! Randomness keyed by what it is for, never by how much was drawn before.
+//! Randomness keyed by its purpose, independent of the number of earlier draws.
 //!
 //! A [`Stream`] is ChaCha8 under a key that is the SHA-256 of (seed, purpose, step, index). Two streams that differ in
-//! any of the four are independent, and neither a restart nor the number of workers changes what one of them gives.
+//! any of the four are independent. Neither a restart nor the number of workers changes the numbers of a stream.
 //!
-//! Normal deviates come from the inverse of the normal distribution function (Wichura, "Algorithm AS 241", Applied
-//! Statistics 37(3), 1988, PPND16) with a logarithm of our own: only additions, multiplications, divisions and square
-//! roots, which IEEE 754 rounds the same way everywhere. The system's `ln` and `cos` do not give that promise.
+//! Normal deviates are computed by the inverse of the normal distribution function (Wichura, "Algorithm AS 241",
+//! Applied Statistics 37(3), 1988, PPND16) with a logarithm of our own. It uses only additions, multiplications,
+//! divisions and square roots, which IEEE 754 rounds the same way everywhere. The system's `ln` and `cos` do not
+//! guarantee that.
 
 use protocol::{Digest, Seed};
 use rand_chacha::ChaCha8Rng;
@@ -18,9 +19,9 @@ pub struct Stream {
 }
 
 impl Stream {
-    /// The stream of `purpose` for one `index` of one `step`.
+    /// Creates the stream of `purpose` for one `index` of one `step`.
     ///
-    /// A purpose names what is drawn and where, for instance `"pcm/noise"`, so that no two uses share numbers.
+    /// A purpose names the draw and its place, for instance `"pcm/noise"`, so that no two uses share numbers.
     pub fn new(seed: Seed, purpose: &str, step: u64, index: u64) -> Self {
         let mut key = Vec::with_capacity(48 + purpose.len());
         key.extend_from_slice(b"stride/stream/1\0");
@@ -67,7 +68,7 @@ impl Stream {
         self.uniform() < p
     }
 
-    /// A standard normal deviate. One draw each, so the n-th value of a stream is that of `fill_normal`.
+    /// A standard normal deviate. It takes one draw, so the n-th value of a stream equals that of `fill_normal`.
     pub fn normal(&mut self) -> f32 {
         let p = (f64::from(self.generator.next_u32()) + 0.5) / 4_294_967_296.0;
         inverse_normal(p) as f32
@@ -91,7 +92,7 @@ pub fn permutation(seed: Seed, purpose: &str, epoch: u64, n: usize) -> Vec<u32> 
     order
 }
 
-/// Natural logarithm of a positive, normal number. Error below 2 units in the last place.
+/// Natural logarithm of a positive, normal number. The error is below 2 units in the last place.
 fn ln(x: f64) -> f64 {
     let bits = x.to_bits();
     let mut exponent = ((bits >> 52) & 0x7ff) as i64 - 1023;

@@ -1,25 +1,25 @@
 //! The two skeletons and the numbers that depend on them.
 //!
 //! Source: the public HumanML3D and KIT-ML feature definitions (joint order, chains, raw bone directions, contact
-//! thresholds). The bone lengths are those of HumanML3D's uniform skeleton, rounded to 10 micrometres; the length table
-//! of KIT-ML's uniform skeleton (clip `03950`) is not public, so a caller that extracts KIT features hands one over.
+//! thresholds). The bone lengths are those of HumanML3D's uniform skeleton, rounded to 10 micrometres. The lengths of
+//! KIT-ML's uniform skeleton (clip `03950`) are not public, so a caller that extracts KIT features supplies them.
 
 use protocol::stage::DataFormat;
 
-/// What the feature definition needs to know about a body.
+/// Properties of a body that the feature definition uses.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Skeleton {
     /// The data format it belongs to.
     pub format: DataFormat,
-    /// J.
+    /// Number of joints J.
     pub joints: usize,
     /// D, the width of a feature row: `4 + 9 (J - 1) + 3 J + 4`.
     pub features: usize,
     /// Frames per second.
     pub fps: f64,
-    /// Metres in one unit of the data: the one place that decides it, for losses, metrics and drawings. HumanML3D is in metres. KIT-ML's unit is
-    /// not published; 0.75/480 m is what MLD's code divides by, with which its mean root is .87 m high. Others take it for a millimetre, so that
-    /// their values in mm are smaller by 1.5625.
+    /// Metres in one unit of the data, the only definition for losses, metrics and drawings. HumanML3D is in metres.
+    /// KIT-ML's unit is not published. MLD's code divides by 0.75/480 m, with which its mean root is .87 m high. Others
+    /// assume a millimetre, so that their values in mm are smaller by 1.5625.
     pub metres_per_unit: f64,
     /// Clips with fewer feature frames are not used.
     pub min_frames: usize,
@@ -27,38 +27,38 @@ pub struct Skeleton {
     pub max_frames: usize,
     /// Lengths of examples are multiples of this.
     pub unit: usize,
-    /// Joint names.
+    /// Names of the joints in order.
     pub names: &'static [&'static str],
-    /// Kinematic chains. Each starts from the root's heading, whatever its first joint is.
+    /// Kinematic chains. Each starts from the root's heading, for any first joint.
     pub chains: &'static [&'static [usize]],
     /// Parent of each joint; the root is its own.
     pub parents: &'static [usize],
-    /// Direction of the bone that ends in each joint when nothing is rotated.
+    /// Direction of the bone that ends in each joint, without rotation.
     pub directions: &'static [[f64; 3]],
-    /// Right hip, left hip, right shoulder, left shoulder: the joints that give the facing direction.
+    /// Right hip, left hip, right shoulder, left shoulder: the joints that define the facing direction.
     pub face: [usize; 4],
     /// The two joints of the foot that the feature row lists first.
     pub left_foot: [usize; 2],
     /// The two joints of the foot that the feature row lists last.
     pub right_foot: [usize; 2],
-    /// The two bones whose lengths give a body's size: thigh and shank.
+    /// The two bones whose lengths define a body's size: thigh and shank.
     pub legs: [usize; 2],
-    /// Squared displacement in a frame below which a foot joint counts as standing, in squared units.
+    /// Squared displacement per frame below which a foot joint is in contact, in squared units.
     pub contact_threshold: f64,
     /// Pairs of joints that mirroring swaps.
     pub mirror: &'static [(usize, usize)],
     /// Joints of the left side of the body.
     pub left: &'static [usize],
-    /// Joints of the right side.
+    /// Joints of the right side of the body.
     pub right: &'static [usize],
-    /// Bone length by the joint that it ends in, where the uniform skeleton is public.
+    /// Bone length by its end joint, if the uniform skeleton is public.
     pub bone_lengths: Option<&'static [f64]>,
 }
 
-/// Where each group of a feature row lies.
+/// Range of each feature group in a row.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Layout {
-    /// Half the yaw increment, radians a frame.
+    /// Half the yaw increment, radians per frame.
     pub yaw: std::ops::Range<usize>,
     /// Root displacement along x and z in the heading frame.
     pub root_velocity: std::ops::Range<usize>,
@@ -97,7 +97,7 @@ impl Skeleton {
         }
     }
 
-    /// Where each group of a feature row lies.
+    /// Range of each feature group in a row.
     pub fn layout(&self) -> Layout {
         let positions = 4 + 3 * (self.joints - 1);
         let rotations = positions + 6 * (self.joints - 1);
@@ -113,8 +113,8 @@ impl Skeleton {
         }
     }
 
-    /// Bone lengths of a table of offsets `[J, 3]` (direction times length, the form in which target skeletons are
-    /// published).
+    /// Bone lengths from a table of offsets `[J, 3]` (direction times length), the form in which target skeletons are
+    /// published.
     pub fn lengths_of_offsets(&self, offsets: &[f32]) -> Vec<f64> {
         offsets.chunks_exact(3).map(|o| o.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt()).collect()
     }
@@ -164,9 +164,9 @@ static HUMANML3D: Skeleton = Skeleton {
     ]),
 };
 
-// Which joints are "left" is disputed between KIT's joint names and the feature definition. The feature code takes 11
-// as right hip and 5 as right shoulder and lists [19, 20] as the left foot; on a right-handed body that is what the
-// published mean pose shows, so it holds here too.
+// KIT's joint names and the feature definition disagree on the "left" joints. The feature code uses 11 as right hip and
+// 5 as right shoulder and lists [19, 20] as the left foot. The published mean pose shows the same on a right-handed
+// body, so it is used here too.
 static KIT: Skeleton = Skeleton {
     format: DataFormat::Kit,
     joints: 21,

@@ -1,8 +1,8 @@
-//! A procedural, captioned dataset: people-like motion without a download.
+//! A procedural, captioned dataset: human-like motion without a download.
 //!
-//! Every clip is a movement with its own tempo, size, side and length, made on the 22-joint skeleton by forward and
-//! two-bone inverse kinematics and passed through our own feature extraction, in the layout of HumanML3D. A clip is a
-//! function of (seed, index): more clips leave the earlier ones as they are.
+//! Every clip is a movement with its own tempo, size, side and length, in the layout of HumanML3D. It is made on the
+//! 22-joint skeleton by forward and two-bone inverse kinematics, and passes our own feature extraction. A clip is a
+//! function of (seed, index): more clips do not change the earlier ones.
 //!
 //! Departs from HumanML3D in one frame of clips that turn by more than half a turn: see [`Turns::Continuous`].
 
@@ -28,7 +28,7 @@ use crate::npy;
 use crate::random::{Stream, permutation};
 use crate::skeleton::Skeleton;
 
-/// A movement.
+/// A kind of movement and its captions.
 struct Kind {
     #[cfg_attr(not(test), expect(dead_code, reason = "names the row for readers and tests"))]
     name: &'static str,
@@ -304,7 +304,7 @@ const KINDS: &[Kind] = &[
     },
 ];
 
-/// Raw joints `[T, 22, 3]` and captions of clip `index`.
+/// Makes raw joints `[T, 22, 3]` and captions of clip `index`.
 fn clip(seed: Seed, index: usize) -> (Vec<f32>, Vec<crate::text::Caption>) {
     let skeleton = Skeleton::of(DataFormat::Humanml3d);
     let kind = &KINDS[index % KINDS.len()];
@@ -387,7 +387,7 @@ fn features_of(joints: &[f32]) -> Vec<f32> {
     }
 }
 
-/// `make(0), make(1), ...`, computed on all cores.
+/// Computes `make(0), make(1), ...` on all cores.
 fn in_parallel<T: Send>(count: usize, make: impl Fn(usize) -> T + Sync) -> Vec<T> {
     let threads = std::thread::available_parallelism().map_or(1, |n| n.get());
     let part = count.div_ceil(threads).max(1);

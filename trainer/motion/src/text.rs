@@ -1,9 +1,9 @@
 //! Captions: the line grammar of the `texts/` folder, the token form of the evaluators, and the built-in embedding.
 //!
 //! A line is `caption#token token ...#from#to`, a token `word/POS`, the times seconds (`nan` reads as 0). Both times 0
-//! mean that the caption describes the whole clip. As in the published loaders, fields behind the times are not looked at, and a caption whose
-//! times make no range is not used; see [`Oddity`]. Source of grammar, classes and word lists: the HumanML3D and
-//! text-to-motion data definitions.
+//! mean that the caption describes the whole clip. As in the published loaders, fields after the times are ignored, and
+//! a caption whose times are no valid range is not used; see [`Oddity`]. Source of grammar, classes and word lists: the
+//! HumanML3D and text-to-motion data definitions.
 
 use std::path::{Path, PathBuf};
 
@@ -16,19 +16,19 @@ pub const EMBEDDING_WIDTH: usize = 768;
 /// Width of [`hashed_word`].
 pub const WORD_WIDTH: usize = 300;
 
-/// Tokens that the evaluators read of a caption, without the two markers.
+/// Largest number of a caption's tokens that the evaluators read, without the two markers.
 pub const MAX_TOKENS: usize = 20;
 
 /// One caption of a clip.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Caption {
-    /// The sentence.
+    /// The sentence in natural language.
     pub text: String,
-    /// `word/POS` each.
+    /// Tokens in the form `word/POS`.
     pub tokens: Vec<String>,
-    /// Seconds; with `to_s` 0 too, the caption describes the whole clip.
+    /// Start in seconds; if `to_s` is 0 too, the caption describes the whole clip.
     pub from_s: f64,
-    /// Seconds.
+    /// End in seconds.
     pub to_s: f64,
 }
 
@@ -36,31 +36,31 @@ pub struct Caption {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}:{line}: {what}; expected `caption#word/POS word/POS ...#from_seconds#to_seconds`", file.display())]
 pub struct TextError {
-    /// The text file.
+    /// Path of the text file.
     pub file: PathBuf,
-    /// Line, from 1.
+    /// Line number, from 1.
     pub line: usize,
-    /// What is wrong with it.
+    /// Defect of the line.
     pub what: String,
 }
 
 impl Caption {
-    /// A caption of a whole clip.
+    /// Creates a caption of a whole clip.
     pub fn whole(text: impl Into<String>, tokens: Vec<String>) -> Self {
         Self { text: text.into(), tokens, from_s: 0.0, to_s: 0.0 }
     }
 
-    /// Whether it describes the whole clip.
+    /// Returns true if it describes the whole clip.
     pub fn is_whole(&self) -> bool {
         self.from_s == 0.0 && self.to_s == 0.0
     }
 
-    /// The frames `from..to` that it describes at `fps`; both truncated, `None` for the whole clip.
+    /// The described frames `from..to` at `fps`, both truncated; `None` for the whole clip.
     pub fn frames(&self, fps: f64) -> Option<(usize, usize)> {
         (!self.is_whole()).then_some(((self.from_s * fps) as usize, (self.to_s * fps) as usize))
     }
 
-    /// Reads one line, whatever range its times make. The error says what is wrong, without file and line.
+    /// Reads one line, with any times. The error describes the defect, without file and line.
     pub fn parse(line: &str) -> Result<Self, String> {
         if line.len() > limits::CAPTION_BYTES {
             return Err(format!("{} bytes, at most {} are read", line.len(), limits::CAPTION_BYTES));
@@ -81,12 +81,12 @@ impl Caption {
         Ok(Self { text: text.to_owned(), tokens, from_s: seconds(from)?, to_s: seconds(to)? })
     }
 
-    /// Whether its times describe the whole clip or a part of it.
+    /// Returns true if its times describe the whole clip or a valid part of it.
     fn has_range(&self) -> bool {
         self.is_whole() || (self.from_s >= 0.0 && self.from_s < self.to_s && self.to_s.is_finite())
     }
 
-    /// The line that [`Caption::parse`] reads.
+    /// Writes the line that [`Caption::parse`] reads.
     pub fn to_line(&self) -> String {
         format!("{}#{}#{:?}#{:?}", self.text, self.tokens.join(" "), self.from_s, self.to_s)
     }
@@ -102,25 +102,26 @@ pub fn split_token(token: &str) -> Option<(&str, &str)> {
     token.split_once('/').filter(|(word, pos)| !word.is_empty() && !pos.is_empty() && !pos.contains('/'))
 }
 
-/// What the published loaders pass over in silence.
+/// Irregularities that the published loaders ignore silently.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Oddity {
-    /// The times make no range: the caption is not used. As the line has them.
+    /// The times are no valid range, so the caption is not used. Holds them as written.
     Times(String),
-    /// The line has so many fields: those behind the fourth are not looked at.
+    /// The line has this many fields; those after the fourth are ignored.
     ExtraFields(usize),
 }
 
-/// What a text file gives, by line.
+/// Content of a text file, by line.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Texts {
     /// Captions that describe a clip or a part of it.
     pub captions: Vec<(usize, Caption)>,
-    /// What is odd about which line.
+    /// Irregular lines and their kind.
     pub odd: Vec<(usize, Oddity)>,
 }
 
-/// Reads a text file: every line that is not blank, or the lines that do not parse, the first [`limits::MISTAKES`] of them.
+/// Reads a text file: every line that is not blank. The error lists the lines that do not parse, at most
+/// [`limits::MISTAKES`] of them.
 pub fn parse_file(file: &Path, content: &str) -> Result<Texts, Vec<TextError>> {
     let (mut texts, mut errors) = (Texts::default(), vec![]);
     for (i, line) in content.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
@@ -128,7 +129,7 @@ pub fn parse_file(file: &Path, content: &str) -> Result<Texts, Vec<TextError>> {
             Ok(caption) => caption,
             Err(what) => {
                 errors.push(TextError { file: file.into(), line: i + 1, what });
-                // Each names the file, so that many would take far more than the text.
+                // Each error names the file, so many of them would take far more memory than the text.
                 if errors.len() >= limits::MISTAKES {
                     break;
                 }
@@ -148,8 +149,8 @@ pub fn parse_file(file: &Path, content: &str) -> Result<Texts, Vec<TextError>> {
     if errors.is_empty() { Ok(texts) } else { Err(errors) }
 }
 
-/// Tokens as the evaluators take them: `sos/OTHER`, at most 20 tokens, `eos/OTHER`, filled up to 22 with `unk/OTHER`;
-/// and how many there are before filling.
+/// Tokens in the form that evaluators read: `sos/OTHER`, at most 20 tokens, `eos/OTHER`, padded to 22 with `unk/OTHER`.
+/// Also returns their number before padding.
 pub fn padded_tokens(tokens: &[String]) -> (Vec<String>, usize) {
     let mut padded = vec!["sos/OTHER".to_owned()];
     padded.extend(tokens.iter().take(MAX_TOKENS).cloned());
@@ -159,7 +160,7 @@ pub fn padded_tokens(tokens: &[String]) -> (Vec<String>, usize) {
     (padded, sent_len)
 }
 
-/// Names of the 15 POS classes, by class number.
+/// Names of the 15 POS classes, by class index.
 pub const POS_CLASSES: [&str; 15] = [
     "VERB", "NOUN", "DET", "ADP", "NUM", "AUX", "PRON", "ADJ", "ADV", "Loc_VIP", "Body_VIP", "Obj_VIP", "Act_VIP",
     "Desc_VIP", "OTHER",
@@ -173,8 +174,8 @@ const ACTIONS: &str = "walk run swing pick bring kick put squat throw hop dance 
 const MANNERS: &str = "slowly carefully fast careful slow quickly happy angry sad happily angrily sadly";
 
 /// POS class of a token whose word is in the evaluator's vocabulary. A word of one of the five lists has the list's
-/// class whatever its tag. (A word outside the vocabulary is `unk` with class OTHER; only the vocabulary's owner can
-/// tell, so that case is the caller's.)
+/// class, for any tag. (A word outside the vocabulary is `unk` with class OTHER. Only the owner of the vocabulary can
+/// decide that, so the caller handles it.)
 pub fn pos_class(token: &str) -> usize {
     let (word, pos) = split_token(token).unwrap_or((token, "OTHER"));
     let lists = [PLACES, BODY, OBJECTS, ACTIONS, MANNERS];
@@ -188,30 +189,30 @@ fn fnv1a(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(*b)).wrapping_mul(0x0100_0000_01b3))
 }
 
-/// The last mixing steps of MurmurHash3 (64 bit): FNV alone leaves the upper bits of short words too alike.
+/// The last mixing steps of MurmurHash3 (64 bit): FNV alone leaves the upper bits of short words too similar.
 fn finalise(mut h: u64) -> u64 {
     h = (h ^ (h >> 33)).wrapping_mul(0xff51_afd7_ed55_8ccd);
     h = (h ^ (h >> 33)).wrapping_mul(0xc4ce_b9fe_1a85_ec53);
     h ^ (h >> 33)
 }
 
-/// The end of a caption, which is all that an empty one has.
+/// End marker of a caption; an empty caption has nothing else.
 const END: &str = "</s>";
 
-/// The words of a caption: lower-cased, everything outside `[a-z0-9]` separates them. Captions of the same words say the same.
+/// The words of a caption: lower-cased, separated by everything outside `[a-z0-9]`.
 pub fn words(caption: &str) -> Vec<String> {
     let lower = caption.to_lowercase();
     let words = lower.split(|c: char| !matches!(c, 'a'..='z' | '0'..='9')).filter(|w| !w.is_empty());
     words.map(str::to_owned).collect()
 }
 
-/// The coordinate that a word or a pair of words is hashed to, and its sign.
+/// The coordinate and sign that a word or a pair of words is hashed to.
 fn hashed_gram(gram: &str) -> (usize, i32) {
     let h = finalise(fnv1a(gram.as_bytes()));
     ((h % EMBEDDING_WIDTH as u64) as usize, if h >> 63 == 0 { 1 } else { -1 })
 }
 
-/// The built-in text encoder, token by token: each word of the caption and its end as a signed coordinate, in order.
+/// The built-in text encoder by token: each word of the caption and its end as a signed coordinate, in order.
 pub fn hashed_tokens(caption: &str) -> Vec<[f32; EMBEDDING_WIDTH]> {
     let token = |word: &str| {
         let (coordinate, sign) = hashed_gram(word);
@@ -224,8 +225,9 @@ pub fn hashed_tokens(caption: &str) -> Vec<[f32; EMBEDDING_WIDTH]> {
 
 /// The built-in text encoder: words and word pairs hashed to signed coordinates, unit length.
 ///
-/// Hashed are `</s>`, every one of its [`words`] and every pair of neighbours joined by one space; coordinate `h mod 768`, `+1` if bit 63 of `h` is 0, else `-1`. The empty
-/// caption, the null condition of classifier-free guidance, is `</s>` alone.
+/// It hashes `</s>`, every one of its [`words`] and every pair of neighbours joined by one space. The coordinate is `h
+/// mod 768`, its sign `+1` if bit 63 of `h` is 0, else `-1`. The empty caption, the null condition of classifier-free
+/// guidance, is `</s>` alone.
 pub fn hashed_embedding(caption: &str) -> [f32; EMBEDDING_WIDTH] {
     let words = words(caption);
     let pairs = words.windows(2).map(|pair| pair.join(" "));
@@ -235,16 +237,16 @@ pub fn hashed_embedding(caption: &str) -> [f32; EMBEDDING_WIDTH] {
         sums[coordinate] += sign;
     }
     let squares: i32 = sums.iter().map(|v| v * v).sum();
-    // Grams can cancel each other out; then there is no direction to normalise.
+    // Coordinates can cancel out; then there is no direction to normalise.
     let scale = if squares == 0 { 0.0 } else { 1.0 / f64::from(squares).sqrt() };
     sums.map(|v| (f64::from(v) * scale) as f32)
 }
 
-/// The built-in word vector: the directions of the word and of its letter triples, `<` and `>` at its ends, added up; length 6,
-/// about that of the published vectors.
+/// The built-in word vector: the sum of the directions of the word and of its letter triples, with `<` and `>` at its
+/// ends. Its length is 6, about that of the published vectors.
 ///
-/// The direction of a text has coordinates of +1 and -1, bit `i mod 64` of the `i div 64`-th number that its hash leads to. The word
-/// itself counts as much as all its triples together.
+/// The direction of a text has coordinates of +1 and -1: bit `i mod 64` of the `i div 64`-th number generated from its
+/// hash. The word itself has the same weight as all its triples together.
 pub fn hashed_word(word: &str) -> [f32; WORD_WIDTH] {
     const LENGTH: f64 = 6.0;
     let mut sums = [0.0_f64; WORD_WIDTH];
@@ -260,7 +262,7 @@ pub fn hashed_word(word: &str) -> [f32; WORD_WIDTH] {
     let letters: Vec<char> = format!("<{word}>").chars().collect();
     add(word, 1.0);
     let triples: Vec<String> = letters.windows(3).map(|triple| triple.iter().collect()).collect();
-    // Directions are about orthogonal, so that n of them have a root of n times the length of one.
+    // Directions are nearly orthogonal, so the sum of n of them is root n times as long as one.
     let weight = 1.0 / (triples.len().max(1) as f64).sqrt();
     for triple in &triples {
         add(triple, weight);
@@ -356,7 +358,7 @@ mod tests {
     }
 
     proptest::proptest! {
-        /// A line is read or explained; what is read has a range that frames can be cut by.
+        /// A line is read or explained; a line that is read has a range that frames can be cut by.
         #[test]
         fn no_line_breaks_the_reader(
             line in "\\PC{0,40}(#[a-z/ ]{0,20}){0,2}(#(nan|inf|-?[0-9]{0,3}(\\.[0-9]{0,3})?|1e400)){0,4}",

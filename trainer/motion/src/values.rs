@@ -1,4 +1,4 @@
-//! Numbers that lie in memory of their own, or in bytes that somebody else holds: a mapped file that many processes share.
+//! Numbers in their own memory, or in shared bytes such as a mapped file that many processes use.
 
 use std::fmt;
 use std::ops::Deref;
@@ -6,14 +6,14 @@ use std::ops::Deref;
 use bytemuck::Pod;
 use bytes::Bytes;
 
-/// A row of numbers that is only read. Clones share it.
+/// A read-only row of numbers. Clones share it.
 #[derive(Clone)]
 pub struct Values<T>(Held<T>);
 
 #[derive(Clone)]
 enum Held<T> {
     Owned(std::sync::Arc<Vec<T>>),
-    /// Aligned for `T`, and a whole number of them.
+    /// Bytes aligned for `T` that hold a whole number of values.
     Shared(Bytes),
 }
 
@@ -21,12 +21,13 @@ enum Held<T> {
 pub type Floats = Values<f32>;
 
 impl<T: Pod> Values<T> {
-    /// Little-endian numbers in `bytes`, without a copy where they are aligned; `None` if the length is no multiple of theirs.
+    /// Views little-endian numbers in `bytes`, without a copy if they are aligned; `None` if the length is no multiple
+    /// of theirs.
     pub fn view(bytes: Bytes) -> Option<Self> {
         if !bytes.len().is_multiple_of(size_of::<T>()) {
             return None;
         }
-        // Every machine that this is built for is little-endian; another one would have to swap bytes here.
+        // All supported machines are little-endian; another one would have to swap bytes here.
         const { assert!(cfg!(target_endian = "little"), "tensors are stored in little-endian order") };
         if bytemuck::try_cast_slice::<u8, T>(&bytes).is_ok() {
             return Some(Self(Held::Shared(bytes)));
@@ -34,7 +35,7 @@ impl<T: Pod> Values<T> {
         Some(Self::from(bytemuck::pod_collect_to_vec::<u8, T>(&bytes)))
     }
 
-    /// As a vector of its own.
+    /// Copies the numbers to a vector.
     pub fn into_vec(self) -> Vec<T> {
         match self.0 {
             Held::Owned(values) => std::sync::Arc::try_unwrap(values).unwrap_or_else(|shared| shared.to_vec()),
@@ -82,7 +83,7 @@ mod tests {
     #[test]
     fn aligned_bytes_are_read_in_place_and_others_copied() {
         let numbers: Vec<f32> = (0..10).map(|i| i as f32 / 3.0).collect();
-        // Room for the numbers at any place of the first eight bytes.
+        // Room for the numbers at each offset of the first eight bytes.
         let mut room = vec![0_u8; 8 + 40];
         let aligned = room.as_ptr().align_offset(4);
         for at in [aligned, aligned + 1] {

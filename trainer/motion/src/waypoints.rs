@@ -1,13 +1,15 @@
-//! Paths that somebody draws for a motion: where joints should be, and when.
+//! Paths that a user draws for a motion: target positions of joints at given times.
 //!
-//! Positions are metres in the frame of HumanML3D's clips: y is up, the motion starts with its root at x = z = 0 and faces z. Times are seconds from
-//! its first frame; a waypoint is for the frame nearest to its time. Three kinds of file:
+//! Positions are metres in the frame of HumanML3D's clips: y is up, the motion starts with its root at x = z = 0 and
+//! faces z. Times are seconds from its first frame; a waypoint applies to the frame nearest to its time. There are
+//! three kinds of file:
 //!
-//! - `.csv`: a header and a line a waypoint, with the columns `t,x,y,z`, or `t,joint,x,y,z` for more than one joint, in any order;
+//! - `.csv`: a header and one line per waypoint, with the columns `t,x,y,z`, or `t,joint,x,y,z` for more than one
+//!   joint, in any order;
 //! - `.json`: a list of `[t, x, y, z]`, or an object of such lists by joint;
-//! - `.npy`: a motion `[frames, joints, 3]`, or features `[frames, D]`, whose joints are told in every frame.
+//! - `.npy`: a motion `[frames, joints, 3]`, or features `[frames, D]`, whose joints are targets in every frame.
 //!
-//! Not its job: what a model makes of it.
+//! Not its job: the steering of a model by them.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -18,25 +20,25 @@ use serde_json::Value;
 use crate::features::recover_joints;
 use crate::{Skeleton, files, npy};
 
-/// Bytes of a file of waypoints.
+/// Largest size of a file of waypoints, in bytes.
 const PATH_BYTES: u64 = 4 << 20;
-/// Seconds that no motion lasts.
+/// Upper limit of times, in seconds.
 const LONGEST: f64 = 3600.0;
-/// Metres a second that no body moves at.
+/// Upper limit of a body's speed, in metres per second.
 pub const FASTEST: f64 = 10.0;
 
-/// Where a joint should be at a frame.
+/// Target position of a joint at a frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Waypoint {
-    /// The frame.
+    /// Index of the frame.
     pub frame: usize,
-    /// The joint's number.
+    /// Index of the joint.
     pub joint: usize,
-    /// Metres.
+    /// Position in metres.
     pub position: [f32; 3],
 }
 
-/// One line of a file: what it is called in errors, when, which joint if it says so, where.
+/// One line of a file: its name in errors, its time, its joint if it has one, and its position.
 #[derive(Debug, Clone, PartialEq)]
 struct Line {
     place: String,
@@ -45,13 +47,13 @@ struct Line {
     position: [f64; 3],
 }
 
-/// Waypoints of a file, by joint and then in time.
+/// Reads the waypoints of a file, ordered by joint and then by time.
 ///
-/// `joints` are those that are told: of a file that names joints, or of a motion, only these count; a file that names none is of the one that there
-/// is. Empty takes those that the file names, or the root.
+/// `joints` selects the joints of a file that names joints, or of a motion. A file without joint names needs exactly
+/// one. An empty list selects all joints that the file names, or the root.
 ///
 /// # Errors
-/// What is wrong with it, with its line or place and what was expected.
+/// The defect, with its line or place and the expected content.
 pub fn read(file: &Path, skeleton: &Skeleton, joints: &[String]) -> Result<Vec<Waypoint>, String> {
     let limit = if ending(file) == "npy" { limits::ARRAY_BYTES } else { PATH_BYTES };
     let bytes = if ["csv", "json", "npy"].contains(&ending(file).as_str()) {
@@ -62,7 +64,7 @@ pub fn read(file: &Path, skeleton: &Skeleton, joints: &[String]) -> Result<Vec<W
     parse(file, &bytes, skeleton, joints)
 }
 
-/// Waypoints of a file's bytes, as [`read`] gives them; what kind they are the file's name says.
+/// Reads waypoints from a file's bytes, like [`read`]; the extension of the file's name decides the kind.
 ///
 /// # Errors
 /// As [`read`].
@@ -81,20 +83,20 @@ pub fn parse(file: &Path, bytes: &[u8], skeleton: &Skeleton, joints: &[String]) 
     waypoints(&lines, skeleton, &told).map_err(named)
 }
 
-/// Waypoints of a JSON value, as a `.json` file holds it; `joints` as for [`read`].
+/// Reads waypoints from a JSON value with the content of a `.json` file; `joints` as for [`read`].
 ///
 /// # Errors
-/// What is wrong with it, with its place and what was expected.
+/// The defect, with its place and the expected content.
 pub fn of_json(value: &Value, skeleton: &Skeleton, joints: &[String]) -> Result<Vec<Waypoint>, String> {
     let told: Vec<usize> = joints.iter().map(|name| number(name, skeleton)).collect::<Result<_, _>>()?;
     waypoints(&of_value(value)?, skeleton, &told)
 }
 
-/// Refuses a first waypoint of the root that it cannot reach from where it stands as the motion begins, `start` in metres: faster than 10 m/s, and at once
-/// farther than it would come in a frame.
+/// Refuses a first waypoint of the root that it cannot reach from its start, `start` in metres. The limit is 10 m/s
+/// over the time to the waypoint, which counts as one frame at least.
 ///
 /// # Errors
-/// How fast it would have to be.
+/// The speed that it would need.
 pub fn check_start(waypoints: &[Waypoint], skeleton: &Skeleton, start: [f64; 3]) -> Result<(), String> {
     let Some(first) = waypoints.iter().filter(|waypoint| waypoint.joint == 0).min_by_key(|waypoint| waypoint.frame)
     else {
@@ -113,7 +115,7 @@ pub fn check_start(waypoints: &[Waypoint], skeleton: &Skeleton, start: [f64; 3])
     Ok(())
 }
 
-/// What a file's name ends in, in lower case.
+/// Extension of a file's name, in lower case.
 fn ending(file: &Path) -> String {
     file.extension().and_then(|ending| ending.to_str()).unwrap_or_default().to_lowercase()
 }
@@ -129,7 +131,7 @@ fn number(name: &str, skeleton: &Skeleton) -> Result<usize, String> {
     })
 }
 
-/// Joints of a motion in every frame.
+/// Waypoints from the joints of a motion, in every frame.
 fn motion(file: &Path, bytes: &[u8], skeleton: &Skeleton, told: &[usize]) -> Result<Vec<Waypoint>, String> {
     let array = npy::parse(file, bytes, true).map_err(|error| error.to_string())?;
     let (joints, features) = (skeleton.joints, skeleton.features);

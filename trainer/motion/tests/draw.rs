@@ -62,7 +62,7 @@ fn what_was_told_is_drawn() {
     assert_eq!(purple(plain), (0, 210));
     let (found, height) = purple(along);
     assert!(found > 60 && height > 400, "{found} pixels of waypoints, {height} high");
-    // What was drawn between kept frames has that colour too, and no more height.
+    // Poses between kept frames have the colour of generated frames, and add no height.
     let mut edited = vec![];
     let given = draw::Given { kept: &[0..5, 15..21], ..draw::Given::default() };
     draw::strip_png_along_to(&[(title.clone(), joints.clone())], 6, skeleton, given, &mut edited).unwrap();

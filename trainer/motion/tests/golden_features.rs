@@ -1,4 +1,4 @@
-//! Walks the golden feature clips: every folder is a case, whatever its name. 21 joints are KIT-ML.
+//! Checks the golden feature clips: every folder is a case. 21 joints mean KIT-ML.
 
 mod shared;
 
@@ -14,7 +14,7 @@ fn target_of(folder: &Path, skeleton: &Skeleton) -> Vec<f64> {
     skeleton.lengths_of_offsets(&load(&folder.join("tgt_offsets.npy")).data)
 }
 
-/// Largest errors by file name, printed as one line a case.
+/// Largest errors by file name, printed as one line per case.
 struct Case {
     line: String,
     worst: f64,

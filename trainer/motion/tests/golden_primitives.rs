@@ -1,4 +1,4 @@
-//! Walks `golden/primitives`: quaternion operations and the heading filter.
+//! Checks `golden/primitives`: quaternion operations and the heading filter.
 
 mod shared;
 

@@ -1,4 +1,4 @@
-//! Mean and Std of the mini sets by our rule, and what is known about the published statistics.
+//! Mean and Std of the mini sets by our rule, and known properties of the published statistics.
 
 mod shared;
 

@@ -1,4 +1,4 @@
-//! Walks `golden/text`: every `*.json` there holds caption lines and what becomes of them.
+//! Checks `golden/text`: every `*.json` there holds caption lines and their expected results.
 
 mod shared;
 

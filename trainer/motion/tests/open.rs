@@ -1,4 +1,4 @@
-//! Opening folders: what real ones give, and what is said about broken ones.
+//! Opening folders: the content of real ones, and the errors of broken ones.
 
 mod shared;
 
@@ -146,7 +146,7 @@ fn what_the_rules_leave_out_is_reported() {
     assert!(report.to_string().contains("too short, train (1)"));
 }
 
-/// What the published loaders skip in silence is skipped, and told with file and line.
+/// Lines that the published loaders skip silently are skipped, and reported with file and line.
 #[test]
 fn odd_captions_are_left_out_and_listed() {
     let (folder, ids) = folder();
@@ -175,7 +175,7 @@ fn odd_captions_are_left_out_and_listed() {
     assert!(shown.contains(&format!("texts/{}.txt:3 (5 fields)", ids[0])), "{shown}");
 }
 
-/// Pipes, circles of links, sockets and folders where files should be: each is named at once, none is waited for.
+/// Pipes, cycles of links, sockets and folders in place of files: each is reported at once, without blocking.
 #[test]
 fn what_is_no_file_is_named() {
     let (folder, ids) = folder();

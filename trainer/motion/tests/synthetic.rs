@@ -55,7 +55,7 @@ fn bodies_move_like_bodies() {
             assert!(lowest > -1e-4, "{text}: below the floor in frame {t}");
         }
         if text.contains("walk") {
-            // A foot that stands does not slide: of frames with a toe on the floor, nearly all are still.
+            // A standing foot does not slide: of frames with a toe on the floor, nearly all are still.
             let toe = |t: usize| [10, 11].map(|j| (at(t, j)[1] < 0.006, distance(at(t, j), at(t - 1, j))));
             let low: Vec<f64> = (1..entry.len).flat_map(toe).filter(|(low, _)| *low).map(|(_, d)| d).collect();
             let sliding = low.iter().filter(|d| **d > 0.02).count();
@@ -77,8 +77,8 @@ proptest! {
             let from_rotations = recover_from_rotations(&clip.features, skeleton, skeleton.bone_lengths.unwrap());
             let apart = joints.iter().zip(&from_rotations).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             prop_assert!(apart < 2e-3, "{}: rotations and positions are {apart} apart", clip.id);
-            // The last frame of features has no successor, so one row fewer comes back; the smoothed heading sees one
-            // frame less, so only the positions can be compared.
+            // The last frame of features has no successor, so the result is one row shorter. The smoothed heading has
+            // one frame less, so only the positions can be compared.
             let again = extract_with(&joints, skeleton, None, Turns::Continuous).unwrap();
             let back = recover_joints(&again, skeleton);
             let apart = joints.iter().zip(&back).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);

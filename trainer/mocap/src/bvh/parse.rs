@@ -1,4 +1,4 @@
-//! Reading. One pass over the bytes, without recursion, so that depth costs no stack.
+//! Parser of BVH. One pass over the bytes without recursion, so that depth uses no stack.
 
 use std::path::Path;
 
@@ -6,16 +6,16 @@ use motion::quaternion::Vec3;
 
 use super::{Bvh, BvhError, Channel, MAX_DEPTH, MAX_NODES, MAX_SECONDS, MAX_VALUES, Node, nominal_rate};
 
-/// Bytes of a word that are shown in an error.
+/// Largest number of a word's bytes shown in an error.
 const SHOWN: usize = 40;
-/// Bytes of a joint's name.
+/// Largest length of a joint's name, in bytes.
 const NAME_BYTES: usize = 256;
 
 impl Bvh {
-    /// Reads a file's bytes; `file` only names it in errors.
+    /// Parses a file's bytes; `file` is only its name in errors.
     ///
     /// # Errors
-    /// With file and line.
+    /// The defect, with file and line.
     pub fn parse(file: &Path, bytes: &[u8]) -> Result<Self, BvhError> {
         let fail = |(line, what)| BvhError::Text { file: file.into(), line, what };
         let text = std::str::from_utf8(bytes).map_err(|error| {
@@ -26,10 +26,10 @@ impl Bvh {
     }
 }
 
-/// A line and what is wrong there.
+/// A line number and the defect there.
 type Fault = (usize, String);
 
-/// The text that is left, and the line where it begins.
+/// The remaining text, and the number of its first line.
 struct Reader<'a> {
     rest: &'a str,
     line: usize,
@@ -48,7 +48,7 @@ impl<'a> Reader<'a> {
         self.advance(blanks);
     }
 
-    /// The next word: a brace, or what stands before a blank or a brace. Empty at the end of the file.
+    /// The next word: a brace, or the text before a blank or a brace. Empty at the end of the file.
     fn word(&mut self) -> &'a str {
         self.skip_blanks();
         let end = self.rest.find(|c: char| c.is_whitespace() || matches!(c, '{' | '}')).unwrap_or(self.rest.len());
@@ -72,7 +72,7 @@ impl<'a> Reader<'a> {
         self.fault(format!("{}, expected `{wanted}`", shown(found)))
     }
 
-    /// What is left of the line, up to a brace.
+    /// The rest of the line up to a brace.
     fn name(&mut self) -> Result<String, Fault> {
         let end = self.rest.find(['\n', '{', '}']).unwrap_or(self.rest.len());
         let name = self.rest[..end].trim();
@@ -117,7 +117,7 @@ fn shown(word: &str) -> String {
     }
 }
 
-/// A number that is finite, also as a float of 32 bits.
+/// Parses a number that is finite, also as a float of 32 bits.
 fn number(word: &str) -> Option<f64> {
     word.parse::<f64>().ok().filter(|value| value.abs() <= f64::from(f32::MAX))
 }
@@ -129,10 +129,10 @@ fn read(text: &str) -> Result<Bvh, Fault> {
     motion(&mut reader, nodes)
 }
 
-/// From `ROOT` to the brace that closes it.
+/// Parses from `ROOT` to its closing brace.
 fn hierarchy(reader: &mut Reader<'_>) -> Result<Vec<Node>, Fault> {
     let mut nodes: Vec<Node> = vec![];
-    // Joints whose braces are open, outermost first.
+    // Joints with open braces, outermost first.
     let mut open: Vec<usize> = vec![];
     reader.expect("ROOT")?;
     open_joint(reader, &mut nodes, &mut open)?;
@@ -233,7 +233,7 @@ fn channels(reader: &mut Reader<'_>, joint: &Node) -> Result<Vec<Channel>, Fault
     Ok(channels)
 }
 
-/// From `MOTION` to the end.
+/// Parses from `MOTION` to the end.
 fn motion(reader: &mut Reader<'_>, nodes: Vec<Node>) -> Result<Bvh, Fault> {
     let found = reader.word();
     match found.to_ascii_uppercase().as_str() {
@@ -272,7 +272,7 @@ fn motion(reader: &mut Reader<'_>, nodes: Vec<Node>) -> Result<Bvh, Fault> {
     Ok(Bvh { nodes, frame_time, rate, frames, values })
 }
 
-/// Words of which the last one is followed by a colon.
+/// Parses words; a colon follows the last one.
 fn label(reader: &mut Reader<'_>, words: &[&str]) -> Result<(), Fault> {
     let wanted = format!("{}:", words.join(" "));
     for (i, wanted_word) in words.iter().enumerate() {
@@ -289,7 +289,7 @@ fn label(reader: &mut Reader<'_>, words: &[&str]) -> Result<(), Fault> {
     Ok(())
 }
 
-/// `[frames, channels]`. Memory follows what the file holds, not what it promises.
+/// Parses rows `[frames, channels]`. Memory grows with the actual content, not with the declared size.
 fn rows(reader: &Reader<'_>, frames: usize, channels: usize) -> Result<Vec<f64>, Fault> {
     // Each number takes at least two bytes of the text.
     let mut values = Vec::with_capacity((frames * channels).min(reader.rest.len() / 2 + 1));
@@ -331,7 +331,7 @@ fn rows(reader: &Reader<'_>, frames: usize, channels: usize) -> Result<Vec<f64>,
     Ok(values)
 }
 
-/// What one unit in the last digit of a written number stands for.
+/// Value of one unit in the last digit of a written number.
 fn last_digit(word: &str) -> f64 {
     let (mantissa, exponent) = word.split_once(['e', 'E']).unwrap_or((word, "0"));
     let decimals = mantissa.split_once('.').map_or(0, |(_, digits)| digits.len());
@@ -398,7 +398,7 @@ mod tests {
     }
 
     proptest::proptest! {
-        /// Any answer will do, but no panic, and no row that the text does not have.
+        /// Arbitrary bytes must not cause a panic, nor more rows than the text has.
         #[test]
         fn no_bytes_break_the_reader(at in 0_usize..150, byte in proptest::prelude::any::<u8>(), cut in 0_usize..150, junk in "(?s).{0,80}") {
             let mut bytes = SMALL.as_bytes().to_vec();

@@ -1,4 +1,5 @@
-//! Writing. Six decimals everywhere: a tenth of a micrometre in metres, and less than a micrometre at the end of an arm in degrees.
+//! Writer of BVH. All numbers have six decimals: a tenth of a micrometre in metres, and less than a micrometre at the
+//! end of an arm in degrees.
 
 use std::fmt::Write as _;
 
@@ -10,12 +11,12 @@ use super::{Bvh, Channel};
 pub const ROTATIONS: [Channel; 3] = [Channel::Rotation(2), Channel::Rotation(0), Channel::Rotation(1)];
 
 impl Bvh {
-    /// The file's text.
+    /// Serialises the recording as text.
     ///
-    /// What it reads back as has the same nodes, and values to six decimals.
+    /// The text parses to the same nodes, and to values with six decimals.
     pub fn to_text(&self) -> String {
         let mut text = String::from("HIERARCHY\n");
-        // Nodes whose braces are open.
+        // Nodes with open braces.
         let mut open: Vec<usize> = vec![];
         for (i, node) in self.nodes.iter().enumerate() {
             while open.last().is_some_and(|last| Some(*last) != node.parent) {
@@ -53,22 +54,23 @@ impl Bvh {
     }
 }
 
-/// Six decimals, without a sign before zero.
+/// Formats with six decimals, without a sign before zero.
 fn decimals(value: f64) -> String {
     let text = format!("{value:.6}");
     if text == "-0.000000" { "0.000000".to_owned() } else { text }
 }
 
-/// The three angles of [`ROTATIONS`] in degrees. `before` are those of the frame before: of all triples that are the same rotation, the one nearest to it is
-/// taken, so that a curve has no jumps that the motion has not. Where x is 90 degrees up or down only the sum of the other two is determined; z keeps its value then.
+/// The three angles of [`ROTATIONS`] in degrees. `before` are those of the frame before: of all equivalent triples the
+/// nearest to it is returned, so that curves do not jump. With x at 90 degrees up or down only the sum of the other two
+/// is determined; then z keeps its value.
 pub fn angles(rotation: Quat, before: [f64; 3]) -> [f64; 3] {
     let m = quat::to_matrix(rotation);
-    // R = Rz Rx Ry: row 2 is (-cos x sin y, sin x, cos x cos y), column 1 is (-sin z cos x, cos z cos x, sin x).
+    // R = Rz Rx Ry. Row 2 is (-cos x sin y, sin x, cos x cos y); column 1 is (-sin z cos x, cos z cos x, sin x).
     let x = m[2][1].clamp(-1.0, 1.0).asin();
     let (z, y) = if m[2][1].abs() < 1.0 - 1e-12 {
         ((-m[0][1]).atan2(m[1][1]), (-m[2][0]).atan2(m[2][2]))
     } else {
-        // At the pole R is a function of z + y (up) or z - y (down).
+        // R is a function of z + y (up) or z - y (down) at the pole.
         let turn = m[1][0].atan2(m[0][0]);
         let z = before[0].to_radians();
         (z, if m[2][1] > 0.0 { turn - z } else { z - turn })

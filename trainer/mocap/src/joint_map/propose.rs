@@ -1,8 +1,9 @@
-//! A joint map for a file: a shipped one whose names it has, else one by the skeleton's shape.
+//! Proposes a joint map for a file: a built-in one with the file's names, else one by the skeleton's shape.
 //!
-//! By shape, the pelvis is the first node with three long branches, of which the two whose bones are most alike are the legs; the other one leads to the chest, the next node with
-//! three, of which the two most alike are the arms. A leg is hip, knee, ankle, foot, an arm collar, shoulder, elbow, wrist. Left is where up x forward points in
-//! frame 0, with feet ahead of ankles. Nodes that lie on their parent are passed over.
+//! By shape, the pelvis is the first node with three long branches. The two branches with the most similar bones are
+//! the legs. The other leads to the chest, the next node with three branches; its two most similar ones are the arms. A
+//! leg is hip, knee, ankle, foot; an arm is collar, shoulder, elbow, wrist. Left is the direction up x forward in frame
+//! 0, with feet in front of ankles. Nodes at their parent's position are skipped.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -13,10 +14,10 @@ use super::{Along, JointMap, MapError, Proposal, SHIPPED, Source};
 use crate::bvh::Bvh;
 
 impl JointMap {
-    /// The map that fits a file: a shipped one by names, else one by the skeleton's shape.
+    /// Proposes a map for a file: a built-in one by names, else one by the skeleton's shape.
     ///
     /// # Errors
-    /// The skeleton has no shape of a figure either.
+    /// The skeleton does not have the shape of a figure either.
     pub fn propose(bvh: &Bvh) -> Result<Proposal, MapError> {
         for (name, text) in SHIPPED {
             let map = Self::parse(Path::new(name), text)?;
@@ -31,10 +32,10 @@ impl JointMap {
 
 struct Shape<'a> {
     bvh: &'a Bvh,
-    /// Of frame 0.
+    /// Positions in frame 0.
     at: Vec<Vec3>,
     children: Vec<Vec<usize>>,
-    /// Nodes of the longest way down, itself included, without those on their parent.
+    /// Length of the longest path down in nodes, itself included, without those at their parent's position.
     depth: Vec<usize>,
 }
 
@@ -119,7 +120,7 @@ impl<'a> Shape<'a> {
         Self { bvh, at, children, depth }
     }
 
-    /// Branches of a node, helper nodes that lie on it looked through.
+    /// Branches of a node; helper nodes at its position are skipped.
     fn branches(&self, node: usize) -> Vec<usize> {
         let mut found = vec![];
         let mut next: Vec<usize> = self.children[node].iter().rev().copied().collect();
@@ -151,7 +152,7 @@ impl<'a> Shape<'a> {
         }
     }
 
-    /// The two branches with `least` joints whose bones are most alike, and the other branches, longest first.
+    /// The two branches with `least` joints and the most similar bones, and the other branches, longest first.
     fn pair(&self, node: usize, least: usize) -> Option<([usize; 2], Vec<usize>)> {
         let long = self.long(node, least);
         let mut best: Option<(f64, [usize; 2])> = None;
@@ -182,7 +183,7 @@ impl<'a> Shape<'a> {
         (apart < 0.05).then_some((pair, rest))
     }
 
-    /// From the top of a branch down its longest way, end sites included where nothing else follows.
+    /// The longest path from the top of a branch down, with the end site if it is the only continuation.
     fn chain(&self, branch: usize) -> Vec<usize> {
         let mut chain = vec![branch];
         let mut node = branch;
@@ -193,7 +194,7 @@ impl<'a> Shape<'a> {
         chain
     }
 
-    /// Joints of the chain of a branch up to where it forks.
+    /// Number of joints in the chain of a branch up to its fork.
     fn bones(&self, branch: usize) -> usize {
         let mut count = 1;
         let mut node = branch;
@@ -207,7 +208,7 @@ impl<'a> Shape<'a> {
         count
     }
 
-    /// Nodes below `from` down to `to`.
+    /// Nodes on the path below `from` down to `to`.
     fn way(&self, from: usize, to: usize) -> Vec<usize> {
         let mut way = vec![];
         let mut node = Some(to);

@@ -1,6 +1,6 @@
-//! Base64 read back, for tests of pages that hold bytes.
+//! Decoder of base64, for tests of pages that hold bytes.
 
-/// The bytes that `text` stands for.
+/// Decodes base64 `text`.
 pub(super) fn decoded(text: &str) -> Vec<u8> {
     let value = |c: u8| match c {
         b'A'..=b'Z' => c - b'A',

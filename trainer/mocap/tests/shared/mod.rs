@@ -1,4 +1,4 @@
-//! Finds the reference material and measures how far a result is from it.
+//! Finds the reference data and measures the distance of a result from it.
 
 #![allow(dead_code, reason = "each test binary uses its own part of this module")]
 
@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use motion::npy::{self, Array};
 use serde_json::Value;
 
-/// The folder of reference data, or `None` (said loudly) on a machine without it.
+/// The folder of reference data, or `None` with a notice on a machine without it.
 pub(crate) fn data(part: &str) -> Option<PathBuf> {
     let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
     let shared = std::env::var_os("STRIDE_SHARED").map_or_else(|| workspace.join("../shared"), PathBuf::from);
@@ -20,12 +20,12 @@ pub(crate) fn data(part: &str) -> Option<PathBuf> {
     None
 }
 
-/// Reads f32 or f64.
+/// Reads an f32 or f64 array.
 pub(crate) fn load(file: &Path) -> Array {
     npy::read_any_float(file).unwrap_or_else(|e| panic!("{e}"))
 }
 
-/// A JSON file.
+/// Reads a JSON file.
 pub(crate) fn json(file: &Path) -> Value {
     let text = fs::read_to_string(file).unwrap_or_else(|e| panic!("{}: {e}", file.display()));
     serde_json::from_str(&text).unwrap_or_else(|e| panic!("{}: {e}", file.display()))

@@ -1,20 +1,20 @@
-//! Opening a folder in the HumanML3D or KIT-ML layout.
+//! Opens a folder in the HumanML3D or KIT-ML layout.
 //!
-//! Two kinds of findings, kept apart: what the published rules leave out (a clip too short or too long, a listed file
-//! that is not there) is a [`Skip`] in the report; what would train on wrong numbers (another width, NaN, a truncated
-//! file, a caption that does not parse) is a [`Problem`], and all problems of a folder come back together.
+//! Two kinds of findings are kept apart. A [`Skip`] in the report is data that the published rules leave out: a clip
+//! too short or too long, a listed file that does not exist. A [`Problem`] is data that would give wrong numbers:
+//! another width, NaN, a truncated file, a caption that does not parse. All problems of a folder are returned together.
 //!
 //! Load rules, from the published loaders, with our decisions:
 //! * A clip is used if `min <= L < max` (40, or 24 for KIT, and 200).
-//! * A caption whose two times are 0 belongs to the whole clip; any other becomes an entry of its own over frames
-//!   `trunc(from * fps) .. trunc(to * fps)`, under the same length rule. The loaders name such entries with random
-//!   letters; ours are named by their frames, so that the same folder always gives the same dataset.
-//! * A time range that is inverted, empty, negative or not finite cuts no frames upstream, and its caption is dropped; fields behind the times
-//!   are not looked at. Both are reported with file and line.
-//! * KIT times are read at KIT's 12.5 fps. (Some loaders use 20 for both. Published KIT texts carry no times, so no
+//! * A caption whose two times are 0 belongs to the whole clip. Any other caption becomes an entry of its own over
+//!   frames `trunc(from * fps) .. trunc(to * fps)`, under the same length rule. The loaders name such entries with
+//!   random letters; ours are named by their frames, so that the same folder always gives the same dataset.
+//! * A time range that is inverted, empty, negative or not finite cuts no frames upstream, and its caption is dropped.
+//! Fields after the times are ignored. Both are reported with file and line.
+//! * KIT times are read at KIT's 12.5 fps. (Some loaders use 20 for both. Published KIT texts have no times, so no
 //!   published number depends on it, and seconds should be seconds.)
-//! * `007975` and `M007975` of HumanML3D are known to hold NaN in some builds. They are skipped by name then; NaN in any
-//!   other clip is a problem.
+//! * `007975` and `M007975` of HumanML3D are known to hold NaN in some builds. They are then skipped by name; NaN in
+//!   any other clip is a problem.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fmt;
@@ -32,17 +32,17 @@ use crate::text::{self, Oddity, Texts};
 /// Clips of the published HumanML3D that hold NaN in some builds.
 const KNOWN_NOT_FINITE: [&str; 2] = ["007975", "M007975"];
 
-/// A folder that cannot be used, with everything that is wrong with it.
+/// A folder that cannot be used, with all of its problems.
 #[derive(Debug)]
 pub struct OpenError {
     pub folder: PathBuf,
-    /// In the order of the files.
+    /// All problems in the order of the files.
     pub problems: Vec<Problem>,
 }
 
-/// How many problems are printed one by one.
+/// Largest number of problems that are printed one by one.
 const PRINTED: usize = 40;
-/// After so many nobody reads on.
+/// Reading stops after this many problems.
 pub(crate) const MANY_PROBLEMS: usize = 1_000;
 
 impl fmt::Display for OpenError {
@@ -60,10 +60,10 @@ impl fmt::Display for OpenError {
 
 impl std::error::Error for OpenError {}
 
-/// What kind of problem; the text is in [`Problem::what`].
+/// Kind of a problem; [`Problem::what`] has the text.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum ProblemKind {
-    /// The folder, a list, or the statistics are not there.
+    /// The folder, a list, or the statistics do not exist.
     Missing,
     /// A file or folder cannot be read.
     Io,
@@ -81,12 +81,11 @@ pub enum ProblemKind {
     Empty,
 }
 
-/// Something that must be repaired before the folder is used.
+/// A problem that must be repaired before the folder is used.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Problem {
-    /// What kind.
     pub kind: ProblemKind,
-    /// File (and line), what was found, what was expected, what to do.
+    /// File (and line), the value found, the value expected, and the remedy.
     pub what: String,
 }
 
@@ -114,26 +113,26 @@ impl From<NpyError> for Problem {
     }
 }
 
-/// Why a clip or one of its captions is not used.
+/// Reason for leaving out a clip or one of its captions.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum SkipReason {
     /// Fewer frames than the format's minimum.
     TooShort {
         frames: usize,
-        /// The minimum.
+        /// The minimum, in frames.
         min: usize,
     },
-    /// As many frames as the format's bound, or more.
+    /// At least as many frames as the format's bound.
     TooLong {
         frames: usize,
         /// The bound, exclusive.
         bound: usize,
     },
-    /// Listed, but without features.
+    /// Listed, but without a features file.
     NoMotion,
     /// Listed, but without a text file.
     NoText,
-    /// Its text file has no caption, or none that covers enough frames.
+    /// The text file has no caption, or none that covers enough frames.
     NoCaption,
     /// The part of the clip that a caption describes is too short or too long.
     CaptionRange {
@@ -142,18 +141,18 @@ pub enum SkipReason {
         /// Frames in the range.
         frames: usize,
     },
-    /// The time range of a caption begins behind its end, or is no range from 0 on.
+    /// The time range of a caption ends before its start, or is negative or not finite.
     CaptionTimes {
         /// Line of the text file.
         line: usize,
-        /// As the line has it, in seconds.
+        /// The range as written in the line, in seconds.
         range: String,
     },
-    /// A caption line has fields behind its times; the caption itself is used.
+    /// A caption line has fields after its times; the caption itself is used.
     ExtraFields {
         /// Line of the text file.
         line: usize,
-        /// Fields of the line, 4 expected.
+        /// Number of fields of the line, 4 expected.
         fields: usize,
     },
     /// Listed twice in one split.
@@ -163,7 +162,7 @@ pub enum SkipReason {
 }
 
 impl SkipReason {
-    /// In a few words.
+    /// A heading for the report.
     pub fn heading(&self) -> &'static str {
         match self {
             Self::TooShort { .. } => "too short",
@@ -180,14 +179,13 @@ impl SkipReason {
     }
 }
 
-/// A clip, or a caption of it, that is not used.
+/// A clip, or a caption of it, that is left out.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Skip {
-    /// The clip.
+    /// Id of the clip.
     pub id: String,
-    /// Where it is listed.
+    /// The split that lists the clip.
     pub split: Split,
-    /// Why.
     pub reason: SkipReason,
 }
 
@@ -205,24 +203,24 @@ impl fmt::Display for Skip {
     }
 }
 
-/// What was opened and what was left out. Prints as text.
+/// Summary of an opened folder, with the clips left out. Its `Display` is the report.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OpenReport {
-    /// Which format the folder was read as.
+    /// Format in which the folder was read.
     pub format: DataFormat,
-    /// Ids in the lists, by split.
+    /// Number of ids in the lists, by split.
     pub listed: BTreeMap<Split, usize>,
-    /// Entries, by split.
+    /// Number of entries, by split.
     pub entries: BTreeMap<Split, usize>,
-    /// Clips that at least one entry uses.
+    /// Number of clips that at least one entry uses.
     pub clips: usize,
-    /// Frames of these clips.
+    /// Number of frames of these clips.
     pub frames: usize,
-    /// Captions that at least one entry uses.
+    /// Number of captions that at least one entry uses.
     pub captions: usize,
-    /// Everything that was left out.
+    /// Clips and captions that were left out.
     pub skips: Vec<Skip>,
-    /// Ids that stand in more than one split: their evaluation would be on training data.
+    /// Ids in more than one split; an evaluation on them uses training data.
     pub shared: Vec<String>,
 }
 
@@ -257,7 +255,7 @@ impl fmt::Display for OpenReport {
     }
 }
 
-/// What reading one listed clip gave.
+/// Result of reading one listed clip.
 enum Loaded {
     Clip { frames: usize, features: Vec<f32>, texts: Texts },
     Skip(SkipReason),
@@ -335,13 +333,13 @@ impl Dataset {
         Ok((dataset, report))
     }
 
-    /// Turns loaded clips into entries by the load rules, and writes down what is left out.
+    /// Converts loaded clips to entries by the load rules, and records those left out.
     fn collect(&mut self, lists: &[(Split, Vec<String>)], mut loaded: HashMap<&str, Loaded>) -> OpenReport {
         let skeleton = self.skeleton();
         let usable = |frames: usize| (skeleton.min_frames..skeleton.max_frames).contains(&frames);
         let mut skips = vec![];
         let mut shared = vec![];
-        // Where a clip that is already stored lies, and its captions by line.
+        // Indices of a stored clip and of its captions by line.
         let mut stored: HashMap<String, (usize, Vec<(usize, usize)>)> = HashMap::new();
         let mut odd: HashMap<String, Vec<SkipReason>> = HashMap::new();
         for (split, ids) in lists {
@@ -441,7 +439,7 @@ impl Dataset {
     }
 }
 
-/// Ids of a list, stripped, without blank lines.
+/// Reads the ids of a list, trimmed, without blank lines.
 fn read_list(file: &Path) -> Result<Vec<String>, Vec<Problem>> {
     let content = files::read(file, limits::CLIP_LIST_BYTES).map_err(|e| {
         let (kind, hint) = match e.kind() {
@@ -469,14 +467,14 @@ fn read_list(file: &Path) -> Result<Vec<String>, Vec<Problem>> {
     if bad.is_empty() { Ok(lines().map(|(_, id)| id.to_owned()).collect()) } else { Err(bad) }
 }
 
-/// Whether `id` with an ending is the name of a file in a folder, and can be shown.
+/// Returns true if `id` with an extension is a file name that is safe to print.
 pub fn is_clip_id(id: &str) -> bool {
     id.len() <= limits::CLIP_NAME_BYTES
         && !id.starts_with('.')
         && !id.contains(|c: char| matches!(c, '/' | '\\') || c.is_control())
 }
 
-/// What the report says of an odd line.
+/// The report's reason for an unusual line.
 fn left_out((line, oddity): (usize, Oddity)) -> SkipReason {
     match oddity {
         Oddity::Times(range) => SkipReason::CaptionTimes { line, range },
@@ -504,7 +502,7 @@ fn read_statistic(file: &Path, skeleton: &Skeleton, positive: bool) -> Result<Ve
     Ok(array.data)
 }
 
-/// Loads all clips, a contiguous part of the list on each core. The order of the result is that of `ids`.
+/// Loads all clips, a contiguous part of the list on each core. The result has the order of `ids`.
 fn load_all(root: &Path, ids: &[&str], skeleton: &Skeleton) -> Vec<Loaded> {
     let threads = std::thread::available_parallelism().map_or(1, |n| n.get()).min(8);
     let part = ids.len().div_ceil(threads).max(1);

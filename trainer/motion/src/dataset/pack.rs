@@ -1,9 +1,9 @@
 //! A dataset as the files of an artifact.
 //!
 //! `dataset.json` holds everything but the features: format, statistics, captions, entries, and for each clip its id,
-//! frames and shard. The features lie in `clips-0000.safetensors`, `clips-0001.safetensors`, ... of at most 64 MiB of
-//! data (or one clip), tensor `c` and the clip's index in seven digits, f32 `[L, D]`. Equal datasets give equal bytes:
-//! clips keep their order, and neither file has a map with an order of its own.
+//! frames and shard. The features are in `clips-0000.safetensors`, `clips-0001.safetensors`, ... with at most 64 MiB of
+//! data (or one clip) each. A tensor's name is `c` and the clip's index in seven digits, its values f32 `[L, D]`. Equal
+//! datasets give equal bytes: clips keep their order, and neither file has a map with an order of its own.
 
 use std::borrow::Cow;
 
@@ -20,28 +20,28 @@ use crate::text::Caption;
 const INDEX: &str = "dataset.json";
 const SHARD_BYTES: usize = 64 << 20;
 
-/// Why an artifact's files are not a dataset.
+/// The files of an artifact are not a dataset.
 #[derive(Debug, thiserror::Error)]
 pub enum PackError {
     /// A file could not be fetched.
     #[error("{file}: {why}")]
     Fetch {
         file: String,
-        /// What the store said.
+        /// Message of the store.
         why: String,
     },
-    /// A file's content is not what `dataset.json` says.
+    /// A file's content differs from `dataset.json`.
     #[error("{file}: {what}")]
     Content {
         file: String,
-        /// What is wrong.
+        /// Difference between the two.
         what: String,
     },
     /// A file could not be written.
     #[error("{file}: cannot be encoded: {what}")]
     Encode {
         file: String,
-        /// What the encoder said.
+        /// Message of the encoder.
         what: String,
     },
 }
@@ -96,7 +96,7 @@ fn tensor_name(clip: usize) -> String {
 }
 
 impl Dataset {
-    /// Hands the artifact's files to `sink` one after the other, so that only one shard is in memory at a time.
+    /// Passes the artifact's files to `sink` one after the other, so that only one shard is in memory at a time.
     pub fn write_files<E: From<PackError>>(
         &self,
         mut sink: impl FnMut(String, Vec<u8>) -> Result<(), E>,
@@ -139,7 +139,8 @@ impl Dataset {
         sink(INDEX.into(), bytes)
     }
 
-    /// The artifact's files, name and content. Needs the dataset's size in memory again; see [`Dataset::write_files`].
+    /// Returns the artifact's files as name and content. Needs the dataset's size in memory again; see
+    /// [`Dataset::write_files`].
     pub fn to_files(&self) -> Result<Vec<(String, Vec<u8>)>, PackError> {
         let mut files = vec![];
         self.write_files::<PackError>(|name, bytes| {
@@ -149,7 +150,7 @@ impl Dataset {
         Ok(files)
     }
 
-    /// The captions alone, without fetching a clip.
+    /// Reads only the captions, without fetching a clip.
     pub fn captions_from_files(fetch: &dyn Fn(&str) -> Result<Bytes, String>) -> Result<Vec<Caption>, PackError> {
         let bytes = fetch(INDEX).map_err(|why| PackError::Fetch { file: INDEX.into(), why })?;
         let index: Index = serde_json::from_slice(&bytes)
@@ -157,7 +158,8 @@ impl Dataset {
         Ok(index.captions)
     }
 
-    /// Reads what [`Dataset::write_files`] wrote; `fetch` gives a file's content by its name. Features stay where the content is.
+    /// Reads the files of [`Dataset::write_files`]; `fetch` returns a file's content by its name. Features borrow that
+    /// content without a copy.
     pub fn from_files(fetch: &dyn Fn(&str) -> Result<Bytes, String>) -> Result<Self, PackError> {
         let get = |file: &str| fetch(file).map_err(|why| PackError::Fetch { file: file.into(), why });
         let bad = |file: &str, what: String| PackError::Content { file: file.into(), what };

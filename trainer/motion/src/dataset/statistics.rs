@@ -1,11 +1,11 @@
-//! Mean and Std as the published sets define them.
+//! Mean and Std as defined by the published sets.
 
 use crate::skeleton::Skeleton;
 
-/// Mean and Std `[D]` over all frames of all clips: the population standard deviation, then every group of features gets
-/// the mean of its deviations, so that Std is constant inside a group. Summed in f64, in the order of the clips.
+/// Mean and Std `[D]` over all frames of all clips. Std is the population standard deviation, averaged over each group
+/// of features, so that it is constant inside a group. Sums are in f64, in the order of the clips.
 ///
-/// A group that never varies (contacts of a set without a step, say) has the scale 1.
+/// A group that never varies (for instance contacts of a set without a step) has the scale 1.
 pub fn statistics<'a>(skeleton: &Skeleton, clips: impl Iterator<Item = &'a [f32]> + Clone) -> (Vec<f64>, Vec<f64>) {
     let width = skeleton.features;
     let rows = || clips.clone().flat_map(|clip| clip.chunks_exact(width));

@@ -1,8 +1,8 @@
-//! A 5x7 font of our own: small letters, digits and some signs. Capitals are drawn as small letters.
+//! A 5x7 font of our own: small letters, digits and some punctuation. Capitals are drawn as small letters.
 
 use super::raster::{Canvas, Colour};
 
-/// Rows from the top, five bits each, the highest at the left.
+/// Rows from the top, five bits each, the highest bit at the left.
 #[rustfmt::skip]
 const GLYPHS: &[(char, [u8; 7])] = &[
     ('a', [0b00000, 0b00000, 0b01110, 0b00001, 0b01111, 0b10001, 0b01111]),
@@ -59,10 +59,10 @@ const GLYPHS: &[(char, [u8; 7])] = &[
     ('@', [0b01110, 0b10001, 0b10111, 0b10101, 0b10111, 0b10000, 0b01110]),
 ];
 
-/// What is drawn for a character that the font lacks.
+/// Glyph for a character that the font lacks.
 const UNKNOWN: [u8; 7] = [0b11111, 0b10001, 0b10001, 0b10001, 0b10001, 0b10001, 0b11111];
 
-/// Draws a line of text, its upper left corner at `at`, `size` pixels a dot.
+/// Draws a line of text with its upper left corner at `at`, `size` pixels per dot.
 pub(super) fn draw(canvas: &mut Canvas, text: &str, at: [f64; 2], size: i64, colour: Colour) {
     for (i, c) in text.chars().flat_map(char::to_lowercase).enumerate() {
         if c == ' ' {
@@ -78,7 +78,7 @@ pub(super) fn draw(canvas: &mut Canvas, text: &str, at: [f64; 2], size: i64, col
     }
 }
 
-/// Breaks a text into lines of at most `width` characters, at spaces where there are any.
+/// Breaks a text into lines of at most `width` characters, at spaces if possible.
 pub(super) fn wrap(text: &str, width: usize) -> Vec<String> {
     let mut lines: Vec<String> = vec![];
     for word in text.split_whitespace() {

@@ -1,21 +1,21 @@
-//! A motion from above beside the waypoints that it was told: z up the page and so x to the left, a cell of the grid half a metre.
+//! A motion from above with its waypoints. z points up the page, so x points left; a cell of the grid is half a metre.
 
 use super::colours::{GRID, INK, TOLD};
 use super::font;
 use super::raster::Canvas;
 use crate::waypoints::Waypoint;
 
-/// Pixels.
+/// Height of the plan in pixels.
 pub(super) const HEIGHT: usize = 380;
-/// Free pixels at the edges.
+/// Margin at the edges in pixels.
 const MARGIN: f64 = 34.0;
 /// Metres between lines of the grid.
 const STEP: f64 = 0.5;
-/// Least extent, metres.
+/// Smallest extent of the plan, metres.
 const LEAST: f64 = 1.0;
 
-/// Draws below `top`: waypoints as discs, a line from each to where its joint is at its frame, and the courses of the joints that were told. Of the motion
-/// it is given the frames, and where a joint is in a frame, in metres.
+/// Draws below `top`: waypoints as discs, a line from each to its joint at its frame, and the paths of the joints with
+/// waypoints. The motion is given as its number of frames and a joint's position in a frame, in metres.
 pub(super) fn draw(
     canvas: &mut Canvas,
     top: f64,

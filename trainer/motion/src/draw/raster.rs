@@ -1,9 +1,9 @@
 //! Anti-aliased lines and discs on an RGB canvas, and the palette of a GIF.
 
-/// Red, green, blue.
+/// Red, green and blue, 0 to 255.
 pub(super) type Colour = [u8; 3];
 
-/// `share` of `over`, the rest of `under`.
+/// Mixes `share` of `over` with the rest of `under`.
 pub(super) fn blend(under: Colour, over: Colour, share: f64) -> Colour {
     std::array::from_fn(|k| (f64::from(under[k]) + (f64::from(over[k]) - f64::from(under[k])) * share).round() as u8)
 }
@@ -23,7 +23,7 @@ impl Canvas {
         self.pixels.as_flattened()
     }
 
-    /// A line with round ends; a pixel is covered as far as its middle lies inside.
+    /// Draws a line with round ends; the coverage of a pixel depends on the distance of its middle from the edge.
     pub(super) fn line(&mut self, a: [f64; 2], b: [f64; 2], width: f64, colour: Colour) {
         let radius = 0.5 * width;
         let bounds = |k: usize, limit: usize| {
@@ -62,10 +62,10 @@ impl Canvas {
     }
 }
 
-/// A fixed palette: every mixture of two of the given colours in a few steps, so that anti-aliased edges have theirs.
+/// A fixed palette: every mixture of two of the given colours in a few steps, for anti-aliased edges.
 pub(super) struct Palette {
     pub(super) bytes: Vec<u8>,
-    /// Nearest entry by colour, 5 bits a channel.
+    /// Nearest entry by colour, 5 bits per channel.
     nearest: Vec<u8>,
 }
 

@@ -1,12 +1,12 @@
-//! Feature rows back to joints.
+//! Conversion of feature rows back to joints.
 
 use crate::quaternion::{self as quat, Quat, Vec3};
 use crate::skeleton::Skeleton;
 
 /// Heading and root position in each frame: the running sums of the root's turn and velocity.
 ///
-/// The turn feature already is half the yaw angle, so its sum is the angle of the quaternion as it stands. Turn and
-/// velocity of a row lead to the next frame; those of the last row are not used.
+/// The turn feature is half the yaw angle, so its sum is the angle of the quaternion itself. Turn and velocity of a row
+/// lead to the next frame; those of the last row are not used.
 pub fn root_path(features: &[f32], skeleton: &Skeleton) -> Vec<(Quat, Vec3)> {
     let (mut angle, mut x, mut z) = (0.0_f64, 0.0, 0.0);
     let mut before: Option<&[f32]> = None;
@@ -31,12 +31,12 @@ pub fn root_path(features: &[f32], skeleton: &Skeleton) -> Vec<(Quat, Vec3)> {
 
 /// Global joints `[L, J, 3]` from the position features of rows `[L, D]`, which must not be normalised.
 ///
-/// The root of frame 0 stands above the origin. Rotations, velocities and contacts are not read.
+/// The root of frame 0 is above the origin. Rotations, velocities and contacts are not read.
 pub fn recover_joints(features: &[f32], skeleton: &Skeleton) -> Vec<f32> {
     recover_joints_wide(features, skeleton).into_iter().map(|v| v as f32).collect()
 }
 
-/// As [`recover_joints`], before its result is rounded: for what takes differences of neighbouring frames.
+/// Like [`recover_joints`] without rounding the result, for differences of neighbouring frames.
 pub fn recover_joints_wide(features: &[f32], skeleton: &Skeleton) -> Vec<f64> {
     let mut joints = Vec::with_capacity(features.len() / skeleton.features * skeleton.joints * 3);
     for (row, (heading, root)) in features.chunks_exact(skeleton.features).zip(root_path(features, skeleton)) {
@@ -50,8 +50,8 @@ pub fn recover_joints_wide(features: &[f32], skeleton: &Skeleton) -> Vec<f64> {
     joints
 }
 
-/// Makes the displacements of joints in rows `[L, D]`, which must not be normalised, those that positions, turns and the root's way come to. The last row
-/// leads nowhere and keeps its own.
+/// Recomputes the displacements of joints in rows `[L, D]`, which must not be normalised, from positions, turns and the
+/// root's path. The last row has no next frame and is unchanged.
 pub fn follow_path(features: &mut [f32], skeleton: &Skeleton) {
     let joints = recover_joints_wide(features, skeleton);
     let frames: Vec<&[f64]> = joints.chunks_exact(3 * skeleton.joints).collect();

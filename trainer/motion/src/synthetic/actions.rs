@@ -1,6 +1,7 @@
-//! What the synthetic body does: one function a movement, from the clip's draw to the pose at a time.
+//! Movements of the synthetic body: one function per movement, from the clip's draw to the pose at a time.
 //!
-//! Times and sizes depend on the draw (tempo, size, side, a few free numbers), so that no two clips of a movement are equal.
+//! Times and sizes depend on the draw (tempo, size, side, a few free numbers), so that no two clips of a movement are
+//! equal.
 
 mod draw;
 mod fights;

@@ -1,16 +1,16 @@
-//! A posable body: where its joints are, given what pelvis, spine, arms and feet do.
+//! A posable body: computes its joints from the positions of pelvis, spine, arms and feet.
 //!
-//! Legs and, where a hand has a place in the world, arms are solved with two-bone inverse kinematics; the rest is
-//! forward kinematics. Bone lengths are those of the uniform skeleton, so extraction leaves the body as it is.
-//! Frame: y up, metres, the body faces +z at yaw 0 and its left is +x.
+//! Legs are solved with two-bone inverse kinematics, and so are arms whose hand has a place in the world; the rest is
+//! forward kinematics. Bone lengths are those of the uniform skeleton, so extraction does not change the body. Frame: y
+//! up, metres, the body faces +z at yaw 0 and its left is +x.
 
 use crate::quaternion::{self as quat, Quat, Vec3};
 use crate::skeleton::Skeleton;
 
-/// Height of the toe joint of a foot that stands flat.
+/// Height of the toe joint of a flat foot.
 pub(super) const TOE: f64 = 0.02;
 
-/// Directions of the bones of a body that stands upright, for joints 1..22; the left side, mirrored for the right.
+/// Directions of the bones of an upright body, for joints 1..22; the left side, mirrored for the right.
 const UPRIGHT: [Vec3; 22] = [
     [0.0, 0.0, 0.0],
     [0.58, -0.80, -0.12],
@@ -41,7 +41,7 @@ const UPRIGHT: [Vec3; 22] = [
 pub(super) struct Arm {
     pub(super) upper: Vec3,
     pub(super) fore: Vec3,
-    /// A place in the world that the wrist goes to instead.
+    /// A place in the world for the wrist, which replaces the directions.
     pub(super) reach: Option<Vec3>,
 }
 
@@ -50,31 +50,31 @@ impl Arm {
         Self { upper: quat::unit(upper), fore: quat::unit(fore), reach: None }
     }
 
-    /// Hanging beside the body, swung forward by `swing` radians, the elbow bent by `bend`.
+    /// An arm hanging beside the body, swung forward by `swing` radians, with the elbow bent by `bend`.
     pub(super) fn hanging(swing: f64, bend: f64) -> Self {
         let along = |angle: f64, out: f64| [out, -angle.cos(), angle.sin()];
         Self::new(along(swing, 0.16), along(swing + bend, 0.05))
     }
 
-    /// Between this (0) and `other` (1).
+    /// Interpolates between this (0) and `other` (1).
     pub(super) fn toward(self, other: Self, share: f64) -> Self {
         let mix = |a: Vec3, b: Vec3| quat::add(quat::scale(a, 1.0 - share), quat::scale(b, share));
         Self::new(mix(self.upper, other.upper), mix(self.fore, other.fore))
     }
 }
 
-/// What a leg does.
+/// Position of a leg.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Leg {
-    /// The toe joint of the flat foot would be at `toe`; the foot turns to `yaw` and tips by `pitch` (positive lifts the
-    /// heel about the toe, negative the toe about the heel).
+    /// The toe joint of the flat foot would be at `toe`. The foot turns to `yaw` and tips by `pitch` (positive lifts
+    /// the heel about the toe, negative the toe about the heel).
     Foot { toe: Vec3, yaw: f64, pitch: f64 },
     /// On the knee: the thigh points to `knee`, the shank along `shank`.
     Knee { knee: Vec3, shank: Vec3 },
 }
 
 impl Leg {
-    /// Adds to the position of a foot.
+    /// Moves a foot by `by`.
     pub(super) fn moved(self, by: Vec3) -> Self {
         match self {
             Self::Foot { toe, yaw, pitch } => Self::Foot { toe: quat::add(toe, by), yaw, pitch },
@@ -82,7 +82,7 @@ impl Leg {
         }
     }
 
-    /// Sets the tip of a foot.
+    /// Sets the pitch of a foot.
     pub(super) fn tipped(self, pitch: f64) -> Self {
         match self {
             Self::Foot { toe, yaw, .. } => Self::Foot { toe, yaw, pitch },
@@ -96,24 +96,24 @@ impl Leg {
 pub(super) struct Pose {
     pub(super) pelvis: Vec3,
     pub(super) yaw: f64,
-    /// Of the pelvis, forward.
+    /// Pitch of the pelvis, positive forward.
     pub(super) pitch: f64,
-    /// Of the pelvis, positive raises the left hip.
+    /// Roll of the pelvis, positive raises the left hip.
     pub(super) roll: f64,
-    /// Of the chest against the pelvis, forward.
+    /// Pitch of the chest against the pelvis, positive forward.
     pub(super) bend: f64,
-    /// Of the chest against the pelvis, to the left.
+    /// Turn of the chest against the pelvis, positive to the left.
     pub(super) twist: f64,
-    /// Of the chest against the pelvis, positive leans to the left.
+    /// Lean of the chest against the pelvis, positive to the left.
     pub(super) side: f64,
-    /// Of the head against the chest, forward.
+    /// Pitch of the head against the chest, positive forward.
     pub(super) nod: f64,
     pub(super) arms: [Arm; 2],
     pub(super) legs: [Leg; 2],
 }
 
 impl Pose {
-    /// Standing at the origin.
+    /// A standing body at the origin.
     pub(super) fn standing() -> Self {
         let leg = |side: f64| Leg::Foot { toe: [side * 0.11, TOE, 0.10], yaw: side * 0.12, pitch: 0.0 };
         Self {
@@ -157,7 +157,7 @@ fn two_bones(from: Vec3, to: Vec3, lengths: [f64; 2], pole: Vec3) -> (Vec3, Vec3
     (middle, quat::add(from, quat::scale(along, distance)))
 }
 
-/// Joints `[22, 3]` of a pose. The pelvis is lowered where a standing foot would be out of the leg's reach.
+/// Joints `[22, 3]` of a pose. The pelvis is lowered if a standing foot would be out of the leg's reach.
 pub(super) fn joints(pose: &Pose, skeleton: &Skeleton) -> [f64; 66] {
     let lengths = skeleton.bone_lengths.unwrap_or(&[]);
     let bone = |j: usize| quat::scale(quat::unit(UPRIGHT[j]), lengths[j]);
@@ -182,7 +182,7 @@ pub(super) fn joints(pose: &Pose, skeleton: &Skeleton) -> [f64; 66] {
         let (knee, ankle, toe) = match pose.legs[side] {
             Leg::Foot { toe, yaw, pitch } => {
                 let target = ankle_of(toe, yaw, pitch, bone(10 + side));
-                // The knee points where the foot points, and a little to where the pelvis points.
+                // The knee points in the direction of the foot, and slightly in that of the pelvis.
                 let ahead =
                     quat::add(quat::rotate(turn_y(yaw), [0.0, 0.15, 1.0]), quat::rotate(pelvis_turn, [0.0, 0.0, 0.7]));
                 let (knee, ankle) = two_bones(hip, target, [thigh, shank], ahead);
@@ -240,7 +240,7 @@ fn arm(
     let (at, turn) = chest;
     let outward = if side == 0 { 1.0 } else { -1.0 };
     let in_chest = |v: Vec3| quat::rotate(turn, [v[0] * outward, v[1], v[2]]);
-    // A raised arm takes the shoulder girdle along.
+    // A raised arm raises the shoulder girdle.
     let shrug = turn_z(outward * 0.35 * (arm.upper[1] + 0.2).clamp(0.0, 1.0));
     let collar = quat::add(at, quat::rotate(turn, bone(13 + side)));
     let shoulder = quat::add(collar, quat::rotate(quat::mul(turn, shrug), bone(16 + side)));

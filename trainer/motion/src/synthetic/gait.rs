@@ -1,8 +1,8 @@
-//! Getting about on two feet: a root path, and footprints that stay where they are while a foot stands.
+//! Locomotion on two feet: a root path, and footprints that stay in place while a foot stands.
 //!
-//! The path is integrated on a fine grid from speed and turn rate. A foot stands for the share `duty` of each stride, on
-//! a print that lies beside the path where the body is in the middle of that stand; in between it swings from print to
-//! print. So a standing foot cannot skate, whatever the path does.
+//! The path is integrated on a fine grid from speed and turn rate. A foot stands for the share `duty` of each stride.
+//! Its print lies beside the path where the body is in the middle of that stand. In between the foot swings from print
+//! to print. So a standing foot cannot skate on any path.
 
 use std::f64::consts::{PI, TAU};
 
@@ -11,18 +11,18 @@ use crate::quaternion::{self as quat, Vec3};
 
 /// Grid of the path integration, seconds.
 const DT: f64 = 0.0125;
-/// How far the path is known before and after the clip, seconds.
+/// Duration of the known path before and after the clip, seconds.
 const MARGIN: f64 = 2.5;
 
-/// How somebody walks. Speeds in metres a second, lengths in metres, angles in radians.
+/// Parameters of a gait. Speeds in metres per second, lengths in metres, angles in radians.
 #[derive(Debug, Clone)]
 pub(super) struct Gait {
     pub(super) forward: f64,
-    /// To the left.
+    /// Speed to the left.
     pub(super) sideways: f64,
-    /// Strides (two steps) a second.
+    /// Strides (two steps) per second.
     pub(super) cadence: f64,
-    /// Share of a stride that a foot stands.
+    /// Share of a stride in which a foot stands.
     pub(super) duty: f64,
     /// Distance of a print from the path.
     pub(super) width: f64,
@@ -30,14 +30,14 @@ pub(super) struct Gait {
     pub(super) lift: f64,
     /// Height of the pelvis.
     pub(super) height: f64,
-    /// Up and down of the pelvis; negative is lowest in the middle of a stand, as in running.
+    /// Vertical movement of the pelvis; negative is lowest in the middle of a stand, as in running.
     pub(super) bounce: f64,
     pub(super) lean: f64,
     pub(super) arm_swing: f64,
     pub(super) elbow: f64,
-    /// Greatest tip of the foot at push-off.
+    /// Largest pitch of the foot at push-off.
     pub(super) push: f64,
-    /// Seconds over which the body starts and stops; 0 is a steady gait.
+    /// Seconds in which the body starts and stops; 0 is a steady gait.
     pub(super) start: f64,
     pub(super) stop: f64,
 }
@@ -79,13 +79,13 @@ impl Gait {
     }
 }
 
-/// A point of the path.
+/// A point of the integrated path.
 #[derive(Debug, Clone, Copy)]
 struct Point {
     at: [f64; 2],
     yaw: f64,
     phase: f64,
-    /// 0 standing, 1 full speed.
+    /// Share of the full speed, from 0 (standing) to 1.
     pace: f64,
 }
 
@@ -106,7 +106,7 @@ fn mix(a: f64, b: f64, share: f64) -> f64 {
 }
 
 impl Walk {
-    /// Follows `gait` for `seconds`, turning to the left by `turn(t)` radians a second.
+    /// Follows `gait` for `seconds`, turning to the left by `turn(t)` radians per second.
     pub(super) fn new(gait: Gait, seconds: f64, phase: f64, turn: impl Fn(f64) -> f64) -> Self {
         let steps = ((seconds + 2.0 * MARGIN) / DT) as usize;
         let (starting, stopping) = (gait.start, gait.stop);
@@ -164,7 +164,7 @@ impl Walk {
         }
     }
 
-    /// Where the body is when the stride counter reaches `phase`.
+    /// The point of the path at which the stride counter reaches `phase`.
     fn at_phase(&self, phase: f64) -> Point {
         let i = self.points.partition_point(|p| p.phase < phase);
         let Some(next) = self.points.get(i) else { return self.points[self.points.len() - 1] };
@@ -176,8 +176,8 @@ impl Walk {
         self.at((i as f64 - 1.0 + s) * DT - MARGIN)
     }
 
-    /// Toe position and direction of print `k` of something that lands at `offset` of the stride and lies `aside` (to
-    /// the left) and `ahead` of the path.
+    /// Toe position and direction of print `k` of a limb that lands at `offset` of the stride, `aside` (to the left)
+    /// and `ahead` of the path.
     pub(super) fn print(&self, k: f64, offset: f64, aside: f64, ahead: f64) -> (Vec3, f64) {
         let body = self.at_phase(k + offset + 0.5 * self.gait.duty);
         let by = quat::rotate(turn_y(body.yaw), [aside, 0.0, ahead]);
@@ -191,13 +191,13 @@ impl Walk {
         (p.floor(), u, ((u - self.gait.duty) / (1.0 - self.gait.duty)).max(0.0))
     }
 
-    /// Place on the ground and direction at `t`, and how much of the gait's speed the body has.
+    /// Place on the ground and direction at `t`, and the share of the gait's speed.
     pub(super) fn body(&self, t: f64) -> ([f64; 2], f64, f64) {
         let p = self.at(t);
         (p.at, p.yaw, p.pace)
     }
 
-    /// What a limb does at `t`: it lies on a print or moves to the next one, lifted by `lift`.
+    /// Position of a limb at `t`: on a print, or on the way to the next one, lifted by `lift`.
     pub(super) fn limb(&self, t: f64, offset: f64, aside: f64, ahead: f64, lift: f64) -> (Vec3, f64) {
         let (k, _, swing) = self.stride(t, offset);
         let (from, yaw) = self.print(k, offset, aside, ahead);
@@ -210,7 +210,7 @@ impl Walk {
         ([mix(from[0], to[0], s), TOE + up, mix(from[2], to[2], s)], mix(yaw, next_yaw, s))
     }
 
-    /// The body at `t`.
+    /// Pose of the body at `t`.
     pub(super) fn pose(&self, t: f64) -> Pose {
         let g = &self.gait;
         let body = self.at(t);
@@ -231,7 +231,7 @@ impl Walk {
             };
             pose.legs[side] = Leg::Foot { toe, yaw: yaw + sign * 0.10, pitch: tip };
         }
-        // Left foot in the middle of its stand: 0. The pelvis goes over the standing foot.
+        // 0 is the middle of the left foot's stand. The pelvis moves over the standing foot.
         let middle = TAU * (body.phase - 0.5 * g.duty);
         let sway = 0.018 * pace * middle.cos();
         let aside = quat::rotate(turn_y(body.yaw), [sway, 0.0, 0.0]);

@@ -1,14 +1,14 @@
 //! Sentences for synthetic clips, with the tokens that the evaluators read.
 //!
-//! A template names its slots: `{s}` who, `{m}` manner (from the tempo, may be empty), `{side}` and `{other}`, `{round}`
-//! the turning direction. Words are tagged from a small dictionary; a test holds every template against it.
+//! A template names its slots: `{s}` the subject, `{m}` manner (from the tempo, may be empty), `{side}` and `{other}`,
+//! `{round}` the turning direction. Words are tagged from a small dictionary; a test checks every template against it.
 
 use crate::random::Stream;
 use crate::text::Caption;
 
 const WHO: [&str; 6] = ["a person", "someone", "a man", "a woman", "the person", "a figure"];
 
-/// How fast the clip is, in words.
+/// Speed of the clip, in words.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Manner {
     Slow,
@@ -16,7 +16,7 @@ pub(super) enum Manner {
     Fast,
 }
 
-/// `word=lemma/POS`, or `word/POS` where the word is its own lemma.
+/// Entries `word=lemma/POS`, or `word/POS` if the word is its own lemma.
 const DICTIONARY: &str = "a/DET the/DET an/DET one/NUM his=his/DET both/DET each/DET \
     person/NOUN someone/PRON man/NOUN woman/NOUN figure/NOUN something/PRON they/PRON \
     is/AUX walks=walk/VERB walking=walk/VERB runs=run/VERB running=run/VERB jogs=jog/VERB turns=turn/VERB \
@@ -48,7 +48,7 @@ fn token(word: &str) -> Option<String> {
     })
 }
 
-/// Tokens of a sentence; words that the dictionary lacks get the tag `X`.
+/// Tokenises a sentence; words that the dictionary lacks get the tag `X`.
 pub fn tokens(text: &str) -> Vec<String> {
     text.split(|c: char| !c.is_ascii_alphabetic())
         .filter(|word| !word.is_empty())
@@ -72,7 +72,7 @@ fn fill(template: &str, who: &str, manner: Manner, side: usize) -> String {
         + "."
 }
 
-/// Two or three different sentences from the templates of a movement.
+/// Draws two or three different sentences from the templates of a movement.
 pub(super) fn captions(stream: &mut Stream, templates: &[&str], manner: Manner, side: usize) -> Vec<Caption> {
     let mut open: Vec<&str> = templates.to_vec();
     (0..2 + stream.below(2))
@@ -88,7 +88,7 @@ pub(super) fn captions(stream: &mut Stream, templates: &[&str], manner: Manner, 
         .collect()
 }
 
-/// The caption of the mirrored clip: left and right, clockwise and counterclockwise swapped.
+/// The caption of the mirrored clip, with left and right, clockwise and counterclockwise swapped.
 pub(super) fn mirrored(caption: &Caption) -> Caption {
     const PAIRS: [(&str, &str); 2] = [("left", "right"), ("clockwise", "counterclockwise")];
     let swap = |word: &str| {

@@ -1,4 +1,4 @@
-//! Finds the reference material and prints how far a result is from it.
+//! Finds the reference data and prints the distance of a result from it.
 
 #![allow(dead_code, reason = "each test binary uses its own part of this module")]
 
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use motion::npy::{self, Array};
 
-/// The folder of reference data, or `None` (said loudly) on a machine without it.
+/// The folder of reference data, or `None` with a notice on a machine without it.
 pub(crate) fn data(part: &str) -> Option<PathBuf> {
     let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
     let shared = std::env::var_os("STRIDE_SHARED").map_or_else(|| workspace.join("../shared"), PathBuf::from);
@@ -19,7 +19,7 @@ pub(crate) fn data(part: &str) -> Option<PathBuf> {
     None
 }
 
-/// Reads f32 or f64.
+/// Reads an f32 or f64 array.
 pub(crate) fn load(file: &Path) -> Array {
     npy::read_any_float(file).unwrap_or_else(|e| panic!("{e}"))
 }

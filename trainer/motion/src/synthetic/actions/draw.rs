@@ -1,25 +1,25 @@
-//! What a clip draws, and what movements are put together from.
+//! The draws of a clip, and the building blocks of movements.
 
 use std::f64::consts::TAU;
 
 use crate::quaternion::{self as quat, Vec3};
 use crate::synthetic::body::{Arm, Pose};
 
-/// What was drawn for one clip.
+/// The draws of one clip.
 #[derive(Debug, Clone)]
 pub(in crate::synthetic) struct Draw {
     pub(in crate::synthetic) seconds: f64,
-    /// 1 is an ordinary speed.
+    /// Tempo, where 1 is an ordinary speed.
     pub(in crate::synthetic) tempo: f64,
-    /// 1 is an ordinary size.
+    /// Size, where 1 is an ordinary size.
     pub(in crate::synthetic) size: f64,
-    /// Which side leads: 0 left, 1 right.
+    /// The leading side: 0 left, 1 right.
     pub(in crate::synthetic) side: usize,
     /// Free numbers in `[0, 1)`.
     pub(in crate::synthetic) free: [f64; 6],
 }
 
-/// The pose at a time in seconds.
+/// Maps a time in seconds to a pose.
 pub(in crate::synthetic) type Motion = Box<dyn Fn(f64) -> Pose>;
 
 pub(super) fn ramp(t: f64, from: f64, to: f64) -> f64 {
@@ -27,7 +27,7 @@ pub(super) fn ramp(t: f64, from: f64, to: f64) -> f64 {
     x * x * x * (x * (6.0 * x - 15.0) + 10.0)
 }
 
-/// Rises from `a` to `b`, stays, and falls from `c` to `d`.
+/// Rises from `a` to `b`, stays at 1, and falls from `c` to `d`.
 pub(super) fn hold(t: f64, a: f64, b: f64, c: f64, d: f64) -> f64 {
     ramp(t, a, b) * (1.0 - ramp(t, c, d))
 }
@@ -36,7 +36,7 @@ pub(super) fn mix(a: f64, b: f64, share: f64) -> f64 {
     a + (b - a) * share
 }
 
-/// A smooth course through (time, value) pairs.
+/// Interpolates (time, value) pairs smoothly.
 pub(super) fn course<const N: usize>(t: f64, keys: &[(f64, [f64; N])]) -> [f64; N] {
     let mut value = keys[0].1;
     for pair in keys.windows(2) {
@@ -52,7 +52,7 @@ pub(super) fn outward(side: usize) -> f64 {
     if side == 0 { 1.0 } else { -1.0 }
 }
 
-/// Standing, with the slow sway of somebody who stands.
+/// A standing body with a slow sway.
 pub(super) fn standing(d: &Draw, t: f64) -> Pose {
     let mut pose = Pose::standing();
     let wave = |rate: f64, k: usize| (TAU * (rate * t + d.free[k])).sin();
@@ -69,7 +69,7 @@ pub(super) fn standing(d: &Draw, t: f64) -> Pose {
     pose
 }
 
-/// Bends hips and knees: the pelvis goes down by `depth` and back, the trunk forward.
+/// Bends hips and knees: moves the pelvis down by `depth` and back, and the trunk forward.
 pub(super) fn crouch(pose: &mut Pose, depth: f64) {
     pose.pelvis[1] -= depth;
     pose.pelvis[2] -= 0.42 * depth;
@@ -92,7 +92,7 @@ pub(super) fn guard() -> Arm {
     Arm::new(GUARD.0, GUARD.1)
 }
 
-/// Lifts the whole body: pelvis and both feet.
+/// Lifts the whole body by moving pelvis and both feet.
 pub(super) fn lift(pose: &mut Pose, by: Vec3) {
     pose.pelvis = quat::add(pose.pelvis, by);
     pose.legs = pose.legs.map(|leg| leg.moved(by));

@@ -40,7 +40,7 @@ pub(in crate::synthetic) fn kick(d: &Draw) -> Motion {
     })
 }
 
-/// One punch of `side`, `reach` from 0 (guard) to 1.
+/// Makes one punch of `side`, `reach` from 0 (guard) to 1.
 fn punch_with(pose: &mut Pose, side: usize, reach: f64, height: f64) {
     let out = Arm::new([0.42, height, 0.95], [0.36, height, 1.0]);
     pose.arms[side] = pose.arms[side].toward(out, reach);

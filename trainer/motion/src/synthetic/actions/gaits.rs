@@ -1,4 +1,4 @@
-//! Ways to get along on the ground.
+//! Locomotion on the ground.
 
 use std::f64::consts::{PI, TAU};
 
@@ -127,7 +127,7 @@ pub(in crate::synthetic) fn crawl(d: &Draw) -> Motion {
         pose.side = 0.06 * sway;
         for side in 0..2 {
             let aside = outward(side);
-            // Diagonal: the left hand goes with the right knee.
+            // Diagonal: the left hand moves with the right knee.
             let (knee, _) = path.limb(t, 0.5 * side as f64, aside * 0.10, 0.02, lift);
             let (hand, _) = path.limb(t, 0.5 - 0.5 * side as f64, aside * 0.19, 0.56, lift * 1.4);
             let shank = quat::rotate(turn_y(yaw), [aside * 0.03, 0.10, -1.0]);

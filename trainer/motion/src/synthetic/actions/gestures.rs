@@ -15,7 +15,7 @@ pub(in crate::synthetic) fn wave(d: &Draw) -> Motion {
         let beat = (TAU * 1.4 * d.tempo * t).sin() * 0.75 * d.size;
         let high = mix(0.10, 0.55, d.free[3]);
         let waving = Arm::new([0.85, high, 0.30], [0.15 + beat, 1.0, 0.25]);
-        // By way of the side, so that the arm does not pass through the body.
+        // Through the side, so that the arm does not pass through the body.
         let aside = Arm::new([0.8, -0.5, 0.3], [0.6, -0.1, 0.7]);
         let rest = pose.arms[d.side];
         pose.arms[d.side] = if up < 0.5 { rest.toward(aside, 2.0 * up) } else { aside.toward(waving, 2.0 * up - 1.0) };
@@ -131,7 +131,7 @@ pub(in crate::synthetic) fn jumping_jacks(d: &Draw) -> Motion {
     Box::new(move |t| {
         let u = 2.0 * (t / period).fract();
         let open = hold(u, 0.05, 0.90, 1.05, 1.90);
-        // Two hops a cycle, each while the feet move.
+        // Two hops per cycle, each while the feet move.
         let air = [(0.10, 0.80), (1.10, 1.80)].iter().map(|(a, b)| ((u - a) / (b - a)).clamp(0.0, 1.0));
         let up: f64 = air.map(|s| 0.36 * d.size * s * (1.0 - s)).sum();
         let mut pose = standing(&d, t);
@@ -161,7 +161,7 @@ pub(in crate::synthetic) fn pick_up(d: &Draw) -> Motion {
         let brace = Arm::hanging(lean * 0.55, 0.7);
         pose.arms[d.side] = pose.arms[d.side].toward(grip, down);
         pose.arms[1 - d.side] = pose.arms[1 - d.side].toward(brace, down);
-        // What was picked up is held in front of the body on the way up.
+        // The picked object is held in front of the body on the way up.
         let carried = ramp(t, from + time, d.seconds - 0.6) * (1.0 - down);
         pose.arms[d.side] = pose.arms[d.side].toward(Arm::new([0.15, -0.95, 0.2], [-0.1, 0.2, 1.0]), carried);
         pose

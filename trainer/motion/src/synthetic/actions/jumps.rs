@@ -1,4 +1,4 @@
-//! Movements with a flight.
+//! Movements with a flight phase.
 
 use super::draw::{Draw, Motion, course, crouch, hold, lift, outward, standing};
 use crate::synthetic::body::{Arm, Leg};
@@ -17,12 +17,12 @@ fn flight(u: f64, air: (f64, f64)) -> f64 {
     ((u - air.0) / (air.1 - air.0)).clamp(0.0, 1.0)
 }
 
-/// The height that gravity allows for a flight of so many seconds.
+/// The height that gravity allows for a flight of `seconds`.
 fn ballistic(seconds: f64) -> f64 {
     9.81 * seconds * seconds / 8.0
 }
 
-/// When the feet are in the air in a jump, as shares of its cycle.
+/// Flight phase of a jump, as shares of its cycle.
 const JUMP_AIR: (f64, f64) = (0.42, 0.70);
 const HOP_AIR: (f64, f64) = (0.34, 0.76);
 
