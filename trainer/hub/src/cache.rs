@@ -1,4 +1,4 @@
-//! What is in the cache.
+//! Lookup in the cache of the hub.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -11,26 +11,26 @@ use crate::name::{Name, is_commit};
 use crate::settings::Settings;
 use crate::wanted::{Encoder, Failure, Repository, get_all};
 
-/// Bytes of a file with a commit.
+/// Largest size of a file with a commit, in bytes.
 const COMMIT_BYTES: u64 = 1 << 10;
 
-/// The folder of a repository.
+/// Folder of a repository in the cache.
 pub(crate) fn root(settings: &Settings, name: &Name) -> PathBuf {
     settings.cache.join(format!("models--{}", name.repository.replace('/', "--")))
 }
 
-/// The folder of a commit.
+/// Folder of a commit in the cache.
 pub(crate) fn snapshot(settings: &Settings, name: &Name, commit: &str) -> PathBuf {
     root(settings, name).join("snapshots").join(commit)
 }
 
-/// Whether the name is that of a file below a folder, and of none above it.
+/// Returns true if the name is that of a file below a folder, and cannot lead out of it.
 pub(crate) fn is_sound(name: &str) -> bool {
     let plain = |part: &str| !part.is_empty() && part != "." && part != ".." && !part.contains(['\\', '\0']);
     name.len() <= 1_000 && name.split('/').all(plain)
 }
 
-/// A commit's files as they lie here.
+/// A commit's files in the cache.
 struct Snapshot {
     folder: PathBuf,
     names: BTreeSet<String>,
@@ -50,19 +50,19 @@ fn commit(settings: &Settings, name: &Name) -> Option<String> {
     if name.is_commit() {
         return Some(name.revision.clone());
     }
-    // A branch that was never asked for has no file.
+    // A branch that was never resolved has no file.
     let bytes = files::read(&root(settings, name).join("refs").join(&name.revision), COMMIT_BYTES).ok()?;
     String::from_utf8(bytes).ok().map(|text| text.trim().to_owned()).filter(|text| is_commit(text))
 }
 
 fn names(folder: &Path) -> BTreeSet<String> {
-    // What is not there is named by who misses it.
+    // Missing files are reported by the reader that needs them.
     let Ok(all) = files::tree(folder) else { return BTreeSet::new() };
     let name = |path: PathBuf| Some(path.strip_prefix(folder).ok()?.to_string_lossy().into_owned());
     all.into_iter().filter_map(name).collect()
 }
 
-/// The snapshot of a name with all that is wanted; `why` says why nothing is fetched.
+/// Finds the complete snapshot of a name; `why` is the reason for not fetching, for errors.
 pub(crate) fn find(settings: &Settings, name: &Name, encoder: Encoder, why: &str) -> Result<Found, HubError> {
     let away = |why: String| HubError::NotHere { name: name.to_string(), cache: settings.cache.clone(), why };
     let commit = commit(settings, name).ok_or_else(|| away(why.to_owned()))?;

@@ -1,50 +1,50 @@
-//! Why an encoder is not to be had.
+//! Errors of finding an encoder.
 
 use std::path::PathBuf;
 
-/// Why there is no folder.
+/// No folder of the encoder can be returned.
 #[derive(Debug, thiserror::Error)]
 pub enum HubError {
-    /// It is not in the cache, and the hub is not to be asked, or cannot be.
+    /// The encoder is not in the cache, and the hub must not or cannot be reached.
     #[error("`{name}` is not in the cache {}, {why}", cache.display())]
     NotHere {
-        /// As the pipeline has it, with its revision.
+        /// Name as in the pipeline, with its revision.
         name: String,
-        /// Where the cache is.
+        /// Folder of the cache.
         cache: PathBuf,
-        /// Why the hub is not asked.
+        /// Reason for not using the hub.
         why: String,
     },
-    /// The hub says no.
+    /// The hub refuses the request.
     #[error("{endpoint} says of `{name}`: {what}")]
     Refused {
-        /// As the pipeline has it, with its revision.
+        /// Name as in the pipeline, with its revision.
         name: String,
-        /// Where was asked.
+        /// Address of the hub.
         endpoint: String,
-        /// What it says, and what to do.
+        /// Message of the hub, and the remedy.
         what: String,
     },
-    /// A repository without what the encoder needs, or with something else in its place.
+    /// The repository lacks files that the encoder needs, or has other content.
     #[error("`{name}`: {what}")]
     Content {
-        /// As the pipeline has it, with its revision.
+        /// Name as in the pipeline, with its revision.
         name: String,
-        /// What is wrong with it.
+        /// Defect of the repository.
         what: String,
     },
     /// The cache cannot be written.
     #[error("{}: {source}", file.display())]
     Io {
-        /// Which file.
+        /// Path of the file.
         file: PathBuf,
-        /// What the system said.
+        /// Error of the system.
         source: std::io::Error,
     },
 }
 
 impl HubError {
-    /// What to do.
+    /// Advice to the user.
     pub fn advice(&self) -> String {
         match self {
             Self::NotHere { name, .. } => {

@@ -1,14 +1,14 @@
-//! What is found.
+//! Result of finding an encoder.
 
 use std::path::PathBuf;
 
-/// A folder that was found.
+/// Folder of an encoder that was found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Found {
-    /// The snapshot.
+    /// Folder of the snapshot, with one file or link per file of the encoder.
     pub folder: PathBuf,
-    /// Its commit.
+    /// Commit of the snapshot.
     pub commit: String,
-    /// What was noticed on the way, for people.
+    /// A notice for the user, such as a fallback to the cache.
     pub note: Option<String>,
 }

@@ -1,12 +1,15 @@
 //! Published text encoders by their names on the Hugging Face hub.
 //!
-//! [`Hub::folder`] gives a folder with what an encoder needs of a repository: from the cache that all programs of the hub share, else fetched into it. The cache is
-//! that of `huggingface_hub`: `models--ORG--NAME/snapshots/COMMIT/FILE` leads to `models--ORG--NAME/blobs/ETAG`, and `refs/REVISION` holds the commit that a branch or
-//! a tag had when it was last asked for. `HF_HOME`, `HF_HUB_CACHE`, `HF_HUB_OFFLINE`, `HF_TOKEN`, `HF_TOKEN_PATH` and `HF_ENDPOINT` mean what they mean there.
+//! [`Hub::folder`] returns a folder with the files of a repository that an encoder needs, from the cache or fetched
+//! into it. The cache is that of `huggingface_hub`, which all programs share: `models--ORG--NAME/snapshots/COMMIT/FILE`
+//! links to `models--ORG--NAME/blobs/ETAG`, and `refs/REVISION` holds the last resolved commit of a branch or tag.
+//! `HF_HOME`, `HF_HUB_CACHE`, `HF_HUB_OFFLINE`, `HF_TOKEN`, `HF_TOKEN_PATH` and `HF_ENDPOINT` have the same meaning as
+//! there.
 //!
-//! Not the crate `hf-hub`: its 1.0 brings a second TLS provider, which builds with CMake, and does not know `HF_HUB_OFFLINE`.
-//! What is needed of it is a listing and a download. Files come whole or not at all: they are written beside their place, held against the length and, where
-//! the hub says it, the SHA-256, and then renamed. A download that is cut begins anew.
+//! The crate `hf-hub` is not used: its 1.0 adds a second TLS provider, which builds with CMake, and it ignores
+//! `HF_HUB_OFFLINE`. Only a listing and a download are needed. Files arrive whole or not at all: they are written
+//! beside their place, checked against the length and, if the hub sends it, the SHA-256, and then renamed. An
+//! interrupted download starts again.
 
 mod cache;
 mod error;
@@ -22,32 +25,33 @@ pub use name::Name;
 pub use settings::Settings;
 pub use wanted::Encoder;
 
-/// The hub as this process sees it.
+/// The hub with the settings of this process.
 #[derive(Debug)]
 pub struct Hub {
     settings: Settings,
 }
 
 impl Hub {
-    /// By these settings.
+    /// Creates it with these settings.
     pub fn new(settings: Settings) -> Self {
         Self { settings }
     }
 
-    /// What is in the cache; nothing is fetched.
+    /// Finds an encoder in the cache without fetching.
     ///
     /// # Errors
-    /// If it is not there, or not all of it.
+    /// If it is missing or incomplete.
     pub fn cached(&self, name: &Name, encoder: Encoder) -> Result<Found, HubError> {
         self.check(name)?;
         cache::find(&self.settings, name, encoder, "and nothing is fetched now")
     }
 
-    /// From the cache, else fetched into it. A branch or a tag is asked for each time, and what it names today is fetched; where the hub cannot be reached, what it
-    /// was when it was last asked for will do. Blocks; not for a thread that drives an async runtime.
+    /// Finds an encoder in the cache, or fetches it. A branch or a tag is resolved on the hub each time, and its
+    /// current commit is fetched. If the hub cannot be reached, the last resolved commit is used. Blocks; do not call
+    /// it on a thread that drives an async runtime.
     ///
     /// # Errors
-    /// If it is neither here nor there, or is not such an encoder.
+    /// If it is in neither, or is not such an encoder.
     pub fn folder(&self, name: &Name, encoder: Encoder, said: &mut dyn FnMut(&str)) -> Result<Found, HubError> {
         self.check(name)?;
         if self.settings.offline {

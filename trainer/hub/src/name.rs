@@ -1,19 +1,20 @@
-//! Names on the hub, and how they are told from paths.
+//! Names on the hub, and their distinction from paths.
 
-/// A name on the hub, `ORG/NAME`, perhaps of one revision.
+/// A name on the hub, `ORG/NAME`, with an optional revision.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Name {
     pub(crate) repository: String,
     pub(crate) revision: String,
 }
 
-/// The branch that is meant where no revision is given.
+/// The default branch, if no revision is given.
 const MAIN: &str = "main";
-/// First parts of paths that are folders whether they are there or not: recipes keep data in them.
+/// First parts of paths that are always folders, even if they do not exist: recipes keep data in them.
 const FOLDERS: [&str; 4] = ["data", "deps", "models", "weights"];
 
 impl Name {
-    /// A name and its revision, a branch, a tag or a commit; empty is the branch `main`. None if this is no name on the hub, but a path.
+    /// Parses a name and its revision, a branch, a tag or a commit; an empty revision is the branch `main`. `None` if
+    /// this is a path and not a name on the hub.
     pub fn of(path: &str, revision: &str) -> Option<Self> {
         let (organisation, name) = path.split_once('/')?;
         let is_part = |part: &str| {
@@ -25,7 +26,7 @@ impl Name {
         is_name.then(|| Self { repository: path.to_owned(), revision: revision.to_owned() })
     }
 
-    /// Whether the revision may stand in an address and in a path.
+    /// Returns true if the revision is safe in an address and in a path.
     pub(crate) fn has_sound_revision(&self) -> bool {
         let plain = |part: &str| {
             !part.is_empty()
@@ -35,13 +36,13 @@ impl Name {
         self.revision.len() <= 200 && self.revision.split('/').all(plain)
     }
 
-    /// Whether it names one commit, which never changes.
+    /// Returns true if it names one commit, which never changes.
     pub(crate) fn is_commit(&self) -> bool {
         is_commit(&self.revision)
     }
 }
 
-/// Whether a text is the digest of a commit.
+/// Returns true if a text is the digest of a commit.
 pub(crate) fn is_commit(text: &str) -> bool {
     text.len() == 40 && text.bytes().all(|c| c.is_ascii_digit() || (b'a'..=b'f').contains(&c))
 }

@@ -1,4 +1,4 @@
-//! What the hub has, and how it gets into the cache.
+//! Requests to the hub, and download into the cache.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
@@ -22,18 +22,18 @@ use crate::name::{Name, is_commit};
 use crate::settings::Settings;
 use crate::wanted::{Encoder, Repository, get_all};
 
-/// Bytes of the hub's answer about a repository.
+/// Largest size of the hub's answer about a repository, in bytes.
 const LISTING_BYTES: u64 = 16 << 20;
-/// Files of a repository.
+/// Largest number of files of a repository.
 const FILES: usize = 20_000;
-/// Until there is a connection.
+/// Time limit for connecting.
 const CONNECT: Duration = Duration::from_secs(10);
-/// Until something more arrives.
+/// Time limit for each read.
 const SILENCE: Duration = Duration::from_secs(60);
-/// Large enough to be told.
+/// Smallest download that is logged, in bytes.
 const TOLD_BYTES: u64 = 1 << 20;
 
-/// What the hub says of a revision.
+/// The hub's answer about a revision.
 #[derive(Deserialize)]
 struct Listing {
     sha: String,
@@ -49,16 +49,16 @@ struct Sibling {
 struct Remote<'a> {
     settings: &'a Settings,
     name: &'a Name,
-    /// Follows nobody: the first answer says what the file is, and where.
+    /// Client that follows no redirects: the first answer has the file's identity and address.
     asks: Client,
-    /// Follows to where the file is. What was shown to the hub is not shown there.
+    /// Client that follows redirects to the file. The token is not sent to another host.
     fetches: Client,
     commit: String,
     names: BTreeSet<String>,
     said: &'a mut dyn FnMut(&str),
 }
 
-/// Fetches what is not in the cache.
+/// Fetches the files that are not in the cache.
 pub(crate) fn fetch(
     settings: &Settings,
     name: &Name,
@@ -66,7 +66,7 @@ pub(crate) fn fetch(
     said: &mut dyn FnMut(&str),
 ) -> Result<Found, Failure> {
     access::tls::install_provider();
-    // Of a blocking client the limit is for each wait, not for the whole.
+    // The timeout applies to each read, not to the whole transfer.
     let client = || Client::builder().connect_timeout(CONNECT).timeout(SILENCE).user_agent("stride");
     let built = |client: reqwest::blocking::ClientBuilder| client.build().map_err(|e| Failure::Away(chain(&e)));
     let asks = built(client().redirect(reqwest::redirect::Policy::none()))?;
@@ -91,7 +91,7 @@ fn io(file: &Path) -> impl FnOnce(std::io::Error) -> Failure + '_ {
     |source| Failure::Said(HubError::Io { file: file.into(), source })
 }
 
-/// Writes a file beside its place first.
+/// Writes a temporary file beside the target, then renames it.
 fn write_whole(file: &Path, bytes: &[u8]) -> Result<(), Failure> {
     let folder = file.parent().unwrap_or(Path::new("."));
     fs::create_dir_all(folder).map_err(io(folder))?;
@@ -101,7 +101,7 @@ fn write_whole(file: &Path, bytes: &[u8]) -> Result<(), Failure> {
     Ok(())
 }
 
-/// What a file is called in the cache, and its SHA-256 where the name is that.
+/// Name of a file in the cache, and its SHA-256 if the name is that.
 struct Identity {
     etag: String,
     sha256: Option<String>,
@@ -134,7 +134,7 @@ impl Remote<'_> {
         Ok(url)
     }
 
-    /// Asks with the token, and tells what is no success.
+    /// Sends a request with the token, and converts failures to errors.
     fn send(&self, client: &Client, method: reqwest::Method, url: Url) -> Result<Response, Failure> {
         let request = client.request(method, url);
         let request = match &self.settings.token {
@@ -156,12 +156,12 @@ impl Remote<'_> {
         }
     }
 
-    /// Asks which commit the revision is, and which files it has.
+    /// Resolves the revision to a commit, and lists its files.
     fn list(&mut self) -> Result<(), Failure> {
         let repository = self.name.repository.clone();
         let (organisation, name) = repository.split_once('/').unwrap_or(("", &repository));
         let url = self.url(&["api", "models", organisation, name, "revision", &self.name.revision])?;
-        // A repository that was renamed is somewhere else on the hub.
+        // The hub redirects from the old name of a renamed repository.
         let answer = self.send(&self.fetches, reqwest::Method::GET, url)?;
         let mut bytes = Vec::new();
         answer.take(LISTING_BYTES + 1).read_to_end(&mut bytes).map_err(|e| Failure::Away(e.to_string()))?;
@@ -173,7 +173,7 @@ impl Remote<'_> {
         Ok(())
     }
 
-    /// Fetches a file to its blob, or to its place if nothing says what it is.
+    /// Fetches a file to its blob, or directly to its place if the hub sends no identity.
     fn download(&mut self, name: &str, place: &Path) -> Result<(), Failure> {
         let repository = self.name.repository.clone();
         let parts: Vec<&str> =
@@ -192,17 +192,17 @@ impl Remote<'_> {
         }
         let folder = place.parent().unwrap_or(Path::new("."));
         fs::create_dir_all(folder).map_err(io(folder))?;
-        // From `snapshots/COMMIT/a/b` to `blobs/ETAG`.
+        // Relative path from `snapshots/COMMIT/a/b` to `blobs/ETAG`.
         let up = "../".repeat(2 + name.matches('/').count());
         let target = PathBuf::from(up).join("blobs").join(blob.file_name().unwrap_or_default());
         match std::os::unix::fs::symlink(target, place) {
-            // Another process was faster.
+            // Another process made the link first.
             Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => Ok(()),
             made => made.map_err(io(place)),
         }
     }
 
-    /// Writes an answer to `blob`, once all of it is there and is what it should be.
+    /// Writes an answer to `blob`, once it is complete and verified.
     fn keep(&mut self, name: &str, mut answer: Response, blob: &Path, sha256: Option<&str>) -> Result<(), Failure> {
         let length = answer.content_length();
         if length.is_some_and(|bytes| bytes > limits::WEIGHTS_BYTES) {
@@ -245,7 +245,7 @@ impl Remote<'_> {
     }
 }
 
-/// Temporary files are their owner's alone; what is in the cache is everybody's who may read the cache.
+/// Temporary files are readable only by their owner; files in the cache are for all users who can read the cache.
 fn readable(file: &File) -> std::io::Result<()> {
     file.set_permissions(std::os::unix::fs::PermissionsExt::from_mode(0o644))
 }

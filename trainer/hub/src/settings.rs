@@ -1,20 +1,20 @@
-//! Where the cache is, where the hub is, and as whom it is asked.
+//! Settings of the hub: cache, address and token.
 
 use std::path::{Path, PathBuf};
 
-/// Bytes of a token's file.
+/// Largest size of a token's file, in bytes.
 const TOKEN_BYTES: u64 = 4 << 10;
 
-/// What the variables say.
+/// Settings from the environment variables.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Settings {
-    /// The folder with `models--*`.
+    /// The folder that contains `models--*`.
     pub cache: PathBuf,
-    /// The hub's address.
+    /// Base address of the hub.
     pub endpoint: String,
-    /// Shown to the hub, and to nobody else.
+    /// Token, which is sent only to the hub.
     pub token: Option<String>,
-    /// Whether the hub is never asked.
+    /// True if the hub must not be used.
     pub offline: bool,
 }
 
@@ -31,7 +31,7 @@ impl std::fmt::Debug for Settings {
 }
 
 impl Settings {
-    /// From variables by their names; those that are empty are none.
+    /// Reads settings from variables by name; an empty variable counts as not set.
     pub fn of(variable: &dyn Fn(&str) -> Option<String>) -> Self {
         let variable = |name: &str| variable(name).filter(|value| !value.is_empty());
         let is_on = |name: &str| {
@@ -55,15 +55,15 @@ impl Settings {
         }
     }
 
-    /// From this process's environment.
+    /// Reads settings from this process's environment.
     pub fn of_environment() -> Self {
         Self::of(&|name| std::env::var(name).ok())
     }
 }
 
-/// The token that `hf auth login` keeps, if there is one.
+/// Reads the token that `hf auth login` stores, if there is one.
 fn kept_token(file: &Path) -> Option<String> {
-    // Without it what is public is still there.
+    // Public repositories need no token.
     let bytes = motion::files::read(file, TOKEN_BYTES).ok()?;
     let token = String::from_utf8(bytes).ok()?.trim().to_owned();
     (!token.is_empty()).then_some(token)

@@ -1,4 +1,4 @@
-//! Which files of a repository an encoder reads: those that `text_models::EncoderFolder` opens, and no others.
+//! Files of a repository that an encoder reads: exactly the files that `text_models::EncoderFolder` opens.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path, PathBuf};
@@ -8,45 +8,45 @@ use serde::Deserialize;
 
 use crate::error::HubError;
 
-/// Bytes of a file that says which others there are.
+/// Largest size of a file that lists others, in bytes.
 const LISTING_BYTES: u64 = 16 << 20;
-/// Files of sharded weights.
+/// Largest number of files of sharded weights.
 const SHARDS: usize = 256;
-/// Modules of a sentence encoder.
+/// Largest number of modules of a sentence encoder.
 const MODULES: usize = 16;
 
-/// What is read of a repository.
+/// The encoder in a repository, which decides the files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Encoder {
     /// CLIP's text tower, whose tokenizer may be in parts.
     Clip,
-    /// T5's encoder.
+    /// T5's encoder alone.
     T5,
-    /// T5 with what `modules.json` lists behind it.
+    /// T5's encoder with the later modules of `modules.json`.
     SentenceT5,
 }
 
-/// A repository's files, of which some are wanted.
+/// A repository's files, from the cache or the hub.
 pub(crate) trait Repository {
     /// All names, folders separated by `/`.
     fn names(&self) -> &BTreeSet<String>;
 
-    /// One of the names as a file of this machine.
+    /// Returns one of the names as a file on this machine.
     fn get(&mut self, name: &str) -> Result<PathBuf, Failure>;
 }
 
-/// Why a file is not to be had.
+/// A file that cannot be returned.
 #[derive(Debug)]
 pub(crate) enum Failure {
     /// The hub cannot be reached.
     Away(String),
-    /// All else, for people.
+    /// Any other error, for the user.
     Said(HubError),
     /// The repository is not such an encoder.
     Content(String),
 }
 
-/// Gets all that an encoder reads.
+/// Gets all files that an encoder reads.
 pub(crate) fn get_all(repository: &mut dyn Repository, encoder: Encoder) -> Result<(), Failure> {
     let modules = modules(repository, encoder)?;
     let (root, behind) = modules.split_first().map_or(("", &[][..]), |(first, behind)| (first.as_str(), behind));
@@ -68,7 +68,7 @@ pub(crate) fn get_all(repository: &mut dyn Repository, encoder: Encoder) -> Resu
     }
     weights(repository, root)?;
     for folder in behind {
-        // What only divides has neither.
+        // A module that only normalises has neither.
         if repository.names().contains(&below(folder, "config.json")) {
             repository.get(&below(folder, "config.json"))?;
             let is_there = |name: &str| repository.names().contains(&below(folder, name));
@@ -97,7 +97,7 @@ fn json<T: serde::de::DeserializeOwned>(repository: &mut dyn Repository, name: &
     serde_json::from_slice(&bytes).map_err(|e| Failure::Content(format!("`{name}`: {e}")))
 }
 
-/// The folders that `modules.json` lists, the network's first; none if there is no such file.
+/// The folders that `modules.json` lists, the network's first; empty without such a file.
 fn modules(repository: &mut dyn Repository, encoder: Encoder) -> Result<Vec<String>, Failure> {
     #[derive(Deserialize)]
     struct Module {
@@ -120,7 +120,7 @@ fn modules(repository: &mut dyn Repository, encoder: Encoder) -> Result<Vec<Stri
     Ok(listed.into_iter().map(|module| module.path).collect())
 }
 
-/// The weights of a folder: safetensors, whole or in parts, before pickles.
+/// Gets the weights of a folder: safetensors, whole or sharded, are preferred to pickles.
 fn weights(repository: &mut dyn Repository, folder: &str) -> Result<(), Failure> {
     #[derive(Deserialize)]
     struct Index {

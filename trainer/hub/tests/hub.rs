@@ -1,4 +1,5 @@
-//! A hub of our own on a loopback port, with small files of both kinds (named by their SHA-256 and served from another host; not), and the cache that comes of it.
+//! A test hub on a loopback port, with small files of both kinds (named by their SHA-256 and served from another host;
+//! or not), and the resulting cache.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -16,15 +17,15 @@ use protocol::Digest;
 const COMMIT: &str = "0123456789abcdef0123456789abcdef01234567";
 const TOKEN: &str = "hf_ours";
 
-/// What the hub has, and what was asked of it.
+/// Contents of the hub, and the requests it received.
 #[derive(Default)]
 struct World {
     files: BTreeMap<String, Vec<u8>>,
-    /// Method, path, and the token that was shown.
+    /// Method, path, and the token of each request.
     asked: Vec<(String, String, Option<String>)>,
-    /// A file whose bytes are not those that it is named by.
+    /// A file that is served with other bytes than its name declares.
     damaged: Option<String>,
-    /// Where large files are.
+    /// Address of the host of large files.
     elsewhere: String,
     wants_token: bool,
 }
@@ -76,7 +77,7 @@ async fn answer(State(world): State<Shared>, request: Request) -> Response {
     response.header(header::CONTENT_LENGTH, length).body(body).expect("an answer")
 }
 
-/// The hub as long as it lives.
+/// The running hub.
 struct Server {
     runtime: Option<tokio::runtime::Runtime>,
     world: Shared,
@@ -177,7 +178,7 @@ fn what_is_read_is_fetched_once_and_found_again() {
         let expected = SENTENCE.iter().find(|(known, _)| *known == file).expect("one of them").1;
         assert_eq!(fs::read_to_string(found.folder.join(file)).expect("a file"), expected, "{file}");
     }
-    // The layout of huggingface_hub: links to blobs that are named by what the hub says they are.
+    // The layout of huggingface_hub: links to blobs that are named by the hub's identity for them.
     let blob = root.join("blobs").join(Digest::of(b"dense weights").hex());
     assert_eq!(
         fs::canonicalize(found.folder.join("2_Dense/model.safetensors")).unwrap(),
@@ -228,7 +229,7 @@ fn what_is_not_there_is_said_with_what_to_do() {
     let error = fetch(&settings, "../x", Encoder::SentenceT5).expect_err("no revision");
     assert!(error.to_string().contains("expected a branch, a tag or a commit"), "{error}");
 
-    // Files that arrive with other bytes than they are named by are not kept.
+    // Files with other bytes than their name declares are not kept.
     server.world.lock().expect("ours").damaged = Some("model.safetensors".into());
     let error = fetch(&settings, "", Encoder::SentenceT5).expect_err("damaged");
     assert!(error.to_string().contains("`model.safetensors` arrived with another digest"), "{error}");
@@ -265,7 +266,7 @@ fn parts_and_older_layouts_are_fetched_too() {
     let error = fetch(&server.settings(cache.path()), "", Encoder::T5).expect_err("a CLIP");
     assert!(error.to_string().contains("has no `tokenizer.json`; it is no such encoder"), "{error}");
 
-    // Names that lead out of the folder are none, and one that is listed as weights is not there.
+    // Names that lead out of the folder are ignored, and a listed weights file outside it counts as missing.
     let hostile = [
         ("config.json", "{}"),
         ("tokenizer.json", "{}"),

@@ -1,24 +1,24 @@
-//! What is wrong with an encoder's files.
+//! Errors in the files of a published encoder.
 
 use std::path::Path;
 
-/// Characters that are said of a file.
+/// Largest number of characters of a message, which may quote a file.
 const SHOWN: usize = 2_000;
 
-/// What is wrong with a file of an encoder, what was expected, and what to do.
+/// A defect in a file of an encoder, with the expected content and the remedy.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{place}: {what}")]
 pub struct EncoderError {
-    /// The folder, or the file.
+    /// The folder or the file.
     pub place: String,
-    /// What is wrong with it.
+    /// The defect, the expected content and the remedy.
     pub what: String,
 }
 
 impl EncoderError {
     pub(crate) fn new(place: impl ToString, what: impl Into<String>) -> Self {
         let mut what = what.into();
-        // It may quote the file.
+        // The message may quote the file.
         if let Some((end, _)) = what.char_indices().nth(SHOWN) {
             what.truncate(end);
             what.push_str("...");

@@ -1,8 +1,9 @@
 //! A folder with a published encoder, in the layout of Hugging Face or of sentence-transformers.
 //!
-//! Read are `config.json`; `tokenizer.json`, or for CLIP `vocab.json` and `merges.txt`; `tokenizer_config.json` and `special_tokens_map.json` for
-//! lengths and special tokens; the weights. Of sentence-transformers also `modules.json`, which says where the parts are, and of Sentence-T5
-//! `sentence_bert_config.json`, the pooling and the dense layer. What else is there, such as CLIP's vision tower, is passed over.
+//! These files are read: `config.json`; `tokenizer.json`, or for CLIP `vocab.json` and `merges.txt`; the weights;
+//! `tokenizer_config.json` and `special_tokens_map.json` for lengths and special tokens. For sentence-transformers,
+//! `modules.json` lists the folders of the parts. For Sentence-T5 `sentence_bert_config.json`, the pooling and the
+//! dense layer are read too. Everything else, such as CLIP's vision tower, is skipped.
 
 use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};
@@ -18,59 +19,58 @@ use crate::rules::Rules;
 use crate::tokenizer::{TOKENIZER_BYTES, Tokenizer, clip_from_parts};
 use crate::weights::{StoredTensor, Weights, packed};
 
-/// Bytes of a configuration.
+/// Largest size of a configuration, in bytes.
 const CONFIG_BYTES: u64 = 4 << 20;
-/// Tokens of a T5 caption where nothing says otherwise: what it was trained with.
+/// Default number of tokens of a T5 caption: the number in its training.
 const T5_TOKENS: usize = 512;
-/// Stands before the names of the dense layer's weights.
+/// Prefix of the names of the dense layer's weights.
 pub const DENSE: &str = "dense.";
 
-/// Which encoder is in a folder.
+/// The encoder in a folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// CLIP's text tower.
     Clip,
-    /// T5's encoder.
+    /// T5's encoder alone.
     T5,
-    /// The same with mean pooling, a dense layer and a norm.
+    /// T5's encoder with mean pooling, a dense layer and a norm.
     SentenceT5,
 }
 
-/// How captions become CLIP's ids.
+/// Conversion of captions to CLIP's ids.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TokenIds {
-    /// As the folder's tokenizer says; padded with what it pads with.
+    /// The folder's tokenizer, with its own padding.
     HuggingFace,
-    /// As OpenAI's package has it: repaired first, padded with zeros.
+    /// The rules of OpenAI's package: captions are repaired first, and padded with zeros.
     OpenAi,
 }
 
-/// What is asked of a folder.
+/// Requested properties of an encoder folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Request {
-    /// Which encoder.
     pub kind: Kind,
-    /// How captions become ids; only of CLIP.
+    /// Conversion of captions to ids; only for CLIP.
     pub ids: TokenIds,
-    /// Ids of a caption at most; 0 takes what the folder says.
+    /// Largest number of ids of a caption; 0 means the folder's own.
     pub most: usize,
 }
 
-/// What comes behind the network of a sentence encoder, after the mean over a caption's tokens.
+/// The layers of a sentence encoder after the mean over a caption's tokens.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Head {
     /// Width of the caption's vector.
     pub width: usize,
-    /// Whether there is a dense layer.
+    /// True if there is a dense layer.
     pub dense: bool,
-    /// Whether it has a bias.
+    /// True if the dense layer has a bias.
     pub bias: bool,
-    /// Whether the vector is divided by its length.
+    /// True if the vector is divided by its length.
     pub normalise: bool,
 }
 
 impl Head {
-    /// The tensors of the dense layer behind states of `width`.
+    /// The tensors of the dense layer for states of `width`.
     pub fn tensors(&self, width: usize) -> Vec<TensorSpec> {
         let spec = |name: &str, shape: &[usize]| TensorSpec { name: name.into(), shape: shape.to_vec() };
         let weight = self.dense.then(|| spec("linear.weight", &[self.width, width]));
@@ -79,24 +79,23 @@ impl Head {
     }
 }
 
-/// All that is known of an encoder besides its tokenizer and its weights.
+/// The description of an encoder, without its tokenizer and its weights.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Description {
-    /// The network.
     #[serde(flatten)]
     pub network: Network,
-    /// What comes behind it; of a sentence encoder.
+    /// The layers after the network of a sentence encoder.
     #[serde(default)]
     pub head: Option<Head>,
-    /// How captions become ids.
+    /// Rules for converting captions to ids.
     pub rules: Rules,
 }
 
 impl Description {
-    /// Refuses sizes that no network has, and captions that have no room in it.
+    /// Refuses sizes that no network has, and rules for captions longer than the network's limit.
     ///
     /// # Errors
-    /// What is wrong.
+    /// The defect.
     pub fn check(&self) -> Result<(), String> {
         self.network.check()?;
         let (most, positions) = (self.rules.most, self.network.positions());
@@ -112,24 +111,24 @@ impl Description {
     }
 }
 
-/// An encoder in its folder.
+/// An encoder folder with its weights not yet read.
 #[derive(Debug)]
 pub struct EncoderFolder {
     path: PathBuf,
-    /// What it is.
+    /// Description of the encoder.
     pub description: Description,
-    /// Its tokenizer as a `tokenizer.json`.
+    /// The tokenizer in the form of `tokenizer.json`.
     pub tokenizer_json: Vec<u8>,
     tensors: BTreeMap<String, StoredTensor>,
-    /// Names of tensors that are there and not of the encoder.
+    /// Names of tensors in the folder that are not the encoder's.
     pub skipped: Vec<String>,
 }
 
 impl EncoderFolder {
-    /// Reads all but the weights' values.
+    /// Reads everything except the weights' values.
     ///
     /// # Errors
-    /// Which file is missing or not what it should be, and what to do.
+    /// The missing or invalid file, with the remedy.
     pub fn open(path: &Path, request: &Request) -> Result<Self, EncoderError> {
         if !path.is_dir() {
             let what = if path.exists() { "is no folder" } else { "no such folder" };
@@ -149,7 +148,7 @@ impl EncoderFolder {
         Tokenizer::new(&place, &tokenizer_json, &rules, network.rows())?;
 
         let mut weights = Weights::open(&root)?;
-        // One table under two names, of which a file may have either.
+        // One table with two names; a file may have either.
         weights.alias("encoder.embed_tokens.weight", "shared.weight");
         let mut tensors = weights.take(&root, &network.tensors(), "")?;
         let mut skipped = weights.left();
@@ -170,7 +169,7 @@ impl EncoderFolder {
         Ok(Self { path: path.to_owned(), description, tokenizer_json, tensors, skipped })
     }
 
-    /// The tokenizer.
+    /// Creates the tokenizer under the description's rules.
     ///
     /// # Errors
     /// As [`Tokenizer::new`].
@@ -179,22 +178,22 @@ impl EncoderFolder {
         Tokenizer::new(&self.path.display().to_string(), &self.tokenizer_json, rules, network.rows())
     }
 
-    /// The encoder's weights as the pieces of one safetensors file, in the type that they are stored in.
+    /// Reads the encoder's weights as the pieces of one safetensors file, in their stored type.
     ///
     /// # Errors
-    /// Which file cannot be read.
+    /// The file that cannot be read.
     pub fn weights(&self) -> Result<Vec<Vec<u8>>, EncoderError> {
         packed(&self.path, &self.tensors)
     }
 
-    /// The digest of all that captions' vectors depend on, whose weights are `weights`.
+    /// Digest of everything that captions' vectors depend on; `weights` are the weights.
     pub fn digest(&self, weights: &[Vec<u8>]) -> Digest {
         let parts = [&self.tokenizer_json].into_iter().chain(weights);
         let parts: Vec<Digest> = parts.map(|part| Digest::of(part)).collect();
         protocol::canonical::digest(&(&self.description, parts))
     }
 
-    /// Where tensors are that were passed over, a line: the first part of their names, and how many there are.
+    /// Summary of the skipped tensors: the first part of their names, and their number.
     pub fn skipped_line(&self) -> Option<String> {
         let mut parts: BTreeMap<&str, usize> = BTreeMap::new();
         for name in &self.skipped {
@@ -219,12 +218,12 @@ fn json(file: &Path) -> Result<Value, EncoderError> {
     serde_json::from_slice(&bytes).map_err(|e| refuse(format!("{e}; expected JSON")))
 }
 
-/// A file that may be missing.
+/// Reads a JSON file, or returns null if it does not exist.
 fn json_if_there(file: &Path) -> Result<Value, EncoderError> {
     if file.symlink_metadata().is_ok() { json(file) } else { Ok(Value::Null) }
 }
 
-/// The bytes of a `tokenizer.json`, and which file to name in errors.
+/// The bytes of a `tokenizer.json`, and the file's name for errors.
 fn tokenizer(root: &Path, kind: Kind) -> Result<(String, Vec<u8>), EncoderError> {
     let read = |name: &str| {
         let file = root.join(name);
@@ -254,7 +253,7 @@ fn tokenizer(root: &Path, kind: Kind) -> Result<(String, Vec<u8>), EncoderError>
     Err(EncoderError::at(root, what))
 }
 
-/// How captions become the ids that published models read.
+/// The rules by which published models convert captions to ids.
 fn rules(root: &Path, request: &Request, network: &Network, tokenizer: (&str, &[u8])) -> Result<Rules, EncoderError> {
     let config = json_if_there(&root.join("tokenizer_config.json"))?;
     let special = json_if_there(&root.join("special_tokens_map.json"))?;
@@ -264,7 +263,7 @@ fn rules(root: &Path, request: &Request, network: &Network, tokenizer: (&str, &[
         found.unwrap_or(fallback).to_owned()
     };
     let id = |word: &str| Tokenizer::id(tokenizer.0, tokenizer.1, word);
-    // Files that know no limit say 1e30.
+    // Files without a limit have 1e30.
     let own = |value: &Value| value.as_f64().filter(|most| (1.0..1e6).contains(most)).map(|most| most as usize);
     let own_most = own(&config["model_max_length"]);
     let most = |own: usize, highest: usize| match request.most {
@@ -306,27 +305,27 @@ fn rules(root: &Path, request: &Request, network: &Network, tokenizer: (&str, &[
     }
 }
 
-/// What comes behind a network.
+/// The layers after a network, with their weights.
 struct Behind {
     head: Head,
-    /// Of the dense layer.
+    /// Weights of the dense layer.
     weights: BTreeMap<String, StoredTensor>,
-    /// Names of tensors that are there and not of it.
+    /// Names of tensors in its folder that are not the dense layer's.
     left: Vec<String>,
 }
 
-/// What `modules.json` lists.
+/// The modules in `modules.json`.
 #[derive(Debug)]
 struct Modules {
     file: PathBuf,
-    /// Where the network is.
+    /// Folder of the network.
     first: PathBuf,
-    /// What comes behind it: class, folder.
+    /// The later modules, as class and folder.
     others: Vec<(String, PathBuf)>,
 }
 
 impl Modules {
-    /// None if the folder has no `modules.json`.
+    /// Reads `modules.json`; `None` if the folder has none.
     fn read(path: &Path) -> Result<Option<Self>, EncoderError> {
         #[derive(Deserialize)]
         struct Module {
@@ -357,7 +356,7 @@ impl Modules {
         Ok(Some(Self { file, first, others: all }))
     }
 
-    /// What comes behind states of `width`.
+    /// Reads the layers after states of `width`.
     fn behind(&self, width: usize) -> Result<Behind, EncoderError> {
         let refuse = |what: String| EncoderError::at(&self.file, what);
         let mut head = Head { width, dense: false, bias: false, normalise: false };
@@ -391,7 +390,7 @@ impl Modules {
     }
 }
 
-/// Refuses pooling of another kind than the mean over tokens.
+/// Refuses any pooling except the mean over tokens.
 fn check_pooling(file: &Path, width: usize) -> Result<(), EncoderError> {
     let config = json(file)?;
     let refuse = |what: String| EncoderError::at(file, what);

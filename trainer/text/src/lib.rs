@@ -1,10 +1,11 @@
-//! Published text encoders without tensors: what lies in their folders, and captions as their token ids.
+//! Published text encoders without tensors: the contents of their folders, and captions as token ids.
 //!
-//! [`EncoderFolder::open`] reads a folder in the layout of Hugging Face or of sentence-transformers: sizes, tokenizer, where each weight is. Everything
-//! is held against everything before memory is asked for: shapes against sizes, ids against the token table. [`Description`] and the bytes
-//! of [`EncoderFolder::tokenizer_json`] and [`EncoderFolder::weights`] are all that is needed to use the encoder where its folder is not.
+//! [`EncoderFolder::open`] reads a folder in the layout of Hugging Face or of sentence-transformers: sizes, tokenizer,
+//! and the place of each weight. All parts are checked against each other before memory is allocated: shapes against
+//! sizes, ids against the token table. [`Description`] and the bytes of [`EncoderFolder::tokenizer_json`] and
+//! [`EncoderFolder::weights`] are sufficient to use the encoder without its folder.
 //!
-//! Not its job: networks; what an artifact is.
+//! Not its job: networks, and the definition of an artifact.
 
 mod error;
 mod folder;

@@ -1,50 +1,48 @@
-//! Sizes of published encoders as their `config.json` has them, and the tensors that follow from them.
+//! Sizes of published encoders from their `config.json`, and their tensors.
 //!
-//! Sources: the configurations of `CLIPTextModel` and `T5EncoderModel` in Hugging Face's transformers, whose defaults stand in for what a file
-//! leaves out.
+//! Sources: the configurations of `CLIPTextModel` and `T5EncoderModel` in Hugging Face's transformers, whose defaults
+//! replace keys that a file leaves out.
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-/// The largest value of any width; published ones stay below 11,000.
+/// Largest accepted width; published ones are below 11,000.
 pub(crate) const WIDEST: usize = 65_536;
-/// Rows of a token table.
+/// Largest accepted number of rows of a token table.
 const ROWS: usize = 4_000_000;
-/// Positions, and so tokens of a caption.
+/// Largest accepted number of positions, and so of tokens of a caption.
 const POSITIONS: usize = 4_096;
 
-/// A tensor that a network has.
+/// Name and shape of a tensor of a network.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TensorSpec {
-    /// Its published name.
+    /// Published name of the tensor.
     pub name: String,
-    /// Its shape.
+    /// Length of each axis.
     pub shape: Vec<usize>,
 }
 
-/// CLIP's text tower.
+/// Sizes of CLIP's text tower.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct ClipSizes {
     /// Rows of the token table.
     pub vocab_size: usize,
-    /// Width H.
     pub hidden_size: usize,
-    /// Feed-forward width.
     pub intermediate_size: usize,
-    /// Blocks.
+    /// Number of blocks.
     pub num_hidden_layers: usize,
-    /// Heads.
+    /// Number of attention heads.
     pub num_attention_heads: usize,
-    /// Positions.
+    /// Largest number of tokens.
     pub max_position_embeddings: usize,
     /// Width C of a projected caption.
     pub projection_dim: usize,
-    /// `quick_gelu` or `gelu`.
+    /// Activation of the feed-forward, `quick_gelu` or `gelu`.
     pub hidden_act: String,
     /// Added to variances in layer norms.
     pub layer_norm_eps: f64,
-    /// The end token; 2, as published files have it, stands for the largest id of a caption.
+    /// The end token; in published files 2 means the largest id of a caption.
     pub eos_token_id: usize,
 }
 
@@ -65,31 +63,29 @@ impl Default for ClipSizes {
     }
 }
 
-/// T5's encoder.
+/// Sizes of T5's encoder.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct T5Sizes {
     /// Rows of the token table.
     pub vocab_size: usize,
-    /// Width H.
     pub d_model: usize,
     /// Width of a head.
     pub d_kv: usize,
-    /// Feed-forward width.
     pub d_ff: usize,
-    /// Blocks.
+    /// Number of blocks.
     pub num_layers: usize,
-    /// Heads.
+    /// Number of attention heads.
     pub num_heads: usize,
-    /// Buckets of distances.
+    /// Number of buckets of distances.
     pub relative_attention_num_buckets: usize,
-    /// Distances from here on share a bucket.
+    /// Distances from this one on share a bucket.
     pub relative_attention_max_distance: usize,
     /// Added to mean squares in norms.
     pub layer_norm_epsilon: f64,
-    /// `relu` or `gated-gelu`.
+    /// Form of the feed-forward, `relu` or `gated-gelu`.
     pub feed_forward_proj: String,
-    /// What pads a caption.
+    /// Id that pads a caption.
     pub pad_token_id: u32,
 }
 
@@ -111,17 +107,17 @@ impl Default for T5Sizes {
     }
 }
 
-/// Which network, how large.
+/// A network with its sizes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "network", rename_all = "lowercase")]
 pub enum Network {
     /// CLIP's text tower.
     Clip(ClipSizes),
-    /// T5's encoder.
+    /// T5's encoder without further layers.
     T5(T5Sizes),
 }
 
-/// The value of a key, refused outside `1..=most`.
+/// Refuses a value of a key outside `1..=most`.
 fn size(key: &str, value: usize, most: usize) -> Result<(), String> {
     if (1..=most).contains(&value) {
         return Ok(());
@@ -137,16 +133,16 @@ fn small(key: &str, value: f64) -> Result<(), String> {
     }
 }
 
-/// What `model_type` says, if it does.
+/// The value of `model_type`, or an empty string.
 fn model_type(config: &Value) -> &str {
     config["model_type"].as_str().unwrap_or("not named")
 }
 
 impl Network {
-    /// Reads CLIP's `config.json`: that of the whole model, or of the text tower alone.
+    /// Reads CLIP's `config.json`, of the whole model or of the text tower alone.
     ///
     /// # Errors
-    /// Which key is wrong and what was expected.
+    /// The invalid key, and the expected value.
     pub fn clip(config: &Value) -> Result<Self, String> {
         let found = model_type(config);
         let mut text = match found {
@@ -167,7 +163,7 @@ impl Network {
         Ok(network)
     }
 
-    /// Reads T5's `config.json`.
+    /// Reads the `config.json` of a T5 encoder.
     ///
     /// # Errors
     /// As [`clip`](Self::clip).
@@ -184,7 +180,7 @@ impl Network {
     /// Refuses sizes that no network has.
     ///
     /// # Errors
-    /// Which key is wrong and what was expected.
+    /// The invalid key, and the expected value.
     pub fn check(&self) -> Result<(), String> {
         match self {
             Self::Clip(of) => {
@@ -234,7 +230,7 @@ impl Network {
         }
     }
 
-    /// Rows of the token table.
+    /// Number of rows of the token table.
     pub fn rows(&self) -> usize {
         match self {
             Self::Clip(sizes) => sizes.vocab_size,
@@ -250,7 +246,7 @@ impl Network {
         }
     }
 
-    /// Tokens of a caption at most. T5 has no end, but attention that grows with the square of them.
+    /// Largest number of tokens of a caption. T5 has no limit, but its attention grows with the square of the number.
     pub fn positions(&self) -> usize {
         match self {
             Self::Clip(sizes) => sizes.max_position_embeddings,
@@ -320,14 +316,14 @@ mod tests {
 
     use super::*;
 
-    /// The counts of parameters that are published of the papers' encoders.
+    /// The published numbers of parameters of the papers' encoders.
     #[test]
     fn published_sizes_have_their_published_parameters() {
         let count = |network: &Network| -> usize {
             network.tensors().iter().map(|tensor| tensor.shape.iter().product::<usize>()).sum()
         };
         let clip = Network::clip(&json!({"model_type": "clip", "projection_dim": 512, "text_config": {}})).unwrap();
-        // ViT-B/32: 63,165,952 of the tower and 512 x 512 of the projection.
+        // ViT-B/32: 63,165,952 for the tower and 512 x 512 for the projection.
         assert_eq!(count(&clip), 63_165_952 + 512 * 512);
         let large = json!({"model_type": "t5", "d_model": 1024, "d_ff": 4096, "num_layers": 24, "num_heads": 16});
         assert_eq!(count(&Network::t5(&large).unwrap()), 334_939_648, "Sentence-T5-large");

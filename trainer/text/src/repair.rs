@@ -1,20 +1,24 @@
-//! What OpenAI's CLIP package does to a caption before it is cut into tokens: `ftfy.fix_text`, then `html.unescape` twice, then no space around it.
+//! Preparation of a caption by OpenAI's CLIP package before tokenising: `ftfy.fix_text`, then `html.unescape` twice,
+//! then trimming.
 //!
-//! Sources: `clip/simple_tokenizer.py` (`basic_clean`); ftfy 6's documented steps. Here are those that captions meet: mojibake of UTF-8 that was
-//! read as Windows-1252, HTML entities, ligatures, full-width forms, curly quotes, control characters, composed characters (NFC).
+//! Sources: `clip/simple_tokenizer.py` (`basic_clean`); ftfy 6's documented steps. The steps that matter for captions
+//! are implemented: mojibake of UTF-8 that was read as Windows-1252, HTML entities, ligatures, full-width forms, curly
+//! quotes, control characters, composed characters (NFC).
 //!
-//! Departs: of HTML's 2231 named entities the thirty that captions hold are known, with their semicolon; mojibake of other encodings than
-//! Windows-1252 stays as it is, and so does one in a text whose other characters Windows-1252 does not have.
+//! Departs: only thirty of HTML's 2231 named entities are known, with their semicolon; captions have no others.
+//! Mojibake of other encodings than Windows-1252 is kept, and so is mojibake in a text with characters that
+//! Windows-1252 lacks.
 
 use unicode_normalization::UnicodeNormalization as _;
 
-/// What Windows-1252 has from 0x80 to 0x9f; what it leaves undefined is the control character of that number, as browsers read it.
+/// Characters of Windows-1252 from 0x80 to 0x9f. An undefined one is the control character of that number, as in
+/// browsers.
 const WINDOWS: [char; 32] = [
     '€', '\u{81}', '‚', 'ƒ', '„', '…', '†', '‡', 'ˆ', '‰', 'Š', '‹', 'Œ', '\u{8d}', 'Ž', '\u{8f}', '\u{90}', '‘', '’',
     '“', '”', '•', '–', '—', '˜', '™', 'š', '›', 'œ', '\u{9d}', 'ž', 'Ÿ',
 ];
 
-/// Named entities.
+/// Named entities of HTML with their characters.
 const ENTITIES: [(&str, &str); 30] = [
     ("amp", "&"),
     ("lt", "<"),
@@ -48,7 +52,7 @@ const ENTITIES: [(&str, &str); 30] = [
     ("reg", "®"),
 ];
 
-/// Ligatures, which NFC leaves alone.
+/// Ligatures, which NFC keeps.
 const LIGATURES: [(char, &str); 9] = [
     ('ﬀ', "ff"),
     ('ﬁ', "fi"),
@@ -61,9 +65,9 @@ const LIGATURES: [(char, &str); 9] = [
     ('ĳ', "ij"),
 ];
 
-/// A caption as OpenAI's package hands it to its tokenizer, but for white space and case, which the tokenizer sees to.
+/// Repairs a caption like OpenAI's package, except for white space and case, which the tokenizer handles.
 pub fn repaired(text: &str) -> String {
-    // As ftfy: in what holds a `<`, entities may be meant; what follows unescapes them all the same.
+    // As in ftfy: a text with `<` may mean its entities. The last step unescapes them in any case.
     let text = if text.contains('<') { text.to_owned() } else { unescaped(text) };
     let text = without_mojibake(text);
     let text: String = text.chars().filter_map(plain).collect();
@@ -71,7 +75,7 @@ pub fn repaired(text: &str) -> String {
     unescaped(&unescaped(&text)).trim().to_owned()
 }
 
-/// A character with the plain form of quotes, ligatures and full-width forms; nothing of a control character.
+/// The plain form of quotes, ligatures and full-width characters; `None` for a control character.
 fn plain(c: char) -> Option<std::borrow::Cow<'static, str>> {
     let is_white = matches!(c, '\t' | '\n' | '\u{c}' | '\r');
     if (c.is_control() && !is_white && !('\u{80}'..='\u{9f}').contains(&c)) || c == '\u{feff}' {
@@ -91,7 +95,7 @@ fn plain(c: char) -> Option<std::borrow::Cow<'static, str>> {
     Some(c.to_string().into())
 }
 
-/// A text whose characters, written in Windows-1252, are UTF-8, as that; again, for text that went wrong twice.
+/// Decodes a text whose characters in Windows-1252 are valid UTF-8; repeated for text that was decoded wrongly twice.
 fn without_mojibake(mut text: String) -> String {
     for _ in 0..4 {
         let bytes: Option<Vec<u8>> = text.chars().map(windows_byte).collect();
@@ -110,7 +114,7 @@ fn windows_byte(c: char) -> Option<u8> {
     u8::try_from(u32::from(c)).ok()
 }
 
-/// Entities as what they stand for.
+/// Replaces entities by their characters.
 fn unescaped(text: &str) -> String {
     let (mut out, mut rest) = (String::with_capacity(text.len()), text);
     while let Some(at) = rest.find('&') {
@@ -131,9 +135,9 @@ fn unescaped(text: &str) -> String {
     out
 }
 
-/// What the entity at the start of `text` stands for, and its length.
+/// The character of the entity at the start of `text`, and the entity's length.
 fn entity(text: &str) -> Option<(String, usize)> {
-    // None is longer than this.
+    // The longest known entity is shorter than this.
     let end = text.bytes().take(12).position(|b| b == b';')?;
     let name = text.get(1..end)?;
     let found = match name.strip_prefix('#') {

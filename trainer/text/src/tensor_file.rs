@@ -1,4 +1,4 @@
-//! Safetensors as bytes that are read tensor by tensor, in the type that they are stored in.
+//! Safetensors read tensor by tensor from bytes, in their stored type.
 
 use std::collections::BTreeMap;
 
@@ -6,22 +6,22 @@ use safetensors::tensor::{Dtype, Metadata, TensorInfo};
 
 use crate::network::TensorSpec;
 
-/// The largest header; that of a thousand tensors has a hundred kilobytes.
+/// Largest accepted header; the header of a thousand tensors has some hundred kilobytes.
 const HEADER_BYTES: u64 = 16 << 20;
 
-/// What a number is stored as.
+/// Stored type of a number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Element {
-    /// 32 bits.
+    /// IEEE single precision, 32 bits.
     F32,
-    /// 16 bits, IEEE.
+    /// IEEE half precision, 16 bits.
     F16,
-    /// The upper 16 bits of 32.
+    /// The upper 16 bits of an IEEE single.
     Bf16,
 }
 
 impl Element {
-    /// Bytes of a number.
+    /// Number of bytes of a number.
     pub fn bytes(self) -> usize {
         match self {
             Self::F32 => 4,
@@ -47,10 +47,10 @@ impl Element {
     }
 }
 
-/// Little-endian numbers as f32.
+/// Converts little-endian numbers to f32.
 ///
 /// # Panics
-/// If there are not as many as `out` has.
+/// If their number is not the length of `out`.
 pub fn widen(element: Element, bytes: &[u8], out: &mut [f32]) {
     assert_eq!(bytes.len(), out.len() * element.bytes(), "bytes for as many numbers");
     let halves = || bytes.as_chunks::<2>().0.iter().map(|b| u16::from_le_bytes(*b));
@@ -65,12 +65,12 @@ pub fn widen(element: Element, bytes: &[u8], out: &mut [f32]) {
     }
 }
 
-/// IEEE's 16 bits as 32, exactly.
+/// Converts IEEE's 16 bits to 32, exactly.
 fn from_half(bits: u16) -> f32 {
     let sign = u32::from(bits >> 15) << 31;
     let (exponent, fraction) = (u32::from(bits >> 10 & 0x1f), u32::from(bits & 0x3ff));
     match exponent {
-        // Below the smallest normal one: a multiple of 2^-24.
+        // A subnormal number, a multiple of 2^-24.
         0 => {
             let size = fraction as f32 * f32::from_bits(103 << 23);
             f32::from_bits(size.to_bits() | sign)
@@ -80,15 +80,15 @@ fn from_half(bits: u16) -> f32 {
     }
 }
 
-/// Bytes that are read where they are needed.
+/// Bytes that are read on demand.
 pub trait ReadAt {
-    /// How many.
+    /// Number of bytes.
     fn bytes(&self) -> u64;
 
-    /// Fills `out` with those at `offset`.
+    /// Fills `out` with the bytes at `offset`.
     ///
     /// # Errors
-    /// Why they cannot be had.
+    /// The reason that they cannot be read.
     fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), String>;
 }
 
@@ -115,14 +115,14 @@ impl ReadAt for [u8] {
     }
 }
 
-/// Where a tensor of a file is.
+/// A tensor's place in a file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TensorFile {
-    /// What its numbers are stored as; none if they are no floats of at most 32 bits.
+    /// Stored type of its numbers; `None` for other types than floats of at most 32 bits.
     pub element: Option<Element>,
-    /// Its shape.
+    /// Length of each axis.
     pub shape: Vec<usize>,
-    /// Where it begins.
+    /// Offset of its first byte.
     pub offset: u64,
 }
 
@@ -130,15 +130,15 @@ pub struct TensorFile {
 #[derive(Debug)]
 pub struct WeightsFile<R> {
     pub(crate) source: R,
-    /// By name.
+    /// Tensors by name.
     pub tensors: BTreeMap<String, TensorFile>,
 }
 
 impl<R: ReadAt> WeightsFile<R> {
-    /// Reads the header and holds it against the length.
+    /// Reads the header and checks it against the length.
     ///
     /// # Errors
-    /// What is wrong with it, without the file's name.
+    /// The defect, without the file's name.
     pub fn open(source: R) -> Result<Self, String> {
         let bytes = source.bytes();
         let bad = |what: &str| format!("{what}; expected a safetensors file");
@@ -167,7 +167,8 @@ impl<R: ReadAt> WeightsFile<R> {
         Ok(Self { source, tensors })
     }
 
-    /// Refuses a file without some of `specs`, whose names have `prefix` before them there: before a network of these sizes is made.
+    /// Refuses a file without one of `specs`, whose names have `prefix` there. Called before a network of these sizes
+    /// is created.
     ///
     /// # Errors
     /// The first tensor that is missing or has another shape.
@@ -181,10 +182,10 @@ impl<R: ReadAt> WeightsFile<R> {
         Ok(())
     }
 
-    /// The numbers of the tensor `name`, as many as `out` has.
+    /// Reads the numbers of the tensor `name` into `out`.
     ///
     /// # Errors
-    /// If there is no such tensor of floats of that size, or it cannot be read.
+    /// If there is no tensor of floats with that number of elements, or it cannot be read.
     pub fn read(&self, name: &str, out: &mut [f32]) -> Result<(), String> {
         let missing = || format!("no tensor `{name}` of {} numbers", out.len());
         let tensor = self.tensors.get(name).ok_or_else(missing)?;

@@ -1,8 +1,8 @@
-//! Captions as ids: the `tokenizers` crate under the [`Rules`] of a published model.
+//! Converts captions to ids: the `tokenizers` crate under the [`Rules`] of a published model.
 //!
-//! The crate takes what a file says on trust, so a file is looked at first. Refused are: a network's table that is shorter than the vocabulary,
-//! dropout (ids would be drawn), more entries than any vocabulary has, and steps before the cutting that make much text of little. What the file says of truncation and padding is
-//! replaced by the rules. A panic of the crate is an error here.
+//! The crate trusts its files, so a file is checked first. These are refused: a vocabulary larger than the network's
+//! table, dropout (ids would be random), more entries than any vocabulary has, and steps that expand text before it is
+//! cut. The rules replace the file's truncation and padding. A panic of the crate becomes an error.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -15,22 +15,24 @@ use tokenizers::{PostProcessor as _, TruncationParams};
 use crate::error::EncoderError;
 use crate::rules::Rules;
 
-/// Bytes of a tokenizer's file; that of the papers' encoders has at most two and a half million.
+/// Largest size of a tokenizer's file, in bytes; those of the papers' encoders have at most two and a half million.
 pub(crate) const TOKENIZER_BYTES: u64 = 32 << 20;
-/// Steps that a file may take before a text is cut.
+/// Largest number of steps before a text is cut.
 const STEPS: usize = 16;
-/// Of those that put text in the place of other text, and the bytes that they put there.
+/// Largest number of steps that replace text, and of the bytes that each inserts.
 const REPLACEMENTS: (usize, usize) = (4, 8);
-/// Bytes that a character may become in a table of SentencePiece's.
+/// Largest number of bytes for one character in a SentencePiece table.
 const MAPPED_BYTES: usize = 64;
 
-/// Entries of a vocabulary, of its merges, and of the tokens added to it; that of the papers' encoders has at most 49,408.
+/// Largest number of entries of a vocabulary, of its merges, and of the tokens added to it. Those of the papers'
+/// encoders have at most 49,408.
 const ENTRIES: usize = 500_000;
 
-/// Bytes of a token. The crate keeps some vocabularies as a tree with a level a byte, which takes as much stack where it is dropped.
+/// Largest number of bytes of a token. The crate keeps some vocabularies as a tree with a level per byte, whose drop
+/// uses stack for each level.
 const TOKEN_BYTES: usize = 1_024;
 
-/// The parts of `tokenizer.json` that are looked at; vocabulary and merges are counted.
+/// The checked parts of `tokenizer.json`; vocabulary and merges are only counted.
 #[derive(Deserialize)]
 struct Looked {
     #[serde(default)]
@@ -50,7 +52,7 @@ struct LookedModel {
     merges: Count,
 }
 
-/// How many entries a list or a mapping has, and the bytes of the longest text in it, however deep; none is kept.
+/// Number of entries of a list or mapping, and size of the longest text in it at any depth; no entry is kept.
 #[derive(Default)]
 struct Count {
     entries: usize,
@@ -131,10 +133,11 @@ pub struct Tokenizer {
 }
 
 impl Tokenizer {
-    /// Of the bytes of a `tokenizer.json`, for a token table of `rows` rows; `place` names the file in errors.
+    /// Creates a tokenizer from the bytes of a `tokenizer.json`, for a token table of `rows` rows; `place` names the
+    /// file in errors.
     ///
     /// # Errors
-    /// What is wrong with the file, or with the rules.
+    /// The defect of the file or of the rules.
     pub fn new(place: &str, json: &[u8], rules: &Rules, rows: usize) -> Result<Self, EncoderError> {
         let refuse = |what: String| EncoderError::new(place, what);
         let inner = parsed(place, json)?;
@@ -165,7 +168,7 @@ impl Tokenizer {
         Ok(Self { inner, rules: rules.clone(), rows })
     }
 
-    /// The id of a token in a `tokenizer.json`.
+    /// Looks up the id of a token in a `tokenizer.json`.
     ///
     /// # Errors
     /// As [`new`](Self::new), and if there is no such token.
@@ -176,15 +179,15 @@ impl Tokenizer {
         })
     }
 
-    /// What it does besides cutting.
+    /// Rules for the steps before and after it.
     pub fn rules(&self) -> &Rules {
         &self.rules
     }
 
-    /// The ids of a caption, its end last, without padding: at least one.
+    /// The ids of a caption, the end last, without padding: at least one.
     ///
     /// # Errors
-    /// If the caption is too long to be one, or the tokenizer breaks.
+    /// If the caption exceeds the limit, or the tokenizer fails.
     pub fn ids(&self, caption: &str) -> Result<Vec<u32>, EncoderError> {
         let shown: String = caption.chars().take(40).collect();
         let refuse = |what: String| EncoderError::new(format!("the caption `{}`", shown.escape_debug()), what);
@@ -207,7 +210,7 @@ impl Tokenizer {
         Ok(ids)
     }
 
-    /// The ids of a caption, padded to `length`, and how many of them are its own.
+    /// The ids of a caption, padded to `length`, and their number before padding.
     ///
     /// # Errors
     /// As [`ids`](Self::ids).
@@ -219,7 +222,7 @@ impl Tokenizer {
     }
 }
 
-/// The tokenizer of a file that was looked at.
+/// Creates the tokenizer of a checked file.
 fn parsed(place: &str, json: &[u8]) -> Result<tokenizers::Tokenizer, EncoderError> {
     let refuse = |what: String| EncoderError::new(place, what);
     let expected = "expected a `tokenizer.json` as Hugging Face's tokenizers write it";
@@ -243,7 +246,7 @@ fn parsed(place: &str, json: &[u8]) -> Result<tokenizers::Tokenizer, EncoderErro
         .map_err(|e| refuse(format!("{e}; {expected}")))
 }
 
-/// Refuses steps that would make much text of little; `met` counts steps, and those of them that replace.
+/// Refuses steps that would expand text; `met` counts steps, and those of them that replace.
 fn check_normalizer(step: &Value, met: &mut (usize, usize)) -> Result<(), String> {
     let kind = match step["type"].as_str() {
         Some(kind) => kind,
@@ -272,7 +275,7 @@ fn check_normalizer(step: &Value, met: &mut (usize, usize)) -> Result<(), String
     if met.0 > STEPS { Err(format!("`normalizer` has more than {STEPS} steps")) } else { Ok(()) }
 }
 
-/// SentencePiece's table in base64: the bytes of a trie of 32-bit units, the trie, and texts with a zero behind each.
+/// Checks SentencePiece's table in base64: the bytes of a trie of 32-bit units, the trie, and zero-terminated texts.
 fn check_character_map(text: &str) -> Result<(), String> {
     let broken = || "`precompiled_charsmap` of `normalizer` is damaged".to_owned();
     let bytes = from_base64(text).ok_or_else(broken)?;
@@ -314,12 +317,12 @@ fn from_base64(text: &str) -> Option<Vec<u8>> {
     Some(out)
 }
 
-/// CLIP's `tokenizer.json` out of its `vocab.json` and `merges.txt`, for folders that have no other.
+/// Makes CLIP's `tokenizer.json` from its `vocab.json` and `merges.txt`, for folders without one.
 ///
 /// Source: the converter of `CLIPTokenizer` in Hugging Face's transformers.
 ///
 /// # Errors
-/// Which file is not what it should be.
+/// The invalid file.
 pub(crate) fn clip_from_parts(vocab: (&str, &[u8]), merges: (&str, &[u8])) -> Result<Vec<u8>, EncoderError> {
     let table: serde_json::Map<String, Value> = serde_json::from_slice(vocab.1)
         .map_err(|e| EncoderError::new(vocab.0, format!("{e}; expected a mapping from tokens to ids")))?;
@@ -332,7 +335,7 @@ pub(crate) fn clip_from_parts(vocab: (&str, &[u8]), merges: (&str, &[u8])) -> Re
     let (start, end) = ("<|startoftext|>", "<|endoftext|>");
     let (first, last) = (id(start)?, id(end)?);
     let text = std::str::from_utf8(merges.1).map_err(|e| EncoderError::new(merges.0, e.to_string()))?;
-    // The last line may be without an end, or there may be an empty one behind it.
+    // The last line may lack its end, or an empty line may follow.
     let lines = text.lines().filter(|line| !line.starts_with("#version") && !line.is_empty());
     let mut pairs = Vec::new();
     for line in lines {
@@ -444,7 +447,7 @@ mod tests {
         assert!(none.contains("v: no token `<|startoftext|>`"));
     }
 
-    /// Overwritten, cut and doubled bytes: any answer will do, but no panic and no id that the table does not have.
+    /// Overwritten, cut and doubled bytes must not cause a panic, nor an id outside the table.
     #[test]
     fn no_bytes_break_it() {
         let whole = clip().to_string().into_bytes();

@@ -1,6 +1,7 @@
-//! Weights where they lie: safetensors, one file or several, and torch's pickles. Read tensor by tensor, in the type that they are stored in.
+//! Weights in files: safetensors, one file or several, and torch's pickles. They are read tensor by tensor, in their
+//! stored type.
 //!
-//! Nothing of a pickle is run. An archive is not unpacked if that would make more of it than it is.
+//! No code of a pickle is executed. An archive that would grow beyond its own length is not unpacked.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -19,14 +20,14 @@ use crate::error::EncoderError;
 use crate::network::TensorSpec;
 use crate::tensor_file::{Element, ReadAt, TensorFile, WeightsFile, widen};
 
-/// Files of sharded weights.
+/// Largest number of files of sharded weights.
 const SHARDS: usize = 256;
-/// Bytes of the list of shards.
+/// Largest size of the list of shards, in bytes.
 const INDEX_BYTES: u64 = 16 << 20;
-/// Names in an error.
+/// Largest number of names in an error.
 const SHOWN: usize = 8;
 
-/// A file of somebody else's.
+/// An untrusted file.
 #[derive(Debug)]
 struct OnDisk {
     file: RefCell<File>,
@@ -44,19 +45,19 @@ impl ReadAt for OnDisk {
     }
 }
 
-/// Where a tensor's bytes come from.
+/// Source of a tensor's bytes.
 #[derive(Clone)]
 enum Place {
     Safe(Rc<OnDisk>, u64),
     Torch(pytorch_reader::Tensor),
 }
 
-/// A tensor in a folder.
+/// A tensor in a folder that is not read yet.
 #[derive(Clone)]
 pub struct StoredTensor {
-    /// What its numbers are stored as.
+    /// Stored type of its numbers.
     pub element: Element,
-    /// Its shape.
+    /// Length of each axis.
     pub shape: Vec<usize>,
     place: Place,
 }
@@ -68,10 +69,10 @@ impl std::fmt::Debug for StoredTensor {
 }
 
 impl StoredTensor {
-    /// Its numbers, row by row.
+    /// Reads its numbers as f32, row by row.
     ///
     /// # Errors
-    /// Why they cannot be had.
+    /// The reason that they cannot be read.
     pub fn values(&self) -> Result<Vec<f32>, String> {
         let bytes = self.read()?;
         let mut values = vec![0.0; bytes.len() / self.element.bytes()];
@@ -82,7 +83,7 @@ impl StoredTensor {
         Ok(values)
     }
 
-    /// Its bytes, little-endian.
+    /// Reads its bytes, little-endian.
     fn read(&self) -> Result<Vec<u8>, String> {
         let length = self.shape.iter().product::<usize>() * self.element.bytes();
         match &self.place {
@@ -102,19 +103,20 @@ impl StoredTensor {
     }
 }
 
-/// Tensors by name, of which nothing is read yet.
+/// Tensors by name, not read yet.
 #[derive(Debug, Default)]
 pub struct Weights {
     tensors: BTreeMap<String, StoredTensor>,
-    /// Tensors that are there and hold no floats of at most 32 bits.
+    /// Tensors that do not hold floats of at most 32 bits, with a description.
     others: BTreeMap<String, String>,
 }
 
 impl Weights {
-    /// The weights of a folder: `model.safetensors`, the shards of `model.safetensors.index.json`, or `pytorch_model.bin`.
+    /// Opens the weights of a folder: `model.safetensors`, the shards of `model.safetensors.index.json`, or
+    /// `pytorch_model.bin`.
     ///
     /// # Errors
-    /// Which file is not what it should be.
+    /// The invalid file.
     pub fn open(folder: &Path) -> Result<Self, EncoderError> {
         let is_there = |name: &str| folder.join(name).symlink_metadata().is_ok();
         let mut weights = Self::default();
@@ -133,11 +135,11 @@ impl Weights {
         Ok(weights)
     }
 
-    /// The tensors of one file, safetensors or torch's, whatever it is called. Names of tensors in dicts of a torch file have the dicts' keys before
-    /// them, with dots between.
+    /// Opens the tensors of one file, safetensors or torch's, under any file name. A tensor inside dicts of a torch
+    /// file has the dicts' keys as prefix, joined by dots.
     ///
     /// # Errors
-    /// Why the file is none of the two, or promises more than it holds.
+    /// If the file is neither, or declares more data than it holds.
     pub fn open_file(path: &Path) -> Result<Self, EncoderError> {
         let refuse = |what: String| EncoderError::at(path, what);
         let (file, bytes) = files::open(path).map_err(|e| refuse(e.to_string()))?;
@@ -147,7 +149,7 @@ impl Weights {
         let mut first = Vec::new();
         file.take(9).read_to_end(&mut first).map_err(|e| refuse(e.to_string()))?;
         let mut weights = Self::default();
-        // The length of a header stands before it, and a header is an object.
+        // A header follows its length, and is a JSON object.
         match first.get(8) {
             Some(b'{') => weights.add_safetensors(path)?,
             Some(_) => weights.add_torch(path)?,
@@ -161,7 +163,7 @@ impl Weights {
         &self.tensors
     }
 
-    /// What is there and holds no floats of at most 32 bits: its name, and what it is instead.
+    /// Tensors that do not hold floats of at most 32 bits, by name, with a description.
     pub fn others(&self) -> &BTreeMap<String, String> {
         &self.others
     }
@@ -214,7 +216,7 @@ impl Weights {
         Ok(())
     }
 
-    /// Renames a tensor, if it is there and nothing has the other name.
+    /// Renames a tensor, if it exists and the other name is unused.
     pub(crate) fn alias(&mut self, from: &str, to: &str) {
         if !self.tensors.contains_key(to)
             && let Some(tensor) = self.tensors.remove(from)
@@ -223,10 +225,10 @@ impl Weights {
         }
     }
 
-    /// Takes the tensors of `specs`, `prefix` before the names of what is given; the names of those that are left over stay.
+    /// Takes the tensors of `specs`, and returns them with `prefix` before their names. The others stay.
     ///
     /// # Errors
-    /// The names and shapes that are missing, and what is in their place.
+    /// The missing names and shapes, and the file's shapes under those names.
     pub(crate) fn take(
         &mut self,
         place: &Path,
@@ -266,7 +268,7 @@ impl Weights {
     }
 }
 
-/// Files named by a list of shards, each once.
+/// Reads the names of the files in a list of shards, each once.
 fn shards(path: &Path) -> Result<Vec<String>, EncoderError> {
     #[derive(Deserialize)]
     struct Index {
@@ -278,7 +280,7 @@ fn shards(path: &Path) -> Result<Vec<String>, EncoderError> {
     let mut names: Vec<String> = index.weight_map.into_values().collect();
     names.sort();
     names.dedup();
-    // A list may name no file outside its folder.
+    // A list must not name files outside its folder.
     if let Some(name) =
         names.iter().find(|name| name.is_empty() || name.contains(['/', '\\', '\0']) || name.starts_with('.'))
     {
@@ -290,11 +292,11 @@ fn shards(path: &Path) -> Result<Vec<String>, EncoderError> {
     Ok(names)
 }
 
-/// The length of a file that a pickle reader may open: a regular file, not too large, and no archive that unpacks to more than it is.
-/// `torch.save` writes archives that are not compressed.
+/// The length of a file that a pickle reader may open: a regular file, not too large, and no archive that unpacks to
+/// more than its own length. `torch.save` writes uncompressed archives.
 ///
 /// # Errors
-/// What it is instead, without its path.
+/// The reason for refusing it, without its path.
 pub fn archive_length(path: &Path) -> Result<u64, String> {
     let (mut file, length) = files::open(path).map_err(|e| e.to_string())?;
     if length > limits::WEIGHTS_BYTES {
@@ -317,7 +319,7 @@ pub fn archive_length(path: &Path) -> Result<u64, String> {
     Ok(length)
 }
 
-/// Tensors as the pieces of one safetensors file, in the order of their names.
+/// Serialises tensors as the pieces of one safetensors file, in the order of their names.
 pub(crate) fn packed(place: &Path, tensors: &BTreeMap<String, StoredTensor>) -> Result<Vec<Vec<u8>>, EncoderError> {
     let mut end = 0;
     let info = |(name, tensor): (&String, &StoredTensor)| {

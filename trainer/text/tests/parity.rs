@@ -1,6 +1,8 @@
-//! The tokenizers and folders of the fixtures `09_text_clip*` and `09_text_t5*`: ids of every caption, cut and padded as published models do.
+//! The tokenizers and folders of the fixtures `09_text_clip*` and `09_text_t5*`: ids of every caption, cut and padded
+//! as in published models.
 //!
-//! Driven by what is there: every folder that starts so, every set of ids that its arrays name, lengths and padding out of their shapes.
+//! The fixtures drive the tests: every folder with these prefixes, every set of ids that its arrays name, with lengths
+//! and padding from their shapes.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -9,7 +11,7 @@ use safetensors::SafeTensors;
 use serde_json::Value;
 use text_models::{EncoderFolder, Kind, Network, Request, TokenIds, WeightsFile};
 
-/// Folders of fixtures that start with `prefix`; none, said loudly, where this checkout has none.
+/// Folders of fixtures with the prefix `prefix`; none, with a notice, if this checkout has none.
 fn folders(prefix: &str) -> Vec<PathBuf> {
     let root = std::env::var_os("STRIDE_SHARED")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"), PathBuf::from);
@@ -34,7 +36,7 @@ fn captions(folder: &Path) -> Vec<String> {
     serde_json::from_value(json(&folder.join("captions.json"))).expect("a list of captions")
 }
 
-/// The stored rows of ids by case.
+/// Reads the stored rows of ids by case.
 fn ids(folder: &Path) -> BTreeMap<String, Vec<Vec<u32>>> {
     let bytes = std::fs::read(folder.join("io.safetensors")).expect("a file of the fixture");
     let stored = SafeTensors::deserialize(&bytes).expect("safetensors");
@@ -51,7 +53,7 @@ fn clip(ids: TokenIds, most: usize) -> Request {
     Request { kind: Kind::Clip, ids, most }
 }
 
-/// How many ids the case `hf77`, `openai77` or `mdm22` is cut at: what its name ends with.
+/// Number of ids that the case `hf77`, `openai77` or `mdm22` is cut at, from the end of its name.
 fn cut_at(case: &str) -> usize {
     let digits = case.trim_start_matches(|c: char| !c.is_ascii_digit());
     digits.parse().unwrap_or_else(|_| panic!("`{case}` ends with a number"))
@@ -90,7 +92,7 @@ fn a_folder_without_its_tokenizer_file_is_read_from_vocabulary_and_merges() {
         for caption in captions(&folder) {
             assert_eq!(whole.ids(&caption).unwrap(), parts.ids(&caption).unwrap(), "{caption:?}");
         }
-        // The published settings are 77 tokens, whatever its length.
+        // The limit is the folder's own `model_max_length`, 77 in published folders.
         assert_eq!(whole.rules().most, json(&folder.join("tokenizer_config.json"))["model_max_length"]);
         let said = EncoderFolder::open(&folder, &clip(TokenIds::OpenAi, 10_000)).unwrap_err().to_string();
         assert!(said.contains("10000 tokens are asked for"), "{said}");
@@ -143,7 +145,7 @@ fn captions_become_t5s_ids() {
     }
 }
 
-/// The dense layer is the same out of safetensors and out of torch's pickle.
+/// The dense layer is the same from safetensors and from torch's pickle.
 #[test]
 fn a_dense_layer_is_read_from_either_file() {
     for folder in folders("09_text_t5") {
@@ -163,7 +165,7 @@ fn a_dense_layer_is_read_from_either_file() {
     }
 }
 
-/// The older layout, with the network in a folder of its own and its weights in shards, is the same encoder.
+/// The older layout, with the network in its own folder and sharded weights, is the same encoder.
 #[test]
 fn shards_in_a_folder_below_are_the_same_encoder() {
     for folder in folders("09_text_t5") {
@@ -245,7 +247,7 @@ impl text_models::ReadAt for Pieces {
     }
 }
 
-/// A copy of what lies in a folder and one below it, but for some files.
+/// Copies the files of a folder and of the folders one level below, except for some.
 fn copy_of(folder: &Path, without: &[&str]) -> tempfile::TempDir {
     let copy = tempfile::tempdir().expect("a folder");
     let files = |path: &Path| -> Vec<PathBuf> {
