@@ -1,4 +1,4 @@
-//! The manifest: what an artifact or a checkpoint is made of.
+//! The manifest of an artifact or a checkpoint.
 //!
 //! A manifest is a small canonical JSON document that lists blobs by digest; its own digest names the artifact. Parts
 //! that two artifacts share (a frozen VAE in every student) are stored once.
@@ -11,27 +11,27 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Digest, canonical};
 
-/// What kind of thing an artifact is. A stage that is handed another kind is refused before anything runs.
+/// Kind of an artifact. A stage refuses an input of another kind before anything runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ArtifactKind {
     /// Clips, captions, splits and normalisation.
     Dataset,
-    /// Caption embeddings.
+    /// Caption embeddings with their encoder.
     Embeddings,
     /// A motion VAE.
     Vae,
     /// VAE posteriors of a dataset.
     Latents,
-    /// Turns motion into tokens, and back.
+    /// Converts motion into tokens, and back.
     Tokenizer,
     /// Token ids of a dataset.
     Tokens,
-    /// Turns tokens into motion along a flow.
+    /// Converts tokens into motion along a flow.
     FlowDecoder,
     /// Draws token ids for captions.
     TokenGenerator,
-    /// Turns captions into vectors.
+    /// Converts captions into vectors.
     TextEncoder,
     /// A latent denoiser: teacher or student.
     Denoiser,
@@ -39,20 +39,20 @@ pub enum ArtifactKind {
     Evaluator,
     /// Estimates the length of a motion from its caption.
     Length,
-    /// Tells a latent denoiser which positions to pass.
+    /// Steers a latent denoiser towards target positions.
     Control,
     /// Metrics of an evaluation.
     Report,
-    /// A generator and its parts: everything that drawing a motion needs.
+    /// A generator with all parts that generating a motion needs.
     Model,
-    /// All that continuing a training stage bit for bit needs.
+    /// Everything that continuing a training stage bit for bit needs.
     Checkpoint,
-    /// What one shard of a map stage made; merged into the stage's artifact.
+    /// Result of one shard of a map stage; merged into the stage's artifact.
     Shard,
 }
 
 impl ArtifactKind {
-    /// Whether a registered model is one or has one as a part, so that a version may stand where a stage gives it.
+    /// Returns true if a registered model is of this kind or has a part of it, so that a version may replace a stage.
     pub fn is_of_models(self) -> bool {
         match self {
             Self::Vae
@@ -75,7 +75,7 @@ impl ArtifactKind {
         }
     }
 
-    /// What it is called in a message.
+    /// Name of the kind in messages.
     pub fn noun(self) -> &'static str {
         match self {
             Self::Dataset => "a dataset",
@@ -99,10 +99,10 @@ impl ArtifactKind {
     }
 }
 
-/// What an artifact is for in a model: `denoiser`, `vae`, `text`, `length`, `control`.
+/// Role of an artifact in a model: `denoiser`, `vae`, `text`, `length`, `control`.
 ///
-/// A role is a text, not a list of those there are: storing, registering, exporting and showing models handle each alike. Files of a
-/// model bear it as a folder's name, so it consists of small letters, digits and `-`.
+/// A role is a text and not an enum, because storing, registering, exporting and showing models treat all roles alike.
+/// A role is also the name of a folder of a model's files, so it consists of small letters, digits and `-`.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Role(Cow<'static, str>);
@@ -110,22 +110,22 @@ pub struct Role(Cow<'static, str>);
 impl Role {
     /// The network that removes noise.
     pub const DENOISER: Self = Self(Cow::Borrowed("denoiser"));
-    /// Turns latents into motion.
+    /// Decodes latents to motion.
     pub const VAE: Self = Self(Cow::Borrowed("vae"));
     /// The network that draws tokens.
     pub const GENERATOR: Self = Self(Cow::Borrowed("generator"));
-    /// Turns tokens into motion instead of the tokenizer.
+    /// Decodes tokens to motion instead of the tokenizer.
     pub const DECODER: Self = Self(Cow::Borrowed("decoder"));
-    /// Turns tokens into motion.
+    /// Decodes tokens to motion.
     pub const TOKENIZER: Self = Self(Cow::Borrowed("tokenizer"));
-    /// Turns captions into what the generator is conditioned on.
+    /// Encodes captions as the condition of the generator.
     pub const TEXT: Self = Self(Cow::Borrowed("text"));
-    /// Tells the denoiser which positions to pass.
+    /// Steers the denoiser towards target positions.
     pub const CONTROL: Self = Self(Cow::Borrowed("control"));
-    /// Says how long a caption's motion is when nobody else does.
+    /// Default length of a caption's motion.
     pub const LENGTH: Self = Self(Cow::Borrowed("length"));
 
-    /// Its name.
+    /// The role as text.
     pub fn as_str(&self) -> &str {
         &self.0
     }
@@ -158,40 +158,39 @@ impl fmt::Display for Role {
 /// One file of an artifact.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FileEntry {
-    /// The blob.
+    /// Digest of the blob.
     pub digest: Digest,
-    /// Its length.
+    /// Length of the blob in bytes.
     pub bytes: u64,
 }
 
-/// What an artifact is made of.
+/// Kind, meta and files of an artifact.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
-    /// The version of this document, [`Manifest::FORMAT`].
+    /// Version of this document, [`Manifest::FORMAT`].
     pub format: u32,
-    /// What it is.
     pub kind: ArtifactKind,
-    /// What a reader must know before it opens a file: shapes, settings, lineage. Never a clock, a host or a path.
+    /// Data that a reader needs before it opens a file: shapes, settings, lineage. Never a clock, a host or a path.
     pub meta: serde_json::Value,
     /// Files by name.
     pub files: BTreeMap<String, FileEntry>,
 }
 
 impl Manifest {
-    /// The version that this build writes.
+    /// Format version that this build writes.
     pub const FORMAT: u32 = 1;
 
-    /// An artifact without files yet.
+    /// Creates a manifest without files.
     pub fn new(kind: ArtifactKind, meta: serde_json::Value) -> Self {
         Self { format: Self::FORMAT, kind, meta, files: BTreeMap::new() }
     }
 
-    /// The bytes that are stored and hashed.
+    /// Serialises the bytes that are stored and hashed.
     pub fn to_bytes(&self) -> Vec<u8> {
         canonical::to_bytes(self)
     }
 
-    /// The artifact's name.
+    /// Digest of the bytes, the artifact's name.
     pub fn digest(&self) -> Digest {
         Digest::of(&self.to_bytes())
     }

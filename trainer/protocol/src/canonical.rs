@@ -1,12 +1,12 @@
-//! One byte string per JSON value: keys sorted, no white space. Digests of settings and manifests rest on it, so it
-//! must not depend on the key order of a map type that a dependency's feature flag could change.
+//! One byte string per JSON value: keys sorted, no white space. Digests of settings and manifests depend on it, so it
+//! must not depend on the key order of a map type, which a feature flag of a dependency could change.
 
 use serde::Serialize;
 use serde_json::Value;
 
 use crate::Digest;
 
-/// The canonical bytes of `value`.
+/// Serialises `value` canonically.
 ///
 /// # Panics
 /// If `value` cannot be a JSON value (a map with keys that are not strings); none of our types is like that.
@@ -17,7 +17,7 @@ pub fn to_bytes<T: Serialize + ?Sized>(value: &T) -> Vec<u8> {
     out
 }
 
-/// The digest of the canonical bytes of `value`.
+/// Digest of the canonical bytes of `value`.
 pub fn digest<T: Serialize + ?Sized>(value: &T) -> Digest {
     Digest::of(&to_bytes(value))
 }

@@ -1,4 +1,4 @@
-//! Names of things. A type each, so that a fence is never handed over as an attempt.
+//! Identifiers. Each has its own type, so that a fence cannot be passed as an attempt.
 
 use std::fmt;
 use std::str::FromStr;
@@ -14,12 +14,12 @@ macro_rules! text_id {
         pub struct $name(String);
 
         impl $name {
-            /// Wraps a text that is known to be well formed.
+            /// Wraps a text that is known to be valid.
             pub fn new(text: impl Into<String>) -> Self {
                 Self(text.into())
             }
 
-            /// The text.
+            /// The identifier as text.
             pub fn as_str(&self) -> &str {
                 &self.0
             }
@@ -47,7 +47,7 @@ macro_rules! number_id {
         pub struct $name(pub u64);
 
         impl $name {
-            /// The one after this.
+            /// The next value, one larger.
             #[must_use]
             pub fn next(self) -> Self {
                 Self(self.0 + 1)
@@ -79,7 +79,7 @@ text_id! {
     WorkerId
 }
 text_id! {
-    /// A registered model: `[a-z0-9][a-z0-9._-]*`.
+    /// Name of a registered model: `[a-z0-9][a-z0-9._-]*`.
     ModelName
 }
 text_id! {
@@ -104,12 +104,12 @@ number_id! {
     Incarnation
 }
 number_id! {
-    /// What all of a run's randomness is keyed by, together with stage, purpose, step and index.
+    /// Seed that keys all of a run's randomness, together with stage, purpose, step and index.
     Seed
 }
 
 impl TaskId {
-    /// The task of a stage that is not cut into shards, or of one shard of it.
+    /// The task of a stage without shards, or of one shard of it.
     pub fn of(run: &RunId, stage: &StageName, shard: Option<u32>) -> Self {
         match shard {
             None => Self(format!("{run}/{stage}")),
@@ -122,12 +122,12 @@ impl TaskId {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("`{text}` is not a {what}: expected a letter or digit, then letters, digits, `.`, `_` or `-`, at most 64")]
 pub struct ParseNameError {
-    /// What the text was meant to be.
+    /// Kind of the expected identifier.
     pub what: &'static str,
     pub text: String,
 }
 
-/// Whether `text` can stand in a path, a URL and a reference such as `model@alias` without quoting.
+/// Returns true if `text` can be used in a path, a URL and a reference such as `model@alias` without quoting.
 pub fn is_name(text: &str) -> bool {
     let mut bytes = text.bytes();
     text.len() <= 64
@@ -135,7 +135,8 @@ pub fn is_name(text: &str) -> bool {
         && bytes.all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
 }
 
-/// Whether `text` names a stage that a user writes: `[a-z][a-z0-9_-]*`, at most 64. Names that the program makes have dots.
+/// Returns true if `text` is a stage name for users: `[a-z][a-z0-9_-]*`, at most 64. Names made by the program have
+/// dots.
 pub fn is_stage_name(text: &str) -> bool {
     is_name(text)
         && text.starts_with(|c: char| c.is_ascii_lowercase())

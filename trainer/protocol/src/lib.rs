@@ -1,7 +1,7 @@
-//! What two builds of Stride must agree on: names, pipelines, stage settings and messages.
+//! The types that two builds of Stride must agree on: names, pipelines, stage settings and messages.
 //!
-//! Not its job: I/O, clocks, async, tensors. Everything here is plain data with serde, so that the control plane
-//! builds in seconds and a message can be read without running anything.
+//! Not its job: I/O, clocks, async, tensors. Everything here is plain data with serde, so that the control plane builds
+//! in seconds and a message can be read without running anything.
 
 pub mod artifact;
 pub mod canonical;

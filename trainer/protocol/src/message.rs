@@ -1,11 +1,11 @@
 //! Messages between workers, the coordinator and its clients: JSON over HTTP.
 //!
-//! Workers pull. `poll` is heartbeat and order book in one: a worker reports what it does, the coordinator answers with
-//! the full set of assignments that the worker should have, and the worker makes it so. Nothing is lost when an answer
-//! is, because the next one says it all again.
+//! Workers pull. `poll` is both heartbeat and request for work: a worker reports its work, and the coordinator answers
+//! with the full set of assignments that the worker should have. The worker then starts and stops work to match it. A
+//! lost answer does no harm, because the next one has the same content.
 //!
-//! Every write carries a [`Grant`]; the coordinator checks its fence in the transaction that stores the write and answers
-//! 409 with [`ApiError`] code `stale-fence` to an old one.
+//! Every write carries a [`Grant`]. The coordinator checks its fence in the transaction that stores the write. It
+//! answers 409 with [`ApiError`] code `stale-fence` to an old one.
 
 use std::collections::BTreeMap;
 
@@ -15,71 +15,70 @@ use crate::stage::{Backend, CheckpointPolicy, Mode, StageSettings};
 use crate::sweep::{SearchKind, Values};
 use crate::{Attempt, Digest, Fence, Generation, Incarnation, RunId, Seed, StageName, TaskId, WorkerId};
 
-/// The version of these messages; a worker of another version is turned away.
+/// Version of these messages; a worker with another version is refused.
 pub const PROTOCOL_VERSION: u32 = 4;
 
-/// `POST /v1/workers`: a process offers itself.
+/// `POST /v1/workers`: a process registers as a worker.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Join {
-    /// [`PROTOCOL_VERSION`].
+    /// Version of the worker's messages, [`PROTOCOL_VERSION`].
     pub protocol: u32,
     /// The worker's name, unique among live workers.
     pub worker: WorkerId,
-    /// Process id, for people.
+    /// Process id, for display.
     pub pid: u32,
-    /// Where it computes.
+    /// Backend on which it computes.
     pub backend: Backend,
-    /// What its processor's kernels dispatch to, such as `avx512` or `neon`. Sums round differently under another one, so all that
-    /// work on one stage share it.
+    /// Instruction set of its processor's kernels, such as `avx512` or `neon`. Sums round differently under another
+    /// one, so all workers of one stage must have the same.
     pub instruction_set: String,
-    /// Where peers reach its collective listener, `host:port`.
+    /// Address of its collective listener for peers, `host:port`.
     pub peer_address: String,
 }
 
 /// The answer to [`Join`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Joined {
-    /// This process among all that bore the name.
+    /// Incarnation of this process among all with the worker's name.
     pub incarnation: Incarnation,
-    /// A worker that was not heard of for so long loses its assignments.
+    /// A worker that is silent for this time loses its assignments.
     pub lease_ms: u64,
-    /// How long `poll` may wait for news.
+    /// Longest time that `poll` may wait for changes.
     pub poll_ms: u64,
 }
 
-/// `POST /v1/workers/{worker}/poll`.
+/// `POST /v1/workers/{worker}/poll`: a worker reports its work and asks for assignments.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Poll {
-    /// From [`Joined`].
+    /// Incarnation from [`Joined`].
     pub incarnation: Incarnation,
-    /// What the worker does now, one for each assignment it holds.
+    /// Current work, one entry for each assignment of the worker.
     pub doing: Vec<Doing>,
-    /// Of the tasks that it was asked to prepare ([`DesiredAssignments::prepare`]), those whose inputs it has.
+    /// Tasks of [`DesiredAssignments::prepare`] whose inputs the worker has.
     pub ready: Vec<TaskId>,
-    /// Digest-like number of the assignments the worker knows ([`DesiredAssignments::version`]); the coordinator answers at once
-    /// when it has others, else within `poll_ms`.
+    /// Version of the assignments that the worker has ([`DesiredAssignments::version`]). The coordinator answers at
+    /// once if it has another version, else within `poll_ms`.
     pub version: u64,
 }
 
-/// What a worker does about one assignment.
+/// State of a worker's work on one assignment.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Doing {
-    /// Which assignment.
+    /// Grant of the assignment.
     pub grant: Grant,
-    /// How far.
     pub progress: Progress,
     /// Gang members that this one could not reach in this generation. The coordinator drops them from the gang.
     pub lost: Vec<WorkerId>,
 }
 
-/// How far a task is.
+/// Progress of a task.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Progress {
-    /// Steps, clips or shards done.
+    /// Number of steps, clips or shards done.
     pub done: u64,
-    /// Out of.
+    /// Total number of steps, clips or shards.
     pub total: u64,
-    /// What is counted: `steps`, `clips`, `captions`.
+    /// Unit of the numbers: `steps`, `clips`, `captions`.
     pub unit: String,
     /// Newest values, for a progress line.
     pub metrics: BTreeMap<String, f64>,
@@ -88,71 +87,70 @@ pub struct Progress {
 /// The answer to [`Poll`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DesiredAssignments {
-    /// Changes with the assignments.
+    /// Version that changes with the assignments.
     pub version: u64,
-    /// All that the worker should be doing; what is missing here it must stop and forget.
+    /// All assignments of the worker; it must stop and drop any other work.
     pub assignments: Vec<Assignment>,
-    /// Tasks that an idle worker may be given: it fetches what they need and says so, and only then takes part. What is missing here it
-    /// stops fetching.
+    /// Tasks that an idle worker may get. It fetches their inputs and reports that it is ready, and only then takes
+    /// part. It stops fetching for tasks that are no longer listed.
     pub prepare: Vec<Prepare>,
-    /// The worker should exit when it holds nothing.
+    /// True if the worker should exit once it has no work.
     pub leave: bool,
 }
 
-/// What a worker fetches before it is given a task.
+/// Inputs to be fetched before a task can be assigned.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Prepare {
     pub task: TaskId,
     /// Artifacts by the field that names them, as in [`StageTask::inputs`].
     pub inputs: BTreeMap<String, Digest>,
-    /// The checkpoint that it goes on from, unless a member would hand over its state.
+    /// Checkpoint to continue from, unless a member would supply its state.
     pub resume: Option<Digest>,
 }
 
-/// The right to write about a task.
+/// The right to write for a task.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Grant {
     pub task: TaskId,
-    /// The try.
+    /// Number of the attempt.
     pub attempt: Attempt,
-    /// The fence. For a gang it is the generation.
+    /// Fence of the grant; for a gang it is the generation.
     pub fence: Fence,
     pub worker: WorkerId,
-    /// Its process.
+    /// Incarnation of the worker's process.
     pub incarnation: Incarnation,
 }
 
-/// One thing to do.
+/// Work for one worker on one task.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Assignment {
-    /// Carried by every write.
+    /// Grant, carried by every write.
     pub grant: Grant,
-    /// What to do.
+    /// Settings and inputs of the stage.
     pub stage: StageTask,
-    /// Alone or with whom.
+    /// Part of the worker: alone, a shard, or a gang member.
     pub role: Role,
-    /// Newest committed checkpoint of the task: a manifest's digest.
+    /// Newest committed checkpoint of the task, as its manifest's digest.
     pub resume: Option<Digest>,
-    /// Stop between two steps: save, report `Yielded`.
+    /// True if the worker should stop between two steps: save and report `Yielded`.
     pub drain: bool,
 }
 
-/// A stage's work as a worker sees it.
+/// A stage's work from the point of view of a worker.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageTask {
     pub run: RunId,
-    /// The stage.
     pub name: StageName,
     pub settings: StageSettings,
     /// Artifacts by the field that names them.
     pub inputs: BTreeMap<String, Digest>,
     /// The run's seed.
     pub seed: Seed,
-    /// Cadence.
+    /// Cadence and retention of checkpoints.
     pub checkpoint: CheckpointPolicy,
 }
 
-/// How a worker takes part.
+/// Part of a worker in a task.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "role", rename_all = "kebab-case")]
 pub enum Role {
@@ -160,23 +158,23 @@ pub enum Role {
     Alone,
     /// One shard of a map stage.
     Shard {
-        /// Which, from 0.
+        /// Index of the shard, from 0.
         index: u32,
-        /// Of how many.
+        /// Number of shards.
         of: u32,
     },
     /// Merges the shards of a map stage into its artifact.
     Merge {
-        /// The shards' artifacts, in order.
+        /// Artifacts of the shards, in order.
         shards: Vec<Digest>,
     },
     /// A member of a gang.
     Member {
         /// The gang's generation, equal to the grant's fence.
         generation: Generation,
-        /// All members, rank by rank. Rank 0 saves checkpoints, records metrics and reports the outcome.
+        /// All members by rank. Rank 0 saves checkpoints, records metrics and reports the outcome.
         members: Vec<Member>,
-        /// Proves that a peer is of this generation.
+        /// Secret that proves membership of this generation.
         secret: String,
     },
 }
@@ -184,36 +182,34 @@ pub enum Role {
 /// A member of a gang.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Member {
-    /// Who.
     pub worker: WorkerId,
-    /// Which process.
     pub incarnation: Incarnation,
-    /// Where.
+    /// Address of its collective listener, `host:port`.
     pub peer_address: String,
 }
 
 /// `POST /v1/metrics`: values by step, exactly once per (task, attempt, key, step).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MetricBatch {
-    /// The right to write.
+    /// Grant of the write.
     pub grant: Grant,
     pub rows: Vec<MetricRow>,
 }
 
-/// One value.
+/// One recorded value.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MetricRow {
-    /// After which step.
+    /// Step after which it was recorded.
     pub step: u64,
-    /// Name.
+    /// Name of the value.
     pub key: String,
     pub value: f64,
 }
 
-/// `POST /v1/logs`.
+/// `POST /v1/logs`: lines of a task's log.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LogBatch {
-    /// The right to write.
+    /// Grant of the write.
     pub grant: Grant,
     /// Number of the first line within the attempt and worker; a batch sent twice is stored once.
     pub first: u64,
@@ -223,116 +219,113 @@ pub struct LogBatch {
 /// `POST /v1/checkpoints`: makes an uploaded manifest the task's newest checkpoint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CommitCheckpoint {
-    /// The right to write.
+    /// Grant of the write.
     pub grant: Grant,
-    /// Steps applied.
+    /// Number of steps applied.
     pub step: u64,
-    /// The manifest, uploaded before with the blobs it lists.
+    /// Manifest, uploaded earlier with all blobs that it lists.
     pub manifest: Digest,
-    /// Values that retention may rank by.
+    /// Values by which retention may rank.
     pub metrics: BTreeMap<String, f64>,
 }
 
-/// `POST /v1/outcomes`: how an assignment ended.
+/// `POST /v1/outcomes`: the end of an assignment.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ReportOutcome {
-    /// The right to write.
+    /// Grant of the write.
     pub grant: Grant,
-    /// How.
     pub outcome: TaskOutcome,
 }
 
-/// How an assignment ended.
+/// End of an assignment.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "outcome", rename_all = "kebab-case")]
 pub enum TaskOutcome {
-    /// The output's manifest is uploaded with all it lists.
+    /// The output's manifest is uploaded with all blobs that it lists.
     Finished {
         output: Digest,
-        /// Final values.
+        /// Final metrics by name.
         metrics: BTreeMap<String, f64>,
     },
     /// Stopped between steps, with a checkpoint committed.
     Yielded {
-        /// Steps applied.
+        /// Number of steps applied.
         at: u64,
     },
-    /// It cannot be done, or not now.
+    /// The task cannot be done, or not now.
     Failed {
-        /// Whether trying again may help.
+        /// Class of the failure, which decides about retries.
         class: FailureClass,
-        /// What happened, for the user.
+        /// Description of the failure for the user.
         message: String,
     },
 }
 
-/// What a failure says about trying again.
+/// Consequence of a failure for retries.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum FailureClass {
-    /// The user's data or settings: final.
+    /// The user's data or settings are wrong: final.
     Input,
-    /// The loss or the gradient is not a number any more: final.
+    /// The loss or the gradient is not finite: final.
     Diverged,
-    /// Out of memory: final.
+    /// The memory was exhausted: final.
     OutOfMemory,
-    /// No space or no permission in the store: final, once freed `resume` goes on.
+    /// The store is full or not writable: final; after freeing space, `resume` continues.
     Storage,
-    /// The store has no whole copy of something that the task reads: what gave it does so again, within the restart budget.
+    /// The store has no intact copy of an input: its producer runs again, within the restart budget.
     Damaged,
-    /// A panic or another fault of ours: counts against the restart budget.
+    /// A panic or another internal fault: counts against the restart budget.
     Fault,
-    /// A lost peer, a network error: counts against the infrastructure budget.
+    /// A lost peer or a network error: counts against the infrastructure budget.
     Infrastructure,
 }
 
-/// `POST /v1/runs`.
+/// `POST /v1/runs`: submits a pipeline.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Submit {
     /// The validated pipeline as JSON (`protocol::pipeline::Pipeline`).
     pub pipeline: serde_json::Value,
-    /// The YAML as written, kept for people.
+    /// YAML as written, kept for display.
     pub source: String,
-    /// Submitting twice with one key gives one run.
+    /// Submitting twice with one key creates one run.
     pub idempotency_key: Option<String>,
-    /// Stop after this stage.
+    /// Last stage to run.
     pub until: Option<StageName>,
 }
 
 /// A run as clients see it: `GET /v1/runs/{run}`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunView {
-    /// Which.
     pub run: RunId,
     /// The pipeline's name.
     pub pipeline: String,
-    /// Where it stands.
     pub state: RunState,
-    /// Stages in topological order, and behind them those that sweeps made.
+    /// Stages in topological order, then the stages made by sweeps.
     pub stages: Vec<StageView>,
-    /// Sweeps that have begun.
+    /// Sweeps that have started.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub sweeps: Vec<SweepView>,
 }
 
-/// Where a run stands.
+/// State of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum RunState {
-    /// Work is under way or waits for workers.
+    /// Work is in progress or waits for workers.
     Running,
-    /// Held back by the user; work yields.
+    /// Paused by the user; work yields.
     Paused,
-    /// Every stage asked for is done.
+    /// Every requested stage is done.
     Finished,
-    /// A stage failed for good.
+    /// A stage failed permanently.
     Failed,
-    /// Ended by the user.
+    /// Cancelled by the user.
     Cancelled,
 }
 
 impl RunState {
-    /// Whether nothing will happen any more.
+    /// Returns true if the state cannot change any more.
     pub fn is_final(self) -> bool {
         matches!(self, Self::Finished | Self::Failed | Self::Cancelled)
     }
@@ -341,32 +334,29 @@ impl RunState {
 /// A stage as clients see it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageView {
-    /// Which.
     pub name: StageName,
-    /// Its kind, such as `train.vae`.
+    /// Stage kind, such as `train.vae`.
     pub kind: String,
-    /// Where it stands.
     pub state: StageState,
-    /// Its key, once its inputs are known.
+    /// Key of the stage, once its inputs are known.
     pub key: Option<Digest>,
     /// Outputs by name.
     pub outputs: BTreeMap<String, Digest>,
-    /// Final values, or the newest while it runs.
+    /// Final values, or the newest ones while it runs.
     pub metrics: BTreeMap<String, f64>,
-    /// How far.
     pub progress: Progress,
     /// Seconds of work so far, over all attempts of this run; not part of any key.
     pub wall_s: f64,
-    /// The try.
+    /// Number of the current attempt.
     pub attempt: Attempt,
-    /// Who works on it now.
+    /// Workers with an assignment of it now.
     pub workers: Vec<WorkerId>,
-    /// What the kernels of those dispatch to that computed it, or compute it now; not part of any key.
+    /// Instruction set of the workers that computed it, or compute it now; not part of any key.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub instruction_set: Option<String>,
-    /// Why it failed or what it waits for.
+    /// Reason of a failure, or of waiting.
     pub message: Option<String>,
-    /// The swept stage that it is a part of, if a sweep made it.
+    /// Swept stage that it belongs to, if a sweep made it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub of: Option<StageName>,
 }
@@ -376,93 +366,92 @@ pub struct StageView {
 pub struct SweepView {
     /// The swept stage.
     pub stage: StageName,
-    /// How it is searched.
+    /// Search method of the sweep.
     pub search: SearchKind,
-    /// What decides.
+    /// Metric that ranks the trials.
     pub metric: String,
-    /// Its direction.
+    /// Direction of the metric.
     pub mode: Mode,
     /// Steps at which trials are compared; the last is the whole budget.
     pub rungs: Vec<u64>,
-    /// Nothing is under way and nothing will be.
+    /// True if no work is in progress or will follow.
     pub over: bool,
-    /// Steps trained so far, for this sweep or another before it.
+    /// Number of steps trained so far, for this sweep or an earlier one.
     pub spent: u64,
-    /// Steps that it will take if no trial fails.
+    /// Number of steps if no trial fails.
     pub planned: u64,
-    /// Steps of every trial at the whole budget.
+    /// Number of steps if every trial had the whole budget.
     pub full: u64,
-    /// The best trial at the whole budget so far.
+    /// Best trial at the whole budget so far.
     pub best: Option<usize>,
-    /// All trials, by number.
+    /// All trials in the order of their numbers.
     pub trials: Vec<TrialView>,
 }
 
 /// A trial as clients see it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TrialView {
-    /// Its number, from 0.
+    /// Number of the trial, from 0.
     pub trial: usize,
-    /// Its values by the settings' paths.
+    /// Values of the searched settings by path.
     pub values: Values,
-    /// Where it stands.
     pub state: TrialState,
-    /// Steps trained.
+    /// Number of steps trained.
     pub steps: u64,
-    /// The metric after each rung that has a result; `None` is a failure.
+    /// Metric after each rung with a result; `None` for a failure.
     pub results: Vec<Option<f64>>,
-    /// Why it failed.
+    /// Reason of a failure.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub message: Option<String>,
 }
 
-/// Where a trial stands.
+/// State of a trial.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum TrialState {
-    /// Has not begun.
+    /// Not started yet.
     Waiting,
-    /// A rung is asked for: workers are on it or will be.
+    /// A rung is scheduled: workers compute it or will.
     Running,
-    /// Done with a rung; whether it goes on is not decided.
+    /// A rung is done; the next one is not decided.
     Paused,
-    /// Did not go on after a rung.
+    /// Ended after a rung before the whole budget.
     Stopped,
     /// Trained for the whole budget.
     Finished,
-    /// Failed, and was stopped.
+    /// Failed and was stopped.
     Failed,
 }
 
-/// Where a stage stands.
+/// State of a stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum StageState {
     /// Waits for other stages.
     Waiting,
-    /// Could start; waits for workers.
+    /// Can start; waits for workers.
     Ready,
-    /// Workers are on it.
+    /// Workers compute it.
     Running,
     /// Done in this run, from step 0.
     Ran,
-    /// Not run: its key was known.
+    /// Not run, because a result with its key exists.
     Cached,
     /// Done in this run, continuing a checkpoint of an earlier attempt.
     Resumed,
-    /// Failed for good.
+    /// Failed, without further attempts.
     Failed,
     /// Will not run: an input failed, the run was cancelled, or `--until` ends before it.
     Skipped,
 }
 
-/// What every refused call answers.
+/// Answer to every refused call.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ApiError {
-    /// For programs: `stale-fence`, `not-found`, `conflict`, `invalid`, `storage`, `gate`, `internal`.
+    /// Code for programs: `stale-fence`, `not-found`, `conflict`, `invalid`, `storage`, `gate`, `internal`.
     pub code: String,
-    /// For people.
+    /// Description for users.
     pub message: String,
-    /// What to do.
+    /// Remedy, if there is one.
     pub hint: Option<String>,
 }

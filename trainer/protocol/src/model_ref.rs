@@ -1,4 +1,4 @@
-//! How a version of a registered model is named: `motionlcm@prod`, `motionlcm@best`, `motionlcm@3`, `motionlcm:3`.
+//! References to a version of a registered model: `motionlcm@prod`, `motionlcm@best`, `motionlcm@3`, `motionlcm:3`.
 
 use std::fmt;
 use std::str::FromStr;
@@ -6,38 +6,38 @@ use std::str::FromStr;
 use crate::id::ParseNameError;
 use crate::{Alias, ModelName};
 
-/// An alias that is a query: the best version by the model's metric. Nothing is promoted to it.
+/// An alias that is a query: the best version by the model's metric. No version can be promoted to it.
 pub const BEST: &str = "best";
-/// Likewise: the newest version, by number.
+/// An alias that is a query: the newest version, by number.
 pub const LATEST: &str = "latest";
 
-/// How users point at a model version: `quickstart@staging`, `quickstart@best`, `quickstart:3` or `quickstart@3`.
+/// A user's reference to a model version: `quickstart@staging`, `quickstart@best`, `quickstart:3` or `quickstart@3`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ModelRef {
     pub model: ModelName,
-    /// Which of its versions; `None` means the model as a whole.
+    /// Selected version; `None` means the model as a whole.
     pub pick: Option<Pick>,
 }
 
-/// Which version of a model.
+/// Selection of one version of a model.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Pick {
-    /// The best by the model's metric.
+    /// The best version by the model's metric.
     Best,
-    /// The newest.
+    /// The newest version, by number.
     Latest,
-    /// Where an alias points.
+    /// The version that an alias names.
     Alias(Alias),
-    /// By number.
+    /// The version with this number.
     Number(u64),
 }
 
-/// Whether a name in a pipeline is that of a version rather than of a stage, which has neither `@` nor `:`.
+/// Returns true if a name in a pipeline is that of a version. A stage's name has neither `@` nor `:`.
 pub fn names_version(name: &str) -> bool {
     name.contains(['@', ':'])
 }
 
-/// Whether a text stands for a version's number behind `@`, so that no alias may be called so.
+/// Returns true if a text after `@` is a version's number, so that no alias may have it as name.
 pub fn is_number(text: &str) -> bool {
     !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit())
 }

@@ -1,12 +1,14 @@
-//! Texts from outside on their way to a terminal.
+//! Untrusted texts for a terminal.
 //!
-//! A caption, a path or a stage's message may hold escape sequences, which a terminal obeys: they clear what stands there, change its title, or
-//! answer as if the user had typed. What is printed goes through [`printable`], at the place where it is printed.
+//! A caption, a path or a stage's message may hold escape sequences, which a terminal executes. They clear the screen,
+//! change its title, or answer as if the user had typed. Printed text passes [`printable`] at the place where it is
+//! printed.
 
 use std::borrow::Cow;
 use std::fmt::Write as _;
 
-/// `text` with control characters and those that change the direction of writing as `\u001b`, which JSON reads too. Line ends and tabs stay.
+/// Escapes control characters and marks that change the reading direction as `\u001b`, which is also valid JSON. Line
+/// ends and tabs stay.
 pub fn printable(text: &str) -> Cow<'_, str> {
     let is_hidden = |c: char| {
         (c.is_control() && !matches!(c, '\n' | '\t'))
@@ -26,10 +28,10 @@ pub fn printable(text: &str) -> Cow<'_, str> {
     Cow::Owned(shown)
 }
 
-/// Characters of a text that an error shows.
+/// Largest number of characters of a text in an error.
 const SHOWN: usize = 120;
 
-/// The beginning of a text of somebody else's, for an error.
+/// Start of an untrusted text, for an error.
 pub fn excerpt(text: &str) -> String {
     let begins: String = text.chars().take(SHOWN).collect();
     let more = if begins.len() < text.len() { "..." } else { "" };

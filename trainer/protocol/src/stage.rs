@@ -1,13 +1,13 @@
-//! The settings of each stage kind: plain structs whose `Default` is the published recipe where there is one.
+//! The settings of each stage kind: plain structs whose `Default` is the published recipe, if there is one.
 //!
-//! A kind is one file in `kinds/` and one line of the list there; what it says of itself is [`StageSpec`].
+//! A kind is one file in `kinds/` and one line of the list there; [`StageSpec`] is its description.
 //!
-//! A settings struct is the schema too: the pipeline reader learns the closed set of keys and their types from the
+//! A settings struct is also the schema. The pipeline reader derives the closed set of keys and their types from the
 //! serialised default, so a field is declared once. Fields that cannot change a stage's value (worker counts,
-//! checkpoint cadence) live in [`Placement`] and stay out of the stage's key.
+//! checkpoint cadence) are in [`Placement`] and not part of the stage's key.
 //!
-//! A store outlives the build that wrote it. Every struct that has a `Default` fills in what an older build did not write; a field that
-//! joins one that has none ([`Training`], [`Batch`]) brings `#[serde(default)]` along.
+//! A store outlives the build that wrote it. Every struct with a `Default` fills in values that an older build did not
+//! write. A new field of a struct without one ([`Training`], [`Batch`]) needs `#[serde(default)]`.
 
 mod augment;
 mod control;
@@ -60,42 +60,42 @@ pub use sampler::{Family, Sampler, Solver, measured_with};
 pub use spec::{Output, Ref, Shape, StageSpec, Target};
 pub use training::{Batch, Decay, Optimizer, Training};
 
-/// A folder, or a file, outside the store that a stage reads.
+/// A folder or file outside the store that a stage reads.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ExternalFolder {
-    /// The field that names it.
+    /// Field that names it.
     pub field: String,
-    /// Where it is.
+    /// Path of the folder or file.
     pub path: String,
-    /// The dataset format that decides which of its files count; all of them without one.
+    /// Dataset format that selects the files that count; `None` counts all files.
     pub format: Option<DataFormat>,
-    /// Files that it must have; of several with `|` between them, one.
+    /// Files that it must have; `|` separates alternatives.
     pub files: &'static [&'static str],
-    /// What it is and where to get it.
+    /// Description of the folder, and its source.
     pub origin: &'static str,
 }
 
-/// A version of the registry that a stage reads where it could read another stage.
+/// A version of the registry as an input in place of a stage.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct VersionInput {
-    /// The field that names it, such as `init` or `teacher`.
+    /// Field that names it, such as `init` or `teacher`.
     pub field: String,
-    /// The version as written, such as `motionlcm@prod`.
+    /// Version as written, such as `motionlcm@prod`.
     pub version: String,
-    /// What is read of it: the whole model, or its part of this kind.
+    /// Kind of the artifact that is read: the whole model, or its part of this kind.
     pub kind: ArtifactKind,
-    /// The part that the model must have, where the whole model is read for it.
+    /// Part that the model must have, if the whole model is read for it.
     pub part: Option<ArtifactKind>,
 }
 
-/// What is asked of every kind, answered by the kind's [`StageSpec`].
+/// Properties of every kind, from the kind's [`StageSpec`].
 impl StageSettings {
-    /// The name in YAML, such as `train.vae`.
+    /// Name in YAML, such as `train.vae`.
     pub fn kind(&self) -> &'static str {
         self.spec().kind()
     }
 
-    /// The settings of kind `S`, if these are of that kind.
+    /// Returns the settings of kind `S`, if these are of that kind.
     pub fn get<S: StageSpec>(&self) -> Option<&S> {
         (self.spec() as &dyn std::any::Any).downcast_ref()
     }
@@ -105,43 +105,43 @@ impl StageSettings {
         self.spec().version()
     }
 
-    /// How its work is laid over workers.
+    /// Distribution of its work over workers.
     pub fn shape(&self) -> Shape {
         self.spec().shape()
     }
 
-    /// What its one output is, and what it is called.
+    /// Kind and name of its only output.
     pub fn output(&self) -> Output {
         self.spec().output()
     }
 
-    /// Shards of a map stage, 1 otherwise.
+    /// Number of shards of a map stage, 1 otherwise.
     pub fn shards(&self) -> u32 {
         u32::try_from(self.spec().shards().max(1)).unwrap_or(u32::MAX)
     }
 
-    /// Optimizer updates of a training stage.
+    /// Number of optimizer updates of a training stage.
     pub fn steps(&self) -> Option<Steps> {
         self.training().map(|training| training.steps)
     }
 
-    /// What every training stage shares, of one that can be swept.
+    /// Common settings of a training stage; `None` for kinds that cannot be swept.
     pub fn training(&self) -> Option<Training> {
         self.clone().spec_mut().training().cloned()
     }
 
-    /// As [`training`](Self::training), to change it.
+    /// Like [`training`](Self::training), mutable.
     pub fn training_mut(&mut self) -> Option<&mut Training> {
         self.spec_mut().training()
     }
 
-    /// What the settings refer to, with the places that hold the names.
+    /// References of the settings, with the places that hold the names.
     pub fn refs(&mut self) -> Vec<Ref<'_>> {
         self.spec_mut().refs()
     }
 
-    /// The settings as they enter a stage's key: references to other stages and paths are blank, because the digests of
-    /// what they name stand beside them.
+    /// The settings as part of a stage's key: references to other stages and paths are blank, because the key has the
+    /// digests of their artifacts.
     #[must_use]
     pub fn without_references(&self) -> Self {
         let mut settings = self.clone();
@@ -149,13 +149,13 @@ impl StageSettings {
         settings
     }
 
-    /// The digest of all that decides a value, references left out.
+    /// Digest of everything that decides a value, without references.
     pub fn digest(&self) -> Digest {
         crate::canonical::digest(&self.without_references())
     }
 
-    /// The stages it reads, and versions of the registry in the place of stages: field name, stage name, what that stage must give.
-    /// `register` reads more (the evaluations of its candidates), which the pipeline adds.
+    /// Stages that it reads, and versions of the registry in their place: field name, stage name, kind that the stage
+    /// must output. `register` reads more (the evaluations of its candidates), which the pipeline adds.
     pub fn inputs(&self) -> Vec<(String, String, ArtifactKind)> {
         let mut settings = self.clone();
         let read = settings.refs().into_iter().filter(|reference| reference.read);
@@ -166,7 +166,7 @@ impl StageSettings {
         .collect()
     }
 
-    /// The versions of the registry that it reads, among its [`inputs`](Self::inputs).
+    /// Versions of the registry among its [`inputs`](Self::inputs).
     pub fn versions(&self) -> Vec<VersionInput> {
         let mut settings = self.clone();
         let read = settings.refs().into_iter().filter(|reference| reference.read && names_version(reference.name));
@@ -177,8 +177,8 @@ impl StageSettings {
         .collect()
     }
 
-    /// The settings as the reader of pipelines and the reference of keys take them: references that are left out while they are empty,
-    /// so that keys of stages are what they were before there were such references, are there.
+    /// The settings for the reader of pipelines and the reference of keys. They include references that are not
+    /// serialised while empty; those are left out so that they do not change the keys of older stages.
     pub(crate) fn example(&self) -> serde_json::Value {
         let mut json = serde_json::to_value(self).expect("settings are JSON");
         for reference in self.clone().refs() {
@@ -192,7 +192,7 @@ impl StageSettings {
         json
     }
 
-    /// Folders outside the store that it reads. Their contents count for its key, not their paths.
+    /// Folders outside the store that it reads. Their contents are part of its key, not their paths.
     pub fn folders(&self) -> Vec<ExternalFolder> {
         let mut settings = self.clone();
         let read = settings.refs().into_iter().filter(|reference| reference.read);
@@ -207,29 +207,29 @@ impl StageSettings {
         .collect()
     }
 
-    /// The stage that an evaluation measures.
+    /// Stage that an evaluation measures.
     pub fn evaluated_model(&self) -> Option<String> {
         let mut settings = self.clone();
         settings.refs().into_iter().find(|reference| reference.measured).map(|reference| reference.name.clone())
     }
 
-    /// How an evaluation draws from what it measures.
+    /// Sampler of an evaluation for the measured model.
     pub fn sampler(&self) -> Option<&Sampler> {
         self.spec().sampler()
     }
 
-    /// The values that an evaluation may give, by name; none if that is not known.
+    /// Names of the values that an evaluation may return; `None` if unknown.
     pub fn metrics(&self) -> Option<BTreeSet<String>> {
         self.spec().metrics()
     }
 
-    /// What a training saves with its checkpoints, by name; empty if that is not known.
+    /// Names of the values that a training saves with its checkpoints; empty if unknown.
     pub fn recorded(&self) -> Vec<&'static str> {
         let own = self.spec().recorded();
         if own.is_empty() { Vec::new() } else { own.iter().copied().chain(["gradient_norm", "lr"]).collect() }
     }
 
-    /// The schema of the kind's keys.
+    /// Schema of the kind's keys.
     pub(crate) fn schema(&self, generator: &mut schemars::SchemaGenerator) -> schemars::Schema {
         self.spec().schema(generator)
     }

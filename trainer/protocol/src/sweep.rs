@@ -1,9 +1,9 @@
-//! `sweep:` on a training stage: which settings are searched, how, and what evaluates a trial.
+//! `sweep:` on a training stage: the searched settings, the search method, and the evaluation of a trial.
 //!
-//! A trial is the stage with some of its settings changed, trained in rungs: a rung is an ordinary stage that stops before the end of
-//! its learning rate schedule, and the next rung goes on from the state that it left. Settings of the stage that evaluates can be searched
-//! too: trials that differ in those alone have one training key, and so share one training. This module is data and the arithmetic on it;
-//! who is tried next is decided by the coordinator (`coordinator::search`).
+//! A trial is the stage with some of its settings changed, trained in rungs. A rung is an ordinary stage that stops
+//! before the end of its learning rate schedule, and the next rung continues from its state. Settings of the evaluating
+//! stage can be searched too: trials that differ only in those have one training key, and so share one training. This
+//! module is data and arithmetic on it; the coordinator selects the next trial (`coordinator::search`).
 
 use std::collections::BTreeMap;
 
@@ -14,7 +14,7 @@ use serde_json::Value;
 use crate::stage::{Mode, Placement, Ref, StageSettings, Target, WorkerRange};
 use crate::{ArtifactKind, StageName, Steps, pipeline};
 
-/// How the space is searched.
+/// Method of searching the space.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum SearchKind {
@@ -22,12 +22,12 @@ pub enum SearchKind {
     Grid,
     /// Points drawn at random, each for the whole budget.
     Random,
-    /// Points drawn at random, each for the first rung; the best go on to the next rung, as soon as it is clear who they are.
+    /// Points drawn at random, each for the first rung. The best continue to the next rung as soon as they are known.
     Asha,
 }
 
 impl SearchKind {
-    /// The name in YAML.
+    /// Name in YAML.
     pub fn name(self) -> &'static str {
         match self {
             Self::Grid => "grid",
@@ -37,13 +37,13 @@ impl SearchKind {
     }
 }
 
-/// Budgets at which ASHA compares trials: `first`, `first * factor`, ... below the stage's `steps`, and these.
+/// Budgets at which ASHA compares trials: `first`, `first * factor`, ... below the stage's `steps`, and `steps` itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Rungs {
-    /// Steps of the first rung.
+    /// Number of steps of the first rung.
     pub first: Steps,
-    /// One in so many goes on, for so many times the steps.
+    /// Factor between rungs: one in this many trials continues, for this many times the steps.
     pub factor: u64,
 }
 
@@ -53,20 +53,20 @@ impl Default for Rungs {
     }
 }
 
-/// The values that a setting may take.
+/// Values that a setting may have.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Domain {
-    /// One of these.
+    /// One of these values.
     Choice(Vec<Value>),
-    /// Between these two; a whole number if the setting is one.
+    /// Uniform between two numbers; a whole number if the setting is one.
     Uniform(f64, f64),
-    /// Between these two, with a logarithm that is uniform.
+    /// Log-uniform between two numbers.
     LogUniform(f64, f64),
 }
 
 impl Domain {
-    /// How many values it lists.
+    /// Number of listed values.
     pub fn choices(&self) -> usize {
         match self {
             Self::Choice(values) => values.len(),
@@ -75,10 +75,10 @@ impl Domain {
     }
 }
 
-/// What the path of a searched setting of [`Sweep::evaluate`] begins with, before a `.`.
+/// First part of the path of a searched setting of [`Sweep::evaluate`], before a `.`.
 pub const EVALUATE: &str = "evaluate";
 
-/// The path within the stage that evaluates, if `path` leads there.
+/// Path within the evaluating stage, if `path` is of that stage.
 pub fn in_evaluation(path: &str) -> Option<&str> {
     path.strip_prefix(EVALUATE)?.strip_prefix('.')
 }
@@ -89,29 +89,29 @@ pub type Values = BTreeMap<String, Value>;
 /// A search over the settings of a training stage.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Sweep {
-    /// How.
+    /// Method of searching the space.
     pub search: SearchKind,
-    /// The metric of `evaluate` that decides.
+    /// Metric of `evaluate` that ranks the trials.
     pub metric: String,
-    /// Its direction.
+    /// Direction of the metric.
     pub mode: Mode,
-    /// Points to try. A grid may leave it out.
+    /// Number of points to try. A grid may leave it out.
     pub trials: usize,
-    /// How many trials may be under way at a time. Part of what is decided: with more, decisions rest on fewer results.
+    /// Largest number of concurrent trials. It affects the result: with more, decisions are based on fewer results.
     pub parallel: usize,
-    /// ASHA's budgets.
+    /// Budgets of ASHA.
     pub rungs: Rungs,
-    /// What is searched, by path.
+    /// Domains of the searched settings, by path.
     pub space: BTreeMap<String, Domain>,
-    /// The stage that evaluates a trial; its reference to the evaluated stage is filled in.
+    /// Stage that evaluates a trial, with its reference to the evaluated stage filled in.
     pub evaluate: Box<StageSettings>,
 }
 
-/// More trials than this are a mistake.
+/// Largest accepted number of trials.
 pub const MAX_TRIALS: usize = crate::limits::TRIALS;
 
 impl Sweep {
-    /// Steps after which trials are compared; the last is `budget`, the steps of the stage.
+    /// Steps at which trials are compared; the last is `budget`, the steps of the stage.
     pub fn rungs(&self, budget: u64) -> Vec<u64> {
         let mut rungs = Vec::new();
         if self.search == SearchKind::Asha {
@@ -125,7 +125,7 @@ impl Sweep {
         rungs
     }
 
-    /// Points of the grid, if every domain is a choice.
+    /// Number of points of the grid, if every domain is a choice.
     pub fn points(&self) -> Option<usize> {
         self.space.values().try_fold(1_usize, |product, domain| match domain {
             Domain::Choice(values) => Some(product.saturating_mul(values.len())),
@@ -133,7 +133,7 @@ impl Sweep {
         })
     }
 
-    /// The setting at `path` of a stage with settings `base`, or of the stage that evaluates, if there is one.
+    /// Setting at `path` of a stage with settings `base`, or of the evaluating stage.
     pub fn setting(&self, base: &StageSettings, path: &str) -> Option<Value> {
         match in_evaluation(path) {
             Some(path) => setting(&self.evaluate, path),
@@ -141,10 +141,10 @@ impl Sweep {
         }
     }
 
-    /// `base` and the stage that evaluates, each with those of `values` in place that are its own.
+    /// Inserts `values` into `base` and the evaluating stage, each value into its own stage.
     ///
     /// # Errors
-    /// What does not fit, each with the rule that it breaks.
+    /// Values that do not fit, each with the violated rule.
     pub fn with_values(&self, base: &StageSettings, values: &Values) -> Result<(StageSettings, StageSettings), String> {
         let (mut own, mut of_evaluation) = (Values::new(), Values::new());
         for (path, value) in values {
@@ -160,7 +160,7 @@ impl Sweep {
         Ok((with_values(base, &own)?, evaluate))
     }
 
-    /// How many trials there will be, before equal ones are left out.
+    /// Number of trials before equal ones are left out.
     pub fn trials(&self) -> usize {
         let points = self.points().unwrap_or(usize::MAX);
         match self.search {
@@ -171,16 +171,16 @@ impl Sweep {
     }
 }
 
-/// The setting at `path`, if there is one.
+/// Setting at `path`, if it exists.
 pub fn setting(settings: &StageSettings, path: &str) -> Option<Value> {
     let json = serde_json::to_value(settings).ok()?;
     path.split('.').try_fold(&json, |value, key| value.get(key)).cloned()
 }
 
-/// `base` with `values` in place.
+/// Inserts `values` into `base`.
 ///
 /// # Errors
-/// What does not fit, each with the rule that it breaks.
+/// Values that do not fit, each with the violated rule.
 pub fn with_values(base: &StageSettings, values: &Values) -> Result<StageSettings, String> {
     let mut json = serde_json::to_value(base).map_err(|e| e.to_string())?;
     for (path, value) in values {
@@ -192,7 +192,7 @@ pub fn with_values(base: &StageSettings, values: &Values) -> Result<StageSetting
     if broken.is_empty() { Ok(settings) } else { Err(broken.join("; ")) }
 }
 
-/// The field through which `evaluate` looks at a stage that gives a `kind`: one that it reads, or one that it would if a stage were named there.
+/// Field of `evaluate` that names the evaluated stage with output `kind`, whether it is set or still empty.
 pub fn evaluated_field(evaluate: &StageSettings, kind: ArtifactKind) -> Option<String> {
     let mut settings = evaluate.clone();
     let refs: Vec<Ref<'_>> = settings.refs().into_iter().filter(|of| of.target == Target::Stage(kind)).collect();
@@ -200,29 +200,29 @@ pub fn evaluated_field(evaluate: &StageSettings, kind: ArtifactKind) -> Option<S
     found.map(|of| of.field.clone().into_owned())
 }
 
-/// What makes a stage one that a sweep derived.
+/// Origin of a stage that a sweep made.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Derived {
     /// The swept stage.
     pub of: StageName,
-    /// Which trial.
+    /// Number of the trial.
     pub trial: usize,
-    /// Which of its rungs.
+    /// Number of its rung.
     pub rung: usize,
-    /// What keys its randomness instead of its own name: the same for all trials, so that they differ in their settings alone, and
-    /// so that a trial's result is bit for bit that of the plain stage with the trial's values.
+    /// Name that keys its randomness instead of its own. It is the same for all trials, so that they differ only in
+    /// their settings. A trial's result is bit for bit that of the plain stage with the trial's values.
     pub keyed_as: StageName,
 }
 
-/// The output of a rung that is gone on from.
+/// Name of the output that the next rung continues from.
 pub const STATE_OUTPUT: &str = "state";
 
-/// Name of the training part of a rung; the evaluation's has `.eval` behind it. User's names have no dots.
+/// Name of the training part of a rung; the evaluation's has the suffix `.eval`. Users' names have no dots.
 pub fn rung_name(stage: &StageName, trial: usize, rung: usize) -> StageName {
     StageName::new(format!("{stage}.t{trial:02}.r{rung}"))
 }
 
-/// Where the stages of a trial run: one worker each, so that trials run side by side.
+/// Placement of the stages of a trial: one worker each, so that trials run side by side.
 pub(crate) fn beside(placement: &Placement) -> Placement {
     Placement { workers: WorkerRange { min: 1, max: 1 }, ..placement.clone() }
 }

@@ -19,7 +19,7 @@ impl fmt::Display for Steps {
 }
 
 impl Steps {
-    /// Reads `300k`, `1.2M`, `2000 steps`.
+    /// Parses `300k`, `1.2M`, `2000 steps`.
     pub fn parse(text: &str) -> Option<Self> {
         let text = text.trim();
         let text = text.strip_suffix("steps").or_else(|| text.strip_suffix("step")).unwrap_or(text).trim();

@@ -1,4 +1,4 @@
-//! The rules of a pipeline that was not read from a file.
+//! Rules for a pipeline that was not read from a file.
 
 use std::collections::BTreeSet;
 
@@ -8,10 +8,10 @@ use crate::stage::{Register, StageSettings};
 use crate::{StageName, limits};
 
 impl Pipeline {
-    /// Repeats the rules that need no text, for a pipeline that came as JSON.
+    /// Applies the rules that need no text, for a pipeline that arrived as JSON.
     ///
     /// # Errors
-    /// What does not hold, a line for each.
+    /// The violated rules, one per line.
     pub fn check(&self) -> Result<(), String> {
         self.check_size()?;
         let mut wrong = Vec::new();
@@ -54,7 +54,7 @@ impl Pipeline {
         if wrong.is_empty() { Ok(()) } else { Err(wrong.join("\n")) }
     }
 
-    /// Names and counts, before anything is done that takes longer the more there is.
+    /// Checks names and counts before any check whose time grows with them.
     fn check_size(&self) -> Result<(), String> {
         if !crate::id::is_name(&self.name) {
             return Err(format!("`{}` is not a pipeline name", shown(&self.name)));
@@ -83,7 +83,7 @@ impl Pipeline {
 }
 
 impl PipelineStage {
-    /// What a stage that was not read from a file may have wrong besides its settings.
+    /// Violated rules of a stage that was not read from a file, besides those of its settings.
     fn unfit_for_submission(&self) -> Vec<String> {
         let mut wrong = Vec::new();
         let name = &self.name;
@@ -115,7 +115,7 @@ impl PipelineStage {
     }
 }
 
-/// A text from outside, for a message: its beginning, without control characters.
+/// The start of an untrusted text for a message, without control characters.
 fn shown(text: &str) -> String {
     yaml::shortened(text).escape_debug().to_string()
 }

@@ -1,4 +1,4 @@
-//! A pipeline as data: its stages, the edges between them, and what identifies each.
+//! A pipeline as data: its stages, the edges between them, and the identity of each.
 
 use std::collections::BTreeMap;
 
@@ -8,19 +8,19 @@ use crate::stage::{Backend, ExternalFolder, Placement, StageIdentity, StageSetti
 use crate::sweep::{Derived, Sweep};
 use crate::{ArtifactKind, Digest, Seed, StageName};
 
-/// An immutable DAG of stages, in an order in which each stage comes after those it reads.
+/// An immutable DAG of stages, in an order in which each stage comes after its inputs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Pipeline {
-    /// For people and for run names: a letter or digit, then letters, digits, `.`, `_`, `-`.
+    /// Name for display and for run names: a letter or digit, then letters, digits, `.`, `_`, `-`.
     pub name: String,
-    /// What all randomness is keyed by.
+    /// Seed that keys all randomness.
     pub seed: Seed,
-    /// Where tensors live.
+    /// Backend that computes.
     pub backend: Backend,
     /// Stages in topological order.
     pub stages: Vec<PipelineStage>,
-    /// Code versions of its kinds at the time it was read, those beyond 1. They stand here so that a run that goes on under a later
-    /// program keeps the keys that it has.
+    /// Code versions of its kinds when it was read, those above 1. They are stored so that a run that continues under a
+    /// later program keeps its keys.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub code_versions: BTreeMap<String, u32>,
 }
@@ -28,21 +28,21 @@ pub struct Pipeline {
 /// A node of a pipeline.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PipelineStage {
-    /// Its name, unique in the pipeline.
+    /// Name, unique in the pipeline.
     pub name: StageName,
-    /// What it does.
+    /// Kind and settings of the stage.
     pub settings: StageSettings,
-    /// Where it runs and how often it saves; not part of its key.
+    /// Number of workers and cadence of checkpoints; not part of its key.
     pub placement: Placement,
-    /// The stages it reads.
+    /// Stages that it reads.
     pub inputs: Vec<StageInput>,
-    /// Digests of what it reads that no stage of the pipeline gives, by the field that names each: the contents of folders outside the
-    /// store, and versions of the registry, which are resolved when the pipeline is submitted and stay what they were then.
+    /// Digests of its inputs from outside the pipeline, by field: the contents of folders outside the store, and
+    /// versions of the registry. They are resolved when the pipeline is submitted and stay fixed.
     pub external: BTreeMap<String, Digest>,
-    /// A search over its settings.
+    /// Search over its settings, if there is one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sweep: Option<Sweep>,
-    /// Set on a stage that a sweep made while the run went on; never in a pipeline that is submitted.
+    /// Origin of a stage that a sweep made during the run; never present in a submitted pipeline.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub derived: Option<Derived>,
 }
@@ -50,22 +50,23 @@ pub struct PipelineStage {
 /// An edge of the DAG.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct StageInput {
-    /// The field that names the stage, such as `vae` or `from[0]`. A `register` stage also reads the evaluations of its
+    /// Field that names the stage, such as `vae` or `from[0]`. A `register` stage also reads the evaluations of its
     /// candidates; their fields are `evaluations.<stage>`.
     pub field: String,
-    /// The stage that is read.
+    /// Stage that is read.
     pub stage: StageName,
-    /// What it must give.
+    /// Kind of artifact that it must output.
     pub kind: ArtifactKind,
 }
 
 impl Pipeline {
-    /// The stage of that name.
+    /// Finds the stage with this name.
     pub fn stage(&self, name: &StageName) -> Option<&PipelineStage> {
         self.stages.iter().find(|stage| &stage.name == name)
     }
 
-    /// The digest that names the pipeline: everything but the paths of folders outside the store, whose contents count instead.
+    /// Digest that names the pipeline. It covers everything except paths of folders outside the store, whose contents
+    /// count.
     pub fn digest(&self) -> Digest {
         let mut pipeline = self.clone();
         for stage in &mut pipeline.stages {
@@ -75,7 +76,8 @@ impl Pipeline {
         crate::canonical::digest(&pipeline)
     }
 
-    /// Asks `digest` for the content of every folder outside the store that a stage reads, and keeps the answers by field.
+    /// Calls `digest` for the content of every folder outside the store that a stage reads, and stores the results by
+    /// field.
     ///
     /// # Errors
     /// The first error of `digest`.
@@ -92,8 +94,8 @@ impl Pipeline {
         Ok(())
     }
 
-    /// The identity of `stage`, once the artifacts it reads are known: all that decides its value. `inputs` are artifacts by field; what the
-    /// stage reads from outside is added.
+    /// Identity of `stage`, once its input artifacts are known: everything that its value depends on. `inputs` are
+    /// artifacts by field; inputs from outside are added.
     pub fn identity(&self, stage: &PipelineStage, inputs: &BTreeMap<String, Digest>) -> StageIdentity {
         let mut all = stage.external.clone();
         all.extend(inputs.iter().map(|(field, digest)| (field.clone(), *digest)));
@@ -107,7 +109,7 @@ impl Pipeline {
         }
     }
 
-    /// Notes the code versions of its kinds, those that evaluate trials included.
+    /// Records the code versions of its kinds, including the kinds that evaluate trials.
     pub(crate) fn note_code_versions(&mut self) {
         let evaluations = self.stages.iter().filter_map(|stage| stage.sweep.as_ref()).map(|sweep| &*sweep.evaluate);
         let kinds = self.stages.iter().map(|stage| &stage.settings).chain(evaluations);
@@ -116,11 +118,11 @@ impl Pipeline {
     }
 }
 
-/// What stands before the fields of a sweep's evaluation among those of its stage.
+/// Prefix of the fields of a sweep's evaluation among those of its stage.
 pub(super) const IN_EVALUATION: &str = "sweep.evaluate.";
 
 impl PipelineStage {
-    /// The versions of the registry that it reads, those of a sweep's evaluation included.
+    /// Versions of the registry that it reads, including those of a sweep's evaluation.
     pub fn versions(&self) -> Vec<VersionInput> {
         let mut all = self.settings.versions();
         let evaluation = self.sweep.iter().flat_map(|sweep| sweep.evaluate.versions());
@@ -128,7 +130,7 @@ impl PipelineStage {
         all
     }
 
-    /// The digests among [`external`](Self::external) that its settings name, or its sweep's evaluation, by the fields there.
+    /// Digests of [`external`](Self::external) for its settings or for its sweep's evaluation, by field.
     pub(super) fn external_of(&self, evaluation: bool) -> BTreeMap<String, Digest> {
         let own = |(field, digest): (&String, &Digest)| match (field.strip_prefix(IN_EVALUATION), evaluation) {
             (Some(field), true) => Some((field.to_owned(), *digest)),
@@ -139,10 +141,10 @@ impl PipelineStage {
     }
 }
 
-/// The code version of every kind that has not changed yet.
+/// Code version of every kind that has not changed yet.
 const FIRST_VERSION: u32 = 1;
 
-/// The name that keys a stage's randomness.
+/// Name that keys a stage's randomness.
 pub fn keyed_as(stage: &PipelineStage) -> &StageName {
     stage.derived.as_ref().map_or(&stage.name, |derived| &derived.keyed_as)
 }

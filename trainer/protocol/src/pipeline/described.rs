@@ -1,4 +1,5 @@
-//! The schema of a settings struct as the pipeline reader takes it: closed, with defaults, in the words of its doc comments.
+//! The schema of a settings struct for the pipeline reader: closed, with defaults, and descriptions from its doc
+//! comments.
 
 use schemars::JsonSchema;
 use schemars::generate::SchemaSettings;
@@ -9,19 +10,19 @@ pub(super) fn generator() -> schemars::SchemaGenerator {
     SchemaSettings::draft2020_12().with(|settings| settings.inline_subschemas = true).into_generator()
 }
 
-/// The schema of a settings struct: closed, with the defaults of `example`.
+/// Schema of a settings struct: closed, with the defaults of `example`.
 pub(super) fn described<T: JsonSchema + Serialize>(example: &T) -> Value {
     described_as(T::json_schema(&mut generator()).to_value(), example)
 }
 
-/// As [`described`], for a schema that is there already.
+/// Like [`described`], for an existing schema.
 pub(super) fn described_as(mut schema: Value, example: &impl Serialize) -> Value {
     close(&mut schema, &serde_json::to_value(example).expect("settings are JSON"));
     schema
 }
 
-/// Closes the keys of a schema to those that the example has, and notes the example's values as defaults. What the example does not have is
-/// not for users.
+/// Closes the keys of a schema to those of the example, and records the example's values as defaults. Keys that the
+/// example lacks are not for users.
 fn close(schema: &mut Value, example: &Value) {
     if let Some(text) = schema.get("description").and_then(Value::as_str) {
         schema["description"] = prose(text).into();
@@ -30,7 +31,7 @@ fn close(schema: &mut Value, example: &Value) {
     for key in ["title", "format", "required"] {
         schema.remove(key);
     }
-    // A mapping that may be left out has no example of its keys.
+    // An optional mapping has no example of its keys.
     if let Some(properties) = schema.get_mut("properties").and_then(Value::as_object_mut)
         && (example.is_object() || example.is_null())
     {
@@ -49,13 +50,13 @@ fn close(schema: &mut Value, example: &Value) {
         }
     }
     schema.insert("default".into(), example.clone());
-    // One text stands for a list of one.
+    // One text is a list of one.
     if schema.get("items").is_some_and(|items| items["type"] == "string") {
         schema.insert("type".into(), json!(["array", "string"]));
     }
 }
 
-/// A doc comment as a line: without links and line breaks.
+/// Converts a doc comment to one line without links.
 fn prose(text: &str) -> String {
     let text = text.split_whitespace().collect::<Vec<_>>().join(" ");
     text.replace("[`", "`").replace("`]", "`")

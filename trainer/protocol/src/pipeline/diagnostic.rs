@@ -1,34 +1,34 @@
-//! Mistakes in a pipeline file, and how they look: place, what is wrong, what to do, the line with a caret.
+//! Mistakes in a pipeline file, and their display: place, mistake, remedy, and the line with a caret.
 
 use std::fmt;
 
-/// Where something stands: a line and a column of the file, or of a `--set` override.
+/// Position of a value: a line and a column of the file, or of a `--set` override.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Position {
-    /// 0 is the file, `i + 1` the i-th override.
+    /// Number of the source: 0 is the file, `i + 1` the i-th override.
     pub(super) source: usize,
     pub(super) line: usize,
     pub(super) column: usize,
 }
 
-/// One mistake.
+/// A mistake with its place and its remedy.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Diagnostic {
-    /// The file's name, or `--set stages.vae.lr=x`.
+    /// Name of the file, or `--set stages.vae.lr=x`.
     pub source: String,
-    /// The line, from 1.
+    /// Line number, from 1.
     pub line: usize,
-    /// The column in characters, from 1.
+    /// Column number in characters, from 1.
     pub column: usize,
-    /// The path of the key, such as `stages.vae.batch.global`; empty for the document.
+    /// Path of the key, such as `stages.vae.batch.global`; empty for the document.
     pub path: String,
-    /// What is wrong and what was expected, in one fragment.
+    /// Mistake and expected value, in one fragment.
     pub message: String,
-    /// What to do.
+    /// Remedy, if there is one.
     pub help: Option<String>,
-    /// The part of the line around the column, at most 110 characters and two ellipses.
+    /// Part of the line around the column, at most 110 characters and two ellipses.
     pub excerpt: String,
-    /// Where the caret stands below it, from 1.
+    /// Column of the caret below the excerpt, from 1.
     pub caret: usize,
 }
 
@@ -50,7 +50,7 @@ impl fmt::Display for Diagnostic {
     }
 }
 
-/// The part of a line around a column, at most 110 characters, and where the caret stands in it.
+/// Part of a line around a column, at most 110 characters, and the caret's column in it.
 pub(super) fn window(text: &str, column: usize) -> (String, usize) {
     // A line may be as long as the file, which is not copied for each of its mistakes.
     let skipped = column.saturating_sub(256);
@@ -71,7 +71,8 @@ fn window_of(characters: Vec<char>, column: usize) -> (String, usize) {
     (format!("{before}{shown}{after}"), column - from + before.len())
 }
 
-/// The mistakes of a file, in the order of their places, the first [`limits::MISTAKES`](crate::limits::MISTAKES) of them. Never empty as an error.
+/// Mistakes of a file, ordered by place, at most [`limits::MISTAKES`](crate::limits::MISTAKES). Never empty as an
+/// error.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Diagnostics(pub Vec<Diagnostic>);
 
@@ -89,10 +90,10 @@ impl fmt::Display for Diagnostics {
 
 impl std::error::Error for Diagnostics {}
 
-/// The candidate that `text` was probably meant to be: at most a third of its letters differ.
+/// Finds the candidate that `text` probably means: at most a third of its letters differ.
 pub(super) fn nearest<'a>(text: &str, candidates: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     let text = text.to_lowercase();
-    // What other programs call it.
+    // Names of other programs for it.
     let text = match text.as_str() {
         "learning_rate" => "lr".to_owned(),
         "iterations" | "epochs" | "max_steps" => "steps".to_owned(),
@@ -103,7 +104,7 @@ pub(super) fn nearest<'a>(text: &str, candidates: impl IntoIterator<Item = &'a s
     let limit = (text.chars().count().max(3) / 3).clamp(1, 4);
     let distance = |candidate: &str| {
         let candidate = candidate.to_lowercase();
-        // `steps_total` for `steps`, or `learning_rate` for `rate`: a whole word shared counts as near.
+        // `steps_total` for `steps`, or `learning_rate` for `rate`: sharing a whole word counts as similar.
         if text.split(['_', '-', '.']).any(|word| word == candidate) {
             return 1;
         }
@@ -117,7 +118,7 @@ pub(super) fn nearest<'a>(text: &str, candidates: impl IntoIterator<Item = &'a s
         .map(|(_, candidate)| candidate)
 }
 
-/// Edit distance in characters; swapping neighbours counts as one.
+/// Edit distance in characters; swapping neighbours counts as one edit.
 fn levenshtein(a: &str, b: &str) -> usize {
     let a: Vec<char> = a.chars().take(64).collect();
     let b: Vec<char> = b.chars().take(64).collect();

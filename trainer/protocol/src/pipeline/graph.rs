@@ -1,4 +1,4 @@
-//! What must hold between stages: references exist and give the right kind, nothing waits for itself, shapes agree.
+//! Rules between stages: references exist and have the right kind, there is no cycle, and shapes agree.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,20 +9,20 @@ use crate::stage::{Neighbour, Neighbours, Register, Shape, StageSettings, Versio
 use crate::sweep::Domain;
 use crate::{ArtifactKind, StageName, limits};
 
-/// Stages that a message lists.
+/// Largest number of stages that a message lists.
 const LISTED: usize = 20;
 
 /// Problems by stage.
 pub(super) type ByStage = BTreeMap<StageName, Problems>;
 
-/// The edges of `settings`, references to stages only; versions of the registry are no stages.
+/// Edges of `settings`: references to stages, without versions of the registry.
 pub(super) fn references(settings: &StageSettings) -> Vec<StageInput> {
     let input =
         |(field, stage, kind): (String, String, ArtifactKind)| StageInput { field, stage: StageName::new(stage), kind };
     settings.inputs().into_iter().filter(|(_, name, _)| !names_version(name)).map(input).collect()
 }
 
-/// Gives every `register` stage the evaluations of its candidates as inputs.
+/// Adds the evaluations of its candidates to the inputs of every `register` stage.
 pub(super) fn add_evaluations(stages: &mut [PipelineStage]) {
     let evaluated_model: Vec<(StageName, StageName)> = stages
         .iter()
@@ -43,10 +43,10 @@ pub(super) fn add_evaluations(stages: &mut [PipelineStage]) {
     }
 }
 
-/// Sorts `stages` so that each comes after those it reads, keeping the given order where it is free.
+/// Sorts `stages` so that each comes after its inputs, and keeps the given order where possible.
 ///
 /// # Errors
-/// The names along a cycle, first and last the same.
+/// The names along a cycle; the first equals the last.
 pub(super) fn sort(stages: Vec<PipelineStage>) -> Result<Vec<PipelineStage>, Vec<StageName>> {
     let names: BTreeSet<&StageName> = stages.iter().map(|stage| &stage.name).collect();
     let known = |input: &&StageInput| names.contains(&input.stage);
@@ -67,7 +67,7 @@ pub(super) fn sort(stages: Vec<PipelineStage>) -> Result<Vec<PipelineStage>, Vec
     Ok(order.into_iter().filter_map(|i| slots[i].take()).collect())
 }
 
-/// Follows unplaced inputs until a name comes again.
+/// Follows unplaced inputs until a name repeats.
 fn cycle(stages: &[PipelineStage], placed: &BTreeSet<&StageName>) -> Vec<StageName> {
     let blocked = |name: &StageName| stages.iter().find(|stage| &stage.name == name && !placed.contains(name));
     let mut path: Vec<StageName> = Vec::new();
@@ -83,7 +83,7 @@ fn cycle(stages: &[PipelineStage], placed: &BTreeSet<&StageName>) -> Vec<StageNa
     path
 }
 
-/// What all stages together may ask for. The problem is one of the stage with which a bound is passed.
+/// Checks the limits on all stages together. The problem is reported at the stage that exceeds a limit.
 pub(super) fn check_totals(stages: &[PipelineStage], found: &mut ByStage) {
     let (mut shards, mut trials, mut values) = (0_u64, 0_usize, 0_usize);
     let most_values = limits::SWEPT_VALUES.min(limits::SWEPT_CHECKS / stages.len().max(1));
@@ -110,7 +110,7 @@ pub(super) fn check_totals(stages: &[PipelineStage], found: &mut ByStage) {
     }
 }
 
-/// References that lead nowhere, or to another kind of thing.
+/// Checks for references that do not exist, or have another kind.
 pub(super) fn check_references(stages: &[PipelineStage], found: &mut ByStage) {
     let by_name: BTreeMap<&StageName, &PipelineStage> = stages.iter().map(|stage| (&stage.name, stage)).collect();
     for stage in stages {
@@ -165,7 +165,7 @@ pub(super) fn check_references(stages: &[PipelineStage], found: &mut ByStage) {
     }
 }
 
-/// What can be said of a version before a registry is asked.
+/// Applies the rules for a version reference that need no registry.
 fn check_version(stage: &PipelineStage, input: &VersionInput, problems: &mut Problems) {
     let VersionInput { field, version, kind, .. } = input;
     let what = kind.noun();
@@ -181,7 +181,7 @@ fn check_version(stage: &PipelineStage, input: &VersionInput, problems: &mut Pro
     }
 }
 
-/// Shapes, samplers and data that must agree. Call when references are sound.
+/// Checks that shapes, samplers and data agree. Called once references are valid.
 pub(super) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
     let neighbours = Neighbours::new(stages.iter().map(|stage| (&stage.name, &stage.settings as &dyn Neighbour)));
     for stage in stages {

@@ -1,8 +1,8 @@
-//! A pipeline: stages, what each reads from which other, and what all of them share.
+//! A pipeline: stages, the inputs of each, and their common settings.
 //!
-//! [`read`] makes one from YAML and reports every mistake of the file at once; [`Pipeline::check`] repeats the rules that
-//! do not need the text, for pipelines that arrive as JSON. Not its job: touching the file system. The content digests of
-//! folders are put in by the caller ([`Pipeline::fill_external`]).
+//! [`read`] makes one from YAML and reports every mistake of the file at once. [`Pipeline::check`] applies the rules
+//! that do not need the text, for pipelines that arrive as JSON. Not its job: accessing the file system. The caller
+//! supplies the content digests of folders ([`Pipeline::fill_external`]).
 
 mod check;
 mod definition;

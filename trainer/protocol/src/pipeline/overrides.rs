@@ -1,4 +1,4 @@
-//! `--set a.b=c`: values put over the tree before it is checked, so that they are checked like the file.
+//! `--set a.b=c`: values are written over the tree before its check, so that they are checked like the file.
 
 use serde_json::Value;
 
@@ -7,13 +7,13 @@ use super::schema::list_keys;
 use super::yaml::{self, Budget, Content, Entry, Node};
 use crate::limits;
 
-/// The keys of a pipeline.
+/// Top-level keys of a pipeline.
 pub(super) const TOP_KEYS: [&str; 6] = ["name", "seed", "backend", "dataset", "text", "stages"];
 
-/// Applies one override; positions of what it adds carry `source`.
+/// Applies one override; positions of added values have `source`.
 ///
 /// # Errors
-/// What is wrong with the override.
+/// The defect of the override.
 pub(super) fn apply(root: &mut Node, text: &str, source: usize, budget: &mut Budget) -> Result<(), String> {
     let at = Position { source, line: 1, column: 1 };
     let Some((path, value)) = text.split_once('=') else {
@@ -30,7 +30,7 @@ pub(super) fn apply(root: &mut Node, text: &str, source: usize, budget: &mut Bud
         return Err(format!("`{path}` is not a path of keys; expected such as `stages.vae.lr`"));
     }
     if !TOP_KEYS.contains(&keys[0]) {
-        // `vae.lr` is short for `stages.vae.lr`.
+        // `vae.lr` abbreviates `stages.vae.lr`.
         let stages: Vec<&str> =
             root.entry("stages").and_then(|e| e.value.map()).unwrap_or(&[]).iter().map(|e| e.key.as_str()).collect();
         if stages.contains(&keys[0]) {

@@ -1,4 +1,4 @@
-//! Every numeric setting of every kind against numbers that no setting should take.
+//! Every numeric setting of every kind, tested with numbers that no setting should accept.
 
 use serde_json::{Value, json};
 
@@ -7,7 +7,7 @@ use super::*;
 use crate::stage::*;
 use crate::{ArtifactKind, Digest, Steps};
 
-/// A setting is replaced by each of these.
+/// Each of these replaces a setting.
 const NUMBERS: &[&str] = &[
     "0",
     "1",
@@ -21,7 +21,7 @@ const NUMBERS: &[&str] = &[
     "1e308",
 ];
 
-/// A stage of each kind, with a value for each numeric setting, so that all fit together.
+/// A stage of each kind, with a value for each numeric setting, such that all fit together.
 fn stages() -> Vec<(String, StageSettings)> {
     let sampler = Sampler { steps: 1, guidance: 7.5, timesteps: vec![999], ..Sampler::default() };
     let mut stages = vec![
@@ -72,7 +72,7 @@ fn stages() -> Vec<(String, StageSettings)> {
     ];
     let register = Register { model: "m".into(), from: vec!["lcm".into()], ..Register::default() };
     stages.push(("out", StageSettings::Register(register)));
-    // A kind that is not named here is tried as it is by default.
+    // A kind that is not listed here is tested with its defaults.
     let named: Vec<&str> = stages.iter().map(|(_, settings)| settings.kind()).collect();
     let others: Vec<StageSettings> =
         StageSettings::all().into_iter().filter(|settings| !named.contains(&settings.kind())).collect();
@@ -94,7 +94,7 @@ fn numbers(value: &Value, at: &str, found: &mut Vec<String>) {
     }
 }
 
-/// As the settings of a stage are written in YAML, in one line.
+/// The settings of a stage as one line of YAML.
 fn flow(value: &Value) -> String {
     match value {
         Value::Object(map) => {
@@ -114,7 +114,7 @@ fn file(stages: &[(String, Value)]) -> String {
     text
 }
 
-/// What a stage has to write because its default is another.
+/// Settings that a stage must write because they differ from the default.
 fn differing(stage: &Value) -> Value {
     let default = StageSettings::all().into_iter().map(|settings| serde_json::to_value(settings).unwrap());
     let default = default.into_iter().find(|default| default["kind"] == stage["kind"]).unwrap();
@@ -130,7 +130,7 @@ fn path(pointer: &str) -> String {
     keys.collect::<Vec<_>>().join(".")
 }
 
-/// Each stage as JSON, placement included, as the file has it.
+/// Each stage as JSON as in the file, placement included.
 fn written() -> Vec<(String, Value)> {
     let placement = serde_json::to_value(Placement::default()).unwrap();
     let stages = stages().into_iter().map(|(name, settings)| {
@@ -202,7 +202,7 @@ fn a_number_out_of_range_is_refused_where_it_stands_and_none_breaks_the_reader()
                         );
                     }
                 }
-                // The same as JSON.
+                // The same value as JSON.
                 let Ok(json) = serde_json::from_str::<Value>(number) else { continue };
                 let mut changed = base.clone();
                 let stages = changed["stages"].as_array_mut().unwrap();
@@ -244,7 +244,7 @@ fn settings_that_are_each_in_range_are_bounded_together() {
     assert!(shown.contains("stage `more9`: the pipeline has more than 100000 shards"), "{shown}");
 }
 
-/// Pipelines that no file could give, but a client can send.
+/// Pipelines that no file can contain, but a client can send.
 #[test]
 fn a_pipeline_that_came_as_json_keeps_the_same_bounds() {
     let mut good = read("p.yaml", &file(&written()), &[]).unwrap();

@@ -1,20 +1,21 @@
-//! The range of every numeric setting, by its path in the stage: what no network, no evaluation and no schedule needs more of.
+//! The range of every numeric setting, by its path in the stage. No network, evaluation or schedule needs a larger
+//! value.
 //!
-//! A bound is far above what the papers use and far below what ends in an overflow or in all of a machine's memory. Rules that depend on
-//! other settings stand in `rules`; these here need the path alone, so that one walk over the serialised settings checks them all and a test
-//! can try every one of them. The kinds share the table: one path means one thing.
+//! A limit is far above the papers' values and far below an overflow or the exhaustion of a machine's memory. Rules
+//! that depend on other settings are in `rules`. The rules here need only the path, so one walk over the serialised
+//! settings checks all of them, and a test can try each. The kinds share the table: a path has one meaning.
 
 use serde_json::Value;
 
 use crate::limits;
 use crate::stage::{Problem, Problems};
 
-/// The numbers that a setting may be, both ends included.
+/// Allowed numbers of a setting, both ends included.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Range {
-    /// Whole numbers.
+    /// Whole numbers in a range.
     Whole(u64, u64),
-    /// Any numbers.
+    /// Real numbers in a range.
     Real(f64, f64),
 }
 
@@ -22,7 +23,7 @@ use Range::{Real, Whole};
 
 /// Range and unit by path; entries of a list have the path of the list.
 const RANGES: &[(&str, Range, &str)] = &[
-    // Data.
+    // Settings of data stages.
     ("clips", Whole(1, 100_000), "clips"),
     ("val", Real(0.0, 1.0), "of the clips"),
     ("test", Real(0.0, 1.0), "of the clips"),
@@ -31,7 +32,7 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("crops", Whole(1, 256), "crops of an entry"),
     ("shards", Whole(1, limits::SHARDS), "shards"),
     ("max_tokens", Whole(0, 4_096), "tokens"),
-    // Networks.
+    // Sizes of networks.
     ("latent.tokens", Whole(1, limits::LATENT_TOKENS), "tokens"),
     ("latent.dim", Whole(1, 16_384), "numbers a token"),
     ("network.width", Whole(1, 16_384), "channels"),
@@ -65,7 +66,7 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("code_dim", Whole(1, 4_096), "numbers a code"),
     ("quantizers", Whole(1, 64), "codebooks"),
     ("padded", Whole(0, 10_000), "frames"),
-    // Training.
+    // Settings of training.
     ("steps", Whole(1, 1_000_000_000), "steps"),
     ("warmup", Whole(0, 1_000_000_000), "steps"),
     ("batch.global", Whole(1, 65_536), "examples"),
@@ -120,13 +121,13 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("movement.smoothness", Real(0.0, 1e6), ""),
     ("emphasis", Real(0.0, 1e6), ""),
     ("margin", Real(0.0, 1e6), ""),
-    // Distillation.
+    // Settings of distillation.
     ("guidance", Real(0.0, 1e3), ""),
     ("skip", Whole(1, 1_000), "timesteps"),
     ("huber_c", Real(0.0, 1e6), ""),
     ("phases", Whole(1, 1_000), "phases"),
     ("adversarial", Real(0.0, 1e6), ""),
-    // Control.
+    // Settings of control.
     ("hints.density", Real(0.0, 100.0), "percent of the frames"),
     ("loss.latent", Real(0.0, 1e6), ""),
     ("loss.tokens", Real(0.0, 1e6), ""),
@@ -139,7 +140,7 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("motions", Whole(1, 10_000), "motions"),
     ("threshold", Real(0.0, 1e3), "metres"),
     ("scale", Real(0.0, 1e3), ""),
-    // Evaluation.
+    // Settings of evaluation.
     ("sampler.steps", Whole(1, 1_000), "steps"),
     ("sampler.guidance", Real(0.0, 1e3), ""),
     ("sampler.timesteps", Whole(0, 999), ""),
@@ -150,7 +151,7 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("multimodality.captions", Whole(0, 1_000), "captions"),
     ("multimodality.samples", Whole(0, 1_000), "samples of a caption"),
     ("multimodality.pairs", Whole(0, 1_000), "pairs of a caption"),
-    // Placement.
+    // Settings of placement.
     ("workers.min", Whole(1, 10_000), "workers"),
     ("workers.max", Whole(0, 10_000), "workers"),
     ("checkpoint.every", Whole(0, 1_000_000_000), "steps"),
@@ -158,8 +159,8 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("checkpoint.keep.best", Whole(0, 10_000), "checkpoints"),
 ];
 
-/// The range of the setting at `path`, and what it counts. One that the table does not name, such as a new kind's, keeps a range in which
-/// nothing overflows; `number` tells whether it is a whole one.
+/// Range of the setting at `path`, and its unit. A path that is not in the table, such as a new kind's, gets a range in
+/// which nothing overflows; `number` decides between whole and real numbers.
 pub(super) fn range(path: &str, number: &Value) -> (Range, &'static str) {
     let general = if number.is_f64() { Real(-1e9, 1e9) } else { Whole(0, 65_536) };
     let found = RANGES.iter().find(|(of, ..)| *of == path);
@@ -167,7 +168,7 @@ pub(super) fn range(path: &str, number: &Value) -> (Range, &'static str) {
 }
 
 impl Range {
-    /// Whether `value`, a JSON number, lies in it.
+    /// Returns true if `value`, a JSON number, is in the range.
     fn holds(self, value: &Value) -> bool {
         match self {
             Whole(from, to) => value.as_u64().is_some_and(|value| (from..=to).contains(&value)),
@@ -184,7 +185,7 @@ impl Range {
     }
 }
 
-/// Adds what is out of range in `settings`, as JSON; a field that `p` has a problem of already is left alone.
+/// Reports values of `settings`, as JSON, that are out of range; skips fields that already have a problem in `p`.
 pub(super) fn check(p: &mut Problems, settings: &Value) {
     let mut found = Problems::default();
     walk(&mut found, "", "", settings);
@@ -193,7 +194,7 @@ pub(super) fn check(p: &mut Problems, settings: &Value) {
     p.0.extend(new);
 }
 
-/// `field` is where `value` stands, with indices; `path` is the same without them.
+/// Walks over `value` at `field`, with indices; `path` is the same without them.
 fn walk(p: &mut Problems, field: &str, path: &str, value: &Value) {
     match value {
         Value::Object(map) => {
@@ -206,7 +207,7 @@ fn walk(p: &mut Problems, field: &str, path: &str, value: &Value) {
             p.add(field, format!("`{path}` has {} entries; expected at most {}", items.len(), limits::LIST), "");
         }
         Value::Array(items) => {
-            // What is wrong with a list of numbers is said of the list, as its other rules do.
+            // A problem in a list of numbers is reported for the list, as by its other rules.
             let texts = items.iter().any(Value::is_string);
             for (i, item) in items.iter().enumerate() {
                 let field = if texts { format!("{field}[{i}]") } else { field.to_owned() };

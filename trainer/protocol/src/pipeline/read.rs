@@ -1,4 +1,4 @@
-//! From YAML to a validated [`Pipeline`], with all mistakes of the file at once.
+//! Converts YAML to a validated [`Pipeline`], reporting all mistakes of the file at once.
 
 use std::collections::BTreeMap;
 
@@ -21,10 +21,10 @@ use crate::stage::{Backend, DataOpen, DataSynthetic, Placement, StageSettings, T
 use crate::sweep::Sweep;
 use crate::{Seed, StageName};
 
-/// Reads a pipeline. `file` is its name for messages, `sets` are overrides such as `stages.vae.lr=1e-4`.
+/// Reads a pipeline. `file` is its name in messages, `sets` are overrides such as `stages.vae.lr=1e-4`.
 ///
 /// # Errors
-/// Every mistake, in the order of the file.
+/// All mistakes, in the order of the file.
 pub fn read(file: &str, text: &str, sets: &[String]) -> Result<Pipeline, Diagnostics> {
     let mut reader = Reader { mistakes: Vec::new() };
     let pipeline = reader.pipeline(text, sets);
@@ -49,14 +49,14 @@ pub fn read(file: &str, text: &str, sets: &[String]) -> Result<Pipeline, Diagnos
     Err(Diagnostics(reader.mistakes.into_iter().map(render).collect()))
 }
 
-/// What a pipeline says of itself.
+/// Settings of a pipeline itself.
 #[derive(Debug, Serialize, Deserialize, JsonSchema)]
 struct Head {
-    /// Names its runs: a letter or digit, then letters, digits, `.`, `_`, `-`.
+    /// Name of the pipeline and prefix of its runs: a letter or digit, then letters, digits, `.`, `_`, `-`.
     name: String,
-    /// What all randomness is keyed by.
+    /// Seed that keys all randomness.
     seed: Seed,
-    /// Where tensors live.
+    /// Backend that computes.
     backend: Backend,
 }
 
@@ -66,16 +66,16 @@ impl Default for Head {
     }
 }
 
-/// The keys of a pipeline that have a type of their own.
+/// Schema of the pipeline's keys that have a type of their own.
 pub(super) fn described_head() -> Value {
     described(&Head::default())
 }
 
-/// A stage as it stands in the file.
+/// A stage as written in the file.
 struct Written {
     name: StageName,
     key_at: Position,
-    /// The mapping with its settings; `None` for a stage that the file does not write.
+    /// Mapping with its settings; `None` for an implicit stage.
     node: Option<Node>,
     /// Path of the mapping.
     path: String,
@@ -141,7 +141,8 @@ impl Reader {
         serde_json::from_value(base).ok()
     }
 
-    /// Every stage that could be read, and where each stands. A stage with mistakes is in the first only.
+    /// All stages of the file, and the readable ones with their settings. A stage with mistakes is only in the first
+    /// list.
     fn stages(&mut self, root: &Node) -> (Vec<Written>, Vec<PipelineStage>) {
         let mut written = Vec::new();
         let mut stages = Vec::new();
@@ -163,7 +164,7 @@ impl Reader {
         } else if declared("dataset").is_none() {
             let help = "such as `dataset: {format: synthetic}` or `dataset: {format: humanml3d, path: data/HumanML3D}`";
             self.mistake(root.at, "dataset", "the pipeline has no `dataset`", Some(help.into()));
-            // Those who read it have nothing to add.
+            // Readers of the stage need not report it again.
             written.push(Written { name: "dataset".into(), key_at: root.at, node: None, path: "dataset".into() });
         }
 
@@ -322,7 +323,7 @@ impl Reader {
             }
         }
         graph::add_evaluations(&mut stages);
-        // The captions are embedded only if somebody asks for them, or the file does.
+        // The captions are embedded only if a stage needs them, or the file has the key.
         let text = StageName::new("text");
         let all_read = stages.len() == written.len();
         let asked = |stages: &[PipelineStage]| stages.iter().any(|s| s.inputs.iter().any(|input| input.stage == text));
@@ -334,7 +335,7 @@ impl Reader {
         graph::check_totals(&stages, &mut found);
         graph::check_references(&stages, &mut found);
         if !all_read {
-            // A stage that could not be read may be what a reference is looking for.
+            // A stage that could not be read may be the target of a reference.
             let unread = |name: &str| {
                 written.iter().any(|w| w.name.as_str() == name) && !stages.iter().any(|s| s.name.as_str() == name)
             };
@@ -372,7 +373,7 @@ impl Reader {
         sorted
     }
 
-    /// Puts a problem where its field stands, or its nearest parent.
+    /// Reports a problem at the position of its field, or of the field's nearest parent.
     fn problem(&mut self, written: &[Written], stage: &StageName, problem: Problem) {
         let Some(written) = written.iter().find(|w| &w.name == stage) else { return };
         let mut at = written.key_at;

@@ -1,4 +1,4 @@
-//! What reads a pipeline file and gathers its mistakes: what reading a stage and reading a sweep share.
+//! Reader of a pipeline file that collects its mistakes: the common part of reading a stage and a sweep.
 
 use serde::Serialize;
 use serde_json::Value;
@@ -17,7 +17,7 @@ impl Reader {
         self.mistakes.push(Mistake { at, path: path.to_owned(), message: message.into(), help });
     }
 
-    /// A settings struct by itself; `None` if anything in it is wrong.
+    /// Reads a settings struct; `None` if it has a mistake.
     pub(super) fn typed<T: Default + Serialize + serde::de::DeserializeOwned>(
         &mut self,
         node: &Node,
@@ -50,7 +50,7 @@ impl Reader {
         }
     }
 
-    /// The default settings of the kind that `node` names.
+    /// Default settings of the kind that `node` names.
     pub(super) fn kind(&mut self, node: &Node, at: Position, owner: &str, path: &str) -> Option<StageSettings> {
         let mut all = StageSettings::all();
         let kinds: Vec<&str> = all.iter().map(StageSettings::kind).collect();

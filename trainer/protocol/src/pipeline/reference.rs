@@ -1,7 +1,8 @@
-//! What may stand in a pipeline, for editors ([`json_schema`]) and for people ([`markdown`]).
+//! Reference of a pipeline's keys, for editors ([`json_schema`]) and for users ([`markdown`]).
 //!
-//! Nothing is said twice: keys, types, ranges, words and their meaning come from the settings structs and their doc comments, defaults from
-//! their `Default`, and what a key refers to from [`StageSpec::refs`](crate::stage::StageSpec::refs).
+//! Each fact has one source. Keys, types, ranges, values and their meaning come from the settings structs and their doc
+//! comments, defaults from their `Default`, and targets of references from
+//! [`StageSpec::refs`](crate::stage::StageSpec::refs).
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -12,7 +13,7 @@ use super::described::{described, described_as, generator};
 use super::{read, sweep};
 use crate::stage::{DataOpen, DataSynthetic, ImportModel, Placement, Shape, StageSettings, Target, TextEmbed};
 
-/// The JSON Schema (draft 2020-12) of a pipeline file.
+/// JSON Schema (draft 2020-12) of a pipeline file.
 pub fn json_schema() -> Value {
     let mut definitions = Map::new();
     let mut cases = Vec::new();
@@ -57,7 +58,7 @@ pub fn json_schema() -> Value {
     top
 }
 
-/// Every key of a stage of this kind.
+/// Schema of a stage of this kind.
 fn stage(settings: &StageSettings) -> Value {
     let mut schema = described_kind(settings);
     let placement = described(&Placement::default());
@@ -73,7 +74,7 @@ fn stage(settings: &StageSettings) -> Value {
     schema
 }
 
-/// The schema of a kind's settings, with what its references lead to.
+/// Schema of a kind's settings, with the targets of its references.
 fn described_kind(settings: &StageSettings) -> Value {
     let mut schema = described_as(settings.schema(&mut generator()).to_value(), &settings.example());
     for (field, target) in references(settings) {
@@ -92,7 +93,7 @@ fn described_kind(settings: &StageSettings) -> Value {
     schema
 }
 
-/// References of a kind. A list that is empty by default is asked as if it had an entry.
+/// References of a kind. A list that is empty by default is treated as having one entry.
 fn references(settings: &StageSettings) -> BTreeMap<String, Target> {
     let mut json = settings.example();
     for value in json.as_object_mut().into_iter().flat_map(Map::values_mut) {
@@ -100,12 +101,12 @@ fn references(settings: &StageSettings) -> BTreeMap<String, Target> {
             *value = json!(["x"]);
         }
     }
-    // A list of numbers does not take a text: then there is none of names.
+    // A list of numbers does not accept a text, so it has no references.
     let mut probe = serde_json::from_value(json).unwrap_or_else(|_| settings.clone());
     probe.refs().into_iter().map(|reference| (reference.field.into_owned(), reference.target)).collect()
 }
 
-/// The reference of all kinds and keys, `docs/pipeline.md`.
+/// Reference of all kinds and keys, `docs/pipeline.md`.
 pub fn markdown() -> String {
     let mut text = String::from(
         "# Stage kinds and their keys\n\n\
@@ -134,7 +135,7 @@ pub fn markdown() -> String {
         };
         let _ = writeln!(text, "\n## {kind}\n\n{}\n", sentence(&schema));
         let version = settings.code_version();
-        // What `import.model` gives stands with its parts.
+        // The output of `import.model` is described at its parts.
         let gives = match settings.get::<ImportModel>() {
             Some(_) => "what `part` says".to_owned(),
             None => format!("{} (`{}`)", output.kind.noun(), output.name),
@@ -184,7 +185,7 @@ fn rows(text: &mut String, schema: &Value, path: &str) {
     }
 }
 
-/// What a value must be, in words.
+/// Type and range of a value, in words.
 fn kind_of_value(property: &Value) -> String {
     if let Some(lead) = property["x-refers-to"].as_str() {
         return lead[..1].to_lowercase() + &lead[1..];
@@ -231,7 +232,7 @@ mod tests {
         PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../..").join(path)
     }
 
-    /// `UPDATE_DOCS=1` writes it.
+    /// `UPDATE_DOCS=1` writes the file.
     #[test]
     fn the_reference_of_kinds_and_keys_is_current() {
         let path = in_repository("docs/pipeline.md");
@@ -266,7 +267,7 @@ mod tests {
         assert!(missing.is_empty(), "{missing:?}");
     }
 
-    /// The part of JSON Schema that ours uses.
+    /// Validates a value by the part of JSON Schema that ours uses.
     fn fits(schema: &Value, value: &Value, root: &Value) -> Result<(), String> {
         let wrong = |what: &str| Err(format!("{value} is not {what} of {schema}"));
         if let Some(reference) = schema["$ref"].as_str() {

@@ -1,10 +1,10 @@
-//! What must hold of one stage alone: what its kind says, and where it runs. What concerns several stages is in `graph`.
+//! Rules for a single stage: those of its kind, and of its placement. Rules between stages are in `graph`.
 
 use super::ranges;
 use crate::stage::{Placement, StageSettings};
 pub(super) use crate::stage::{Problem, Problems};
 
-/// Everything that can be said of one stage alone.
+/// Checks a single stage.
 pub(super) fn stage(settings: &StageSettings, placement: &Placement) -> Vec<Problem> {
     let mut problems = Problems::default();
     settings.check(&mut problems);
@@ -21,7 +21,7 @@ pub(super) fn stage(settings: &StageSettings, placement: &Placement) -> Vec<Prob
     problems.0
 }
 
-/// What does not hold of one stage's settings, a line for each.
+/// Violated rules of one stage's settings, one per line.
 pub fn broken_rules(settings: &StageSettings, placement: &Placement) -> Vec<String> {
     stage(settings, placement).into_iter().map(|problem| problem.message).collect()
 }

@@ -1,7 +1,7 @@
-//! The schema of a stage, learnt from an example of it.
+//! The schema of a stage, derived from an example.
 //!
 //! The serialised default of a settings struct has every key with a value of its type. A mapping in the example closes
-//! the set of keys; anything else is a leaf, checked by putting the user's value in its place and asking serde. So a
+//! the set of keys. Any other value is a leaf, checked by inserting the user's value and deserialising with serde. So a
 //! field is declared once, in its struct.
 
 use serde::de::DeserializeOwned;
@@ -10,7 +10,7 @@ use serde_json::Value;
 use super::diagnostic::nearest;
 use super::yaml::{Content, Node};
 
-/// A mistake at a place of the tree.
+/// A mistake at a position of the tree.
 #[derive(Debug)]
 pub(super) struct Mistake {
     pub(super) at: super::diagnostic::Position,
@@ -19,8 +19,8 @@ pub(super) struct Mistake {
     pub(super) help: Option<String>,
 }
 
-/// Puts the values of `node` over `base`, the example; collects what does not fit. `owner` is for messages: `stage `vae``.
-/// `skip` are keys that the caller reads itself, but which are known here.
+/// Writes the values of `node` over `base`, the example, and collects mistakes. `owner` is for messages: `stage `vae``.
+/// `skip` are keys that the caller reads itself, but which are allowed here.
 pub(super) fn overlay<T: DeserializeOwned>(
     base: &mut Value,
     node: &Node,
@@ -100,7 +100,7 @@ impl Walk<'_> {
             self.push(node.at, path, format!("{label} holds a number that is not finite"), None);
             return;
         };
-        // One text stands for a list of one.
+        // One text is a list of one.
         if example.is_array() && value.is_string() {
             value = Value::Array(vec![value]);
         }
@@ -116,7 +116,7 @@ impl Walk<'_> {
     }
 }
 
-/// What a leaf wants, in words, from its example and serde's reason.
+/// Expected value of a leaf, in words, from its example and serde's error.
 fn expectation(example: &Value, node: &Node, reason: &str) -> (String, Option<String>) {
     if let Some((_, variants)) =
         reason.split_once("unknown variant ").and_then(|(_, rest)| rest.split_once(", expected "))
@@ -164,7 +164,7 @@ fn reason_in_short(reason: &str) -> String {
     reason.split(" at line ").next().unwrap_or(reason).replace("usize", "a whole number").replace("f64", "a number")
 }
 
-/// Message and advice for a key that nobody knows.
+/// Message and advice for an unknown key.
 pub(super) fn unknown_key(key: &str, place: &str, known: &[&str]) -> (String, String) {
     let list = list_keys(known.iter().copied());
     if key == "<<" {
@@ -176,7 +176,7 @@ pub(super) fn unknown_key(key: &str, place: &str, known: &[&str]) -> (String, St
     }
 }
 
-/// `a`, `b`, `c`.
+/// Lists keys as `a`, `b`, `c`.
 pub(super) fn list_keys<'a>(keys: impl IntoIterator<Item = &'a str>) -> String {
     keys.into_iter().map(|key| format!("`{key}`")).collect::<Vec<_>>().join(", ")
 }

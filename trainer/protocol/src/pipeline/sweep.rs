@@ -1,6 +1,6 @@
-//! Sweeps in a pipeline: reading `sweep:`. Its rules are in `sweep_rules`, the stages that a trial is made of in `trial`.
+//! Sweeps in a pipeline: reads `sweep:`. Its rules are in `sweep_rules`, the stages of a trial in `trial`.
 //!
-//! `space` mirrors the stage's own keys, so that a setting is found, checked and misspelt there as it would be in the stage itself.
+//! `space` has the stage's own keys, so that a setting is found, checked and corrected as in the stage itself.
 
 use std::collections::BTreeMap;
 
@@ -17,23 +17,23 @@ use crate::ArtifactKind;
 use crate::stage::{Mode, StageSettings};
 use crate::sweep::{Domain, EVALUATE, Rungs, SearchKind, Sweep, evaluated_field, setting};
 
-/// What a domain may be.
+/// Kinds of domains.
 const DOMAINS: [&str; 3] = ["choice", "uniform", "log_uniform"];
 
-/// Searches some of the stage's settings for the values with which `evaluate` measures best.
+/// Search over some of the stage's settings for the values with the best result of `evaluate`.
 #[derive(Debug, Serialize, Deserialize, JsonSchema)]
 struct Head {
-    /// How.
+    /// Search method of the sweep.
     search: SearchKind,
-    /// The value of `evaluate` that decides which trial is best.
+    /// Value of `evaluate` that ranks the trials.
     metric: String,
-    /// Its direction.
+    /// Direction of the metric.
     mode: Mode,
-    /// How many points of the space are tried; a grid may leave it out.
+    /// Number of points of the space to try; a grid may leave it out.
     trials: usize,
-    /// Trials that may be under way at a time.
+    /// Largest number of concurrent trials.
     parallel: usize,
-    /// ASHA's budgets.
+    /// Budgets of ASHA.
     rungs: Rungs,
 }
 
@@ -50,7 +50,7 @@ impl Default for Head {
     }
 }
 
-/// The keys of a sweep.
+/// Schema of the keys of a sweep.
 pub(super) fn described() -> Value {
     let mut schema = schema_of(&Head::default());
     let properties = &mut schema["properties"];
@@ -68,7 +68,7 @@ pub(super) fn described() -> Value {
 }
 
 impl Reader {
-    /// `sweep:` of stage `name`, whose kind has the settings `default`.
+    /// Reads `sweep:` of stage `name`, whose kind has the settings `default`.
     pub(super) fn sweep(&mut self, entry: &Entry, name: &str, default: &StageSettings) -> Option<Sweep> {
         let path = format!("stages.{name}.sweep");
         let owner = format!("`sweep` of stage `{name}`");
@@ -140,7 +140,7 @@ impl Reader {
         Some(Sweep { search, metric, mode, trials, parallel, rungs, space, evaluate: Box::new(evaluate) })
     }
 
-    /// The stage that evaluates trials, with its reference to the evaluated stage filled in.
+    /// Reads the stage that evaluates trials, and fills in its reference to the evaluated stage.
     fn evaluation(&mut self, entry: &Entry, name: &str, default: &StageSettings, path: &str) -> Option<StageSettings> {
         let owner = format!("`evaluate` of the sweep of stage `{name}`");
         let node = &entry.value;
@@ -204,7 +204,7 @@ impl Reader {
         }
         let example = keys.iter().fold(walk.example, |value, key| &value[key.as_str()]);
         for entry in entries {
-            // Read when it is known what evaluates.
+            // Read once the evaluating stage is known.
             if keys.is_empty() && walk.of_stage && entry.key == EVALUATE {
                 continue;
             }
@@ -313,7 +313,7 @@ impl Reader {
         None
     }
 
-    /// A value that the setting may take, as the setting itself would be written out.
+    /// Reads a value of the setting, in the form in which the setting itself is written.
     fn value(&mut self, walk: &Space<'_>, item: &Node, keys: &[String], path: &str) -> Option<Value> {
         let before = self.mistakes.len();
         let mut base = walk.example.clone();
@@ -329,16 +329,16 @@ impl Reader {
     }
 }
 
-/// What a space is read against.
+/// Schema for reading a space.
 struct Space<'a> {
     default: &'a StageSettings,
     example: &'a Value,
     owner: String,
-    /// Rather than of the stage that evaluates.
+    /// True for the stage itself, false for the stage that evaluates.
     of_stage: bool,
 }
 
-/// `{a: {b: item}}` for the keys `a`, `b`.
+/// Builds `{a: {b: item}}` for the keys `a`, `b`.
 fn nested(keys: &[String], item: &Node) -> Node {
     keys.iter().rev().fold(item.clone(), |value, key| {
         let at: Position = item.at;

@@ -1,4 +1,4 @@
-//! The rules of `sweep:`. Every value of a choice and both ends of a range are checked as if they stood in the stage.
+//! The rules of `sweep:`. Every value of a choice and both ends of a range are checked as values of the stage.
 
 use serde_json::Value;
 
@@ -11,7 +11,7 @@ use crate::stage::{Placement, StageSettings};
 use crate::sweep::{self, Domain, MAX_TRIALS, Rungs, SearchKind, Sweep, Values, evaluated_field};
 use crate::{ArtifactKind, StageName};
 
-/// Everything that can be said of a stage's sweep without looking at other stages.
+/// Checks a stage's sweep without other stages.
 pub(super) fn rules(stage: &PipelineStage) -> Vec<Problem> {
     let mut problems = Problems::default();
     let (p, Some(sweep)) = (&mut problems, &stage.sweep) else { return problems.0 };
@@ -93,7 +93,7 @@ pub(super) fn rules(stage: &PipelineStage) -> Vec<Problem> {
             let at = format!("{field}{at}");
             let problem = match sweep.with_values(&stage.settings, &Values::from([(path.clone(), value.clone())])) {
                 Ok(_) => None,
-                // What is wrong with the stage itself is said there, and what is wrong with its evaluation below.
+                // Problems of the stage itself are reported there, and those of its evaluation below.
                 Err(_) if !rules::stage(&stage.settings, &stage.placement).is_empty() => None,
                 Err(_) if !rules::stage(&sweep.evaluate, &Placement::default()).is_empty() => None,
                 Err(problem) => Some(problem),
@@ -103,12 +103,12 @@ pub(super) fn rules(stage: &PipelineStage) -> Vec<Problem> {
             }
         }
     }
-    // What is wrong with the stage's placement is said there.
+    // Problems of the stage's placement are reported there.
     p.0.extend(rules::stage(&sweep.evaluate, &Placement::default()).into_iter().map(in_evaluation));
     problems.0
 }
 
-/// What the reader makes sure of, for a sweep that came as JSON: each path is a setting that may be searched, each domain has values.
+/// Checks a sweep that arrived as JSON as the reader does: each path is a searchable setting, each domain has values.
 fn space_rules(p: &mut Problems, stage: &PipelineStage, sweep: &Sweep) {
     let settings = sweep.space.len();
     if !(1..=limits::SWEPT_SETTINGS).contains(&settings) {
@@ -144,7 +144,7 @@ fn space_rules(p: &mut Problems, stage: &PipelineStage, sweep: &Sweep) {
     }
 }
 
-/// The values of a domain that are tried before anything runs, with their places below it.
+/// Values of a domain that are checked before anything runs, with their places below it.
 fn tried(domain: &Domain, whole: bool) -> Vec<(String, Value)> {
     let end = |value: f64| if whole { Value::from(value as u64) } else { Value::from(value) };
     match domain {
@@ -162,7 +162,8 @@ fn in_evaluation(problem: Problem) -> Problem {
     Problem { field: format!("sweep.evaluate.{}", problem.field), ..problem }
 }
 
-/// Whether trials and their evaluations agree with the other stages, value by value. Call when the stages themselves do.
+/// Checks that trials and their evaluations agree with the other stages, value by value. Called once the stages
+/// themselves do.
 pub(super) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
     for (i, stage) in stages.iter().enumerate() {
         let Some(sweep) = &stage.sweep else { continue };

@@ -1,4 +1,4 @@
-//! `sweep:` as people write it, and each way to write it wrong.
+//! `sweep:` as users write it, and mistakes in each part.
 
 use std::collections::BTreeMap;
 
@@ -31,7 +31,7 @@ stages:
   out: {kind: register, model: m, from: pcm@best}
 ";
 
-/// (what is replaced, by what, where the mistake is reported, parts of its text)
+/// Cases: the text replaced, the replacement, the place of the mistake, and parts of its message.
 const CASES: &[(&str, &str, &str, &[&str])] = &[
     ("search: asha", "search: ahsa", "11:15", &["the text `ahsa`", "did you mean `asha`?"]),
     (
@@ -125,7 +125,7 @@ fn a_sweep_is_read() {
     assert_eq!((sweep.search, sweep.trials(), sweep.parallel), (SearchKind::Asha, 24, 4));
     assert_eq!(sweep.rungs(900), [100, 300, 900]);
     assert_eq!(sweep.rungs(800), [100, 300, 800]);
-    // Written as in the settings: an integer for a number that is none would give another key.
+    // Written as in the settings: an integer for a real number would give another key.
     assert_eq!(sweep.space["adversarial"], Domain::Choice(vec![0.0.into(), 0.1.into(), 1.0.into()]));
     assert_eq!(sweep.space["optimizer.beta1"], Domain::Uniform(0.5, 0.95));
     let fields: Vec<&str> = stage.inputs.iter().map(|input| input.field.as_str()).collect();
@@ -198,7 +198,7 @@ fn a_rung_is_the_stage_with_other_values_that_stops_early() {
     let state = last.inputs.last().unwrap();
     assert_eq!((state.field.as_str(), &state.stage), ("state", &rung_name(&"pcm".into(), 3, 0)));
     assert!(eval.inputs.iter().any(|input| input.field == "model" && input.stage == first.name));
-    // A trial for the whole budget has the key of the plain stage with its values: neither runs if the other has.
+    // A trial with the whole budget has the key of the plain stage with its values, so only one of them runs.
     let sets = ["pcm.adversarial=1".to_owned(), "pcm.skip=50".to_owned()];
     let mut plain = read("p.yaml", GOOD, &sets).unwrap_or_else(|e| panic!("{e}"));
     let inputs = BTreeMap::from([("teacher".to_owned(), Digest::of(b"t"))]);
@@ -211,7 +211,7 @@ fn a_rung_is_the_stage_with_other_values_that_stops_early() {
     assert!(stage.rung(0, 0, None, &impossible).unwrap_err().contains("divisor"));
 }
 
-/// Settings of the stage that evaluates are searched beside, or instead of, those of the stage.
+/// Settings of the evaluating stage are searched together with those of the stage, or alone.
 #[test]
 fn what_evaluates_can_be_searched() {
     let searched = "        evaluate: {samples: {choice: [1, 2]}, sampler: {guidance: {choice: [1, 2.5]}}}\n";
@@ -233,7 +233,7 @@ fn what_evaluates_can_be_searched() {
         (eval.settings.sampler().unwrap().guidance, other_eval.settings.sampler().unwrap().guidance),
         (1.0, 2.5)
     );
-    // They share one training, and differ in what measures it.
+    // The trials share one training and differ in their evaluation.
     let inputs = BTreeMap::from([("teacher".to_owned(), Digest::of(b"t"))]);
     assert_eq!(pipeline.identity(&train, &inputs), pipeline.identity(&other, &inputs));
     assert_ne!(pipeline.identity(&eval, &inputs), pipeline.identity(&other_eval, &inputs));

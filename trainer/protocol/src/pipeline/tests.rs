@@ -1,4 +1,4 @@
-//! The reader against files that are wrong in one way each, files that are wrong in many, and the shipped ones.
+//! The reader, tested with files that have one mistake each, files with many, and the shipped ones.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -7,7 +7,7 @@ use super::*;
 use crate::stage::{Keep, Mode};
 use crate::{Digest, Seed};
 
-/// A pipeline that is right; cases replace a part of it.
+/// A valid pipeline; cases replace a part of it.
 const GOOD: &str = "name: p
 seed: 7
 dataset: {format: synthetic, clips: 10}
@@ -27,16 +27,16 @@ stages:
   out: {kind: register, model: m, from: pcm, promote: {to: staging, require: [\"latent_fid <= 1\"]}}
 ";
 
-/// (what is replaced, by what, where the mistake is reported, parts of its text)
+/// Cases: the text replaced, the replacement, the place of the mistake, and parts of its message.
 const CASES: &[(&str, &str, &str, &[&str])] = &[
-    // The text.
+    // Mistakes in the text.
     ("name: p\n", "name: [p\n", "", &["not YAML"]),
     ("    lr: 1e-3\n", "\tlr: 1e-3\n", "8:", &["not YAML", "indent with spaces"]),
     ("seed: 7", "seed: 7\nseed: 8", "3:1", &["`seed` stands here a second time", "line 2"]),
     ("    steps: 10\n", "    steps: 10\n    steps: 11\n", "9:5", &["`steps` stands here a second time"]),
     ("name: p", "? [a]\n: b\nname: p", "1:", &["a key must be a text"]),
     ("name: p", "--- a\n--- b\nname: p", "", &["second document"]),
-    // The top.
+    // Mistakes in top-level keys.
     ("name: p\n", "", "1:1", &["no `name`"]),
     ("name: p", "name: p/q", "1:7", &["`p/q` is not a pipeline name"]),
     ("name: p", "name: 12", "1:7", &["the number `12`; expected a text", "quote it"]),
@@ -78,7 +78,7 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
     ),
     ("seed: 7", "text: {shards: 0}", "2:16", &["`shards` is 0; expected 1 to"]),
     ("seed: 7", "text: {dataset: vae}", "2:17", &["`vae` gives a VAE, but `dataset` needs a dataset"]),
-    // Stages.
+    // Mistakes in stages.
     (
         "kind: train.vae",
         "kind: train.vea",
@@ -130,7 +130,7 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
     ("sampler: {steps: 2,", "sampler: {steps: 1,", "", &["`pcm` has 2 phase(s)", "write `steps: 2`"]),
     ("{steps: 2, guidance: 2}", "{steps: 2, timesteps: [9, 99]}", "", &["expected the noisiest first"]),
     ("teacher: mld", "components: 600", "", &["a latent has only 512 numbers"]),
-    // References.
+    // Mistakes in references.
     (
         "kind: encode.latents, vae: vae",
         "kind: encode.latents, vae: vea",
@@ -240,7 +240,7 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
         &["no best are kept", "keep.best"],
     ),
     ("to: staging, ", "", "17:", &["names no alias"]),
-    // Two stages each fine alone.
+    // Two stages that are valid separately.
     (
         "  recon: ",
         "  judge: {kind: import.evaluator, format: kit, path: t2m}\n  real: {kind: evaluate.t2m, real: true, evaluator: judge}\n  recon: ",
@@ -301,7 +301,7 @@ fn each_mistake_is_named_with_its_place() {
         if !shown.contains(&format!("p.yaml:{place}")) {
             wrong.push(format!("{to:?}: expected place {place} in\n{shown}"));
         }
-        // A missing `latents` stage is missed by all who read it; everything else concerns one or two places.
+        // All readers of a missing `latents` stage report it; every other mistake has one or two places.
         let allowed = if to.contains("posteriors") { 4 } else { 2 };
         if error.0.len() > allowed {
             wrong.push(format!("{to:?}: {} messages for one mistake\n{shown}", error.0.len()));
@@ -381,7 +381,7 @@ fn bombs_are_refused() {
     assert!(read("p.yaml", &shared, &[]).is_ok());
 }
 
-/// What a small text may cost is bounded in bytes too, in the file and in overrides. Each of these took gigabytes, or a stack.
+/// The memory for a small text is limited too, in the file and in overrides. Each of these took gigabytes, or a stack.
 #[test]
 fn a_small_text_does_not_become_a_large_one() {
     let refused = |text: &str, part: &str| {
@@ -390,7 +390,7 @@ fn a_small_text_does_not_become_a_large_one() {
         assert!(shown.contains(part), "{part}: {}", &shown[..shown.len().min(500)]);
         assert!(shown.len() < 1 << 20, "{} bytes of messages", shown.len());
     };
-    // One long text, repeated.
+    // One long text, repeated often.
     let long = "x".repeat(7_000);
     refused(&format!("a: &a \"{long}\"\nb: [{}]\n", vec!["*a"; 10_000].join(",")), "bytes of text");
     refused(&format!("a: \"{}\"", "x".repeat(500 << 10)), "a text of 512000 bytes");
@@ -398,7 +398,7 @@ fn a_small_text_does_not_become_a_large_one() {
     // Anchors within anchors are copies too.
     let nested = (0..60).map(|i| format!("&a{i} [")).collect::<String>() + &"x,".repeat(2_000) + &"]".repeat(60);
     refused(&format!("a: {nested}"), "values once aliases are expanded");
-    // Every mistake shows its line; the line is the file.
+    // Every mistake shows its line; here the line is the file.
     let keys: Vec<String> = (0..9_000).map(|i| format!("unknown_{i}: 1")).collect();
     refused(&format!("{{{}}}", keys.join(", ")), "unknown key `unknown_0`");
     let many = read("p.yaml", &format!("{{{}}}", keys.join(", ")), &[]).unwrap_err();
@@ -416,7 +416,7 @@ fn a_small_text_does_not_become_a_large_one() {
     assert!(set(vec!["seed=1".into(); 1_001]).contains("1001 overrides"));
 }
 
-/// Cut, doubled, swapped and overwritten bytes: any answer will do, but no panic.
+/// Cut, doubled, swapped and overwritten bytes must not cause a panic.
 #[test]
 fn nothing_makes_the_reader_panic() {
     let mut state = 0x9e37_79b9_7f4a_7c15_u64;

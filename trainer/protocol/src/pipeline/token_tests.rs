@@ -1,8 +1,8 @@
-//! Stages of tokens that do not fit each other are refused before anything runs, where the mistake stands.
+//! Token stages that do not fit each other are refused before anything runs, at the position of the mistake.
 
 use super::read;
 
-/// A pipeline that is right; cases replace a part of it.
+/// A valid pipeline; cases replace a part of it.
 const GOOD: &str = "name: p
 dataset: {format: synthetic, clips: 10}
 stages:
@@ -56,7 +56,7 @@ fn what_does_not_fit_is_refused_where_it_stands() {
         ("model: momask, decoder: flow", "model: momask, decoder: latent_flow", 14, "reads the latents of `vae`"),
         ("tokenizer: residual, teacher: flow", "tokenizer: plain, teacher: flow", 19, "is of `plain`"),
         ("teacher: flow}", "teacher: latent_flow}", 19, "reads the latents of `vae`"),
-        // Another skeleton.
+        // Clips of another skeleton.
         (
             "{kind: train.discord, tokenizer",
             "{kind: train.discord, dataset: kit, tokenizer",
@@ -81,16 +81,16 @@ fn what_does_not_fit_is_refused_where_it_stands() {
             21,
             "`judge` is for skeletons of 21 joints",
         ),
-        // Lengths that are no multiple of the down-sampling.
+        // Lengths that are not a multiple of the down-sampling.
         ("window: 64", "window: 63", 13, "expected a multiple of 4"),
         ("quantizers: 1, codes: 64", "quantizers: 1, window: 66", 8, "expected a multiple of 4"),
         ("padded: 196", "padded: 198", 9, "expected a multiple of 4"),
-        // MMM's own.
+        // Mistakes in MMM's own settings.
         ("generator: mmm, ", "generator: mmm, text: words, ", 12, "embeds the captions of `kit`"),
         ("generator: mmm, ", "generator: mmm, dataset: kit, ", 12, "but `dataset` is `kit`"),
         ("generator: mmm, ", "generator: mmm, network: {word_blocks: 10}, ", 12, "`network.layers`, 9"),
         ("guidance: 0}", "guidance: 2}", 22, "`mmm` has none"),
-        // What needs denoising, or latents.
+        // Kinds that need denoising, or latents.
         (
             "kind: evaluate.t2m, model: mmm, evaluator: judge",
             "kind: evaluate.spectrum, model: mmm",
@@ -104,7 +104,7 @@ fn what_does_not_fit_is_refused_where_it_stands() {
             "no latent diffusion",
         ),
         ("model: momask, decoder: flow", "model: judge, decoder: flow", 14, "needs a model"),
-        // Networks that give something else.
+        // Networks with another prediction.
         (
             "init: flow",
             "init: whole",

@@ -1,4 +1,4 @@
-//! What a sweep means for the pipeline around it: what it reads, who may read it, and the stages that a trial is made of.
+//! Effects of a sweep on the pipeline: its inputs, its readers, and the stages of a trial.
 
 use super::definition::{IN_EVALUATION, PipelineStage, StageInput};
 use super::graph;
@@ -7,10 +7,10 @@ use crate::stage::{Shape, StageSettings, Target};
 use crate::sweep::{Derived, STATE_OUTPUT, Values, beside, evaluated_field, rung_name};
 use crate::{ArtifactKind, StageName, Steps};
 
-/// What is written behind the name of a swept stage to say that its best trial is meant. It always is.
+/// Optional suffix of a swept stage's name; a reference to a swept stage always means its best trial.
 const BEST: &str = "@best";
 
-/// What a swept stage reads because its trials' evaluations do.
+/// References of a swept stage through its trials' evaluations.
 pub(super) fn references(stage: &PipelineStage) -> Vec<StageInput> {
     let Some(sweep) = &stage.sweep else { return Vec::new() };
     let evaluated = evaluated_field(&sweep.evaluate, stage.settings.output().kind);
@@ -19,7 +19,8 @@ pub(super) fn references(stage: &PipelineStage) -> Vec<StageInput> {
     inputs.map(|input| StageInput { field: format!("{IN_EVALUATION}{}", input.field), ..input }).collect()
 }
 
-/// Takes `@best` off references to swept stages: what such a stage gives is its best trial. A name that no stage has is a model's.
+/// Removes `@best` from references to swept stages, whose output is always their best trial. A name without a stage is
+/// a model's.
 pub(super) fn resolve_best<'a>(
     stage: &mut PipelineStage,
     stages: impl Iterator<Item = (&'a StageName, bool)> + Clone,
@@ -47,7 +48,7 @@ pub(super) fn resolve_best<'a>(
     problems.0
 }
 
-/// Makes the reference `field`, such as `teacher` or `from[0]`, name another stage.
+/// Changes the reference `field`, such as `teacher` or `from[0]`, to another stage.
 fn refer(settings: &mut StageSettings, field: &str, stage: &str) {
     if let Some(reference) = settings.refs().into_iter().find(|reference| reference.field == field) {
         stage.clone_into(reference.name);
@@ -55,11 +56,11 @@ fn refer(settings: &mut StageSettings, field: &str, stage: &str) {
 }
 
 impl PipelineStage {
-    /// The stages of one rung of a trial: the training up to step `stop` (to the end, if `None`), which goes on from the rung before,
-    /// and the evaluation of what it gives.
+    /// The stages of one rung of a trial: the training up to step `stop` (to the end, if `None`), which continues the
+    /// rung before, and the evaluation of its output.
     ///
     /// # Errors
-    /// Why `values` cannot be tried, such as two that are each fine alone.
+    /// The reason that `values` cannot be tried, such as two values that conflict.
     pub fn rung(&self, trial: usize, rung: usize, stop: Option<Steps>, values: &Values) -> Result<[Self; 2], String> {
         let sweep = self.sweep.as_ref().ok_or("the stage has no sweep")?;
         let (mut settings, mut evaluation) = sweep.with_values(&self.settings, values)?;

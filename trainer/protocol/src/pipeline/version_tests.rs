@@ -1,4 +1,4 @@
-//! Versions of the registry where a stage may stand: taken apart from stages, refused where none can be.
+//! Registry versions as inputs of stages: distinguished from stages, and refused where none is allowed.
 
 use std::collections::BTreeMap;
 
@@ -35,7 +35,7 @@ fn versions_are_no_edges_and_their_digests_are_inputs() {
     let edges: Vec<&str> = pipeline.stage(&"lcm".into()).unwrap().inputs.iter().map(|i| i.field.as_str()).collect();
     assert_eq!(edges, ["latents", "text"]);
 
-    // Its key is made of the digest, not of the name that led there.
+    // The key contains the digest, not the name that was resolved to it.
     let key = |pipeline: &super::Pipeline| {
         let stage = pipeline.stage(&"vae".into()).unwrap();
         pipeline.identity(stage, &BTreeMap::from([("dataset".to_owned(), Digest::of(b"d"))])).key()
@@ -54,7 +54,7 @@ fn versions_are_no_edges_and_their_digests_are_inputs() {
     fill(&mut other, Digest::of(b"two"));
     assert_ne!(key(&other), one);
     assert_ne!(without, one);
-    // What nobody asked for is refused.
+    // An input that is not a reference is refused.
     fill(&mut pipeline, Digest::of(b"one"));
     pipeline.stages[0].external.insert("init".into(), Digest::of(b"x"));
     assert!(pipeline.check().unwrap_err().contains("which it does not read"));

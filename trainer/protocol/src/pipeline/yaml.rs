@@ -1,9 +1,9 @@
-//! YAML as a tree whose every key and value knows where it stands.
+//! YAML as a tree whose every key and value has a position.
 //!
-//! Built from the parser's events rather than from a ready-made document type, because we want every duplicate key with
-//! both its places, and bounds ([`limits`]) that hold before anything is allocated. An alias is a copy of what it names, so
-//! a [`Budget`] counts the values and the bytes of text of every copy, before it is made; a file and its overrides share one.
-//! Plain scalars follow the YAML 1.2 core schema, so `no` and `on` are texts.
+//! Built from the parser's events rather than from a ready-made document type. So every duplicate key is reported with
+//! both positions, and limits ([`limits`]) apply before memory is allocated. An alias is a copy of its anchor, so a
+//! [`Budget`] counts the values and the bytes of text of every copy before it is made. A file and its overrides share
+//! one budget. Plain scalars follow the YAML 1.2 core schema, so `no` and `on` are texts.
 
 use std::collections::HashMap;
 
@@ -13,7 +13,7 @@ use serde_json::{Number, Value};
 use super::diagnostic::Position;
 use crate::limits;
 
-/// What may still be read.
+/// Remaining size that may be read.
 #[derive(Debug)]
 pub(super) struct Budget(Size);
 
@@ -23,32 +23,32 @@ impl Default for Budget {
     }
 }
 
-/// What a value takes in memory.
+/// Size of a value in memory.
 #[derive(Debug, Clone, Copy)]
 struct Size {
     values: usize,
     bytes: usize,
 }
 
-/// A value and where it begins.
+/// A value and its position.
 #[derive(Debug, Clone)]
 pub(super) struct Node {
     pub(super) at: Position,
     pub(super) value: Content,
 }
 
-/// What a node is.
+/// Content of a node.
 #[derive(Debug, Clone)]
 pub(super) enum Content {
-    /// Null, a flag, a number or a text. A number that is not finite keeps its text.
+    /// Null, a boolean, a number or a text. A number that is not finite keeps its text.
     Scalar { value: Value, text: String, plain: bool },
-    /// A list.
+    /// A list of nodes.
     List(Vec<Node>),
     /// A mapping in the order of the file; keys are unique.
     Map(Vec<Entry>),
 }
 
-/// A key with its value.
+/// A key and its value.
 #[derive(Debug, Clone)]
 pub(super) struct Entry {
     pub(super) key: String,
@@ -56,7 +56,7 @@ pub(super) struct Entry {
     pub(super) value: Node,
 }
 
-/// A mistake in the text itself.
+/// A syntax error in the text.
 #[derive(Debug)]
 pub(super) struct YamlError {
     pub(super) at: Position,
@@ -76,7 +76,7 @@ impl Node {
         self.map()?.iter().find(|entry| entry.key == key)
     }
 
-    /// The text of a scalar that is a text.
+    /// Text of a scalar, if it is a text.
     pub(super) fn as_text(&self) -> Option<&str> {
         match &self.value {
             Content::Scalar { value: Value::String(text), .. } => Some(text),
@@ -101,7 +101,7 @@ impl Node {
         size
     }
 
-    /// As JSON; `None` if a number in it is not finite.
+    /// Converts to JSON; `None` if a number is not finite.
     pub(super) fn to_json(&self) -> Option<Value> {
         Some(match &self.value {
             Content::Scalar { value, text, plain } => {
@@ -117,7 +117,7 @@ impl Node {
         })
     }
 
-    /// For a message: `the text `x``, `the number 3`, `a list`.
+    /// Description for a message: `the text `x``, `the number 3`, `a list`.
     pub(super) fn describe(&self) -> String {
         match &self.value {
             Content::Scalar { text, plain: true, .. } if is_not_finite(text) => format!("`{}`", shortened(text)),
@@ -131,20 +131,20 @@ impl Node {
     }
 }
 
-/// The beginning of a text, for a message.
+/// Start of a text, for a message.
 pub(super) fn shortened(text: &str) -> String {
     let short: String = text.chars().take(40).collect();
     if short.len() < text.len() { short + "..." } else { short }
 }
 
-/// `.nan`, `.inf`, `nan`, `inf`, or digits that overflow.
+/// Returns true for `.nan`, `.inf`, `nan`, `inf`, or digits that overflow.
 fn is_not_finite(text: &str) -> bool {
     let bare = text.trim_start_matches(['+', '-', '.']).to_ascii_lowercase();
     matches!(bare.as_str(), "nan" | "inf" | "infinity")
         || (text.contains(|c: char| c.is_ascii_digit()) && text.parse::<f64>().is_ok_and(|number| !number.is_finite()))
 }
 
-/// A plain scalar by the core schema.
+/// Interprets a plain scalar by the core schema.
 fn resolve(text: &str) -> Value {
     match text {
         "" | "~" | "null" | "Null" | "NULL" => return Value::Null,
@@ -169,7 +169,7 @@ fn resolve(text: &str) -> Value {
     Value::String(text.to_owned())
 }
 
-/// Reads one document. `source` tells positions of different texts apart.
+/// Reads one document. `source` distinguishes positions of different texts.
 pub(super) fn parse(text: &str, source: usize, budget: &mut Budget) -> Result<Node, Vec<YamlError>> {
     let start = Position { source, line: 1, column: 1 };
     let fail = |message: String| vec![YamlError { at: start, message, help: None }];
@@ -210,7 +210,8 @@ pub(super) fn parse(text: &str, source: usize, budget: &mut Budget) -> Result<No
     }
 }
 
-/// A YAML text of somebody's as JSON, for small files other than pipelines: one document, unique keys, within a pipeline's [`limits`].
+/// Reads an untrusted YAML text as JSON, for small files other than pipelines: one document, unique keys, within a
+/// pipeline's [`limits`].
 ///
 /// # Errors
 /// Each mistake as `line:column: what`.
@@ -223,7 +224,7 @@ pub fn yaml_as_json(text: &str) -> Result<Value, Vec<String>> {
 
 enum Stop {
     Scan(ScanError),
-    /// A limit was passed; the mistake is recorded.
+    /// A limit was exceeded; the mistake is recorded.
     Limit,
 }
 
@@ -258,7 +259,7 @@ impl Builder<'_> {
         self.mistakes.push(YamlError { at, message: format!("this is not YAML: {}", error.info()), help });
     }
 
-    /// Takes `size` off the budget, or says that there is not so much left.
+    /// Subtracts `size` from the budget, or reports that it is exceeded.
     fn take(&mut self, span: Span, size: Size) -> Result<(), Stop> {
         let left = &mut self.budget.0;
         let (values, bytes) = (left.values.checked_sub(size.values), left.bytes.checked_sub(size.bytes));

@@ -1,32 +1,33 @@
-//! Which positions a controlled motion is told. Source: MotionLCM (Dai et al., ECCV 2024; v2 of late 2024), after OmniControl.
+//! Target positions of a controlled motion. Source: MotionLCM (Dai et al., ECCV 2024; v2 of late 2024), after
+//! OmniControl.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{DataFormat, Problems};
 
-/// When a motion's positions are told.
+/// Frames and joints that get targets.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum ControlSetting {
     /// All joints of the list, in the first frames: MotionLCM's task.
     #[default]
     Temporal,
-    /// In frames drawn at random; in training one joint of the list: OmniControl's task.
+    /// Frames drawn at random; in training one joint of the list: OmniControl's task.
     Spatial,
 }
 
-/// What is told of a motion in training.
+/// Target positions of a motion in training.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct ControlHints {
-    /// When.
+    /// Frames and joints that get targets.
     pub setting: ControlSetting,
-    /// Names of joints, or of sets of joints. `six` (K = 6 of the paper): pelvis, feet, head, wrists. `twelve` (K = 12, whose list is public
-    /// nowhere; ours adds hips, ankles and shoulders). `all` (K = 22).
+    /// Names of joints, or of sets of joints. `six` (K = 6 of the paper): pelvis, feet, head, wrists. `twelve` (K =
+    /// 12): its list is not public; ours adds hips, ankles and shoulders. `all` (K = 22).
     pub joints: Vec<String>,
-    /// Percent of the frames in which positions are told: drawn from this range, then rounded down to frames. [0, 100] in the spatial setting
-    /// stands for 1 to all but one frame, each number equally likely, as published.
+    /// Percent of the frames that get targets: drawn from this range, then rounded down to frames. [0, 100] in the
+    /// spatial setting means 1 to all but one frame, each number equally likely, as published.
     pub density: (f64, f64),
 }
 
@@ -37,7 +38,7 @@ impl Default for ControlHints {
 }
 
 impl ControlHints {
-    /// Whether any number of frames is as likely as another.
+    /// Returns true if all numbers of frames are equally likely.
     pub fn any_number(&self) -> bool {
         self.setting == ControlSetting::Spatial && self.density == (0.0, 100.0)
     }
@@ -61,14 +62,14 @@ const SETS: [&str; 3] = ["six", "twelve", "all"];
 
 /// HumanML3D: pelvis, feet, head, wrists.
 const SIX: [usize; 6] = [0, 10, 11, 15, 20, 21];
-/// And hips, ankles, shoulders.
+/// The six joints, hips, ankles and shoulders of HumanML3D.
 const TWELVE: [usize; 12] = [0, 1, 2, 7, 8, 10, 11, 15, 16, 17, 20, 21];
-/// The same of KIT-ML, which has no head above its upper neck.
+/// The six joints of KIT-ML, which has no head above its upper neck.
 const SIX_KIT: [usize; 6] = [0, 4, 7, 10, 15, 20];
 const TWELVE_KIT: [usize; 12] = [0, 4, 5, 7, 8, 10, 11, 13, 15, 16, 18, 20];
 
 impl DataFormat {
-    /// Names of its joints, by number.
+    /// Names of its joints, by index.
     pub const fn joints(self) -> &'static [&'static str] {
         match self {
             Self::Humanml3d => &[
@@ -121,10 +122,10 @@ impl DataFormat {
         }
     }
 
-    /// Numbers of the joints that `word` stands for: a joint's name, `six`, `twelve` or `all`.
+    /// Indices of the joints of `word`: a joint's name, `six`, `twelve` or `all`.
     ///
     /// # Errors
-    /// What the skeleton has instead.
+    /// An unknown word; the message lists the skeleton's joints.
     pub fn joints_of(self, word: &str) -> Result<Vec<usize>, String> {
         let names = self.joints();
         match (word, self) {
@@ -140,7 +141,7 @@ impl DataFormat {
         }
     }
 
-    /// Numbers of all joints that `words` stand for, each once, in the skeleton's order.
+    /// Indices of all joints of `words`, each once, in the skeleton's order.
     ///
     /// # Errors
     /// As [`joints_of`](Self::joints_of).
@@ -155,7 +156,7 @@ impl DataFormat {
     }
 }
 
-/// What can be said of a list of joints before the skeleton is known.
+/// Checks a list of joints before the skeleton is known.
 pub(super) fn check_words(p: &mut Problems, field: &str, words: &[String]) {
     if words.is_empty() {
         p.add(field, format!("`{field}` is empty; expected names of joints, `six`, `twelve` or `all`"), "");
@@ -173,7 +174,7 @@ pub(super) fn check_words(p: &mut Problems, field: &str, words: &[String]) {
     }
 }
 
-/// Refuses joints that the skeleton of `format` has not.
+/// Refuses joints that the skeleton of `format` lacks.
 pub(super) fn check_skeleton(p: &mut Problems, field: &str, words: &[String], format: Option<DataFormat>) {
     for (i, word) in words.iter().enumerate() {
         if let Some(Err(why)) = format.map(|format| format.joints_of(word)) {

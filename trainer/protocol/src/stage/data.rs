@@ -3,7 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Length-dependent rules of the two data formats.
+/// Skeleton, rate and unit of a data format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum DataFormat {
@@ -14,7 +14,7 @@ pub enum DataFormat {
 }
 
 impl DataFormat {
-    /// Its word in settings.
+    /// Name in settings.
     pub fn name(self) -> &'static str {
         match self {
             Self::Humanml3d => "humanml3d",
@@ -22,7 +22,7 @@ impl DataFormat {
         }
     }
 
-    /// Its skeleton in words.
+    /// Description of its skeleton.
     pub fn skeleton(self) -> &'static str {
         match self {
             Self::Humanml3d => "22 joints (humanml3d)",

@@ -1,26 +1,26 @@
-//! How a sample is noised, and what a network predicts of it.
+//! Noising of a sample, and the network's prediction.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::Problems;
 
-/// How noise grows over the timesteps.
+/// Growth of the noise over the timesteps.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum NoiseSchedule {
-    /// Square roots of the betas are equidistant. MLD, MotionLCM, MotionPCM.
+    /// The square roots of the betas are equidistant. MLD, MotionLCM, MotionPCM.
     #[default]
     ScaledLinear,
-    /// Betas are equidistant. DDPM; StableMoFusion with .0001 to .02.
+    /// The betas are equidistant. DDPM; StableMoFusion with .0001 to .02.
     Linear,
-    /// The signal's share of the variance is a squared cosine; no betas are given. Improved DDPM, MDM.
+    /// The signal's share of the variance is a squared cosine, without betas. Improved DDPM, MDM.
     Cosine,
     /// A straight line from sample to noise (rectified flow). DisCoRD.
     Flow,
 }
 
-/// What a network predicts of a noised sample.
+/// Quantity that a network predicts from a noised sample.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Prediction {
@@ -29,21 +29,21 @@ pub enum Prediction {
     Noise,
     /// The clean sample, called x0. MDM, StableMoFusion.
     Sample,
-    /// Of a diffusion `alpha noise - sigma sample` (Salimans and Ho), of a flow `noise - sample`.
+    /// For a diffusion `alpha noise - sigma sample` (Salimans and Ho), for a flow `noise - sample`.
     Velocity,
 }
 
-/// Noise schedule and prediction. Defaults are MLD's.
+/// Noise schedule and prediction. The defaults are MLD's.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Diffusion {
-    /// How noise grows over the 1000 timesteps.
+    /// Growth of the noise over the timesteps.
     pub schedule: NoiseSchedule,
     /// Share of the variance that becomes noise at the first timestep; for `scaled_linear` and `linear`.
     pub beta_first: f64,
-    /// The same at the last timestep.
+    /// Share of the variance that becomes noise at the last timestep.
     pub beta_last: f64,
-    /// What the network gives.
+    /// Quantity that the network predicts.
     pub prediction: Prediction,
 }
 

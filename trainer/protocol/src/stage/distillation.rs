@@ -1,4 +1,4 @@
-//! What both distillations share. Source: MotionLCM, MotionPCM.
+//! Common settings of both distillations. Source: MotionLCM, MotionPCM.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -6,17 +6,17 @@ use serde::{Deserialize, Serialize};
 use super::{Neighbours, Problems, Ref, Training};
 use crate::ArtifactKind;
 
-/// Which distance consistency losses use.
+/// Distance d in consistency losses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Distance {
-    /// `sqrt(d^2 + c^2) - c`.
+    /// Pseudo-Huber distance, `sqrt(d^2 + c^2) - c`.
     Huber,
     /// Mean squared error.
     L2,
 }
 
-/// What both distillations share.
+/// Common settings of both distillations.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default = "Distillation::motion_lcm")]
 pub struct Distillation {
@@ -26,25 +26,25 @@ pub struct Distillation {
     pub latents: String,
     /// Stage that gives the caption embeddings.
     pub text: String,
-    /// Guidance scale w is drawn from this range, in the form `cond + w (cond - uncond)`.
+    /// Range of the guidance scale w, which is drawn from it, in the form `cond + w (cond - uncond)`.
     pub guidance: (f64, f64),
     /// Width of the guidance embedding.
     pub guidance_dim: usize,
     /// Solver step k; the grid has 1000/k points.
     pub skip: usize,
-    /// Distance.
+    /// Distance of the consistency loss.
     pub distance: Distance,
     /// Pseudo-Huber constant c.
     pub huber_c: f64,
     /// Decay of the target network.
     pub ema: f64,
-    /// Dropout in the frozen networks, as the original script has it by accident.
+    /// Applies dropout in the frozen networks, as the original script does by mistake.
     pub upstream_dropout: bool,
-    /// Stage that gives a model whose denoiser the student begins with where shapes fit, or a version such as `motionlcm@prod`; empty begins with
-    /// the teacher's weights.
+    /// Stage or version, such as `motionlcm@prod`, whose denoiser supplies initial weights where shapes fit; empty
+    /// starts from the teacher's weights.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub init: String,
-    /// The rest.
+    /// Batch, schedule and optimizer.
     #[serde(flatten)]
     pub training: Training,
 }
@@ -80,7 +80,7 @@ impl Distillation {
         ]
     }
 
-    /// Points of the solver grid; `None` if `skip` is wrong.
+    /// Number of points of the solver grid; `None` if `skip` is invalid.
     pub(super) fn grid(&self) -> Option<usize> {
         (self.skip > 0 && 1000usize.is_multiple_of(self.skip)).then(|| 1000 / self.skip)
     }

@@ -1,23 +1,23 @@
-//! What evaluations share: which clips, which direction of a metric is better.
+//! Common settings of evaluations: the clips, and the direction of a metric.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Which clips an evaluation looks at.
+/// Clips that an evaluation uses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Split {
-    /// `train.txt`.
+    /// Clips of `train.txt`.
     Train,
-    /// `val.txt`.
+    /// Clips of `val.txt`.
     Val,
-    /// `test.txt`.
+    /// Clips of `test.txt`.
     Test,
-    /// All three.
+    /// Clips of all three lists.
     All,
 }
 
-/// Whether a smaller or a larger value is better.
+/// Direction of a metric.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Mode {

@@ -1,9 +1,9 @@
-//! What models that diffuse motion itself share.
+//! Common checks of models that diffuse motion itself.
 
 use super::{Diffusion, NoiseSchedule, Problems};
 use crate::limits;
 
-/// Checks a schedule of `timesteps` for samplers that draw among features.
+/// Checks a schedule of `timesteps` for samplers of features.
 pub(super) fn check_diffusion(p: &mut Problems, diffusion: &Diffusion, timesteps: usize) {
     diffusion.check(p);
     if diffusion.schedule == NoiseSchedule::Flow {
@@ -22,7 +22,7 @@ pub(super) fn check_frames(p: &mut Problems, max_frames: usize) {
     }
 }
 
-/// Refuses a network of more parameters than any.
+/// Refuses a network with more parameters than the limit.
 pub(super) fn check_parameters(p: &mut Problems, parameters: usize) {
     if parameters > limits::PARAMETERS {
         let message = format!("it has {parameters} parameters or more; expected at most {}", limits::PARAMETERS);

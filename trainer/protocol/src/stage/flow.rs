@@ -1,15 +1,15 @@
-//! How rectified flows are followed, by whichever kind trains or imports one.
+//! Solvers of rectified flows, for kinds that train or import one.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// How the flow is followed when motion is decoded.
+/// Solver of the flow for decoding motion.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum FlowSolver {
-    /// One evaluation of the network a step; the paper's text says 16 steps.
+    /// One evaluation of the network per step; the paper's text says 16 steps.
     Euler,
-    /// Two; the released code makes 15 steps.
+    /// Two evaluations of the network per step; the released code makes 15 steps.
     #[default]
     Midpoint,
 }

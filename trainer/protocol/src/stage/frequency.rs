@@ -1,8 +1,10 @@
-//! Losses that look at a motion's frequencies and at its meaning, each at the noise levels where it helps. Source: Free-T2M (Chen et al., 2025).
+//! Losses on a motion's frequencies and on its meaning, each at the noise levels where it helps. Source: Free-T2M (Chen
+//! et al., 2025).
 //!
-//! The paper prints no K, no threshold and no step at which its two stages part. Stages are here as its code has them for MDM of 50 steps
-//! (30 to 49 and 0 to 20), in shares of the noise schedule. K is 8 by default, a choice of ours; the code keeps one coefficient. The
-//! paper's text wants slow parts early in denoising, which is what this does; its code for StableMoFusion has the two stages the other way round.
+//! The paper prints no K, no threshold and no step between its two stages. The stages here are those of its code for
+//! MDM with 50 steps (30 to 49 and 0 to 20), as shares of the noise schedule. K is 8 by default, our choice; the code
+//! keeps one coefficient. The paper's text puts slow parts early in denoising, as here; its code for StableMoFusion has
+//! the two stages exchanged.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -10,45 +12,45 @@ use serde::{Deserialize, Serialize};
 use super::{Problems, Ref};
 use crate::ArtifactKind;
 
-/// How far apart two numbers are.
+/// Distance of two numbers with difference d.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Norm {
-    /// `|d|`: Free-T2M's paper.
+    /// Absolute error `|d|`: Free-T2M's paper.
     #[default]
     L1,
-    /// `d^2`: its code.
+    /// Squared error `d^2`: its code.
     L2,
 }
 
-/// What a term's sum over samples is divided by.
+/// Divisor of a term's sum over samples.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Over {
-    /// The samples of the batch at whose noise levels the term acts.
+    /// The samples of the batch at noise levels of the term.
     #[default]
     Stage,
     /// All samples of the batch.
     Batch,
 }
 
-/// The slow part of the predicted motion.
+/// The term on the slow part of the predicted motion.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct LowFrequency {
-    /// Weight; 0 leaves the term out.
+    /// Weight of the term; 0 leaves it out.
     pub weight: f64,
-    /// K: coefficients of the cosine transform that are compared. Number k stands for `k fps / 2n` Hz in n frames.
+    /// Number K of compared coefficients of the cosine transform. Coefficient k is at `k fps / 2n` Hz in n frames.
     pub keep: usize,
     /// Distance of the slow parts.
     pub distance: Norm,
-    /// Least noise at which the term acts, as a share of the timesteps.
+    /// Lowest noise at which the term acts, as a share of the timesteps.
     pub from: f64,
-    /// Most noise at which the term acts.
+    /// Highest noise at which the term acts, as a share of the timesteps.
     pub to: f64,
-    /// Transforms a clip's own frames; the published code transforms padding too.
+    /// Transforms only a clip's own frames; the published code transforms padding too.
     pub masked: bool,
-    /// What the mean is over.
+    /// Samples over which the mean is taken.
     pub over: Over,
 }
 
@@ -59,21 +61,22 @@ impl Default for LowFrequency {
     }
 }
 
-/// The meaning of the predicted motion: how well its embedding agrees with that of the real one.
+/// The term on the meaning of the predicted motion: agreement of its embedding with that of the real motion.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Semantic {
-    /// Weight; 0 leaves the term out.
+    /// Weight of the term; 0 leaves it out.
     pub weight: f64,
-    /// Stage that gives the evaluator which embeds. No evaluation may measure with the same one.
+    /// Stage that gives the evaluator for the embeddings. No evaluation may measure with the same one.
     pub evaluator: String,
-    /// Least noise at which the term acts, as a share of the timesteps.
+    /// Lowest noise at which the term acts, as a share of the timesteps.
     pub from: f64,
-    /// Most noise at which the term acts.
+    /// Highest noise at which the term acts, as a share of the timesteps.
     pub to: f64,
-    /// Pulls only while the cosine of the two embeddings is below this; at 1 it pulls everywhere, as the published code does.
+    /// Threshold of the embeddings' cosine, below which the term has a gradient; with 1 it always has, as in the
+    /// published code.
     pub threshold: f64,
-    /// What the mean is over.
+    /// Samples over which the mean is taken.
     pub over: Over,
 }
 
@@ -83,13 +86,13 @@ impl Default for Semantic {
     }
 }
 
-/// Losses besides that of denoising; none by default.
+/// Losses in addition to the denoising loss; off by default.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct FrequencyLosses {
-    /// On the slow part.
+    /// Term on the slow part.
     pub low_frequency: LowFrequency,
-    /// On the meaning.
+    /// Term on the meaning.
     pub semantic: Semantic,
 }
 
@@ -97,7 +100,7 @@ impl FrequencyLosses {
     /// The field of the semantic term's evaluator.
     pub const EVALUATOR: &'static str = "losses.semantic.evaluator";
 
-    /// Whether there is any term.
+    /// Returns true if any term has a weight.
     pub fn any(&self) -> bool {
         self.low_frequency.weight > 0.0 || self.semantic.weight > 0.0
     }

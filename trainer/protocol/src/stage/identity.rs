@@ -1,4 +1,4 @@
-//! What decides a stage's value.
+//! The identity of a stage, which decides its value.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::StageSettings;
 use crate::{Digest, Seed, StageName};
 
-/// Which backend computes. Part of a stage's key: other backends give other bits.
+/// Backend that computes. Part of a stage's key: other backends give other bits.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Backend {
@@ -17,14 +17,14 @@ pub enum Backend {
     Flex,
     /// Burn's older CPU backend.
     Ndarray,
-    /// WebGPU.
+    /// GPUs through WebGPU.
     Wgpu,
-    /// CUDA.
+    /// NVIDIA GPUs through CUDA.
     Cuda,
 }
 
 impl Backend {
-    /// The name in YAML and on the command line.
+    /// Name in YAML and on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::Flex => "flex",
@@ -35,12 +35,12 @@ impl Backend {
     }
 }
 
-/// All that decides a stage's value; its digest is the stage's key.
+/// Everything that decides a stage's value; its digest is the stage's key.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageIdentity {
-    /// Settings, without references to other stages and without paths: their digests stand in `inputs`.
+    /// Settings without references to other stages and without paths, whose digests are in `inputs`.
     pub settings: StageSettings,
-    /// The kind's code version.
+    /// Code version of the kind.
     pub code_version: u32,
     /// Artifacts by the field that names them.
     pub inputs: BTreeMap<String, Digest>,
@@ -48,7 +48,7 @@ pub struct StageIdentity {
     pub seed: Seed,
     /// The stage's name keys its randomness, so that two PCM stages of one pipeline draw different noise.
     pub name: StageName,
-    /// Which backend computes.
+    /// Backend that computes.
     pub backend: Backend,
 }
 

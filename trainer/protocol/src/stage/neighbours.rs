@@ -1,4 +1,4 @@
-//! The other stages of a pipeline, as a kind's checks see them: found by following references, not by kind.
+//! The other stages of a pipeline for a kind's checks, found by following references, not by kind.
 
 use std::any::Any;
 use std::collections::{BTreeMap, BTreeSet};
@@ -6,42 +6,41 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::{DataFormat, Family, LatentShape, Problems, Sampler};
 use crate::{ArtifactKind, StageName};
 
-/// What other stages may ask of a stage; all its settings, if they know its kind.
+/// Properties of a stage for the checks of other stages; all its settings, if they know its kind.
 pub trait Neighbour: std::fmt::Debug {
-    /// Its kind's name in YAML.
+    /// Name of its kind in YAML.
     fn kind(&self) -> &'static str;
-    /// The stages that it reads: field, stage, what that stage must give.
+    /// Stages that it reads: field, stage, kind that the stage must output.
     fn inputs(&self) -> Vec<(String, String, ArtifactKind)>;
-    /// The stage that it measures.
+    /// Stage that it measures.
     fn evaluated_model(&self) -> Option<String>;
-    /// How it draws from what it measures.
+    /// Sampler for the model that it measures.
     fn sampler(&self) -> Option<&Sampler>;
-    /// The values that it may give, if it is an evaluation that says so.
+    /// Names of the values that it may return, if it is an evaluation with known values.
     fn metrics(&self) -> Option<BTreeSet<String>>;
-    /// What the model that it trains can do.
+    /// Family of the model that it trains.
     fn family(&self) -> Option<Family>;
-    /// The skeleton of what it gives, if it decides that.
+    /// Skeleton of its output, if it decides that.
     fn format(&self) -> Option<DataFormat>;
-    /// The shape of the latents that it gives or works on, if it decides that.
+    /// Shape of the latents that it outputs or uses, if it decides that.
     fn latent(&self) -> Option<LatentShape>;
-    /// Its settings.
     fn settings(&self) -> &dyn Any;
 }
 
 impl dyn Neighbour + '_ {
-    /// The settings of kind `S`, if it is of that kind.
+    /// Returns the settings of kind `S`, if it is of that kind.
     pub fn get<S: 'static>(&self) -> Option<&S> {
         self.settings().downcast_ref()
     }
 }
 
-/// The stages of a pipeline by name. References are sound: they lead to stages that give the right kind, and nowhere in a circle.
+/// The stages of a pipeline by name. References are valid: they lead to stages of the right kind, without a cycle.
 #[derive(Debug)]
 pub struct Neighbours<'a> {
     stages: BTreeMap<&'a str, &'a dyn Neighbour>,
-    /// For each stage, the stages that it reads by what they give.
+    /// For each stage, the stages that it reads, with the kind of their output.
     reads: BTreeMap<&'a str, Vec<(ArtifactKind, String)>>,
-    /// For each measured stage, the evaluations of it and how they draw.
+    /// For each measured stage, its evaluations and their samplers.
     measured: BTreeMap<String, Vec<(&'a str, Option<&'a Sampler>)>>,
 }
 
@@ -49,7 +48,7 @@ impl<'a> Neighbours<'a> {
     pub(crate) fn new(stages: impl Iterator<Item = (&'a StageName, &'a dyn Neighbour)>) -> Self {
         let stages: BTreeMap<&str, &dyn Neighbour> = stages.map(|(name, settings)| (name.as_str(), settings)).collect();
         let read = |settings: &dyn Neighbour| -> Vec<(ArtifactKind, String)> {
-            // What a training begins with says nothing of what it gives.
+            // The source of a training's initial weights does not determine its output.
             let read = settings.inputs().into_iter().filter(|(field, ..)| field != "init");
             read.map(|(_, stage, kind)| (kind, stage)).collect()
         };
@@ -63,35 +62,35 @@ impl<'a> Neighbours<'a> {
         Self { stages, reads, measured }
     }
 
-    /// The stage of that name.
+    /// Finds the stage with this name.
     pub fn stage(&self, name: &str) -> Option<&'a dyn Neighbour> {
         self.stages.get(name).copied()
     }
 
-    /// The first stage giving `kind` that stage `name` reads.
+    /// The first stage with output `kind` that stage `name` reads.
     pub fn read_by(&self, name: &str, kind: ArtifactKind) -> Option<&str> {
         self.reads.get(name)?.iter().find(|(found, _)| *found == kind).map(|(_, stage)| stage.as_str())
     }
 
-    /// Which VAE the latents were encoded with.
+    /// The VAE that encoded the latents.
     pub fn vae_of_latents(&self, latents: &str) -> Option<&str> {
         self.read_by(latents, ArtifactKind::Vae)
     }
 
-    /// Which VAE made the latents that a model was trained on.
+    /// The VAE of the latents that a model was trained on.
     pub fn vae_of_model(&self, model: &str) -> Option<&str> {
         let of_latents = |name: &str| self.vae_of_latents(self.read_by(name, ArtifactKind::Latents)?);
-        // What is imported reads no latents.
+        // An imported model reads no latents.
         self.of_model(model, &|name| of_latents(name).or_else(|| self.read_by(name, ArtifactKind::Vae)))
     }
 
-    /// What a model can do.
+    /// Family of a model.
     pub fn family(&self, model: &str) -> Option<Family> {
         self.of_model(model, &|name| self.stage(name)?.family())
     }
 
-    /// What `own` says of the stage that trained `model`. A stage that only passes models on, such as `register`, is asked for what all of
-    /// those have in common.
+    /// Property `own` of the stage that trained `model`. A stage that only passes models on, such as `register`, has it
+    /// if all its models agree.
     fn of_model<T: PartialEq>(&self, model: &str, own: &dyn Fn(&str) -> Option<T>) -> Option<T> {
         if let Some(found) = own(model) {
             return Some(found);
@@ -102,12 +101,12 @@ impl<'a> Neighbours<'a> {
         all.all(|other| other.as_ref() == Some(&first)).then_some(first)
     }
 
-    /// The clips behind latents or caption embeddings.
+    /// The clips of latents or caption embeddings.
     pub fn dataset_of(&self, name: &str) -> Option<&str> {
         self.read_by(name, ArtifactKind::Dataset)
     }
 
-    /// The skeleton of a dataset, of a model's motions, or the one that an evaluator is for.
+    /// Skeleton of a dataset, of a model's motions, or of an evaluator.
     pub fn format(&self, name: &str) -> Option<DataFormat> {
         self.stage(name)?.format().or_else(|| {
             let of = |kind| self.read_by(name, kind);
@@ -118,25 +117,25 @@ impl<'a> Neighbours<'a> {
         })
     }
 
-    /// The shape of a VAE's latents.
+    /// Shape of a VAE's latents.
     pub fn latent(&self, vae: &str) -> Option<LatentShape> {
         self.stage(vae)?.latent()
     }
 
-    /// Whether an evaluation measures stage `name`.
+    /// Returns true if an evaluation measures stage `name`.
     pub fn measures(&self, name: &str) -> bool {
         self.measured.contains_key(name)
     }
 
-    /// The evaluations of the pipeline that draw from stage `name`, and how. What evaluates a sweep's trials is none of them: it has a dot
-    /// in its name, which no name of a user's has.
+    /// Evaluations of the pipeline that sample from stage `name`, and their samplers. The evaluation of a sweep's
+    /// trials is not included: its name contains a dot, unlike users' names.
     pub fn samplers_of(&self, name: &str) -> impl Iterator<Item = (&'a str, &'a Sampler)> {
         let all = self.measured.get(name).into_iter().flatten().filter(|(evaluation, _)| !evaluation.contains('.'));
         all.filter_map(|(evaluation, sampler)| Some((*evaluation, (*sampler)?)))
     }
 
-    /// The metrics that a version of stage `name` may have: those of the evaluations that measure it, each also behind its evaluation's name
-    /// where there are several. `None` if nothing measures it, or an evaluation does not say what it gives.
+    /// Metrics that a version of stage `name` may have: those of the evaluations that measure it. If there are several,
+    /// each also has its evaluation's name as prefix. `None` if no evaluation measures it, or one has unknown values.
     pub fn metrics_of(&self, name: &str) -> Option<BTreeSet<String>> {
         let looking = self.measured.get(name)?.iter().map(|(evaluation, _)| *evaluation);
         let looking: Vec<&str> = looking.filter(|evaluation| !evaluation.contains('.')).collect();
@@ -151,7 +150,7 @@ impl<'a> Neighbours<'a> {
         (!all.is_empty()).then_some(all)
     }
 
-    /// Refuses latents of another VAE than `vae`, which `field` stands for.
+    /// Refuses latents of another VAE than `vae`, the value of `field`.
     pub(crate) fn same_vae(&self, p: &mut Problems, (field, vae): (&str, Option<&str>), latents: &str) {
         if let (Some(vae), Some(other)) = (vae, self.vae_of_latents(latents))
             && vae != other
@@ -179,7 +178,7 @@ impl<'a> Neighbours<'a> {
         }
     }
 
-    /// Refuses clips other than those that `latents` were encoded from.
+    /// Refuses clips other than those of `latents`.
     pub(crate) fn same_clips(&self, p: &mut Problems, dataset: &str, latents: &str) {
         if let Some(data) = self.dataset_of(latents)
             && data != dataset
@@ -189,7 +188,7 @@ impl<'a> Neighbours<'a> {
         }
     }
 
-    /// Refuses clips of another skeleton than what stage `name`, which `field` names, is for.
+    /// Refuses clips of another skeleton than that of stage `name`, the value of `field`.
     pub(crate) fn same_skeleton(&self, p: &mut Problems, (field, name): (&str, &str), dataset: &str) {
         if let (Some(ours), Some(theirs)) = (self.format(dataset), self.format(name))
             && ours != theirs
@@ -203,7 +202,8 @@ impl<'a> Neighbours<'a> {
         }
     }
 
-    /// Refuses a flow decoder of other tokens than those of `encoder`, or of other latents; `field` names the stage `name` that gives it.
+    /// Refuses a flow decoder of other tokens or latents than those of `encoder`; stage `name`, the value of `field`,
+    /// outputs it.
     pub(crate) fn same_codes(&self, p: &mut Problems, (field, name): (&str, &str), encoder: &str) {
         let decoded = |kind| self.read_by(name, kind).filter(|other| *other != encoder);
         if let Some(other) = decoded(ArtifactKind::Tokenizer) {
@@ -226,17 +226,17 @@ impl<'a> Neighbours<'a> {
         }
     }
 
-    /// The evaluator against whose embeddings a model was trained, if there is one.
+    /// The evaluator in the losses of a model's training, if there is one.
     pub(crate) fn evaluator_of_model(&self, model: &str) -> Option<&str> {
         self.of_model(model, &|name| self.read_by(name, ArtifactKind::Evaluator))
     }
 
-    /// Which tokenizer's codes a model draws.
+    /// The tokenizer whose codes a model generates.
     pub(crate) fn tokenizer_of_model(&self, model: &str) -> Option<&str> {
         self.of_model(model, &|name| self.read_by(name, ArtifactKind::Tokenizer))
     }
 
-    /// Refuses anything but a latent teacher where one is needed.
+    /// Refuses any model but a latent teacher.
     pub(crate) fn is_teacher(&self, p: &mut Problems, teacher: &str) {
         let (Some(settings), Some(family)) = (self.stage(teacher), self.family(teacher)) else { return };
         let (what, why) = match family {
@@ -253,7 +253,7 @@ impl<'a> Neighbours<'a> {
         p.add("teacher", message, why);
     }
 
-    /// Refuses steps and timesteps that the model does not have.
+    /// Refuses steps and timesteps that the model does not support.
     pub(crate) fn check_sampler(&self, p: &mut Problems, model: &str, sampler: &Sampler) {
         if let Some(family) = self.family(model) {
             family.check(&format!("`{model}`"), sampler, p);

@@ -6,21 +6,21 @@ use serde::{Deserialize, Serialize};
 use super::Problems;
 use crate::limits;
 
-/// A model's size. The published networks: width 256, 9 layers, 4 heads, feed-forward 1024, dropout 0.1.
+/// Size of a transformer. The published networks: width 256, 9 layers, 4 heads, feed-forward 1024, dropout 0.1.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Network {
     /// Width H of the tokens.
     pub width: usize,
-    /// Transformer blocks in the skip stack; odd.
+    /// Number of transformer blocks in the skip stack; odd.
     pub layers: usize,
-    /// Attention heads; divides `width`.
+    /// Number of attention heads; divides `width`.
     pub heads: usize,
     /// Width of the feed-forward layer.
     pub feed_forward: usize,
-    /// Dropout probability.
+    /// Probability of dropout.
     pub dropout: f64,
-    /// What the learned position tables start from.
+    /// Initial values of the learned position tables.
     pub positions: Positions,
 }
 
@@ -60,15 +60,16 @@ impl Network {
     }
 }
 
-/// What learned position tables start from. The tables are trained either way and import and export alike.
+/// Initial values of learned position tables. The tables are trained, imported and exported in either case.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Positions {
-    /// Uniform on [0, 1), as published: frames start out almost alike.
+    /// Uniform on [0, 1), as published: frames are almost equal at first.
     #[default]
     Uniform,
-    /// `[sin | cos]` of the position at frequencies `10000^(-2i/width)`. Measured on the mini HumanML3D set with a 5+5-layer
-    /// VAE of width 128, one core: feature loss .136 after 1,500 updates, where the published start has .188.
+    /// `[sin | cos]` of the position at frequencies `10000^(-2i/width)`. Measured on the mini HumanML3D set with a
+    /// 5+5-layer VAE of width 128, one core: feature loss .136 after 1,500 updates, .188 with the published
+    /// initialisation.
     Sinusoid,
 }
 
@@ -76,7 +77,7 @@ pub enum Positions {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct LatentShape {
-    /// N latent tokens.
+    /// Number N of latent tokens.
     pub tokens: usize,
     /// Width d of a latent token.
     pub dim: usize,

@@ -1,4 +1,4 @@
-//! What cannot change a stage's value: where it runs and how often it saves.
+//! Settings that cannot change a stage's value: number of workers and cadence of checkpoints.
 
 use std::collections::BTreeMap;
 
@@ -8,11 +8,11 @@ use serde::{Deserialize, Serialize};
 use super::{Mode, Problems};
 use crate::Steps;
 
-/// What cannot change a stage's value: where it runs and how often it saves.
+/// Settings that cannot change a stage's value: number of workers and cadence of checkpoints.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, Default)]
 #[serde(default)]
 pub struct Placement {
-    /// How many workers a gang takes.
+    /// Number of workers of a gang.
     pub workers: WorkerRange,
     /// Checkpoint cadence and retention.
     pub checkpoint: CheckpointPolicy,
@@ -41,13 +41,13 @@ impl Placement {
     }
 }
 
-/// How many workers a gang takes.
+/// Number of workers of a gang.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct WorkerRange {
-    /// Below this many it yields and waits.
+    /// Smallest number; with fewer the stage yields and waits.
     pub min: usize,
-    /// Above this many it takes no more; 0 is no bound.
+    /// Largest number; 0 means no limit.
     pub max: usize,
 }
 
@@ -57,13 +57,13 @@ impl Default for WorkerRange {
     }
 }
 
-/// When checkpoints are saved and which are kept.
+/// Cadence and retention of checkpoints.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct CheckpointPolicy {
-    /// Saved after every so many steps; 0 saves only when the stage yields.
+    /// Number of steps between checkpoints; 0 saves only when the stage yields.
     pub every: Steps,
-    /// Kept.
+    /// Checkpoints to keep.
     pub keep: Keep,
 }
 
@@ -73,17 +73,18 @@ impl Default for CheckpointPolicy {
     }
 }
 
-/// Which checkpoints of a task are kept; the union.
+/// Checkpoints of a task to keep; the union of both rules.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Keep {
-    /// Newest.
+    /// Number of newest checkpoints to keep.
     pub latest: usize,
-    /// Best by `metric`.
+    /// Number of best checkpoints by `metric` to keep.
     pub best: usize,
-    /// One of the values that the stage saves with its checkpoints: means over the last hundred steps of what it records.
+    /// A value that the stage saves with its checkpoints; each is a mean of recorded values over the last hundred
+    /// steps.
     pub metric: String,
-    /// Its direction.
+    /// Direction of the metric.
     pub mode: Mode,
 }
 
@@ -94,8 +95,9 @@ impl Default for Keep {
 }
 
 impl Keep {
-    /// Which of a task's checkpoints stay, given their metrics, oldest first: the newest one at least, and of equally good ones the newer.
-    /// What is no finite number is never best. All stay where none has the metric, for nobody can say which is best.
+    /// Checkpoints of a task to keep, given their metrics, oldest first. The newest is always kept, and of equal ones
+    /// the newer. A value that is not finite is never best. All are kept if none has the metric, because the best is
+    /// unknown.
     pub fn kept(&self, oldest_first: &[&BTreeMap<String, f64>]) -> Vec<bool> {
         let count = oldest_first.len();
         if self.best > 0 && count > 0 && oldest_first.iter().all(|metrics| !metrics.contains_key(&self.metric)) {
@@ -115,7 +117,7 @@ impl Keep {
     /// Refuses a metric that is not among `saved`, if the best are to be kept.
     ///
     /// # Errors
-    /// What there is.
+    /// An unknown metric; the message lists the saved ones.
     pub fn check<'a>(&self, saved: impl IntoIterator<Item = &'a str>) -> Result<(), String> {
         let saved: Vec<&str> = saved.into_iter().collect();
         if self.best == 0 || saved.contains(&self.metric.as_str()) {
@@ -146,7 +148,7 @@ mod tests {
             let count = dice(&mut state) as usize % 9;
             let rows: Vec<BTreeMap<String, f64>> = (0..count)
                 .map(|_| {
-                    // Few values, so that some are equal; some are no numbers, some are missing.
+                    // Few values, so that some are equal; some are not finite, some are missing.
                     let value = match dice(&mut state) % 8 {
                         0 => f64::NAN,
                         1 => f64::INFINITY,
@@ -171,7 +173,7 @@ mod tests {
             }
             let newest = count.saturating_sub(latest.max(1));
             assert!(kept[newest..].iter().all(|kept| *kept), "{keep:?} {rows:?} {kept:?}");
-            // Slowly: a checkpoint is among the best if fewer than `best` are better, or as good and newer.
+            // A slow reference: a checkpoint is among the best if fewer than `best` are better, or equal and newer.
             let finite = |i: usize| rows[i].get("joint").copied().filter(|v| v.is_finite());
             let beats = |i: usize, j: usize| match (finite(i), finite(j)) {
                 (Some(a), Some(b)) if a == b => i > j,

@@ -1,15 +1,15 @@
-//! What does not hold of a stage, collected by its checks.
+//! Violated rules of a stage, collected by its checks.
 
 use crate::limits;
 
-/// A rule that does not hold.
+/// A violated rule.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Problem {
-    /// The field, as a path inside the stage; empty for the stage itself.
+    /// Field as a path inside the stage; empty for the stage itself.
     pub field: String,
-    /// What is wrong and what was expected.
+    /// Mistake and expected value.
     pub message: String,
-    /// What to do.
+    /// Remedy, if there is one.
     pub help: Option<String>,
 }
 
@@ -18,7 +18,7 @@ pub struct Problem {
 pub struct Problems(pub Vec<Problem>);
 
 impl Problems {
-    /// Adds one; an empty `help` is none.
+    /// Adds a problem; an empty `help` means none.
     pub fn add(&mut self, field: &str, message: impl Into<String>, help: &str) {
         let help = (!help.is_empty()).then(|| help.to_owned());
         self.0.push(Problem { field: field.to_owned(), message: message.into(), help });
@@ -42,7 +42,7 @@ impl Problems {
         }
     }
 
-    /// 0 <= value <= 1, or < 1 when `open`.
+    /// Requires 0 <= value <= 1, or < 1 if `open`.
     pub(crate) fn fraction(&mut self, field: &str, value: f64, open: bool) {
         let fits = value >= 0.0 && if open { value < 1.0 } else { value <= 1.0 };
         if !fits {
@@ -51,17 +51,17 @@ impl Problems {
         }
     }
 
-    /// Shards of a map stage.
+    /// Checks the number of shards of a map stage.
     pub(crate) fn shards(&mut self, shards: usize) {
         if !(1..=limits::SHARDS).contains(&(shards as u64)) {
             self.add("shards", format!("`shards` is {shards}; expected 1 to {}", limits::SHARDS), "");
         }
     }
 
-    /// What is kept in memory at once for all of `factors`.
+    /// Limits the product of `factors`, which are all in memory at once.
     pub(crate) fn product(&mut self, field: &str, factors: &[(&str, usize)], most: usize) {
         let product = factors.iter().fold(1_usize, |product, (_, factor)| product.saturating_mul(*factor));
-        // A factor that is out of range by itself is said so where it stands.
+        // A factor that is out of range is reported at its own field.
         if product > most && factors.iter().all(|(_, factor)| *factor <= most) {
             let names = factors.iter().map(|(name, _)| format!("`{name}`")).collect::<Vec<_>>().join(" x ");
             self.add(field, format!("{names} is {product}; expected at most {most}"), "");

@@ -1,43 +1,43 @@
-//! How motions are drawn from a model, which samplers a model has, and which of them is its own.
+//! Samplers of models: settings, the samplers that a family supports, and the default of a model.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::Problems;
 
-/// Timesteps of every published noise schedule.
+/// Number of timesteps of every published noise schedule.
 const TIMESTEPS: usize = 1000;
 
-/// What follows a model's predictions from noise to a motion.
+/// Solver from noise to a motion by a model's predictions.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub enum Solver {
-    /// The one that the model's paper draws with: DDIM (MLD), ancestral sampling (MDM), the stochastic DPM-Solver++ (StableMoFusion), jumps
-    /// (students).
+    /// The solver of the model's paper: DDIM (MLD), ancestral sampling (MDM), the stochastic DPM-Solver++
+    /// (StableMoFusion), jumps (students).
     #[default]
     #[serde(rename = "own")]
     Own,
     /// Ancestral sampling: fresh noise in every step.
     #[serde(rename = "ddpm")]
     Ddpm,
-    /// Deterministic; as MLD spaces it in latent space, as StableMoFusion does among features.
+    /// Deterministic; spaced as in MLD in latent space, as in StableMoFusion for features.
     #[serde(rename = "ddim")]
     Ddim,
-    /// Deterministic, of order two, on the predicted noise.
+    /// Deterministic, second order, on the predicted noise.
     #[serde(rename = "dpm-solver")]
     DpmSolver,
-    /// Deterministic, of order two, on the predicted sample.
+    /// Deterministic, second order, on the predicted sample.
     #[serde(rename = "dpm-solver++")]
     DpmSolverPp,
-    /// The same with fresh noise, on the noise levels of Karras et al.; the last step gives the sample.
+    /// Second order with fresh noise, on the noise levels of Karras et al.; the last step returns the sample.
     #[serde(rename = "sde-dpm-solver++")]
     SdeDpmSolverPp,
-    /// The same as libraries of 2023 have it: the last noise level stands twice, so that the last step changes nothing.
+    /// The same as in libraries of 2023: the last noise level is repeated, so that the last step changes nothing.
     #[serde(rename = "sde-dpm-solver++-2023")]
     SdeDpmSolverPp2023,
 }
 
 impl Solver {
-    /// Its word in settings and on command lines.
+    /// Name in settings and on command lines.
     pub fn name(self) -> &'static str {
         match self {
             Self::Own => "own",
@@ -51,22 +51,22 @@ impl Solver {
     }
 }
 
-/// How motions are drawn from a model.
+/// Settings for sampling from a model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Sampler {
-    /// Network evaluations. A PCM student has as many as phases; a masked token generator fills in a motion in so many, MMM's the longest one,
-    /// in this many; an autoregressive one takes no number of steps, so this is 1.
+    /// Number of network evaluations. A PCM student has as many as phases. A masked token generator makes this many
+    /// iterations, MMM's for the longest motion. An autoregressive generator has no number of steps, so this is 1.
     pub steps: usize,
-    /// Teacher and masked token generator: g in `uncond + g (cond - uncond)`. Student: the embedded w, which is g - 1. An autoregressive
-    /// generator and MMM's have none: 0.
+    /// Guidance scale. Teacher and masked token generator: g in `uncond + g (cond - uncond)`. Student: the embedded w,
+    /// which is g - 1. Autoregressive and MMM's generators have none: 0.
     pub guidance: f64,
-    /// LCM only: timesteps, first to last; empty takes evenly spaced points of the training grid from 999 down.
+    /// For LCM: timesteps, first to last; empty uses evenly spaced points of the training grid from 999 down.
     pub timesteps: Vec<usize>,
-    /// What follows the predictions.
+    /// Solver from noise to a motion.
     pub solver: Solver,
-    /// Lets the root of a drawn motion go where its standing feet let it, so that they do not slide (ours). A motion that is told positions goes there
-    /// instead, and one of which a part is drawn anew keeps the path of what stays.
+    /// Corrects the root path of a generated motion so that standing feet do not slide (ours). Target positions have
+    /// priority, and an edited motion keeps the path of its kept frames.
     pub footing: bool,
 }
 
@@ -93,7 +93,7 @@ impl std::fmt::Display for Sampler {
 }
 
 impl Sampler {
-    /// What must hold whatever model is drawn from.
+    /// Checks that apply to every model.
     pub(super) fn check(&self, p: &mut Problems) {
         if !(1..=TIMESTEPS).contains(&self.steps) {
             p.add("sampler.steps", format!("`sampler.steps` is {}; expected 1 to {TIMESTEPS}", self.steps), "");
@@ -114,7 +114,7 @@ impl Sampler {
     }
 }
 
-/// What a model was trained to do, and so which samplers it has.
+/// Family of a model, which decides its samplers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "family", rename_all = "lowercase")]
 pub enum Family {
@@ -136,15 +136,15 @@ pub enum Family {
         /// M: phases, and sampling steps.
         phases: usize,
     },
-    /// Draws tokens one after the other, and so decides how long a motion is.
+    /// Draws tokens one after the other, and so decides the length of a motion.
     Autoregressive,
-    /// Fills in all tokens at once, again and again, with classifier-free guidance.
+    /// Draws all tokens at once in several iterations, with classifier-free guidance.
     Masked,
-    /// The same as MMM does it: without guidance.
+    /// Draws all tokens at once in several iterations as MMM does, without guidance.
     Mmm,
     /// Diffuses motion itself, without latents; classifier-free guidance.
     Features {
-        /// Timesteps of its noise schedule.
+        /// Number of timesteps of its noise schedule.
         timesteps: usize,
         /// The published solver.
         solver: Solver,
@@ -152,22 +152,22 @@ pub enum Family {
 }
 
 impl Family {
-    /// Whether guidance is built in, so that it cannot be asked without it and teaches nobody.
+    /// Returns true for a student: guidance is built in, so it cannot run without and cannot be a teacher.
     pub fn is_student(&self) -> bool {
         matches!(self, Self::Lcm { .. } | Self::Pcm { .. })
     }
 
-    /// Whether what it draws are tokens.
+    /// Returns true if it generates tokens.
     pub fn draws_tokens(&self) -> bool {
         matches!(self, Self::Autoregressive | Self::Masked | Self::Mmm)
     }
 
-    /// Whether what it draws are latents of a VAE.
+    /// Returns true if it generates latents of a VAE.
     pub fn draws_latents(&self) -> bool {
         matches!(self, Self::Mld | Self::Lcm { .. } | Self::Pcm { .. })
     }
 
-    /// What of `solver` it is that a model of this family draws with; `None` for one that it does not have.
+    /// Resolves `solver` for a model of this family; `None` if the family does not support it.
     pub fn solver(&self, solver: Solver) -> Option<Solver> {
         match (self, solver) {
             (Self::Lcm { .. } | Self::Pcm { .. } | Self::Autoregressive | Self::Masked | Self::Mmm, solver) => {
@@ -181,7 +181,7 @@ impl Family {
         }
     }
 
-    /// What must hold of a sampler for a model of this family; `model` is what messages call it.
+    /// Checks a sampler for a model of this family; `model` is its name in messages.
     pub(super) fn check(&self, model: &str, sampler: &Sampler, p: &mut Problems) {
         let steps = sampler.steps;
         if matches!(self, Self::Autoregressive | Self::Mmm) && sampler.guidance != 0.0 {
@@ -234,10 +234,10 @@ impl Family {
         }
     }
 
-    /// Why `sampler` is not one of this family's: all that a pipeline's check finds, in one line.
+    /// Checks `sampler` for this family like a pipeline's check, with all problems in one line.
     ///
     /// # Errors
-    /// The reasons.
+    /// All problems.
     pub fn accepts(&self, sampler: &Sampler) -> Result<(), String> {
         let mut problems = Problems::default();
         sampler.check(&mut problems);
@@ -246,10 +246,10 @@ impl Family {
         if reasons.is_empty() { Ok(()) } else { Err(reasons.join("; ")) }
     }
 
-    /// How the papers draw: a teacher with 50 steps at its published guidance, a student with as many steps as it has phases (an LCM with
-    /// one), at a third of the range of guidance scales that it was trained for; MoMask in ten steps at 4, MMM in ten; MDM over all its timesteps and
-    /// StableMoFusion in ten steps, both at 2.5. The published range 5 to 15 gives w = 8.3, near
-    /// MotionLCM's 7 to 12.5. For models that nobody has measured; a measured one has its own.
+    /// Samplers of the papers. A teacher has 50 steps at its published guidance. A student has as many steps as phases
+    /// (an LCM has one), at a third of its range of guidance scales. MoMask has ten steps at 4, MMM ten; MDM has all
+    /// its timesteps and StableMoFusion ten steps, both at 2.5. The published range 5 to 15 gives w = 8.3, near
+    /// MotionLCM's 7 to 12.5. For models without an evaluation; others use that of their evaluation.
     pub fn published(&self) -> Sampler {
         let student = |steps: usize, (low, high): (f64, f64)| Sampler {
             steps,
@@ -271,10 +271,10 @@ impl Family {
     }
 }
 
-/// The one sampler that a model was measured with, given the evaluations of it by name; `None` if there are none.
+/// The only sampler among the evaluations of a model, by name; `None` if there are no evaluations.
 ///
 /// # Errors
-/// Which evaluations differ, and in what.
+/// The evaluations that differ, and their difference.
 pub fn measured_with<'a>(
     evaluations: impl IntoIterator<Item = (&'a str, &'a Sampler)>,
 ) -> Result<Option<&'a Sampler>, String> {

@@ -1,7 +1,8 @@
-//! What a stage kind says of itself: [`StageSpec`], implemented by its settings struct in the kind's file in `kinds/`.
+//! The description of a stage kind: [`StageSpec`], implemented by its settings struct in the kind's file in `kinds/`.
 //!
-//! References are declared once, by [`StageSpec::refs`]. The edges of the DAG, what is blank in a stage's key, how a sweep makes a judge
-//! look at its trials, which files outside the store are digested, the schema and the reference of all keys follow from them.
+//! References are declared once, by [`StageSpec::refs`]. These follow from them: the edges of the DAG, the blank fields
+//! of a stage's key, the evaluation of a sweep's trials, the digested files outside the store, the schema and the
+//! reference of keys.
 
 use std::any::Any;
 use std::borrow::Cow;
@@ -14,132 +15,133 @@ use serde::de::DeserializeOwned;
 use super::{DataFormat, Family, LatentShape, Neighbours, Problems, Sampler, Training};
 use crate::ArtifactKind;
 
-/// How a stage's work is laid over workers.
+/// Distribution of a stage's work over workers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shape {
     /// Data parallel: all members step together.
     Gang,
-    /// Cut into shards, each done once by anybody, then merged.
+    /// Divided into shards, each computed once by any worker, then merged.
     Map,
-    /// Done once by one worker.
+    /// Computed once by one worker.
     Plain,
-    /// Done by the coordinator, because it changes the registry.
+    /// Run by the coordinator, because it changes the registry.
     Registry,
 }
 
-/// A stage's one output.
+/// The only output of a stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Output {
-    /// What it is called among the stage's results.
+    /// Name among the stage's results.
     pub name: &'static str,
-    /// What it is.
+    /// Kind of artifact.
     pub kind: ArtifactKind,
 }
 
-/// A stage kind. Its `Default` is the published recipe where there is one, and the schema of its keys.
+/// A stage kind. Its `Default` is the published recipe, if there is one, and the schema of its keys.
 pub trait StageSpec:
     Default + Clone + PartialEq + std::fmt::Debug + Serialize + DeserializeOwned + JsonSchema + 'static
 {
-    /// Its name in YAML, such as `train.vae`.
+    /// Name in YAML, such as `train.vae`.
     const KIND: &'static str;
-    /// Grows when a change of ours changes what the kind computes, so that an old result is not mistaken for a new one.
+    /// Code version. It grows with each change of the kind's results, so that an old result is not reused as a new one.
     const VERSION: u32 = 1;
-    /// How its work is laid over workers.
+    /// Distribution of its work over workers.
     const SHAPE: Shape;
-    /// What it gives.
+    /// Kind and name of its output.
     const OUTPUT: Output;
 
-    /// What it gives with these settings, where that depends on them.
+    /// Output with these settings, if it depends on them.
     fn output(&self) -> Output {
         Self::OUTPUT
     }
 
-    /// The stages and files that it refers to.
+    /// Stages and files that it refers to.
     fn refs(&mut self) -> Vec<Ref<'_>>;
 
-    /// What must hold of the settings beyond their types.
+    /// Checks rules of the settings beyond their types.
     fn check(&self, _problems: &mut Problems) {}
 
-    /// What must hold between the settings and the stages that they refer to. Asked when references are sound.
+    /// Checks rules between the settings and their referenced stages. Called once references are valid.
     fn check_neighbours(&self, _stages: &Neighbours<'_>, _problems: &mut Problems) {}
 
-    /// Shards of a map stage.
+    /// Number of shards of a map stage.
     fn shards(&self) -> usize {
         1
     }
 
-    /// What every training stage shares. A kind that has it can be swept.
+    /// Common settings of training stages. A kind that has them can be swept.
     fn training(&mut self) -> Option<&mut Training> {
         None
     }
 
-    /// The shape of the latents that it gives or works on, if it decides that.
+    /// Shape of the latents that it outputs or uses, if it decides that.
     fn latent(&self) -> Option<LatentShape> {
         None
     }
 
-    /// The skeleton of what it gives, if it decides that rather than a stage that it reads.
+    /// Skeleton of its output, if this stage decides it and none of its inputs.
     fn format(&self) -> Option<DataFormat> {
         None
     }
 
-    /// What the model that it trains can do, and so which samplers it has.
+    /// Family of the model that it trains, which decides its samplers.
     fn family(&self) -> Option<Family> {
         None
     }
 
-    /// How it draws from the model that it measures.
+    /// Sampler for the model that it measures.
     fn sampler(&self) -> Option<&Sampler> {
         None
     }
 
-    /// The values that an evaluation may give, by name: all of them, whatever the data has. None says that it is not known.
+    /// Names of the values that an evaluation may return, for any data; `None` if unknown.
     fn metrics(&self) -> Option<BTreeSet<String>> {
         None
     }
 
-    /// What a training records after each step besides its gradient's norm and its learning rate, which checkpoints are kept by.
+    /// Values that a training records after each step besides its gradient's norm and its learning rate. Retention can
+    /// rank by them.
     fn recorded(&self) -> &'static [&'static str] {
         &[]
     }
 }
 
-/// What a reference leads to.
+/// Target of a reference.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Target {
-    /// A stage that gives this.
+    /// A stage with an output of this kind.
     Stage(ArtifactKind),
-    /// A dataset's folder, of which only what a dataset of this format reads is digested.
+    /// A folder of a dataset; only the files that a dataset of this format reads are digested.
     Dataset(DataFormat),
     /// A folder whose files are all digested.
     Folder,
-    /// A file.
+    /// A file that is digested.
     File,
 }
 
-/// A reference of a stage's settings, with the place that holds the name.
+/// A reference in a stage's settings, with the place that holds the name.
 #[derive(Debug)]
 pub struct Ref<'a> {
-    /// The field, such as `vae` or `from[0]`.
+    /// Field, such as `vae` or `from[0]`.
     pub field: Cow<'static, str>,
-    /// The stage's name, or a path.
+    /// Name of the stage, or a path.
     pub name: &'a mut String,
-    /// What it must lead to.
+    /// Required target of the reference.
     pub target: Target,
-    /// Whether anything is read there. The place is blank in keys either way.
+    /// True if it is read with these settings. The place is blank in keys in either case.
     pub read: bool,
-    /// Whether it is this that an evaluation measures.
+    /// True if an evaluation measures it.
     pub measured: bool,
-    /// Files that the folder must have; of several with `|` between them, one.
+    /// Files that the folder must have; `|` separates alternatives.
     pub files: &'static [&'static str],
-    /// What the folder is and where to get it.
+    /// Description of the folder, and its source.
     pub origin: &'static str,
-    /// The part of a model that is read of it, if one is.
+    /// Part of the model that is read, if it is not the whole model.
     pub part: Option<ArtifactKind>,
 }
 
 impl<'a> Ref<'a> {
-    /// A stage that must give `kind`.
+    /// Reference to a stage with output `kind`.
     pub fn stage(field: impl Into<Cow<'static, str>>, name: &'a mut String, kind: ArtifactKind) -> Self {
         Self {
             field: field.into(),
@@ -153,13 +155,13 @@ impl<'a> Ref<'a> {
         }
     }
 
-    /// A stage that must give `kind`, with whose weights a training begins: those of its `part`, if it gives a model. An empty name
-    /// begins with random ones.
+    /// Reference to the source of initial weights, a stage with output `kind` or with a model that has `part`. An empty
+    /// name means random weights.
     pub fn init(name: &'a mut String, kind: ArtifactKind, part: ArtifactKind) -> Self {
         Self { part: Some(part), ..Self::stage("init", name, kind).optional() }
     }
 
-    /// A dataset's folder.
+    /// Reference to a dataset's folder.
     pub fn dataset(field: &'static str, path: &'a mut String, format: DataFormat) -> Self {
         let (read, target) = (!path.is_empty(), Target::Dataset(format));
         let origin = match format {
@@ -169,45 +171,45 @@ impl<'a> Ref<'a> {
         Self { field: field.into(), name: path, target, read, measured: false, files: &[], origin, part: None }
     }
 
-    /// A folder; none if the path is empty.
+    /// Reference to a folder; an empty path is no reference.
     pub fn folder(field: &'static str, path: &'a mut String) -> Self {
         let read = !path.is_empty();
         let target = Target::Folder;
         Self { field: field.into(), name: path, target, read, measured: false, files: &[], origin: "", part: None }
     }
 
-    /// A file; none if the path is empty.
+    /// Reference to a file; an empty path is no reference.
     pub fn file(field: &'static str, path: &'a mut String) -> Self {
         Self { target: Target::File, ..Self::folder(field, path) }
     }
 
-    /// The folder must have these files; `origin` says what it is and where to get it.
+    /// Requires these files in the folder; `origin` describes the folder and its source.
     #[must_use]
     pub fn holding(self, files: &'static [&'static str], origin: &'static str) -> Self {
         Self { files, origin, ..self }
     }
 
-    /// Nothing is read unless `condition` holds.
+    /// Reads it only if `condition` holds.
     #[must_use]
     pub fn only_if(self, condition: bool) -> Self {
         Self { read: self.read && condition, ..self }
     }
 
-    /// An empty name is no reference.
+    /// Treats an empty name as no reference.
     #[must_use]
     pub fn optional(self) -> Self {
         let given = !self.name.is_empty();
         self.only_if(given)
     }
 
-    /// This is what the evaluation measures, if `condition` holds.
+    /// Marks it as the subject of the evaluation, if `condition` holds.
     #[must_use]
     pub fn measured_if(self, condition: bool) -> Self {
         Self { measured: condition, ..self }
     }
 }
 
-/// [`StageSpec`] without its type, as [`StageSettings`](super::StageSettings) asks it.
+/// Object-safe form of [`StageSpec`], for [`StageSettings`](super::StageSettings).
 pub(super) trait AnySpec: Any {
     fn kind(&self) -> &'static str;
     fn version(&self) -> u32;
@@ -293,17 +295,18 @@ impl<S: StageSpec> AnySpec for S {
     }
 }
 
-/// Makes [`StageSettings`](super::StageSettings) of the list of kinds. All else that is said of a kind is in its file.
+/// Generates [`StageSettings`] from the list of kinds. The kind's own file holds everything else.
 macro_rules! stage_kinds {
     ($($name:ident,)*) => {
-        /// A stage's settings, resolved. The kind's name stands beside them as `kind`, in YAML as in JSON.
+        /// Settings of a stage of any kind. The kind's name is beside them as `kind`, in YAML as in JSON.
         #[derive(Debug, Clone, PartialEq)]
         pub enum StageSettings {
             $(#[doc = concat!("See [`", stringify!($name), "`].")] $name($name),)*
         }
 
         impl StageSettings {
-            /// Every kind, with default settings: the table from which the pipeline reader learns kinds, keys and types.
+            /// Every kind with default settings: the table from which the pipeline reader derives kinds, keys and
+            /// types.
             pub fn all() -> Vec<Self> {
                 vec![$(Self::$name($name::default()),)*]
             }

@@ -1,4 +1,4 @@
-//! What training stages share: batch, schedule, optimizer.
+//! Common settings of training stages: batch, schedule, optimizer.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -6,17 +6,17 @@ use serde::{Deserialize, Serialize};
 use super::Problems;
 use crate::Steps;
 
-/// The global batch and the fixed slices it is cut into. Part of a stage's identity; the number of workers is not.
+/// The global batch and its fixed division into slices. Part of a stage's identity; the number of workers is not.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct Batch {
     /// Examples per optimizer update, over all workers.
     pub global: usize,
-    /// Forward/backward passes that the batch is cut into; divides `global`.
+    /// Number of forward/backward passes that compute the batch; divides `global`.
     pub slices: usize,
 }
 
 impl Batch {
-    /// All slices have one size; `field` is where `global` stands.
+    /// Checks that all slices have equal size; `field` is the field of `global`.
     pub(super) fn check_division(self, p: &mut Problems, field: &str) {
         if self.slices > 0 && !self.global.is_multiple_of(self.slices) {
             let message = format!("`{field}` is {}, which {} slices do not divide", self.global, self.slices);
@@ -31,9 +31,9 @@ impl Batch {
 pub enum Decay {
     /// Half a cosine down to zero at the last step.
     Cosine,
-    /// Stays.
+    /// Constant at the peak rate.
     Constant,
-    /// Times 0.9 after every 5,000 updates. StableMoFusion.
+    /// Factor 0.9 after every 5,000 updates. StableMoFusion.
     Staircase,
 }
 
@@ -41,9 +41,9 @@ pub enum Decay {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Optimizer {
-    /// First moment's decay.
+    /// Decay of the first moment.
     pub beta1: f64,
-    /// Second moment's decay.
+    /// Decay of the second moment.
     pub beta2: f64,
     /// Added to the root of the second moment.
     pub eps: f64,
@@ -66,26 +66,26 @@ impl Optimizer {
     }
 }
 
-/// What every training stage shares.
+/// Common settings of training stages.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Training {
-    /// Optimizer updates.
+    /// Number of optimizer updates.
     pub steps: Steps,
-    /// Global batch and slices.
+    /// Global batch and its slices.
     pub batch: Batch,
     /// Peak learning rate.
     pub lr: f64,
     /// Linear warm-up; the first update has rate 0 when it is positive.
     pub warmup: Steps,
-    /// What follows the warm-up.
+    /// Decay of the rate after the warm-up.
     pub decay: Decay,
-    /// AdamW's constants.
+    /// Constants of AdamW.
     #[serde(default)]
     pub optimizer: Optimizer,
-    /// Gradients are scaled down to this global norm; 0 leaves them alone.
+    /// Largest global norm of gradients, to which they are scaled down; 0 disables clipping.
     pub max_grad_norm: f64,
-    /// Stops after so many steps, before the schedule's end, and leaves its state to go on from: a rung of a sweep. Not for users: the
-    /// reader knows only keys that the default has.
+    /// Step at which a sweep's rung stops before the schedule's end, leaving its state for the next rung. Not for
+    /// users: the reader accepts only keys of the default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stop: Option<Steps>,
 }
@@ -104,7 +104,7 @@ impl Training {
         }
     }
 
-    /// The last step of this stage.
+    /// Last step of this stage.
     pub fn end(&self) -> Steps {
         self.stop.map_or(self.steps, |stop| stop.min(self.steps))
     }

@@ -1,4 +1,5 @@
-//! `data.features`: a folder of recordings to a dataset. Source: the published HumanML3D and KIT-ML procedures; splits by recording are ours.
+//! `data.features`: converts a folder of recordings to a dataset. Source: the published HumanML3D and KIT-ML
+//! procedures; splits by recording are ours.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -6,72 +7,75 @@ use serde::{Deserialize, Serialize};
 use crate::ArtifactKind;
 use crate::stage::{DataFormat, Output, Problems, Ref, Shape, StageSpec};
 
-/// `data.features`: recordings (`.bvh`, joints in `.npy` or `.npz`) with captions beside them, to features.
+/// `data.features`: converts recordings (`.bvh`, joints in `.npy` or `.npz`) with captions beside them to features.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct DataFeatures {
-    /// Which skeleton, rate and features.
+    /// Format of the dataset: skeleton, rate and features.
     pub format: DataFormat,
-    /// The folder, relative to the working directory. Not part of the key: the content's digest is.
+    /// Folder, relative to the working directory. Its content's digest is part of the key, not the path.
     pub path: String,
-    /// A table of captions, CSV or JSON; empty: what the folder has (`captions.csv`, `captions.json`, text beside the clips).
+    /// Table of captions, CSV or JSON; empty uses the folder's own (`captions.csv`, `captions.json`, text beside the
+    /// clips).
     pub captions: String,
-    /// Joint map: a shipped one (`cmu`, `lafan1`, `mixamo`, `bandai`, `cmu-daz`, `smpl`) or a file that ends in `.yaml`; empty: found for each file.
+    /// Joint map: a shipped one (`cmu`, `lafan1`, `mixamo`, `bandai`, `cmu-daz`, `smpl`) or a file that ends in
+    /// `.yaml`; empty detects it for each file.
     pub map: String,
-    /// Length of the files' unit; 0: found for each file.
+    /// Length of the files' unit; 0 detects it for each file.
     pub metres_per_unit: f64,
-    /// The files' upward axis.
+    /// Upward axis of the files.
     pub up: UpAxis,
-    /// Frames per second of arrays that do not say it; 0: 20 for 22 joints, 12.5 for 21.
+    /// Frame rate of arrays without one; 0 means 20 for 22 joints, 12.5 for 21.
     pub fps: f64,
-    /// Bone lengths of the uniform skeleton, a `.npy` of offsets `[J, 3]` or lengths `[J]`; empty: HumanML3D's. KIT-ML's are not public.
+    /// Bone lengths of the uniform skeleton, a `.npy` of offsets `[J, 3]` or lengths `[J]`; empty means HumanML3D's.
+    /// KIT-ML's are not public.
     pub target: String,
-    /// Adds the left/right mirrored twin of every clip, with captions that say so.
+    /// Adds a mirrored twin of every clip, with mirrored captions.
     pub mirror: bool,
-    /// Cuts what is too long into equal parts; else it is left out.
+    /// Cuts clips that are too long into equal parts; otherwise they are left out.
     pub cut: bool,
-    /// How clips are divided.
+    /// Division of clips into splits.
     pub splits: Splits,
-    /// Share of the clips for validation, by `source`.
+    /// Share of the validation clips, for `source`.
     pub val: f64,
-    /// Share of the clips for the test split, by `source`.
+    /// Share of the test clips, for `source`.
     pub test: f64,
-    /// Leaves out files that are broken, and says so; else they end the stage.
+    /// Leaves out broken files and reports them; otherwise they fail the stage.
     pub skip_broken: bool,
-    /// Shards.
+    /// Number of shards.
     pub shards: usize,
 }
 
-/// An upward axis.
+/// Upward axis of recordings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum UpAxis {
-    /// Where the figure stands; y for `.npy`.
+    /// Detected from the figure; y for `.npy`.
     Auto,
-    /// (x, y, z) becomes (-y, x, z).
+    /// Upward x: (x, y, z) becomes (-y, x, z).
     X,
-    /// Positions stay as they are.
+    /// Upward y: positions are unchanged.
     Y,
-    /// (x, y, z) becomes (x, z, -y).
+    /// Upward z: (x, y, z) becomes (x, z, -y).
     Z,
-    /// (x, y, z) becomes (y, -x, z).
+    /// Upward -x: (x, y, z) becomes (y, -x, z).
     #[serde(rename = "-x")]
     NegativeX,
-    /// (x, y, z) becomes (x, -y, -z).
+    /// Upward -y: (x, y, z) becomes (x, -y, -z).
     #[serde(rename = "-y")]
     NegativeY,
-    /// (x, y, z) becomes (x, -z, y).
+    /// Upward -z: (x, y, z) becomes (x, -z, y).
     #[serde(rename = "-z")]
     NegativeZ,
 }
 
-/// What a split is made of.
+/// Division of clips into splits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Splits {
-    /// Whole recordings, so that none is in two splits.
+    /// By whole recordings, so that none is in two splits.
     Source,
-    /// The folder's `train.txt`, `val.txt` and `test.txt`.
+    /// By the folder's `train.txt`, `val.txt` and `test.txt`.
     Lists,
 }
 
@@ -98,7 +102,7 @@ impl Default for DataFeatures {
 }
 
 impl DataFeatures {
-    /// Whether the joint map is a file.
+    /// Returns true if the joint map is a file.
     pub fn map_is_file(&self) -> bool {
         self.map.ends_with(".yaml") || self.map.ends_with(".yml")
     }
@@ -117,7 +121,7 @@ impl StageSpec for DataFeatures {
             Ref::folder("captions", &mut self.captions),
             Ref::folder("target", &mut self.target),
         ];
-        // A shipped map's name is a setting like others.
+        // The name of a shipped map is an ordinary setting.
         if map_is_file {
             refs.push(Ref::folder("map", &mut self.map));
         }

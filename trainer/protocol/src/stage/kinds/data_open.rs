@@ -10,9 +10,9 @@ use crate::stage::{DataFormat, Output, Problems, Ref, Shape, StageSpec};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct DataOpen {
-    /// Which of the two formats.
+    /// Format of the dataset: skeleton, rate and features.
     pub format: DataFormat,
-    /// The folder, relative to the working directory. Not part of the key: the content's digest is.
+    /// Folder, relative to the working directory. Its content's digest is part of the key, not the path.
     pub path: String,
 }
 

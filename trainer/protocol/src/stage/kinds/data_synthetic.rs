@@ -1,4 +1,4 @@
-//! `data.synthetic`: procedural clips, the dataset that needs no download. Source: ours.
+//! `data.synthetic`: procedural clips, a dataset without a download. Source: ours.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -10,13 +10,13 @@ use crate::stage::{DataFormat, Output, Problems, Ref, Shape, StageSpec};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct DataSynthetic {
-    /// Clips to make, before mirroring.
+    /// Number of clips before mirroring.
     pub clips: usize,
-    /// Share of the clips for validation.
+    /// Share of the validation clips.
     pub val: f64,
-    /// Share of the clips for the test split.
+    /// Share of the test clips.
     pub test: f64,
-    /// Adds the left/right mirrored twin of every clip.
+    /// Adds a mirrored twin of every clip.
     pub mirror: bool,
 }
 

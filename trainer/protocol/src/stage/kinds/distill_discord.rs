@@ -1,5 +1,5 @@
-//! `distill.discord`: a flow decoder of one or two jumps, learned from one that follows its flow. Source: DisCoRD's decoder with the consistency
-//! distillation of `distill.lcm`, ours.
+//! `distill.discord`: a flow decoder with one or two jumps, distilled from one that follows its flow. Source: DisCoRD's
+//! decoder with the consistency distillation of `distill.lcm`, ours.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -9,10 +9,11 @@ use crate::stage::{
 };
 use crate::{ArtifactKind, Steps};
 
-/// Frames that one token stands for.
+/// Frames per token.
 const UNIT: usize = 4;
 
-/// `distill.discord`: a flow decoder that is as many times faster as it makes fewer evaluations of its network. All settings are our choice.
+/// `distill.discord`: a flow decoder with fewer evaluations of its network, which is faster by the same factor. All
+/// settings are our choice.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct DistillDiscord {
@@ -20,29 +21,29 @@ pub struct DistillDiscord {
     pub dataset: String,
     /// Stage that gives the tokenizer of the teacher; not read if there is a VAE.
     pub tokenizer: String,
-    /// Stage that gives the VAE of the teacher, if it decodes latents; none if empty.
+    /// Stage that gives the VAE of the teacher, if it decodes latents; empty for a decoder of tokens.
     pub vae: String,
-    /// Stage that gives the flow decoder to learn from.
+    /// Stage that gives the flow decoder to be distilled.
     pub teacher: String,
     /// Frames of an example; a multiple of 4. Shorter clips are left out.
     pub window: usize,
-    /// Which windows make an epoch.
+    /// Windows that make an epoch.
     pub windows_of: WindowsOf,
-    /// Intervals of the grid between noise and data, over each of which the teacher makes a step.
+    /// Number of intervals of the grid between noise and data. The teacher makes one step over each.
     pub intervals: usize,
-    /// Jumps of the student when motion is decoded.
+    /// Number of the student's jumps for decoding motion.
     pub solver_steps: usize,
-    /// Distance.
+    /// Distance of the consistency loss.
     pub distance: Distance,
     /// Pseudo-Huber constant c.
     pub huber_c: f64,
     /// Decay of the target network.
     pub ema: f64,
-    /// Stage that gives the flow decoder whose weights the student begins with where their shapes fit, or a version such as `discord@prod`; empty
-    /// begins with the teacher's.
+    /// Stage or version, such as `discord@prod`, whose flow decoder supplies initial weights where shapes fit; empty
+    /// starts from the teacher's weights.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub init: String,
-    /// The rest.
+    /// Batch, schedule and optimizer.
     #[serde(flatten)]
     pub training: Training,
 }

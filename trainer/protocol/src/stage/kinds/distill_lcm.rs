@@ -6,11 +6,11 @@ use serde::{Deserialize, Serialize};
 use crate::ArtifactKind;
 use crate::stage::{Distillation, Family, Neighbours, Output, Problems, Ref, Shape, StageSpec, Training};
 
-/// `distill.lcm`. Source: MotionLCM.
+/// `distill.lcm`: latent consistency distillation. Source: MotionLCM.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct DistillLcm {
-    /// Everything.
+    /// Common settings of both distillations.
     #[serde(flatten)]
     pub distillation: Distillation,
 }
@@ -23,7 +23,7 @@ impl Default for DistillLcm {
 
 impl StageSpec for DistillLcm {
     const KIND: &'static str = "distill.lcm";
-    // 2: a whole model, with its VAE and text encoder.
+    // Version 2 outputs a whole model, with its VAE and text encoder.
     const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };

@@ -6,22 +6,22 @@ use serde::{Deserialize, Serialize};
 use crate::ArtifactKind;
 use crate::stage::{Distillation, Family, Neighbours, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training};
 
-/// `distill.pcm`. Source: MotionPCM, Algorithm 1.
+/// `distill.pcm`: phased consistency distillation. Source: MotionPCM, Algorithm 1.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct DistillPcm {
-    /// M: phases, and sampling steps.
+    /// M, the number of phases and of sampling steps.
     pub phases: usize,
     /// Weight of the adversarial term; 0 trains without a discriminator.
     pub adversarial: f64,
-    /// The discriminator's learning rate; 0 takes `lr`.
+    /// Learning rate of the discriminator; 0 uses `lr`.
     pub discriminator_lr: f64,
-    /// The discriminator's AdamW.
+    /// AdamW constants of the discriminator.
     pub discriminator_optimizer: Optimizer,
-    /// Student and discriminator are updated in turns, one a step, as the image repository has it; otherwise both in every step. Each one's
-    /// learning rate counts its own updates.
+    /// Updates student and discriminator in alternate steps, as in the image repository; otherwise both in every step.
+    /// The learning rate of each counts its own updates.
     pub alternate: bool,
-    /// Everything else.
+    /// Common settings of both distillations.
     #[serde(flatten)]
     pub distillation: Distillation,
 }
@@ -41,7 +41,7 @@ impl Default for DistillPcm {
 
 impl StageSpec for DistillPcm {
     const KIND: &'static str = "distill.pcm";
-    // 2: a whole model, with its VAE and text encoder.
+    // Version 2 outputs a whole model, with its VAE and text encoder.
     const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };

@@ -1,4 +1,4 @@
-//! `encode.latents`: VAE posteriors, computed once for all who train in the latent space. Source: ours.
+//! `encode.latents`: VAE posteriors, computed once for all stages that train in the latent space. Source: ours.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -14,11 +14,11 @@ pub struct EncodeLatents {
     pub dataset: String,
     /// Stage that gives the VAE.
     pub vae: String,
-    /// Random crops per entry.
+    /// Number of random crops per entry.
     pub crops: usize,
-    /// Crops of the training split follow other paths than were recorded, for a `train.control` on little data.
+    /// Changes the paths of the training split's crops, for a `train.control` on little data.
     pub augment: Augment,
-    /// Shards.
+    /// Number of shards.
     pub shards: usize,
 }
 
@@ -30,7 +30,7 @@ impl Default for EncodeLatents {
 
 impl StageSpec for EncodeLatents {
     const KIND: &'static str = "encode.latents";
-    // 2: says where in its clip each crop begins. 3: and how its path was changed.
+    // Version 2 stores the start of each crop in its clip, version 3 also the change of its path.
     const VERSION: u32 = 3;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "latents", kind: ArtifactKind::Latents };

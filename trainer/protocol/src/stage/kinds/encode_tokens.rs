@@ -1,4 +1,5 @@
-//! `encode.tokens`: the token ids of every clip, computed once for all who train on them. Source: T2M-GPT, MoMask, MMM.
+//! `encode.tokens`: token ids of every clip, computed once for all stages that train on them. Source: T2M-GPT, MoMask,
+//! MMM.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -6,10 +7,10 @@ use serde::{Deserialize, Serialize};
 use crate::ArtifactKind;
 use crate::stage::{Neighbours, Output, Problems, Ref, Shape, StageSpec};
 
-/// Frames that one token stands for.
+/// Frames per token.
 const UNIT: usize = 4;
 
-/// `encode.tokens`: ids of all clips.
+/// `encode.tokens`: token ids of all clips.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EncodeTokens {
@@ -17,10 +18,10 @@ pub struct EncodeTokens {
     pub dataset: String,
     /// Stage that gives the tokenizer.
     pub tokenizer: String,
-    /// Clips are followed by zeros up to so many frames before they are encoded, as MoMask's are (196); 0 adds none. A token sees some
-    /// 90 frames on either side, so ids differ.
+    /// Pads clips with zeros to this many frames before encoding, as MoMask does (196); 0 adds none. A token depends on
+    /// some 90 frames on either side, so ids differ.
     pub padded: usize,
-    /// Shards.
+    /// Number of shards.
     pub shards: usize,
 }
 

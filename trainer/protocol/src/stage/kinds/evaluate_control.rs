@@ -1,4 +1,5 @@
-//! `evaluate.control`: how well motions pass the positions that they are told, and what that costs. Source: OmniControl, MotionLCM (tables 3 and 4).
+//! `evaluate.control`: accuracy of motions at target positions, and its cost in quality. Source: OmniControl, MotionLCM
+//! (tables 3 and 4).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -7,9 +8,9 @@ use crate::stage::control::{check_skeleton, check_words};
 use crate::stage::{ControlSetting, Neighbours, Output, Problems, Ref, Sampler, Shape, Split, StageSpec, TrainControl};
 use crate::{ArtifactKind, limits};
 
-/// `evaluate.control`: errors of told positions, with the control part and without it, by joints and density. Every combination of `joints` with
-/// an entry of `percent` or `frames` is a case, whose metrics are called `METRIC/CASE`, such as `average_error/six/25pct`; without a case a
-/// metric is the mean over the cases.
+/// `evaluate.control`: errors at target positions, with the control part and without it, by joints and density. Every
+/// combination of `joints` with an entry of `percent` or `frames` is a case. Its metrics are named `METRIC/CASE`, such
+/// as `average_error/six/25pct`; without a case a metric is the mean over the cases.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluateControl {
@@ -19,32 +20,32 @@ pub struct EvaluateControl {
     pub dataset: String,
     /// Stage that gives the evaluator.
     pub evaluator: String,
-    /// When positions are told.
+    /// Frames and joints that get targets.
     pub setting: ControlSetting,
-    /// Each a case: a joint, or `six`, `twelve` or `all` of them, which are told together.
+    /// Cases of joints: a joint, or `six`, `twelve` or `all` of them with targets together.
     pub joints: Vec<String>,
-    /// Densities in percent of the frames.
+    /// Densities of targets in percent of the frames.
     pub percent: Vec<f64>,
-    /// Densities as numbers of frames.
+    /// Densities of targets as numbers of frames.
     pub frames: Vec<usize>,
-    /// Metres beyond which a position is missed.
+    /// Distance in metres beyond which a target is missed.
     pub threshold: f64,
-    /// What the ControlNet's residuals, and what feedback changes, are multiplied by.
+    /// Factor on the ControlNet's residuals and on the changes by feedback.
     pub scale: f64,
-    /// Rounds of feedback on drawn latents, of which each motion keeps the one that brought it nearest; as many as the control part was trained with if
-    /// nothing is said.
+    /// Number of rounds of feedback on generated latents; each motion keeps the result of its best round. By default it
+    /// is the number in the control part's training.
     pub feedback: Option<usize>,
-    /// Steps by which drawn latents are refined until their motions pass the positions; 0, as published, refines nothing.
+    /// Number of steps that refine generated latents towards the targets; 0, as published, refines nothing.
     pub refine: usize,
-    /// Sampler.
+    /// Sampler for the model.
     pub sampler: Sampler,
-    /// Repeats with other noise, captions, crops and pools.
+    /// Number of repeats with other noise, captions, crops and pools.
     pub repeats: usize,
-    /// Clips. Choose on `val`; `test` is for the last look.
+    /// Split of the clips. Choose on `val`; keep `test` for the final result.
     pub split: Split,
-    /// Takes all clips where the split has fewer than a pool of 32, and says so in the report; otherwise so small a split is refused.
+    /// Uses all clips if the split has fewer than a pool of 32, and reports it; otherwise so small a split is refused.
     pub all_if_small: bool,
-    /// Shards.
+    /// Number of shards.
     pub shards: usize,
 }
 

@@ -12,26 +12,27 @@ use crate::stage::{Family, Neighbours, Output, Problems, Ref, Sampler, Shape, Sp
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluateLatentFid {
-    /// Stage that gives the model, which makes latents.
+    /// Stage that gives the model, which must generate latents.
     pub model: String,
     /// Stage that gives the latents.
     pub latents: String,
-    /// Stage that gives the clips of the latents, whose captions are drawn.
+    /// Stage that gives the clips of the latents; captions are drawn from them.
     pub dataset: String,
-    /// Stage that gives the teacher whose 50-step samples `match` compares with; empty leaves `match` out.
+    /// Stage that gives the teacher for `match`, which compares with its 50-step samples; empty leaves `match` out.
     pub teacher: String,
-    /// Sampler.
+    /// Sampler for the model.
     pub sampler: Sampler,
-    /// Repeats with other noise.
+    /// Number of repeats with other noise.
     pub repeats: usize,
-    /// Samples per entry and repeat.
+    /// Number of samples per entry and repeat.
     pub samples: usize,
-    /// Principal components of the train latents in which distances are taken.
+    /// Number of principal components of the train latents in which distances are computed.
     pub components: usize,
-    /// Real clips compared with. `all` on small sets, where with few clips the distance of real to real is large; each split then has values
-    /// of its own besides (`latent_fid_test`). The distance of real latents to real ones stands beside each: `_floor`, `_halves`.
+    /// Split of the real clips. Use `all` on small sets, where the distance of real to real is large; each split then
+    /// also has its own values (`latent_fid_test`). The distance of real latents to real ones accompanies each value:
+    /// `_floor`, `_halves`.
     pub split: Split,
-    /// Shards.
+    /// Number of shards.
     pub shards: usize,
 }
 
@@ -54,8 +55,8 @@ impl Default for EvaluateLatentFid {
 
 impl StageSpec for EvaluateLatentFid {
     const KIND: &'static str = "evaluate.latent_fid";
-    // 2: retrieval among latents has names of its own. 3: captions are the same by their words, not by their vectors.
-    // 4: each split besides all, halves.
+    // Version 2 renames retrieval among latents. Version 3 compares captions by their words, not by their vectors.
+    // Version 4 adds each split besides `all`, and halves.
     const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
@@ -112,7 +113,7 @@ impl StageSpec for EvaluateLatentFid {
         self.shards
     }
 
-    /// A split has values of its own if it has entries enough.
+    /// A split has its own values if it has enough entries.
     fn metrics(&self) -> Option<BTreeSet<String>> {
         let own = ["latent_std", "latent_std_real", "latent_r_precision_top1", "latent_r_precision_top3"];
         let mut names: BTreeSet<String> = own.map(str::to_owned).into();

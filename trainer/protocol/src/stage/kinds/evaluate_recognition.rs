@@ -1,5 +1,5 @@
-//! `evaluate.recognition`: whether motions show what their captions name. Source: the recognition accuracy of Action2Motion (Guo et al., 2020), with
-//! classes that are read off captions and a classifier of ours.
+//! `evaluate.recognition`: the share of motions that show the activity of their captions. Source: the recognition
+//! accuracy of Action2Motion (Guo et al., 2020), with classes from captions and a classifier of ours.
 
 use std::collections::BTreeSet;
 
@@ -9,21 +9,22 @@ use serde::{Deserialize, Serialize};
 use crate::ArtifactKind;
 use crate::stage::{Neighbours, Output, Problems, Ref, Sampler, Shape, Split, StageSpec};
 
-/// What a motion can be recognised as.
+/// An activity that the classifier recognises.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Activity {
-    /// What it is called.
+    /// Name of the activity.
     pub name: String,
-    /// Words, or several in a row, of which a caption of it has at least one.
+    /// Phrases of one or more words; a caption with one of them describes the activity.
     pub words: Vec<String>,
-    /// Draws a motion of it into the sheet.
+    /// Draws one of its motions on the sheet.
     #[serde(default)]
     pub sheet: bool,
 }
 
-/// `evaluate.recognition`: a classifier learns activities from the train split's real clips; measured is how many of the drawn motions it takes for what
-/// their captions name (`accuracy`, and `accuracy/NAME`), beside real clips of `split` (`real_accuracy`), and the share of skating steps of both
-/// (`skating`, `real_skating`). The report has a contact sheet.
+/// `evaluate.recognition`: trains a classifier of activities on real clips of the train split. It measures the share of
+/// generated motions that are classified as their caption's activity (`accuracy`, and `accuracy/NAME`), and of real
+/// clips of `split` (`real_accuracy`). It also measures the share of skating steps of both (`skating`, `real_skating`).
+/// The report has a contact sheet.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluateRecognition {
@@ -31,17 +32,18 @@ pub struct EvaluateRecognition {
     pub model: String,
     /// Stage that gives the clips.
     pub dataset: String,
-    /// Activities. A clip is of the first whose words a caption has; one whose captions differ in that is left out, and so is one of none.
+    /// Activities, in order of priority. A clip shows the first one with a phrase in a caption. Clips whose captions
+    /// differ in this, or have no phrase, are left out.
     pub activities: Vec<Activity>,
-    /// Sampler.
+    /// Sampler for the model.
     pub sampler: Sampler,
-    /// Motions, dealt out to the activities in turn.
+    /// Number of motions, divided among the activities in turn.
     pub motions: usize,
-    /// Clips whose captions and lengths are drawn, and which are recognised for comparison.
+    /// Split of the clips for captions and lengths, and for the comparison with real motion.
     pub split: Split,
 }
 
-/// What people ask for first, in words of HumanML3D's captions.
+/// Common activities of users' prompts, in words of HumanML3D's captions.
 fn usual() -> Vec<Activity> {
     let activity = |(name, words): (&str, &[&str])| Activity {
         name: name.to_owned(),

@@ -1,5 +1,5 @@
-//! `evaluate.reconstruction`: what a VAE or a tokenizer loses. Source: MLD's MPJPE, DisCoRD's sJPE, FID of the tokenizers' papers, and our
-//! feature error.
+//! `evaluate.reconstruction`: errors of a VAE or a tokenizer. Source: MLD's MPJPE, DisCoRD's sJPE, FID of the
+//! tokenizers' papers, and our feature error.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -7,28 +7,29 @@ use serde::{Deserialize, Serialize};
 use crate::ArtifactKind;
 use crate::stage::{Neighbours, Output, Problems, Ref, Shape, Split, StageSpec};
 
-/// `evaluate.reconstruction`: MPJPE in mm, sJPE and feature error of a VAE or a tokenizer; with an evaluator also FID, of a tokenizer also how
-/// many codes are in use. A unit of KIT-ML is 1.5625 mm, which `millimetres_per_unit` says; papers that take one for a millimetre print values
-/// smaller by that.
+/// `evaluate.reconstruction`: MPJPE in mm, sJPE and feature error of a VAE or a tokenizer. With an evaluator also FID;
+/// for a tokenizer also the share of codes in use. A unit of KIT-ML is 1.5625 mm, reported as `millimetres_per_unit`;
+/// papers that assume a millimetre print values smaller by that factor.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluateReconstruction {
     /// Stage that gives the VAE; not read if there is a tokenizer.
     pub vae: String,
-    /// Stage that gives the tokenizer that is measured instead of a VAE; none if empty.
+    /// Stage that gives the tokenizer to be measured instead of a VAE; empty for a VAE.
     pub tokenizer: String,
-    /// Stage that gives the flow decoder that decodes the tokenizer's tokens, or the VAE's latents; the tokenizer's own, or the VAE's, if empty.
+    /// Stage that gives the flow decoder for the tokenizer's tokens, or the VAE's latents; empty uses the tokenizer's,
+    /// or the VAE's, own decoder.
     pub decoder: String,
-    /// Steps of the flow decoder's solver, or jumps of a student, instead of those that it was trained with; 0 takes its own. A step of its
-    /// solver `midpoint` is two evaluations of the network, one of `euler` is one.
+    /// Number of steps of the flow decoder's solver, or of a student's jumps; 0 uses its own number. A step of solver
+    /// `midpoint` is two evaluations of the network, a step of `euler` one.
     pub decoder_steps: usize,
-    /// Stage that gives the evaluator in whose space FID is taken, of reconstructions against the clips themselves; no FID if empty.
+    /// Stage that gives the evaluator for FID, of reconstructions against the clips themselves; empty leaves FID out.
     pub evaluator: String,
     /// Stage that gives the clips.
     pub dataset: String,
-    /// Clips.
+    /// Split of the clips.
     pub split: Split,
-    /// Shards.
+    /// Number of shards.
     pub shards: usize,
 }
 
@@ -49,7 +50,7 @@ impl Default for EvaluateReconstruction {
 
 impl StageSpec for EvaluateReconstruction {
     const KIND: &'static str = "evaluate.reconstruction";
-    // 2: PA-MPJPE, accelerations, sJPE, skating. 3: what a unit is.
+    // Version 2 adds PA-MPJPE, accelerations, sJPE, skating. Version 3 adds the length of a unit.
     const VERSION: u32 = 3;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };

@@ -1,4 +1,5 @@
-//! `evaluate.spectrum`: which frequencies of a motion settle when it is denoised. Source: Free-T2M (Chen et al., 2025, figure 4).
+//! `evaluate.spectrum`: the order in which a motion's frequencies settle during denoising. Source: Free-T2M (Chen et
+//! al., 2025, figure 4).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -6,23 +7,23 @@ use serde::{Deserialize, Serialize};
 use crate::ArtifactKind;
 use crate::stage::{Neighbours, Output, Problems, Ref, Sampler, Shape, Split, StageSpec};
 
-/// `evaluate.spectrum`: energy by band of frequencies of the motion that is predicted in each denoising step. Metrics are called
-/// `energy/BAND/STEP`, as a share of the energy of real motion in that band, and `settled/BAND/STEP`, 1 less the share of the final motion's energy by
-/// which the prediction still differs from it; bands and steps count from 1.
+/// `evaluate.spectrum`: energy by frequency band of the predicted motion in each denoising step. `energy/BAND/STEP` is
+/// the share of real motion's energy in that band. `settled/BAND/STEP` is 1 minus the energy of the prediction's
+/// difference from the final motion, as a share of the final motion's. Bands and steps count from 1.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluateSpectrum {
-    /// Stage that gives the model, which draws by denoising.
+    /// Stage that gives the model, which must generate by denoising.
     pub model: String,
     /// Stage that gives the clips.
     pub dataset: String,
-    /// Where bands end, in hertz, the lowest first; one more ends at half the frame rate.
+    /// Ends of the bands in hertz, ascending; an additional band ends at half the frame rate.
     pub bands: Vec<f64>,
-    /// Sampler.
+    /// Sampler for the model.
     pub sampler: Sampler,
-    /// Motions: one for each of so many entries, or for all if there are fewer.
+    /// Number of motions, one per entry; all entries if there are fewer.
     pub motions: usize,
-    /// Clips.
+    /// Split of the clips.
     pub split: Split,
 }
 

@@ -1,4 +1,5 @@
-//! `evaluate.t2m`: the papers' metrics, in an evaluator's space. Source: text-to-motion (Guo et al., CVPR 2022) and all after it.
+//! `evaluate.t2m`: the papers' metrics, in an evaluator's space. Source: text-to-motion (Guo et al., CVPR 2022) and
+//! later papers.
 
 use std::collections::BTreeSet;
 
@@ -8,15 +9,15 @@ use serde::{Deserialize, Serialize};
 use crate::stage::{Family, Neighbours, Output, Problems, Ref, Sampler, Shape, Split, StageSpec};
 use crate::{ArtifactKind, limits};
 
-/// How different the motions of one caption are. Published: 100 captions, 30 motions each, 10 pairs.
+/// Variety of the motions of one caption. Published: 100 captions, 30 motions each, 10 pairs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct MultiModality {
-    /// Captions per repeat; 0 leaves the metric out.
+    /// Number of captions per repeat; 0 leaves the metric out.
     pub captions: usize,
-    /// Motions per caption.
+    /// Number of motions per caption.
     pub samples: usize,
-    /// Pairs compared per caption.
+    /// Number of compared pairs per caption.
     pub pairs: usize,
 }
 
@@ -32,43 +33,46 @@ impl Default for MultiModality {
 pub struct EvaluateT2m {
     /// Stage that gives the model.
     pub model: String,
-    /// Stage that gives a VAE whose reconstructions, of a sample of the posterior, are measured instead of a model's motions; none if empty.
+    /// Stage that gives a VAE whose reconstructions, of a sample of the posterior, are measured instead of a model's
+    /// motions; empty for a model.
     pub vae: String,
-    /// Stage that gives a tokenizer whose reconstructions are measured instead; none if empty.
+    /// Stage that gives a tokenizer whose reconstructions are measured instead; empty for a model.
     pub tokenizer: String,
-    /// Stage that gives the flow decoder that decodes the tokenizer's tokens; the tokenizer's own if empty.
+    /// Stage that gives the flow decoder for the tokenizer's tokens; empty uses the tokenizer's own decoder.
     pub decoder: String,
     /// Stage that gives the clips.
     pub dataset: String,
     /// Stage that gives the evaluator.
     pub evaluator: String,
-    /// Stage that gives a length estimator: a motion is as long as it draws for the caption. Without one it is as long as the caption's crop, as
-    /// in the latent models' papers.
+    /// Stage that gives a length estimator, which draws the length of a motion for its caption. Empty uses the length
+    /// of the caption's crop, as in the latent models' papers.
     pub length: String,
-    /// Measures real motion, against itself with other crops; no model is read.
+    /// Measures real motion against itself with other crops; no model is read.
     pub real: bool,
-    /// The control: captions are dealt to motions at random, so that retrieval is left to chance.
+    /// Control experiment: assigns captions to motions at random, so that retrieval is at chance level.
     pub shuffled: bool,
-    /// Probability that a word of what the model is told is exchanged for another of its meaning, of a table of ours; the evaluator reads the
-    /// caption itself. 0 tells it the caption.
+    /// Probability that a word of the model's caption is replaced by another of the same meaning, from a table of ours;
+    /// the evaluator reads the original caption. 0 changes nothing.
     pub perturbed: f64,
-    /// Sampler.
+    /// Sampler for the model.
     pub sampler: Sampler,
-    /// Repeats with other noise, captions, crops and pools.
+    /// Number of repeats with other noise, captions, crops and pools.
     pub repeats: usize,
-    /// Motions that a caption's own is ranked among. R-precision and MM-Dist are of the first; those of the others have `_poolN` behind
-    /// their names.
+    /// Sizes of the pools in which a caption's own motion is ranked. R-precision and MM-Dist use the first; metrics of
+    /// the others have the suffix `_poolN`.
     pub pools: Vec<usize>,
-    /// Leaves out of every metric but MultiModality what does not fill a pool of the first size, as loaders that drop the last batch do:
-    /// which clips these are is drawn anew in each repeat. Otherwise R-precision and MM-Dist alone leave them out.
+    /// Leaves out of every metric but MultiModality the clips that do not fill a pool of the first size, as loaders
+    /// that drop the last batch do. These clips are drawn again in each repeat. Otherwise only R-precision and MM-Dist
+    /// leave them out.
     pub drop_last: bool,
-    /// MultiModality.
+    /// Settings of MultiModality.
     pub multimodality: MultiModality,
-    /// Clips. Choose on `val`; `test` is for the last look.
+    /// Split of the clips. Choose on `val`; keep `test` for the final result.
     pub split: Split,
-    /// Takes all clips where the split has fewer than the largest pool, and says so in the report; otherwise so small a split is refused.
+    /// Uses all clips if the split has fewer than the largest pool, and reports it; otherwise so small a split is
+    /// refused.
     pub all_if_small: bool,
-    /// Shards.
+    /// Number of shards.
     pub shards: usize,
 }
 
@@ -98,22 +102,22 @@ impl Default for EvaluateT2m {
 }
 
 impl EvaluateT2m {
-    /// Whether a model's motions are measured, not real ones or reconstructions of such.
+    /// Returns true if a model's motions are measured, not real ones or their reconstructions.
     pub fn generates(&self) -> bool {
         !self.real && !self.reconstructs()
     }
 
-    /// Whether what a VAE or a tokenizer makes of real motion is measured.
+    /// Returns true if reconstructions of real motion by a VAE or a tokenizer are measured.
     pub fn reconstructs(&self) -> bool {
         !self.vae.is_empty() || !self.tokenizer.is_empty()
     }
 
-    /// The pool of the metrics without a suffix.
+    /// Size of the pool of the metrics without a suffix.
     pub fn first_pool(&self) -> usize {
         self.pools.first().copied().unwrap_or(1)
     }
 
-    /// The pool that needs the most entries.
+    /// Size of the largest pool, which needs the most entries.
     pub fn largest_pool(&self) -> usize {
         self.pools.iter().copied().max().unwrap_or(1)
     }
@@ -121,7 +125,8 @@ impl EvaluateT2m {
 
 impl StageSpec for EvaluateT2m {
     const KIND: &'static str = "evaluate.t2m";
-    // 2: says which model it measured, and how that was drawn. 3: pools, `drop_last`, drawn lengths, reconstructions.
+    // Version 2 reports the measured model and its sampler. Version 3 adds pools, `drop_last`, drawn lengths,
+    // reconstructions.
     const VERSION: u32 = 3;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
@@ -134,7 +139,8 @@ impl StageSpec for EvaluateT2m {
             Ref::stage("evaluator", &mut self.evaluator, ArtifactKind::Evaluator),
             Ref::stage("model", &mut self.model, ArtifactKind::Model)
                 .only_if(generated)
-                // Shuffled captions say nothing of the model, and others than its own not what it is registered with.
+                // Metrics with shuffled or perturbed captions do not describe the model, so it is not registered with
+                // them.
                 .measured_if(generated && !self.shuffled && self.perturbed == 0.0),
             Ref::stage("length", &mut self.length, ArtifactKind::Length).optional().only_if(generated),
             Ref::stage("vae", &mut self.vae, ArtifactKind::Vae).optional(),
@@ -250,7 +256,7 @@ impl StageSpec for EvaluateT2m {
 }
 
 impl EvaluateT2m {
-    /// One thing is measured.
+    /// Checks that exactly one subject is measured.
     fn check_subject(&self, p: &mut Problems) {
         if self.real && self.reconstructs() {
             let field = if self.vae.is_empty() { "tokenizer" } else { "vae" };

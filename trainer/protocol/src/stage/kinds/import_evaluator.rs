@@ -1,4 +1,4 @@
-//! `import.evaluator`: a published evaluator, read from its files. Source: text-to-motion (Guo et al., CVPR 2022).
+//! `import.evaluator`: imports a published evaluator from its files. Source: text-to-motion (Guo et al., CVPR 2022).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -8,19 +8,19 @@ use crate::stage::{DataFormat, Output, Problems, Ref, Shape, StageSpec};
 
 /// Files of a folder with the published word vectors.
 pub(super) const VOCABULARY: [&str; 3] = ["our_vab_data.npy", "our_vab_words.pkl", "our_vab_idx.pkl"];
-/// Where they are from.
+/// Source of the word vectors.
 pub(super) const WORDS_ORIGIN: &str = "its word vectors (GloVe), linked in github.com/EricGuo5513/HumanML3D";
 
-/// `import.evaluator`: the published files.
+/// `import.evaluator`: imports the published files of an evaluator.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct ImportEvaluator {
-    /// Folder in the published layout: `text_mot_match/model/finest.tar` (or `finest.safetensors`) and, where there are several, the one
-    /// folder `Comp_*/meta` with `mean.npy` and `std.npy`. Not part of the key: the content's digest is.
+    /// Folder in the published layout: `text_mot_match/model/finest.tar` (or `finest.safetensors`) and `mean.npy` and
+    /// `std.npy` in `meta` or in the only folder `Comp_*/meta`. Its content's digest is part of the key, not the path.
     pub path: String,
-    /// What it was trained on.
+    /// Format of its training data.
     pub format: DataFormat,
-    /// Folder with the word vectors that it was trained with; empty takes the built-in ones, for an evaluator of our own.
+    /// Folder with the word vectors of its training; empty uses the built-in ones, for an evaluator of our own.
     pub words: String,
 }
 

@@ -1,4 +1,5 @@
-//! `import.model`: published weights, read from their files. Sources: MLD, MotionLCM, T2M-GPT, MoMask, MMM, MDM, DisCoRD.
+//! `import.model`: imports published weights from their files. Sources: MLD, MotionLCM, T2M-GPT, MoMask, MMM, MDM,
+//! DisCoRD.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -9,105 +10,110 @@ use crate::stage::{
     ControlHints, DataFormat, Family, FlowSolver, Neighbours, Output, Problems, Ref, Shape, Solver, StageSpec,
 };
 
-/// What a file's statistics are called in published folders.
+/// Names of the statistics in published folders.
 const STATISTICS: [&str; 2] = ["mean.npy|Mean.npy", "std.npy|Std.npy"];
 const STATISTICS_ORIGIN: &str = "mean and deviation of the features that the model was trained on: those of the data set (MotionLCM, MDM), \
                                  or the folder `meta` beside the weights (MoMask, T2M-GPT)";
 const HINT_STATISTICS: [&str; 2] = ["Mean_raw.npy", "Std_raw.npy"];
 const HINT_ORIGIN: &str = "mean and deviation of the joints that OmniControl and MotionLCM normalise hints with, `humanml_spatial_norm` there";
 
-/// What is taken of a file, and so what the stage gives.
+/// Network to import from the file; it decides the output of the stage.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum ImportedPart {
-    /// The VAE of MLD or MotionLCM, also out of a file that has a denoiser beside it: a VAE.
+    /// The VAE of MLD or MotionLCM, also from a file with a denoiser; outputs a VAE.
     #[default]
     Vae,
-    /// The denoiser of MLD, or MotionLCM's teacher: a model. Reads `vae` and `text`.
+    /// The denoiser of MLD, or MotionLCM's teacher; outputs a model. Reads `vae` and `text`.
     Mld,
-    /// MotionLCM's student: a model. Reads `vae` and `text`.
+    /// MotionLCM's student; outputs a model. Reads `vae` and `text`.
     Lcm,
-    /// MotionLCM's ControlNet and trajectory encoder: the model `model` with a control part.
+    /// MotionLCM's ControlNet and trajectory encoder; outputs the model `model` with a control part.
     Control,
-    /// The tokenizer of T2M-GPT, MMM or MoMask: a tokenizer.
+    /// The tokenizer of T2M-GPT, MMM or MoMask; outputs a tokenizer.
     Tokenizer,
-    /// T2M-GPT's transformer: a model. Reads `tokenizer` and `text`.
+    /// T2M-GPT's transformer; outputs a model. Reads `tokenizer` and `text`.
     T2mgpt,
-    /// MoMask's masked transformer, and with `residual` the one of the layers above the first: a model. Reads `tokenizer` and `text`.
+    /// MoMask's masked transformer, and with `residual` that of the layers above the first; outputs a model. Reads
+    /// `tokenizer` and `text`.
     Momask,
-    /// MMM's transformer: a model. Reads `tokenizer` and `text`.
+    /// MMM's transformer; outputs a model. Reads `tokenizer` and `text`.
     Mmm,
-    /// MDM, the moving average of its weights if there is one: a model. Reads `text`.
+    /// MDM, with the moving average of its weights if there is one; outputs a model. Reads `text`.
     Mdm,
-    /// DisCoRD's decoder: a flow decoder, which `model.decoder` puts into a model. Reads `tokenizer`.
+    /// DisCoRD's decoder; outputs a flow decoder, which `model.decoder` puts into a model. Reads `tokenizer`.
     Discord,
 }
 
-/// Whether a denoiser has a ReLU on the caption's embedding, which its weights do not say.
+/// ReLU of a denoiser on the caption's embedding, which its weights do not show.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum TextActivation {
-    /// As in the published denoiser of its shape: with latents as wide as the transformer (v1, MLD) it has one, otherwise (v2) none.
+    /// As in the published denoiser of its shape: latents of the transformer's width (v1, MLD) have one, others (v2)
+    /// have none.
     #[default]
     Published,
-    /// It has one.
+    /// With a ReLU.
     Relu,
-    /// It has none.
+    /// Without a ReLU.
     None,
 }
 
-/// `import.model`: published weights. Sizes are read off the shapes of the weights; what these do not say is set here, with the published
-/// value as default. Tensors that nothing reads, such as an evaluator's or an optimizer's, are named in the log and left out.
+/// `import.model`: imports published weights. Sizes come from the shapes of the weights. Facts that the weights lack
+/// are set here, with the published value as default. Unused tensors, such as an evaluator's or an optimizer's, are
+/// listed in the log and left out.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct ImportModel {
-    /// File with the weights, of torch (`.ckpt`, `.tar`, `.pth`, `.pt`) or `.safetensors` under the same names. Nothing in it is run. Not part of the
-    /// key: the content's digest is.
+    /// File with the weights, of torch (`.ckpt`, `.tar`, `.pth`, `.pt`) or `.safetensors` under the same names. No code
+    /// in it is executed. Its content's digest is part of the key, not the path.
     pub path: String,
-    /// What is taken of it.
+    /// Network to import from the file.
     pub part: ImportedPart,
-    /// `momask`: file with the residual transformer; a tokenizer of one codebook needs none.
+    /// For `momask`: file with the residual transformer; a tokenizer of one codebook needs none.
     pub residual: String,
-    /// `vae`, `tokenizer`, `mdm`: what it was trained on.
+    /// For `vae`, `tokenizer`, `mdm`: format of the training data.
     pub format: DataFormat,
-    /// `vae`, `tokenizer`, `mdm`: folder with the mean and the deviation that it was trained with, `mean.npy` and `std.npy`, or `Mean.npy` and
-    /// `Std.npy`.
+    /// For `vae`, `tokenizer`, `mdm`: folder with the mean and the deviation of its training, `mean.npy` and `std.npy`,
+    /// or `Mean.npy` and `Std.npy`.
     pub statistics: String,
-    /// The same out of a data set: stage that gives it, in place of `format` and `statistics`.
+    /// Stage that gives a dataset with both, in place of `format` and `statistics`.
     pub dataset: String,
-    /// `mld`, `lcm`: stage that gives the VAE whose latents it makes. A file that holds a VAE besides must hold this one.
+    /// For `mld`, `lcm`: stage that gives the VAE of its latents. A VAE in the file must be equal to it.
     pub vae: String,
-    /// `t2mgpt`, `momask`, `mmm`, `discord`: stage that gives the tokenizer.
+    /// For `t2mgpt`, `momask`, `mmm`, `discord`: stage that gives the tokenizer.
     pub tokenizer: String,
-    /// All that give a model but `control`: stage that gives caption embeddings of the encoder that it was trained with, of whatever captions.
+    /// For models except `control`: stage that gives caption embeddings of its text encoder, of any captions.
     pub text: String,
-    /// `control`: stage that gives the model that it controls. A file that holds a denoiser besides must hold this one's.
+    /// For `control`: stage that gives the model that it controls. A denoiser in the file must be equal to the model's.
     pub model: String,
-    /// Attention heads; 0 takes the published number: 4 (MLD, MotionLCM, MDM, DisCoRD), 6 (MoMask), 16 (T2M-GPT, MMM).
+    /// Number of attention heads; 0 uses the published number: 4 (MLD, MotionLCM, MDM, DisCoRD), 6 (MoMask), 16
+    /// (T2M-GPT, MMM).
     pub heads: usize,
-    /// `mld`, `lcm`: whether captions go through a ReLU.
+    /// For `mld`, `lcm`: ReLU on the caption's embedding.
     pub text_activation: TextActivation,
-    /// `lcm`: guidance scales w that it was trained with.
+    /// For `lcm`: range of the guidance scales w in its training.
     pub guidance: (f64, f64),
-    /// `lcm`: the solver's step k in training, which samplers without `timesteps` follow: 100 (v2), 20 (v1).
+    /// For `lcm`: the solver's step k in training, which samplers without `timesteps` follow: 100 (v2), 20 (v1).
     pub skip: usize,
-    /// `control`: what it was told in training.
+    /// For `control`: targets in its training.
     pub hints: ControlHints,
-    /// `control`: folder with `Mean_raw.npy` and `Std_raw.npy`, the statistics of joints in metres that hints were normalised with.
+    /// For `control`: folder with `Mean_raw.npy` and `Std_raw.npy`, the statistics of joints in metres that normalise
+    /// hints.
     pub hint_statistics: String,
-    /// `momask`: tokens of the longest motion. The others' files say it.
+    /// For `momask`: tokens of the longest motion. The files of other models contain it.
     pub longest: usize,
-    /// `tokenizer`: what dilations grow by from block to block.
+    /// For `tokenizer`: factor between the dilations of neighbouring blocks.
     pub growth: usize,
-    /// `mdm`: timesteps of its cosine schedule: 1000, or 50 in the authors' later model.
+    /// For `mdm`: timesteps of its cosine schedule: 1000, or 50 in the authors' later model.
     pub timesteps: usize,
-    /// `mdm`: whether attention was kept off padding, as in the later model.
+    /// For `mdm`: masks padding in attention, as in the later model.
     pub mask_frames: bool,
-    /// `mdm`: frames of the longest motion.
+    /// For `mdm`: frames of the longest motion.
     pub max_frames: usize,
-    /// `discord`: how the flow is followed.
+    /// For `discord`: solver of the flow.
     pub solver: FlowSolver,
-    /// `discord`: steps of that.
+    /// For `discord`: number of steps of the solver.
     pub solver_steps: usize,
 }
 
@@ -142,7 +148,7 @@ impl Default for ImportModel {
 }
 
 impl ImportedPart {
-    /// The word in YAML.
+    /// Name in YAML.
     pub fn name(self) -> &'static str {
         match self {
             Self::Vae => "vae",
@@ -158,7 +164,7 @@ impl ImportedPart {
         }
     }
 
-    /// Attention heads of the published one.
+    /// Number of attention heads of the published network.
     pub fn heads(self) -> usize {
         match self {
             Self::Momask => 6,
@@ -167,7 +173,7 @@ impl ImportedPart {
         }
     }
 
-    /// What of a stage it decides: whether it holds features' statistics, and which stages it reads.
+    /// Inputs of the stage for this part: the features' statistics, and stages.
     fn reads(self) -> Reads {
         let none = Reads::default();
         match self {
@@ -180,7 +186,7 @@ impl ImportedPart {
         }
     }
 
-    /// Where its file comes from.
+    /// Source of its file.
     fn origin(self) -> &'static str {
         match self {
             Self::Vae | Self::Lcm | Self::Control => {
@@ -201,7 +207,7 @@ impl ImportedPart {
     }
 }
 
-/// What a part's import reads besides its file.
+/// Inputs of a part's import besides its file.
 #[derive(Debug, Clone, Copy, Default)]
 #[expect(clippy::struct_excessive_bools, reason = "a table of five columns")]
 struct Reads {

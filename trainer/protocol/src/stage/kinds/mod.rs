@@ -1,4 +1,5 @@
-//! The list of stage kinds. A kind is its file here, its file in `stages::kinds` that runs it, and a line in each of the two lists.
+//! The list of stage kinds. A kind is its file here, its file in `stages::kinds` that runs it, and a line in each of
+//! the two lists.
 
 mod data_features;
 mod data_open;

@@ -1,5 +1,5 @@
-//! `model.decoder`: a model of tokens, or of latents, with a flow decoder in place of its tokenizer's, or its VAE's, own. Source: DisCoRD (Cho et
-//! al., arXiv:2411.19527).
+//! `model.decoder`: a model of tokens or latents whose own decoder is replaced by a flow decoder. Source: DisCoRD (Cho
+//! et al., arXiv:2411.19527).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -7,13 +7,13 @@ use serde::{Deserialize, Serialize};
 use crate::ArtifactKind;
 use crate::stage::{Family, Neighbours, Output, Problems, Ref, Shape, StageSpec};
 
-/// `model.decoder`: draws tokens or latents as another model does, and decodes them along a flow.
+/// `model.decoder`: generates tokens or latents with another model, and decodes them along a flow.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct ModelDecoder {
-    /// Stage that gives the model, of tokens or of latents.
+    /// Stage that gives the model, of tokens or latents.
     pub model: String,
-    /// Stage that gives the decoder, trained on the tokenizer, or the VAE, that the model has.
+    /// Stage that gives the decoder, trained on the model's tokenizer or VAE.
     pub decoder: String,
 }
 

@@ -1,4 +1,5 @@
-//! `register`: model versions, and the best of them promoted. Done by the coordinator, because it changes the registry. Source: ours.
+//! `register`: registers model versions and promotes the best. The coordinator runs it, because it changes the
+//! registry. Source: ours.
 
 use std::collections::BTreeSet;
 
@@ -10,25 +11,25 @@ use crate::artifact::Role;
 use crate::id::is_name;
 use crate::stage::{Mode, Neighbours, Output, Problems, Ref, Sampler, Shape, StageSpec, measured_with};
 
-/// `register`: model versions, and the best of them promoted.
+/// `register`: registers model versions and promotes the best of them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Register {
-    /// Model name.
+    /// Name of the model.
     pub model: String,
-    /// Stages whose models become versions. The metrics of every `evaluate.*` stage of the pipeline that
-    /// looks at one of them go with it.
+    /// Stages whose models become versions. The metrics of every `evaluate.*` stage of the pipeline that measures one
+    /// of them are registered with it.
     pub from: Vec<String>,
-    /// Metric that decides which is best.
+    /// Metric that ranks the versions.
     pub metric: String,
-    /// Its direction.
+    /// Direction of the metric.
     pub mode: Mode,
-    /// How the versions are drawn from when nobody says otherwise. Without it, as their evaluations drew; it is needed where those differ.
+    /// Default sampler of the versions. Without it, that of their evaluations; required if those differ.
     #[schemars(with = "Sampler")]
     pub sampler: Option<Sampler>,
     /// Stage that gives a length estimator, which becomes a part of every version; empty adds none.
     pub length: String,
-    /// What is promoted; without it nothing is.
+    /// Promotion of the best version; without it none is promoted.
     pub promote: Promote,
 }
 
@@ -50,15 +51,15 @@ impl Default for Register {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Promote {
-    /// Alias; empty promotes nothing.
+    /// Alias of the promoted version; empty promotes nothing.
     pub to: String,
-    /// Gates, such as `latent_fid <= 0.3`.
+    /// Conditions of the promotion, such as `latent_fid <= 0.3`.
     pub require: Vec<String>,
 }
 
 impl StageSpec for Register {
     const KIND: &'static str = "register";
-    // 2: versions are drawn as they were measured.
+    // Version 2 registers the sampler of the evaluations.
     const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Registry;
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
@@ -126,7 +127,7 @@ impl StageSpec for Register {
     }
 }
 
-/// `one of ...`, those nearest to `wanted` first: at most a few, without the ends of intervals.
+/// Lists `one of ...`, with those most similar to `wanted` first: at most a few, without the ends of intervals.
 fn one_of(wanted: &str, given: &BTreeSet<String>) -> String {
     let plain = |name: &&String| !name.ends_with(".lower") && !name.ends_with(".upper");
     let mut names: Vec<&String> = given.iter().filter(plain).collect();
@@ -136,18 +137,18 @@ fn one_of(wanted: &str, given: &BTreeSet<String>) -> String {
     if more > 0 { format!("name one of {listed} and {more} more") } else { format!("name one of {listed}") }
 }
 
-/// Letters that both have at the same place.
+/// Number of equal letters at equal places.
 fn alike(a: &str, b: &str) -> usize {
     a.bytes().zip(b.bytes()).filter(|(a, b)| a == b).count()
 }
 
-/// Metrics that a message lists.
+/// Largest number of metrics that a message lists.
 const LISTED: usize = 12;
 
-/// What to do about evaluations that differ.
+/// Advice for evaluations that differ.
 const SAY_WHICH: &str = "say which one the model is drawn with, such as `sampler: {steps: 1, guidance: 2}`";
 
-/// Evaluations of `from` that draw in different ways, when nobody said which way is the model's own.
+/// Message for evaluations of `from` with different samplers, without an explicit one.
 fn undecided(from: &str, differ: &str) -> String {
     format!("the evaluations of `{from}` draw from it in different ways ({differ}), and a version has one")
 }
@@ -172,11 +173,11 @@ impl Register {
         [(Role::LENGTH, self.length.as_str())].into_iter().filter(|(_, stage)| !stage.is_empty())
     }
 
-    /// How a version of `from` is drawn from when nobody says otherwise: as these settings name it, or as its evaluations drew. `None` if
-    /// nobody measured it.
+    /// Default sampler of a version of `from`: the one in these settings, or that of its evaluations. `None` without
+    /// evaluations.
     ///
     /// # Errors
-    /// Which evaluations differ, and what to write.
+    /// The evaluations that differ, and the setting to add.
     pub fn sampler_of<'a>(
         &'a self,
         from: &str,
@@ -206,7 +207,7 @@ impl Promote {
     }
 }
 
-/// `metric <= number`, or with `alias`, `alias + number`, `alias - number` on the right.
+/// Checks for `metric <= number`, or with `alias`, `alias + number`, `alias - number` on the right.
 fn is_gate(gate: &str) -> bool {
     let Some(at) = gate.find(['<', '>']) else { return false };
     let (metric, rest) = gate.split_at(at);

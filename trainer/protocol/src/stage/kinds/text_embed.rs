@@ -1,5 +1,6 @@
-//! `text.embed`: every caption of a dataset as a vector, computed once. `hashed` is ours; the others are published encoders, read from their
-//! folders: CLIP (Radford et al., arXiv:2103.00020), T5 (Raffel et al., arXiv:1910.10683), Sentence-T5 (Ni et al., arXiv:2108.08877).
+//! `text.embed`: embeds every caption of a dataset as a vector, once. `hashed` is ours; the others are published
+//! encoders, read from their folders: CLIP (Radford et al., arXiv:2103.00020), T5 (Raffel et al., arXiv:1910.10683),
+//! Sentence-T5 (Ni et al., arXiv:2108.08877).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -7,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::ArtifactKind;
 use crate::stage::{Output, Problems, Ref, Shape, StageSpec};
 
-/// Of each encoder's folder what must be there; of several with `|` between them, one.
+/// Files that an encoder's folder must have; `|` separates alternatives.
 const CLIP_FILES: [&str; 3] = [
     "config.json|modules.json",
     "tokenizer.json|vocab.json|modules.json",
@@ -24,20 +25,22 @@ const SENTENCE_T5_FILES: [&str; 1] = ["modules.json"];
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct TextEmbed {
-    /// Which encoder.
+    /// Encoder of the captions.
     pub encoder: TextEncoder,
-    /// Folder with the published encoder, in the layout of Hugging Face or of sentence-transformers, or its name on huggingface.co, such as
-    /// `sentence-transformers/sentence-t5-large`, where no such folder is; `hashed` has none. Not part of the key: the content's digest is.
+    /// Folder with the published encoder, in the layout of Hugging Face or of sentence-transformers. If there is no
+    /// such folder, its name on huggingface.co, such as `sentence-transformers/sentence-t5-large`. `hashed` has none.
+    /// The content's digest is part of the key, not the path.
     pub path: String,
     /// Branch, tag or commit of a name on huggingface.co; empty is `main`. Not part of the key either.
     pub revision: String,
-    /// Which vector of CLIP's a caption is; its words are the states of all tokens either way.
+    /// Vector of CLIP for a caption; its words are the states of all tokens in either case.
     pub output: ClipOutput,
-    /// How captions become CLIP's token ids.
+    /// Conversion of captions to CLIP's token ids.
     pub ids: ClipIds,
-    /// Tokens of a caption at most, its end among them; 0 takes what the encoder's folder says. MDM reads 22.
+    /// Largest number of tokens of a caption, its end included; 0 uses the number in the encoder's folder. MDM reads
+    /// 22.
     pub max_tokens: usize,
-    /// Shards.
+    /// Number of shards.
     pub shards: usize,
     /// Stage whose captions are embedded.
     pub dataset: String,
@@ -58,7 +61,7 @@ impl Default for TextEmbed {
     }
 }
 
-/// How a caption becomes a vector.
+/// Encoder that embeds a caption as a vector.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum TextEncoder {
@@ -72,30 +75,30 @@ pub enum TextEncoder {
     SentenceT5,
 }
 
-/// Which vector of CLIP's a caption is; never normalised.
+/// Vector of CLIP for a caption; never normalised.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum ClipOutput {
-    /// The state of the end token, projected: what published models read.
+    /// The projected state of the end token, which published models read.
     Projected,
-    /// The same before the projection.
+    /// The state of the end token before the projection.
     Pooled,
 }
 
-/// How captions become CLIP's token ids.
+/// Conversion of captions to CLIP's token ids.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub enum ClipIds {
-    /// As the folder's tokenizer says, padded with the end token: MLD.
+    /// The folder's tokenizer, padded with the end token: MLD.
     #[serde(rename = "huggingface")]
     HuggingFace,
-    /// As OpenAI's package: the text repaired first, padded with zeros, which only states of tokens show: MDM, T2M-GPT, MoMask, MMM,
-    /// StableMoFusion.
+    /// OpenAI's package: the text is repaired first and padded with zeros, which affect only states of tokens: MDM,
+    /// T2M-GPT, MoMask, MMM, StableMoFusion.
     #[serde(rename = "openai")]
     OpenAi,
 }
 
 impl TextEncoder {
-    /// The word in YAML, and in what the encoder made.
+    /// Name in YAML, and in the encoder's artifacts.
     pub fn name(self) -> &'static str {
         match self {
             Self::Hashed => "hashed",
@@ -105,13 +108,13 @@ impl TextEncoder {
         }
     }
 
-    /// Whether enough of its vectors is left by a ReLU. A hashed word is one coordinate, as often -1 as +1, so that half of the words
-    /// would mean nothing, and so would the empty caption.
+    /// Returns true if a ReLU leaves enough of its vectors. A hashed word is one coordinate, -1 as often as +1. So half
+    /// of the words would be lost, and so would the empty caption.
     pub fn survives_relu(self) -> bool {
         self != Self::Hashed
     }
 
-    /// What its folder must have, and where it comes from.
+    /// Required files of its folder, and their source.
     fn folder(self) -> (&'static [&'static str], &'static str) {
         match self {
             Self::Hashed => (&[], ""),
@@ -129,7 +132,7 @@ impl TextEncoder {
 
 impl StageSpec for TextEmbed {
     const KIND: &'static str = "text.embed";
-    // 2: with the encoder. 3: published encoders, in shards.
+    // Version 2 stores the encoder, version 3 adds published encoders and shards.
     const VERSION: u32 = 3;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "embeddings", kind: ArtifactKind::Embeddings };
@@ -146,7 +149,7 @@ impl StageSpec for TextEmbed {
     fn check(&self, p: &mut Problems) {
         let name = self.encoder.name();
         let (_, origin) = self.encoder.folder();
-        // `--set text.encoder=hashed` is how a recipe is tried without its encoder; what else is set means nothing then.
+        // `--set text.encoder=hashed` tries a recipe without its encoder; the other settings then have no effect.
         if self.encoder != TextEncoder::Hashed && self.path.trim().is_empty() {
             let message = format!("`path` is missing: the folder with the encoder `{name}`");
             p.add("path", message, &format!("download {origin}"));

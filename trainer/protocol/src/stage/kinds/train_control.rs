@@ -1,4 +1,4 @@
-//! `train.control`: motion that passes given positions. Source: MotionLCM (Dai et al., ECCV 2024; v2 of late 2024).
+//! `train.control`: motion through target positions. Source: MotionLCM (Dai et al., ECCV 2024; v2 of late 2024).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -8,29 +8,29 @@ use crate::limits;
 use crate::stage::control::check_skeleton;
 use crate::stage::{ControlHints, Neighbours, Network, Output, Problems, Ref, Shape, StageSpec, Training};
 
-/// How a joint's position is compared with the one that was told.
+/// Distance d of a joint from its target.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum ControlDistance {
-    /// `d^2`: temporal.
+    /// Squared error `d^2`: temporal.
     #[default]
     L2,
-    /// `|d|`.
+    /// Absolute error `|d|`.
     L1,
-    /// `d^2 / 2` up to 1, `|d| - 1/2` beyond: spatial.
+    /// Smooth L1, `d^2 / 2` up to 1, `|d| - 1/2` beyond: spatial.
     SmoothL1,
 }
 
-/// What the sum over told positions is divided by.
+/// Divisor of the sum over targets.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum ControlMean {
-    /// The positions told in the whole batch (`sum` upstream): temporal.
+    /// Targets of the whole batch (`sum` upstream): temporal.
     #[default]
     Batch,
-    /// Those of the sample, then the mean over samples (`sum_mask`).
+    /// Targets of the sample, then the mean over samples (`sum_mask`).
     Sample,
-    /// The coordinates of the sample, three a position, then the mean over samples (`mask`): spatial.
+    /// Coordinates of the sample, three per target, then the mean over samples (`mask`): spatial.
     Coordinate,
 }
 
@@ -38,16 +38,17 @@ pub enum ControlMean {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct ControlLoss {
-    /// Weight of the latent term: the clean latent that a student predicts, or the noise that a teacher does.
+    /// Weight of the latent term: on a student's clean latent, or on a teacher's predicted noise.
     pub latent: f64,
-    /// Weight of a term of ours on the trajectory encoder's tokens, which are shaped as latents are: how far they are from the clean latent. It teaches the
-    /// encoder without the ControlNet between, whose layers are zero at first.
+    /// Weight of a term of ours on the trajectory encoder's tokens, which have the shape of latents: their distance
+    /// from the clean latent. It trains the encoder directly, without the ControlNet, whose layers are initialised to
+    /// zero.
     pub tokens: f64,
     /// Weight of the motion term, which compares joints through the frozen decoder; 0 leaves the decoder out.
     pub control: f64,
     /// Distance of the motion term.
     pub distance: ControlDistance,
-    /// Its mean.
+    /// Divisor of the motion term.
     pub mean: ControlMean,
     /// Compares metres (spatial) instead of normalised coordinates (temporal).
     pub metres: bool,
@@ -60,52 +61,55 @@ impl Default for ControlLoss {
     }
 }
 
-/// Rounds in which a drawn latent is corrected, of ours: it is decoded, and a network that is told how far its motion is from the positions changes it.
-/// The denoiser is not asked again.
+/// Rounds that correct a generated latent, ours: the latent is decoded, and a network changes it by its motion's
+/// distance from the targets. The denoiser does not run again.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct ControlFeedback {
-    /// Rounds, each of which decodes what was drawn and changes its latent by what a network makes of how far the motion is from the positions; 0, as
-    /// published, has no such network.
+    /// Number of rounds. Each decodes the latent, and a network changes it by the motion's distance from the targets.
+    /// 0, as published, has no such network.
     pub rounds: usize,
-    /// The learning rate of the network of `feedback`; 0 takes `lr`.
+    /// Learning rate of the network of `feedback`; 0 uses `lr`.
     pub lr: f64,
 }
 
-/// `train.control`: a trajectory encoder and a ControlNet beside the frozen denoiser of a latent model. Defaults are MotionLCM v2's temporal
-/// setting.
+/// `train.control`: trains a trajectory encoder and a ControlNet beside the frozen denoiser of a latent model. Defaults
+/// are those of MotionLCM v2's temporal setting.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct TrainControl {
-    /// Stage that gives the model to be controlled, of `train.mld`, `distill.lcm` or `distill.pcm`. All its parts stay as they are.
+    /// Stage that gives the model to be controlled, of `train.mld`, `distill.lcm` or `distill.pcm`. None of its parts
+    /// changes.
     pub model: String,
-    /// Stage that gives the clips that `latents` were encoded from.
+    /// Stage that gives the clips of `latents`.
     pub dataset: String,
     /// Stage that gives the latents.
     pub latents: String,
     /// Stage that gives the caption embeddings.
     pub text: String,
-    /// What is told.
+    /// Target positions in training.
     pub hints: ControlHints,
     /// Terms of the loss.
     pub loss: ControlLoss,
-    /// A student's guidance scale w is drawn from this range; v1 fixes it at 6.5. A teacher has none.
+    /// Range of a student's guidance scale w, which is drawn from it; v1 fixes it at 6.5. A teacher has none.
     pub guidance: (f64, f64),
-    /// A student trains at timesteps `k - 1`, `2k - 1` and so on to 999 (v2: k = 100); 1 takes all timesteps (v1). A teacher takes all.
+    /// A student trains at timesteps `k - 1`, `2k - 1` and so on to 999 (v2: k = 100); 1 uses all timesteps (v1). A
+    /// teacher uses all.
     pub skip: usize,
-    /// Rounds of feedback on what was drawn.
+    /// Rounds of feedback on generated latents.
     pub feedback: ControlFeedback,
-    /// Size of the trajectory encoder, and of the network of `feedback`. The ControlNet has the denoiser's.
+    /// Size of the trajectory encoder, and of the network of `feedback`. The ControlNet has the denoiser's size.
     pub network: Network,
     /// Width of the layers between trajectory tokens and ControlNet.
     pub embedding: usize,
-    /// The trajectory encoder's learning rate; 0 takes `lr`.
+    /// Learning rate of the trajectory encoder; 0 uses `lr`.
     pub trajectory_lr: f64,
-    /// Stage that gives a model whose control part training begins with where shapes fit, or a version such as `motionlcm@prod`; empty begins with the
-    /// denoiser's weights.
+    /// Stage or version, such as `motionlcm@prod`, whose control part supplies initial weights where shapes fit; empty
+    /// starts from the denoiser's weights.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub init: String,
-    /// The rest. Gradients of ControlNet and trajectory encoder are clipped together, those of the network of `feedback` by themselves.
+    /// Batch, schedule and optimizer. Gradients of ControlNet and trajectory encoder are clipped together, those of the
+    /// network of `feedback` separately.
     #[serde(flatten)]
     pub training: Training,
 }
@@ -133,7 +137,7 @@ impl Default for TrainControl {
 
 impl StageSpec for TrainControl {
     const KIND: &'static str = "train.control";
-    // 2: batches of like length.
+    // Version 2 has batches of similar length.
     const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };

@@ -1,5 +1,5 @@
-//! `train.discord`: a rectified flow that turns frozen tokens, or the latents of a frozen VAE, into motion. Source: DisCoRD (Cho et al.,
-//! arXiv:2411.19527).
+//! `train.discord`: a rectified flow that decodes frozen tokens, or the latents of a frozen VAE, to motion. Source:
+//! DisCoRD (Cho et al., arXiv:2411.19527).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -10,33 +10,35 @@ use crate::stage::{
 };
 use crate::{ArtifactKind, Steps, limits};
 
-/// Frames that one token stands for.
+/// Frames per token.
 const UNIT: usize = 4;
 
-/// What the velocity is predicted by.
+/// Network that predicts the velocity.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum FlowBackbone {
     /// A U-Net over time, as published.
     #[default]
     Unet,
-    /// A transformer, which the code base has and no released weights.
+    /// A transformer, which the published code has without released weights.
     Dit,
 }
 
-/// What the network gives.
+/// Quantity that the network predicts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum FlowPrediction {
-    /// The velocity, data less noise, as published. The network must then carry noise of the features' full width, so it wants to be wider than a frame.
+    /// The velocity, data less noise, as published. The network must then pass noise of the features' full width, so it
+    /// should be wider than a frame.
     #[default]
     Velocity,
-    /// The data, of which the velocity is computed: narrow networks can give that (Li and He, arXiv:2511.13720). The loss is on the data.
+    /// The data, from which the velocity is computed: narrow networks can predict that (Li and He, arXiv:2511.13720).
+    /// The loss is on the data.
     Data,
 }
 
 impl FlowPrediction {
-    /// The word in YAML.
+    /// Name in YAML.
     pub fn name(self) -> &'static str {
         match self {
             Self::Velocity => "velocity",
@@ -44,7 +46,7 @@ impl FlowPrediction {
         }
     }
 
-    /// What the network of the flow decoder that stage `name` gives predicts, as far as the pipeline says it.
+    /// Prediction of the flow decoder of stage `name`, if the pipeline defines it.
     pub(super) fn of_stage(stages: &Neighbours<'_>, name: &str) -> Option<Self> {
         let stage = stages.stage(name)?;
         if let Some(trained) = stage.get::<TrainDiscord>() {
@@ -53,11 +55,11 @@ impl FlowPrediction {
         if stage.get::<ImportModel>().is_some_and(|import| import.part == ImportedPart::Discord) {
             return Some(Self::Velocity);
         }
-        // A student's is its teacher's; what only passes a decoder on says nothing of its own.
+        // A student has its teacher's prediction; a stage that passes a decoder on has none of its own.
         Self::of_stage(stages, stages.read_by(name, ArtifactKind::FlowDecoder)?)
     }
 
-    /// Refuses to begin with a network of another prediction than `ours`.
+    /// Refuses initial weights of a network with another prediction than `ours`.
     pub(super) fn check_init(stages: &Neighbours<'_>, p: &mut Problems, init: &str, ours: Option<Self>) {
         if let (Some(ours), Some(theirs)) = (ours, Self::of_stage(stages, init))
             && ours != theirs
@@ -76,11 +78,11 @@ impl FlowPrediction {
     }
 }
 
-/// How tokens become a condition on each frame, of a U-Net.
+/// Conversion of tokens into a condition on each frame, for a U-Net.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum FlowProjection {
-    /// Repeat, stack, a linear layer, unstack, another: as published.
+    /// Repeat, stack, a linear layer, unstack, a second linear layer, as published.
     #[default]
     Stack,
     /// Repeat and a linear layer.
@@ -89,23 +91,24 @@ pub enum FlowProjection {
     Transposed,
 }
 
-/// Size of the network. The default is the published U-Net; the transformer in the code base has 512, 384, 4 and 4.
+/// Size of the network. The default is the published U-Net; the transformer in the published code has 512, 384, 4 and
+/// 4.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct FlowNetwork {
-    /// Width of the U-Net's first level, of which the second has twice as much; width of the transformer.
+    /// Width of the U-Net's first level (the second has twice as much), or of the transformer.
     pub width: usize,
     /// Width of the condition on a frame.
     pub condition: usize,
-    /// Residual blocks of a level, or blocks of the transformer.
+    /// Residual blocks per level, or blocks of the transformer.
     pub layers: usize,
-    /// Heads of the attention, if there is one.
+    /// Number of attention heads.
     pub heads: usize,
-    /// Attention in the U-Net, which the paper found to be worse.
+    /// Adds attention to the U-Net, which the paper found to be worse.
     pub attention: bool,
-    /// Tokens to condition, of a U-Net.
+    /// Conversion of tokens into the condition, for a U-Net.
     pub projection: FlowProjection,
-    /// Dropout probability.
+    /// Probability of dropout.
     pub dropout: f64,
 }
 
@@ -123,38 +126,40 @@ impl Default for FlowNetwork {
     }
 }
 
-/// `train.discord`: a decoder of tokens, or of a VAE's latents, that draws smooth motion.
+/// `train.discord`: trains a decoder of tokens, or of a VAE's latents, that generates smooth motion.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct TrainDiscord {
     /// Stage that gives the clips.
     pub dataset: String,
-    /// Stage that gives the tokenizer, which stays as it is; not read if there is a VAE.
+    /// Stage that gives the tokenizer, which is not trained; not read if there is a VAE.
     pub tokenizer: String,
-    /// Stage that gives the VAE whose latents are decoded instead of tokens; none if empty. What its own decoder makes of a latent, four frames a
-    /// token, is what the flow is conditioned on, our choice: the paper compares with MLD, and has no decoder of its latents.
+    /// Stage that gives the VAE whose latents are decoded instead of tokens; empty for tokens. The condition is the
+    /// output of the VAE's own decoder, four frames per token. This is our choice: the paper compares with MLD, and has
+    /// no decoder of its latents.
     pub vae: String,
-    /// What the velocity is predicted by.
+    /// Network that predicts the velocity.
     pub backbone: FlowBackbone,
-    /// What the network gives.
+    /// Quantity that the network predicts.
     pub prediction: FlowPrediction,
-    /// Size.
+    /// Size of the network.
     pub network: FlowNetwork,
     /// Frames of an example; a multiple of 4. Shorter clips are left out.
     pub window: usize,
-    /// Which windows make an epoch.
+    /// Windows that make an epoch.
     pub windows_of: WindowsOf,
-    /// How the flow is followed when motion is decoded.
+    /// Solver of the flow for decoding motion.
     pub solver: FlowSolver,
-    /// Steps of the solver.
+    /// Number of steps of the solver.
     pub solver_steps: usize,
-    /// Exponential moving average of the weights that is kept as the result; 0 keeps the weights themselves.
+    /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves.
     pub ema: f64,
-    /// Stage that gives a flow decoder whose weights training begins with where their shapes fit, or a version such as `discord@prod`; empty
-    /// begins with random ones.
+    /// Stage or version, such as `discord@prod`, whose flow decoder supplies initial weights where shapes fit; empty
+    /// starts from random ones.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub init: String,
-    /// The rest. Published: 200 epochs of all windows with batches of 768, a cosine down to a fiftieth of the rate; here it ends at zero.
+    /// Batch, schedule and optimizer. Published: 200 epochs of all windows with batches of 768, a cosine down to a
+    /// fiftieth of the rate; here it ends at zero.
     #[serde(flatten)]
     pub training: Training,
 }
@@ -214,7 +219,7 @@ impl StageSpec for TrainDiscord {
         ] {
             p.positive(field, value);
         }
-        // The second level is twice as wide, and blocks on the way up see as much again.
+        // The second level has twice the width, and blocks on the way up read the same again.
         let parameters = width.saturating_mul(width).saturating_mul(100).saturating_mul(layers);
         if parameters > limits::PARAMETERS {
             let message =

@@ -1,4 +1,5 @@
-//! `train.evaluator`: embeds captions and motions in one space, in which the papers measure. Source: text-to-motion (Guo et al., CVPR 2022).
+//! `train.evaluator`: embeds captions and motions in one space, in which the papers' metrics are computed. Source:
+//! text-to-motion (Guo et al., CVPR 2022).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -7,11 +8,11 @@ use super::import_evaluator::{VOCABULARY, WORDS_ORIGIN};
 use crate::stage::{Batch, Decay, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training};
 use crate::{ArtifactKind, Steps};
 
-/// An evaluator's size. The published one: 512, 1024, 512, 512, dropout 0.2.
+/// Size of an evaluator. The published one: 512, 1024, 512, 512, dropout 0.2.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluatorNetwork {
-    /// Width of a movement, and between the two convolutions that make it.
+    /// Width of a movement, and between the two convolutions that compute it.
     pub movement: usize,
     /// Width of the GRU over movements.
     pub motion: usize,
@@ -19,7 +20,7 @@ pub struct EvaluatorNetwork {
     pub text: usize,
     /// Width of an embedding.
     pub embedding: usize,
-    /// Dropout probability in the movement encoder, first phase only.
+    /// Probability of dropout in the movement encoder, first phase only.
     pub dropout: f64,
 }
 
@@ -29,17 +30,17 @@ impl Default for EvaluatorNetwork {
     }
 }
 
-/// The first phase: movements learn to hold their frames.
+/// The first phase, which trains movements to reconstruct their frames.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct MovementPhase {
-    /// Share of the steps that it takes.
+    /// Share of the steps in this phase.
     pub until: f64,
     /// Frames of an example.
     pub window: usize,
-    /// Examples per update; 0 keeps `batch.global`.
+    /// Examples per update; 0 uses `batch.global`.
     pub batch: usize,
-    /// Weight of the mean size of movements.
+    /// Weight of the mean absolute value of movements.
     pub sparsity: f64,
     /// Weight of the mean difference of neighbouring movements.
     pub smoothness: f64,
@@ -51,31 +52,30 @@ impl Default for MovementPhase {
     }
 }
 
-/// `train.evaluator`. Source: text-to-motion (Guo et al., CVPR 2022).
+/// `train.evaluator`: trains the text-motion evaluator. Source: text-to-motion (Guo et al., CVPR 2022).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct TrainEvaluator {
     /// Stage that gives the clips.
     pub dataset: String,
-    /// Folder with the published word vectors (`our_vab_data.npy`, `our_vab_words.pkl`, `our_vab_idx.pkl`); empty takes the built-in
-    /// hashed ones. Not part of the key: the content's digest is.
+    /// Folder with the published word vectors (`our_vab_data.npy`, `our_vab_words.pkl`, `our_vab_idx.pkl`); empty uses
+    /// the built-in hashed ones. Its content's digest is part of the key, not the path.
     pub words: String,
-    /// Size.
+    /// Size of the networks.
     pub network: EvaluatorNetwork,
-    /// The first phase.
+    /// Settings of the first phase.
     pub movement: MovementPhase,
-    /// The deviations of root and contacts are divided by this, so that the evaluator looks at them more closely. The published
-    /// files come to 25.
+    /// Divisor of the deviations of root and contacts, which increases their weight. The published files have about 25.
     pub emphasis: f64,
-    /// Captions and motions that do not belong together are pushed this far apart.
+    /// Distance up to which captions and motions that do not match are separated.
     pub margin: f64,
-    /// Moving average of the weights that is kept as the result; 0 keeps the weights themselves.
+    /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves.
     pub ema: f64,
-    /// Stage that gives an evaluator whose weights training begins with where their shapes fit, or a version such as `motionlcm@prod`; empty
-    /// begins with random ones.
+    /// Stage or version, such as `motionlcm@prod`, whose evaluator supplies initial weights where shapes fit; empty
+    /// starts from random ones.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub init: String,
-    /// The rest. Gradients are clipped for each of the networks by itself.
+    /// Batch, schedule and optimizer. Gradients of each network are clipped separately.
     #[serde(flatten)]
     pub training: Training,
 }

@@ -1,4 +1,5 @@
-//! `train.length`: how long the motion of a caption is. Source: MoMask's length estimator (Guo et al., CVPR 2024).
+//! `train.length`: predicts the length of a caption's motion. Source: MoMask's length estimator (Guo et al., CVPR
+//! 2024).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -14,13 +15,13 @@ pub struct TrainLength {
     pub dataset: String,
     /// Stage that gives the caption embeddings.
     pub text: String,
-    /// Dropout probability before the second and the third layer.
+    /// Probability of dropout before the second and the third layer.
     pub dropout: f64,
-    /// Stage that gives a length estimator whose weights training begins with where their shapes fit, or a version such as `motionlcm@prod`; empty
-    /// begins with random ones.
+    /// Stage or version, such as `motionlcm@prod`, whose length estimator supplies initial weights where shapes fit;
+    /// empty starts from random ones.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub init: String,
-    /// The rest. Published: 300 epochs of HumanML3D with batches of 64.
+    /// Batch, schedule and optimizer. Published: 300 epochs of HumanML3D with batches of 64.
     #[serde(flatten)]
     pub training: Training,
 }
@@ -48,7 +49,7 @@ impl Default for TrainLength {
 
 impl StageSpec for TrainLength {
     const KIND: &'static str = "train.length";
-    // 2: says which encoder it reads.
+    // Version 2 stores the encoder that it reads.
     const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "length", kind: ArtifactKind::Length };

@@ -10,19 +10,19 @@ use crate::stage::{
 };
 use crate::{ArtifactKind, Steps};
 
-/// Size of an MDM. Published: the default.
+/// Size of an MDM. The default is the published size.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct MdmNetwork {
     /// Width of the tokens; even.
     pub width: usize,
-    /// Transformer blocks.
+    /// Number of transformer blocks.
     pub layers: usize,
-    /// Attention heads; divides `width`.
+    /// Number of attention heads; divides `width`.
     pub heads: usize,
     /// Width of the feed-forward layer.
     pub feed_forward: usize,
-    /// Dropout probability.
+    /// Probability of dropout.
     pub dropout: f64,
 }
 
@@ -65,26 +65,27 @@ pub struct TrainMdm {
     pub dataset: String,
     /// Stage that gives the caption embeddings.
     pub text: String,
-    /// Stage that gives a model whose denoiser training begins with where shapes fit, or a version such as `motionlcm@prod`; empty begins with
-    /// random weights.
+    /// Stage or version, such as `motionlcm@prod`, whose denoiser supplies initial weights where shapes fit; empty
+    /// starts from random ones.
     pub init: String,
-    /// Size.
+    /// Size of the network.
     pub network: MdmNetwork,
     /// Noise schedule and prediction.
     pub diffusion: Diffusion,
-    /// Timesteps of the schedule: 1000 in the paper, 50 in its authors' later model.
+    /// Number of timesteps of the schedule: 1000 in the paper, 50 in its authors' later model.
     pub timesteps: usize,
-    /// Keeps attention off frames of padding, which the authors call a fix; the paper's model looks at them.
+    /// Masks frames of padding in attention, which the authors call a fix; the paper's model attends to them.
     pub mask_frames: bool,
     /// Frames of the longest motion.
     pub max_frames: usize,
-    /// Probability that a caption is left out.
+    /// Probability that a caption is dropped.
     pub guidance_dropout: f64,
-    /// EMA of the weights that is kept as the result; 0 keeps the weights themselves. The authors' model of 50 steps has 0.9999.
+    /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves. The authors'
+    /// model of 50 steps has 0.9999.
     pub ema: f64,
-    /// Free-T2M's losses.
+    /// Losses of Free-T2M.
     pub losses: FrequencyLosses,
-    /// The rest.
+    /// Batch, schedule and optimizer.
     #[serde(flatten)]
     pub training: Training,
 }

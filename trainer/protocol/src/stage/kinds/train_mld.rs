@@ -19,24 +19,24 @@ pub struct TrainMld {
     pub latents: String,
     /// Stage that gives the caption embeddings.
     pub text: String,
-    /// Stage that gives a model whose denoiser training begins with where shapes fit, or a version such as `motionlcm@prod`; empty begins with
-    /// random weights.
+    /// Stage or version, such as `motionlcm@prod`, whose denoiser supplies initial weights where shapes fit; empty
+    /// starts from random ones.
     pub init: String,
-    /// Size.
+    /// Size of the transformer.
     pub network: Network,
-    /// Noise schedule and prediction; students take over the teacher's.
+    /// Noise schedule and prediction; students use the teacher's.
     pub diffusion: Diffusion,
-    /// A ReLU on the text embedding (v1); v2 removed it.
+    /// Applies a ReLU to the text embedding (v1); v2 removed it.
     pub text_relu: bool,
     /// Probability that a caption is replaced by the empty one.
     pub guidance_dropout: f64,
-    /// EMA of the weights that is kept as the result; 0 keeps the weights themselves.
+    /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves.
     pub ema: f64,
-    /// Free-T2M's losses, on motions through the frozen decoder.
+    /// Losses of Free-T2M, on motions from the frozen decoder.
     pub losses: FrequencyLosses,
     /// Share of the batch whose latents are decoded for `losses`: decoding costs more than denoising.
     pub decoded: f64,
-    /// The rest.
+    /// Batch, schedule and optimizer.
     #[serde(flatten)]
     pub training: Training,
 }
@@ -62,7 +62,7 @@ impl Default for TrainMld {
 
 impl StageSpec for TrainMld {
     const KIND: &'static str = "train.mld";
-    // 2: a whole model, with its VAE and text encoder.
+    // Version 2 outputs a whole model, with its VAE and text encoder.
     const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };

@@ -12,30 +12,30 @@ use crate::{ArtifactKind, Steps};
 
 /// Heads of the cross-attention, and groups of the group norms.
 const PARTS: usize = 8;
-/// Frames are filled up to a multiple of 16, so that they can be halved as often.
+/// Frames are padded to a multiple of 16, so that they can be halved this often.
 const LEVELS: usize = 4;
 
-/// Size of a StableMoFusion network. Published: the default.
+/// Size of a StableMoFusion network. The default is the published size.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct StableMoFusionNetwork {
-    /// Channels that the multipliers count in.
+    /// Number of channels that the multipliers scale.
     pub width: usize,
-    /// A level of the U-Net each; at most 4.
+    /// Channels of each level of the U-Net as a multiple of `width`; at most 4 levels.
     pub multipliers: Vec<usize>,
     /// Width of the timestep's embedding; even.
     pub time: usize,
     /// Width of a token.
     pub text: usize,
-    /// Blocks of the text transformer.
+    /// Number of blocks of the text transformer.
     pub text_layers: usize,
-    /// Heads of the text transformer; divides `text`.
+    /// Number of heads of the text transformer; divides `text`.
     pub text_heads: usize,
     /// Feed-forward width of the text transformer.
     pub text_feed_forward: usize,
-    /// The usual cross-attention in place of the linear one.
+    /// Uses softmax cross-attention instead of the linear one.
     pub full_attention: bool,
-    /// Dropout probability.
+    /// Probability of dropout.
     pub dropout: f64,
 }
 
@@ -88,7 +88,7 @@ impl StableMoFusionNetwork {
             let message = format!("`network.time` is {}; expected an even number", self.time);
             p.add("network.time", message, "the timestep becomes pairs of a sine and a cosine");
         }
-        // Two convolutions of five taps in a block, five blocks a level.
+        // Two convolutions of five taps per block, five blocks per level.
         let widest = self.multipliers.iter().max().map_or(0, |m| self.width.saturating_mul(*m));
         let block = widest.saturating_mul(widest.saturating_mul(10));
         check_parameters(p, block.saturating_mul(5 * self.multipliers.len().min(LEVELS)));
@@ -104,31 +104,31 @@ impl StableMoFusionNetwork {
 pub struct TrainStableMoFusion {
     /// Stage that gives the clips.
     pub dataset: String,
-    /// Stage that embeds the captions, whose encoder gives the tokens.
+    /// Stage that embeds the captions; its encoder supplies the tokens.
     pub text: String,
-    /// Stage that gives a model whose denoiser training begins with where shapes fit, or a version such as `motionlcm@prod`; empty begins with
-    /// random weights.
+    /// Stage or version, such as `motionlcm@prod`, whose denoiser supplies initial weights where shapes fit; empty
+    /// starts from random ones.
     pub init: String,
-    /// Size.
+    /// Size of the network.
     pub network: StableMoFusionNetwork,
     /// Noise schedule and prediction.
     pub diffusion: Diffusion,
-    /// Timesteps of the schedule.
+    /// Number of timesteps of the schedule.
     pub timesteps: usize,
-    /// What the deviations of root and contact features are divided by: these count for more.
+    /// Divisor of the deviations of root and contact features, which increases their weight.
     pub feature_bias: f64,
     /// Frames of the longest motion.
     pub max_frames: usize,
-    /// Probability that a caption is left out.
+    /// Probability that a caption is dropped.
     pub guidance_dropout: f64,
-    /// EMA of the weights that is kept as the result; 0 keeps the weights themselves. As published, what an update takes in is `1 - ema` times
-    /// `106667 ema_every / steps`, at most 1.
+    /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves. As published,
+    /// the weight of an update is `1 - ema` times `106667 ema_every / steps`, at most 1.
     pub ema: f64,
-    /// Updates of the weights between two of the average; the first of these copies.
+    /// Updates of the weights per update of the average; the first of these copies.
     pub ema_every: u64,
-    /// Free-T2M's losses.
+    /// Losses of Free-T2M.
     pub losses: FrequencyLosses,
-    /// The rest.
+    /// Batch, schedule and optimizer.
     #[serde(flatten)]
     pub training: Training,
 }
@@ -168,7 +168,7 @@ impl Default for TrainStableMoFusion {
 }
 
 impl TrainStableMoFusion {
-    /// What an update of the average keeps of it. Published: .99317 for 50,000 steps.
+    /// Decay of the average in one of its updates. Published: .99317 for 50,000 steps.
     pub fn ema_decay(&self) -> f64 {
         const UNIT: f64 = 106_667.0;
         let taken = (1.0 - self.ema) * UNIT * self.ema_every as f64 / self.training.steps.0.max(1) as f64;

@@ -1,4 +1,4 @@
-//! `train.tokenizer`: motion as tokens out of one codebook (T2M-GPT, MMM) or a stack of them (MoMask).
+//! `train.tokenizer`: converts motion to tokens of one codebook (T2M-GPT, MMM) or a stack of them (MoMask).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -6,9 +6,9 @@ use serde::{Deserialize, Serialize};
 use crate::stage::{Batch, Decay, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training};
 use crate::{ArtifactKind, Steps, limits};
 
-/// Frames that one token stands for.
+/// Frames per token.
 const UNIT: usize = 4;
-/// Weights of a residual block and of what joins blocks, over the square of the width: a bound, not a count.
+/// Weights per residual block and its connections, divided by the square of the width: an upper bound, not a count.
 const SQUARES_A_BLOCK: usize = 16;
 
 /// Size of a tokenizer's encoder and decoder.
@@ -17,11 +17,11 @@ const SQUARES_A_BLOCK: usize = 16;
 pub struct TokenizerNetwork {
     /// Width of the convolutions.
     pub width: usize,
-    /// Residual blocks of each of the two levels.
+    /// Number of residual blocks in each of the two levels.
     pub depth: usize,
-    /// What dilations grow by from block to block.
+    /// Factor between the dilations of neighbouring blocks.
     pub growth: usize,
-    /// Dropout probability in the blocks: 0.2 in MoMask, none in T2M-GPT and MMM.
+    /// Probability of dropout in the blocks: 0.2 in MoMask, none in T2M-GPT and MMM.
     pub dropout: f64,
 }
 
@@ -35,9 +35,9 @@ impl Default for TokenizerNetwork {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct TokenizerLoss {
-    /// Smooth-L1 on normalised features.
+    /// Smooth L1 on normalised features.
     pub feature: f64,
-    /// Smooth-L1 on local positions ("velocity" upstream).
+    /// Smooth L1 on local positions ("velocity" upstream).
     pub position: f64,
     /// Squared distance of the encoder's rows to their codes.
     pub commitment: f64,
@@ -49,60 +49,61 @@ impl Default for TokenizerLoss {
     }
 }
 
-/// Which codes are taken from the batch anew.
+/// Codes that are replaced by rows of the batch.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Resets {
-    /// In every update those whose running count is below 1 (T2M-GPT, MoMask).
+    /// In every update the codes with a running count below 1 (T2M-GPT, MoMask).
     #[default]
     Always,
-    /// In every 21st update those of them that never had a count of 1 (MMM): none in a run from scratch.
+    /// In every 21st update the codes that never had a count of 1 (MMM): none in a run from scratch.
     Remembering,
 }
 
-/// Which windows make an epoch.
+/// Windows that make an epoch.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum WindowsOf {
-    /// Every window of every clip once (MoMask): long clips count more.
+    /// Every window of every clip once (MoMask): long clips have more weight.
     #[default]
     Frames,
     /// One drawn window of every clip (T2M-GPT, MMM).
     Clips,
 }
 
-/// `train.tokenizer`: a VQ-VAE or a residual VQ-VAE. The default is MoMask's; `quantizers: 1` without dropout and draws is T2M-GPT's.
+/// `train.tokenizer`: a VQ-VAE or a residual VQ-VAE. The default is MoMask's; `quantizers: 1` without dropout and draws
+/// is T2M-GPT's.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct TrainTokenizer {
     /// Stage that gives the clips.
     pub dataset: String,
-    /// Codes of a codebook.
+    /// Number of codes of a codebook.
     pub codes: usize,
     /// Width of a code.
     pub code_dim: usize,
-    /// Codebooks, each of which quantises what those before it leave over.
+    /// Number of codebooks; each quantises the residuals of those before it.
     pub quantizers: usize,
     /// Probability that a step leaves out the codebooks above a drawn one.
     pub quantize_dropout: f64,
-    /// Codes are drawn in training, by their distances, instead of the nearest being taken.
+    /// Draws codes by their distances in training, instead of using the nearest.
     pub drawn: bool,
-    /// Which codes are taken from the batch anew.
+    /// Codes that are replaced by rows of the batch.
     pub resets: Resets,
-    /// Size.
+    /// Size of encoder and decoder.
     pub network: TokenizerNetwork,
-    /// Loss weights.
+    /// Weights of the loss terms.
     pub loss: TokenizerLoss,
     /// Frames of an example; a multiple of 4. Shorter clips are left out.
     pub window: usize,
-    /// Which windows make an epoch.
+    /// Windows that make an epoch.
     pub windows_of: WindowsOf,
-    /// Stage that gives a tokenizer whose weights training begins with where their shapes fit, or a version such as `momask@prod`; empty
-    /// begins with random ones.
+    /// Stage or version, such as `momask@prod`, whose tokenizer supplies initial weights where shapes fit; empty starts
+    /// from random ones.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub init: String,
-    /// The rest. Published: MoMask 50 epochs with batches of 256 (about 360,000 steps), T2M-GPT and MMM 300,000 steps; both lower the rate in
-    /// two steps near the end, here it follows a cosine.
+    /// Batch, schedule and optimizer. Published: MoMask 50 epochs with batches of 256 (about 360,000 steps), T2M-GPT
+    /// and MMM 300,000 steps. Both lower the rate in two steps near the end; here it follows a cosine.
     #[serde(flatten)]
     pub training: Training,
 }

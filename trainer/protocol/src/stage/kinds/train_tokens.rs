@@ -1,4 +1,5 @@
-//! `train.tokens`: generators of tokens: autoregressive (T2M-GPT), masked with residual layers (MoMask), masked with words (MMM).
+//! `train.tokens`: token generators: autoregressive (T2M-GPT), masked with residual layers (MoMask), masked with words
+//! (MMM).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -8,36 +9,38 @@ use crate::stage::{
 };
 use crate::{ArtifactKind, Steps, limits};
 
-/// How tokens are generated.
+/// Method of generating tokens.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum TokenGenerator {
     /// One after the other, until an end is drawn (T2M-GPT).
     #[default]
     Autoregressive,
-    /// All at once, again and again; then the layers above the first (MoMask).
+    /// All tokens at once in several iterations; then the layers above the first (MoMask).
     Masked,
-    /// All at once, again and again, by a network that looks at the caption's words, without guidance (MMM).
+    /// All tokens at once in several iterations, by a network that attends to the caption's words, without guidance
+    /// (MMM).
     Mmm,
 }
 
-/// Size of a token generator. The default is T2M-GPT's, and MMM's; MoMask's two networks have 384, 8, 6, 1024, 0.2 and 512.
+/// Size of a token generator. The default is T2M-GPT's and MMM's; MoMask's two networks have 384, 8, 6, 1024, 0.2 and
+/// 512.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct TokenNetwork {
-    /// Width H.
+    /// Width H of the network.
     pub width: usize,
-    /// Blocks: of each half of T2M-GPT's and MMM's, of each of MoMask's two networks.
+    /// Number of blocks: of each half of T2M-GPT's and MMM's network, of each of MoMask's two networks.
     pub layers: usize,
-    /// Attention heads; divides `width`.
+    /// Number of attention heads; divides `width`.
     pub heads: usize,
-    /// Width of the feed-forward layer; T2M-GPT's and MMM's are a multiple of `width`.
+    /// Width of the feed-forward layer; a multiple of `width` for T2M-GPT and MMM.
     pub feed_forward: usize,
-    /// Dropout probability.
+    /// Probability of dropout.
     pub dropout: f64,
-    /// Width of MoMask's token embeddings; T2M-GPT's are as wide as the network, MMM's are the tokenizer's codes.
+    /// Width of MoMask's token embeddings. T2M-GPT's have the network's width, MMM's are the tokenizer's codes.
     pub embedding: usize,
-    /// MMM: blocks, counted among `layers` of the first half, that look at the caption's words.
+    /// For MMM: number of blocks that attend to the caption's words, counted among `layers` of the first half.
     pub word_blocks: usize,
 }
 
@@ -73,7 +76,7 @@ impl TokenNetwork {
     }
 }
 
-/// `train.tokens`. The default is T2M-GPT's recipe.
+/// `train.tokens`: trains a token generator. The default is T2M-GPT's recipe.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct TrainTokens {
@@ -83,23 +86,25 @@ pub struct TrainTokens {
     pub tokenizer: String,
     /// Stage that gives the caption embeddings.
     pub text: String,
-    /// MMM: stage that gives the clips of the tokens, whose captions are read word by word.
+    /// For MMM: stage that gives the clips of the tokens, whose captions are read word by word.
     pub dataset: String,
-    /// How tokens are generated.
+    /// Method of generating tokens.
     pub generator: TokenGenerator,
-    /// Size.
+    /// Size of the network.
     pub network: TokenNetwork,
-    /// Tokens of the longest motion; of longer ones a drawn part is learned.
+    /// Tokens of the longest motion; longer ones are cut at random.
     pub longest: usize,
-    /// Autoregressive and MMM: probability that the network sees another code instead of a token.
+    /// For `autoregressive` and `mmm`: probability that a random code replaces a token of the input.
     pub corruption: f64,
-    /// Masked: probability that the first layer's network sees no caption; half of what the other one has, 0.1 and 0.2 as published.
+    /// For `masked`: probability that the first layer's network gets no caption; the residual network has twice this,
+    /// 0.1 and 0.2 as published.
     pub guidance_dropout: f64,
-    /// Stage that gives a model whose generator training begins with where shapes fit, or a version such as `momask@prod`; empty begins with random
-    /// weights.
+    /// Stage or version, such as `momask@prod`, whose generator supplies initial weights where shapes fit; empty starts
+    /// from random ones.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub init: String,
-    /// The rest. Published: T2M-GPT and MMM 300,000 steps whose rate, 1e-4 and 2e-4, falls once, at half of them; here it follows a cosine.
+    /// Batch, schedule and optimizer. Published: T2M-GPT and MMM 300,000 steps with a rate of 1e-4 and 2e-4 that falls
+    /// once, at half of them; here it follows a cosine.
     #[serde(flatten)]
     pub training: Training,
 }

@@ -10,19 +10,20 @@ use crate::stage::{Augment, Batch, LatentShape, Network, Output, Problems, Ref, 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct VaeLoss {
-    /// Smooth-L1 on normalised features.
+    /// Smooth L1 on normalised features.
     pub feature: f64,
-    /// Smooth-L1 on recovered joints, in metres.
+    /// Smooth L1 on recovered joints, in metres.
     pub joint: f64,
-    /// Smooth-L1 on local positions ("velocity" upstream).
+    /// Smooth L1 on local positions ("velocity" upstream).
     pub velocity: f64,
-    /// Smooth-L1 on how fast ankles and feet move, in m/s: what lets feet stand (our choice; MDM's L_vel and L_foot are its relatives).
+    /// Smooth L1 on the speed of ankles and feet, in m/s, which reduces sliding (our choice, similar to MDM's L_vel and
+    /// L_foot).
     pub feet: f64,
-    /// KL to the standard normal, a mean over all elements.
+    /// KL divergence from the standard normal, a mean over all elements.
     pub kl: f64,
-    /// Padded frames are left out (v2); off is v1's plain mean.
+    /// Leaves out padded frames (v2); false is v1's plain mean.
     pub masked: bool,
-    /// Share of the steps before the terms on joints and feet join; early, the root drift drowns the posture.
+    /// Share of the steps before the terms on joints and feet start; early, the root drift dominates the posture.
     pub joint_from: f64,
 }
 
@@ -42,7 +43,7 @@ pub struct Windows {
     pub max: usize,
     /// Share of the steps that train on windows; 0 turns them off.
     pub until: f64,
-    /// Examples per update while windows last; 0 keeps `batch.global`.
+    /// Examples per update in this part; 0 uses `batch.global`.
     pub batch: usize,
 }
 
@@ -52,29 +53,30 @@ impl Default for Windows {
     }
 }
 
-/// `train.vae`. Source: MLD (v1, 1x256), MotionLCM v2 (16x32).
+/// `train.vae`: trains the motion VAE. Source: MLD (v1, 1x256), MotionLCM v2 (16x32).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct TrainVae {
     /// Stage that gives the clips.
     pub dataset: String,
-    /// Latent shape.
+    /// Shape of the latent.
     pub latent: LatentShape,
-    /// Size.
+    /// Size of encoder and decoder.
     pub network: Network,
-    /// Loss weights.
+    /// Weights of the loss terms.
     pub loss: VaeLoss,
-    /// Curriculum.
+    /// Short crops for the first part of the training.
     pub windows: Windows,
-    /// Clips follow other paths than were recorded, each time another: on little data paths are otherwise learned by heart, and new ones missed.
+    /// Changes the paths of clips, differently each time. With little data the VAE otherwise memorises paths and fails
+    /// on new ones.
     pub augment: Augment,
-    /// Exponential moving average of the weights that is kept as the result; 0 keeps the weights themselves.
+    /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves.
     pub ema: f64,
-    /// Stage that gives a VAE whose weights training begins with where their shapes fit, or a version such as `motionlcm@prod`; empty
-    /// begins with random ones.
+    /// Stage or version, such as `motionlcm@prod`, whose VAE supplies initial weights where shapes fit; empty starts
+    /// from random ones.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub init: String,
-    /// The rest.
+    /// Batch, schedule and optimizer.
     #[serde(flatten)]
     pub training: Training,
 }
