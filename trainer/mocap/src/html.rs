@@ -4,9 +4,10 @@
 //! can be scrubbed. The caption is above; left bones are blue and right ones orange; waypoints of the motion are shown.
 //! `page.html#t=1.5` opens at that second, stopped.
 //!
-//! Layout of the file: captions and notes are text. Positions are in a block of JSON: per motion the bytes of `T x J x
-//! 3` numbers of 16 bits (little-endian, base64), `step` and `origin`; a coordinate is `origin + step * number` metres.
-//! `step` is [`STEP`], or larger for a motion wider than 6.5 m. So the error of a coordinate is at most half a step.
+//! Layout of the file: captions and notes are text. Positions are in a block of JSON: per motion the bytes of
+//! `T x J x 3` numbers of 16 bits (little-endian, base64), `step` and `origin`; a coordinate is
+//! `origin + step * number` metres. `step` is [`STEP`], or larger for a motion wider than 6.5 m. So the error of a
+//! coordinate is at most half a step.
 //!
 //! Captions come from untrusted users and files. They are escaped; control characters and marks that change the reading
 //! direction are shown as their numbers. The page's policy allows only the script and the style with the given digests,

@@ -31,7 +31,7 @@ pub struct DeviceInfo {
     pub index: Option<usize>,
     /// The backend's name for the device.
     pub name: String,
-    /// Advice for the user, for instance the reason that the backend has no device.
+    /// Description for the user, or the reason that the backend has no device.
     pub note: String,
 }
 

@@ -284,8 +284,9 @@ impl Book<'_> {
         self.set(Some(replacements), |_, count| count >= 1.0)
     }
 
-    /// Makes one update of MMM: all codes move to their means. Every 21st update instead replaces codes that were not
-    /// in use (`used`) since their start. `since` counts updates since the last such update. Both start as zeros.
+    /// Makes one update of MMM: all codes move to their means. Every 21st update replaces the codes whose count has
+    /// never reached 1, which `used` records. `since` counts the updates since the last replacement. Both start as
+    /// zeros.
     pub fn update_remembering(
         &mut self,
         sums: &[f32],

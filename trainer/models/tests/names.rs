@@ -298,7 +298,7 @@ fn weights_are_read_tensor_by_tensor() {
     assert_eq!((broken.unwrap_err().as_str(), reads), ("the line is cut", 5));
 }
 
-/// The values replace the old ones, which may already be gone.
+/// The values replace the old ones, which may already be freed.
 #[test]
 fn parameters_are_assigned_in_place() {
     for device in [Device::flex(), Device::flex().autodiff()] {

@@ -2,10 +2,11 @@
 //!
 //! A feature row holds the motion of the root and that of the pose separately. In generated rows the two agree only
 //! roughly, so feet slide. Here the root's displacement `v` of each step is a least-squares compromise between the
-//! row's own, `v_0`, and that of each ankle and ball that touches the ground: `min_v LOOSE |v - v_0|^2 + sum_f c_f^2 |v
-//! + u_f|^2`. `u_f` is the foot's displacement in a body that stays, and `c_f` the row's own contact. The correction is
-//! smoothed over five steps, so that the root does not jerk when feet change. Poses, turns, heights and contacts stay;
-//! the path gets the length that the feet walked. Steps without contact, as in a jump, keep their path.
+//! row's own, `v_0`, and that of each ankle and ball that touches the ground:
+//! `min_v LOOSE |v - v_0|^2 + sum_f c_f^2 |v + u_f|^2`. `u_f` is the foot's displacement in a body that stays, and
+//! `c_f` the row's own contact. The correction is smoothed over five steps, so that the root does not jerk when feet
+//! change. Poses, turns, heights and contacts stay; the path gets the length that the feet walked. Steps without
+//! contact, as in a jump, keep their path.
 //!
 //! Ours, in a closed form; in inertial capture contacts usually decide the root's path (Yi et al., TransPose, SIGGRAPH
 //! 2021).

@@ -50,7 +50,7 @@ pub enum NpyError {
     /// The array is column-major.
     #[error("{}: stored column by column (fortran_order), expected rows; save numpy.ascontiguousarray(x)", file.display())]
     Order { file: PathBuf },
-    /// The file is shorter or longer than its header says.
+    /// The file is shorter or longer than its header declares.
     #[error("{}: {} bytes of data for shape {shape:?}, expected {expected}; the file is {}", file.display(), found,
         if found < expected { "truncated: copy or download it again" } else { "longer than its header says" })]
     Size {

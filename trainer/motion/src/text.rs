@@ -225,9 +225,9 @@ pub fn hashed_tokens(caption: &str) -> Vec<[f32; EMBEDDING_WIDTH]> {
 
 /// The built-in text encoder: words and word pairs hashed to signed coordinates, unit length.
 ///
-/// It hashes `</s>`, every one of its [`words`] and every pair of neighbours joined by one space. The coordinate is `h
-/// mod 768`, its sign `+1` if bit 63 of `h` is 0, else `-1`. The empty caption, the null condition of classifier-free
-/// guidance, is `</s>` alone.
+/// It hashes `</s>`, every one of its [`words`] and every pair of neighbours joined by one space. The coordinate is
+/// `h mod 768`, its sign `+1` if bit 63 of `h` is 0, else `-1`. The empty caption, the null condition of
+/// classifier-free guidance, is `</s>` alone.
 pub fn hashed_embedding(caption: &str) -> [f32; EMBEDDING_WIDTH] {
     let words = words(caption);
     let pairs = words.windows(2).map(|pair| pair.join(" "));

@@ -134,8 +134,8 @@ impl Schedule {
     }
 
     /// The network's target for samples `clean` and their `noise` at `timesteps`: the noise, the sample, or the
-    /// velocity. The velocity of a flow is `noise - clean`, its slope towards noise; otherwise it is `alpha noise -
-    /// sigma clean`.
+    /// velocity. The velocity of a flow is `noise - clean`, its slope towards noise; otherwise it is
+    /// `alpha noise - sigma clean`.
     pub fn target(&self, clean: Tensor<3>, noise: Tensor<3>, timesteps: &[usize]) -> Tensor<3> {
         match self.prediction {
             Prediction::Noise => noise,

@@ -1,8 +1,8 @@
 //! Post-norm transformer blocks and the skip stack of MLD (Chen et al., arXiv:2212.04048, after DETR and U-ViT).
 //!
-//! A block is `x <- LN(x + Attention(x))`, with memory also `x <- LN(x + CrossAttention(x, memory))`, then `x <- LN(x +
-//! W2 GELU(W1 x))`. A stack of 2k + 1 blocks keeps the outputs of the first k. Before each of the last k the newest
-//! kept output is appended, `[x, skip]`, and a Linear restores the width. A LayerNorm ends the stack.
+//! A block is `x <- LN(x + Attention(x))`, with memory also `x <- LN(x + CrossAttention(x, memory))`, then
+//! `x <- LN(x + W2 GELU(W1 x))`. A stack of 2k + 1 blocks keeps the outputs of the first k. Before each of the last k
+//! the newest kept output is appended, `[x, skip]`, and a Linear restores the width. A LayerNorm ends the stack.
 //!
 //! Departs: biases of cloned layers are drawn separately; upstream copies one layer.
 

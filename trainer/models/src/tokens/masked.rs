@@ -40,8 +40,8 @@ impl Canvas {
 
 /// Ids [B n] of the first layer, with [`NO_CODE`] past the end of each clip; n is the longest clip's length.
 ///
-/// Iteration k of T masks the `round(cos(pi t / 2) open)` open tokens with the lowest scores, at least one, with `t = k
-/// / (T - 1)`. It draws them all at once; the score of a drawn token is its share in the softmax. Tokens that an
+/// Iteration k of T masks the `round(cos(pi t / 2) open)` open tokens with the lowest scores, at least one, with
+/// `t = k / (T - 1)`. It draws them all at once; the score of a drawn token is its share in the softmax. Tokens that an
 /// iteration keeps are final. Known tokens are never masked, and counts are relative to the others.
 ///
 /// `see` receives the network's input ids of each iteration.

@@ -54,8 +54,9 @@ fn own_steps(sampling: &Sampling, tokens: usize) -> f32 {
 
 /// Ids [B P] with end and padding. `given[b]` holds the clip's tokens, `None` for one to be drawn.
 ///
-/// Step k masks the least likely of the drawn tokens and draws them again, all at once. Their number is `max(1, floor(n
-/// cos(pi t / 2)))` with `t = min(1, k / s)` and `s = round(steps tokens / 49)`. Tokens that a step keeps are final.
+/// Step k masks the least likely of the drawn tokens and draws them again, all at once. Their number is
+/// `max(1, floor(n cos(pi t / 2)))` with `t = min(1, k / s)` and `s = round(steps tokens / 49)`. Tokens that a step
+/// keeps are final.
 ///
 /// # Panics
 /// If a clip and its end exceed the network's positions.

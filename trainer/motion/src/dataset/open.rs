@@ -69,7 +69,7 @@ pub enum ProblemKind {
     Io,
     /// A `.npy` header, element type or order that is not the format's.
     Type,
-    /// A `.npy` file shorter or longer than its header says.
+    /// A `.npy` file shorter or longer than its header declares.
     Size,
     /// An array of another shape.
     Shape,

@@ -1,8 +1,8 @@
 //! Frechet distance between Gaussians fitted to two sets, and the principal components in which it is computed.
 //!
-//! Source: Heusel et al., arXiv:1706.08500, eq. 6: `|m1 - m2|^2 + Tr(C1 + C2 - 2 (C1 C2)^(1/2))`, covariances with n -
-//! 1. Departs: the trace of the root is computed from the eigenvalues of the symmetric `C1^(1/2) C2 C1^(1/2)`. They
-//! equal those of `C1 C2` and need no complex arithmetic; rounding below zero counts as zero.
+//! Source: Heusel et al., arXiv:1706.08500, eq. 6: `|m1 - m2|^2 + Tr(C1 + C2 - 2 (C1 C2)^(1/2))`. Covariances divide by
+//! `n - 1`. Departs: the trace of the root is computed from the eigenvalues of the symmetric `C1^(1/2) C2 C1^(1/2)`.
+//! They equal those of `C1 C2` and need no complex arithmetic; rounding below zero counts as zero.
 
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 

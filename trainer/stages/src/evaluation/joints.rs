@@ -31,8 +31,8 @@ fn per_frame(truth: &[f32], guess: &[f32], joints: usize, at: impl Fn(&[f32], us
         .collect()
 }
 
-/// The posture part of feature vectors: joints in the heading frame with the pelvis at the origin, `[frames, joints,
-/// 3]`.
+/// The posture part of feature vectors: joints in the heading frame with the pelvis at the origin,
+/// `[frames, joints, 3]`.
 ///
 /// Channel 3 of a feature vector is the root's height. Channels from 4 on are the other joints' positions, which
 /// include that height.

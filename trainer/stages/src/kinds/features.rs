@@ -1,9 +1,10 @@
 //! `train.mdm` and `train.stablemofusion`: diffusion of motion itself. Sources: MDM (arXiv:2209.14916), StableMoFusion
 //! (arXiv:2405.05691), with the losses of Free-T2M as an option.
 //!
-//! `t ~ U{0..T-1}`, `x_t = alpha_t x_0 + sigma_t eps` on normalised features, loss `mean over a clip's own frames of
-//! (x_0 hat - x_0)^2` (of the noise or the velocity, according to `diffusion`). A caption is dropped with probability
-//! `guidance_dropout`: MDM then reads a zero vector, StableMoFusion skips its cross-attention.
+//! `t ~ U{0..T-1}`, `x_t = alpha_t x_0 + sigma_t eps` on normalised features, loss
+//! `mean over a clip's own frames of (x_0 hat - x_0)^2` (of the noise or the velocity, according to `diffusion`). A
+//! caption is dropped with probability `guidance_dropout`: MDM then reads a zero vector, StableMoFusion skips its
+//! cross-attention.
 
 use std::collections::BTreeMap;
 

@@ -49,8 +49,9 @@ pub(crate) const STATE_FILE: &str = "state.safetensors";
 /// Result of one slice of a step.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct SliceResult {
-    /// For each group the gradient of `sum over the slice's examples of the example's loss, divided by the global
-    /// batch`. Empty for a group that the step does not train.
+    /// For each group the gradient of
+    /// `sum over the slice's examples of the example's loss, divided by the global batch`. Empty for a group that the
+    /// step does not train.
     pub gradients: Vec<Vec<f32>>,
     /// For each term its sum over the slice's examples, divided by the global batch.
     pub terms: Vec<f32>,
