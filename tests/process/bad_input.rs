@@ -84,8 +84,7 @@ stages:
 
 /// A folder in the published layout with three good clips.
 pub(crate) fn folder(path: &Path) {
-    let shared = std::env::var_os("STRIDE_SHARED").map_or_else(|| Bench::repository().join("../shared"), Into::into);
-    let source = shared.join("data/humanml3d-mini");
+    let source = fixtures::data("humanml3d-mini").expect("the caller has checked that real motion is there");
     for sub in ["new_joint_vecs", "texts"] {
         fs::create_dir_all(path.join(sub)).expect("created");
     }
@@ -106,9 +105,7 @@ pub(crate) fn folder(path: &Path) {
 
 #[test]
 fn a_broken_dataset_folder_is_named_file_by_file() {
-    let shared = std::env::var_os("STRIDE_SHARED").map_or_else(|| Bench::repository().join("../shared"), Into::into);
-    if !shared.join("data/humanml3d-mini").exists() {
-        eprintln!("SKIPPED: no real motion under {} (set STRIDE_SHARED)", shared.display());
+    if fixtures::data("humanml3d-mini").is_none() {
         return;
     }
     let bench = Bench::new(TRAINER);

@@ -115,7 +115,7 @@ fn p4_the_coordinator_is_killed_and_away_for_a_while() {
     if std::env::var_os("STRIDE_LONG_TESTS").is_some() {
         coordinator_away(Duration::from_secs(60));
     } else {
-        eprintln!("SKIPPED: 60 s without a coordinator (set STRIDE_LONG_TESTS=1)");
+        fixtures::skip("60 s without a coordinator (set STRIDE_LONG_TESTS=1)");
     }
 }
 
@@ -204,7 +204,7 @@ fn network_cut(how_long: Duration, sets: &[&str], expected: &(Value, Curves), ou
 fn p4_a_worker_that_is_cut_off_is_gone_without_and_comes_back_by_itself() {
     network_cut(Duration::from_secs(19), &VAE, reference(), false);
     if std::env::var_os("STRIDE_LONG_TESTS").is_none() {
-        eprintln!("SKIPPED: a network cut of 30 s (set STRIDE_LONG_TESTS=1)");
+        fixtures::skip("a network cut of 30 s (set STRIDE_LONG_TESTS=1)");
         return;
     }
     // Long enough for a gang of three, whatever this machine does in a second.

@@ -60,7 +60,7 @@ fn bash(dir: &Path, preamble: &str, line: &str) -> Command {
 fn has_openssl() -> bool {
     let found = Command::new("openssl").arg("version").output().is_ok_and(|output| output.status.success());
     if !found {
-        eprintln!("SKIPPED: the documented commands make a certificate with openssl, which is not here");
+        fixtures::skip("the documented commands make a certificate with openssl, which is not here");
     }
     found
 }

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use cluster_tests::cluster::Cluster;
@@ -18,12 +18,8 @@ const OF_FIXTURES: [&str; 3] = ["data.open", "import.evaluator", "import.model"]
 
 /// Real motion and the fixtures of parity, if they are on this machine.
 fn shared() -> Option<PathBuf> {
-    let root = std::env::var_os("STRIDE_SHARED").map_or_else(|| Bench::repository().join("../shared"), Into::into);
-    let there = root.join("data/parity/04_evaluator_humanml").is_dir() && root.join("data/humanml3d-mini").is_dir();
-    if !there {
-        eprintln!("SKIPPED for {OF_FIXTURES:?}: no fixtures under {} (set STRIDE_SHARED)", root.display());
-    }
-    there.then(|| root.join("data"))
+    fixtures::data("parity/04_evaluator_humanml")?;
+    fixtures::data("humanml3d-mini")?.parent().map(Path::to_owned)
 }
 
 /// Writes the pipeline and what it reads into the folder of `bench`.

@@ -37,7 +37,7 @@ impl Network {
         match made.and_then(|network| network.build().map(|()| network)) {
             Ok(network) => Some(network),
             Err(error) => {
-                eprintln!("SKIPPED: network cuts need root and `ip netns`: {error}");
+                fixtures::skip(&format!("network cuts need root and `ip netns`: {error}"));
                 None
             }
         }
@@ -81,7 +81,7 @@ impl Network {
     /// What comes to host `i` comes at so many kilobits a second from now on. False, loudly, where `tc` cannot do that.
     pub fn slow_down(&self, i: usize, kilobits: u32) -> bool {
         let shape = format!("qdisc add dev sv{}-{i} root tbf rate {kilobits}kbit burst 32kb latency 400ms", self.id);
-        tool("tc", &shape).map_err(|error| eprintln!("SKIPPED: a slow link: {error}")).is_ok()
+        tool("tc", &shape).map_err(|error| fixtures::skip(&format!("a slow link: {error}"))).is_ok()
     }
 
     /// The host is back, and so are its connections.

@@ -551,7 +551,7 @@ mod tests {
         assert!(refused.contains("it said nothing"), "{refused}");
         match motion.write(&file) {
             Ok(_) => assert_eq!(&fs::read(&file).unwrap()[4..8], b"ftyp"),
-            Err(ExportError::NoEncoder { .. }) => eprintln!("SKIPPED: there is no ffmpeg here to make a video with"),
+            Err(ExportError::NoEncoder { .. }) => fixtures::skip("there is no ffmpeg here to make a video with"),
             Err(error) => panic!("{error}"),
         }
     }

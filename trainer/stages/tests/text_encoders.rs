@@ -23,23 +23,6 @@ mod common;
 /// Gate of one forward pass, from the fixtures' README.
 const GATE: f64 = 3e-6;
 
-/// Folders of fixtures with the prefix `prefix`; none, with a notice, if this checkout has none.
-fn folders(prefix: &str) -> Vec<PathBuf> {
-    let root = std::env::var_os("STRIDE_SHARED")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"), PathBuf::from);
-    let root = root.join("data/parity");
-    let Ok(listed) = std::fs::read_dir(&root) else {
-        eprintln!("SKIPPED: no fixtures at {} (set STRIDE_SHARED)", root.display());
-        return Vec::new();
-    };
-    let paths = listed.map(|entry| entry.expect("fixtures can be listed").path());
-    let named = |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(prefix));
-    let mut found: Vec<PathBuf> = paths.filter(|path| path.is_dir()).filter(named).collect();
-    found.sort();
-    assert!(!found.is_empty(), "no fixture in {} starts with {prefix}", root.display());
-    found
-}
-
 fn captions(folder: &Path) -> Vec<String> {
     let bytes = std::fs::read(folder.join("captions.json")).expect("a file of the fixture");
     serde_json::from_slice(&bytes).expect("a list of captions")
@@ -98,7 +81,7 @@ fn same_out_of_an_artifact(settings: &TextEmbed, encoder: &dyn text::TextEncoder
 
 #[test]
 fn parity_of_clip_from_its_folder() {
-    for folder in folders("09_text_clip") {
+    for folder in fixtures::parity(&["09_text_clip"]) {
         let owned = captions(&folder);
         let captions: Vec<&str> = owned.iter().map(String::as_str).collect();
         let mut io = arrays(&folder);
@@ -135,7 +118,7 @@ fn parity_of_clip_from_its_folder() {
 
 #[test]
 fn parity_of_t5_from_its_folder() {
-    for folder in folders("09_text_t5") {
+    for folder in fixtures::parity(&["09_text_t5"]) {
         let owned = captions(&folder);
         let captions: Vec<&str> = owned.iter().map(String::as_str).collect();
         let mut io = arrays(&folder);
@@ -186,8 +169,10 @@ fn shards_change_no_byte() {
     let data = DataSynthetic { clips: 12, ..DataSynthetic::default() };
     let dataset = run(&mut bench, "dataset", data.into(), &[]);
     let mut all = vec![TextEmbed::default()];
-    all.extend(folders("09_text_clip").iter().map(|path| clip(path, ClipIds::OpenAi, ClipOutput::Projected, 0)));
-    all.extend(folders("09_text_t5").iter().map(|path| t5(path, TextEncoder::SentenceT5)));
+    all.extend(
+        fixtures::parity(&["09_text_clip"]).iter().map(|path| clip(path, ClipIds::OpenAi, ClipOutput::Projected, 0)),
+    );
+    all.extend(fixtures::parity(&["09_text_t5"]).iter().map(|path| t5(path, TextEncoder::SentenceT5)));
     for settings in all {
         let mut embed = |shards: usize| {
             let settings = TextEmbed { shards, ..settings.clone() };
@@ -211,8 +196,8 @@ fn shards_change_no_byte() {
 /// deleted by then.
 #[test]
 fn models_are_trained_and_drawn_with_encoders_of_folders() {
-    let clips = folders("09_text_clip");
-    let t5s = folders("09_text_t5");
+    let clips = fixtures::parity(&["09_text_clip"]);
+    let t5s = fixtures::parity(&["09_text_t5"]);
     let (Some(clip_folder), Some(t5_folder)) = (clips.first(), t5s.first()) else { return };
     for settings in
         [clip(clip_folder, ClipIds::OpenAi, ClipOutput::Projected, 0), t5(t5_folder, TextEncoder::SentenceT5)]

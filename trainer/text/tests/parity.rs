@@ -11,23 +11,6 @@ use safetensors::SafeTensors;
 use serde_json::Value;
 use text_models::{EncoderFolder, Kind, Network, Request, TokenIds, WeightsFile};
 
-/// Folders of fixtures with the prefix `prefix`; none, with a notice, if this checkout has none.
-fn folders(prefix: &str) -> Vec<PathBuf> {
-    let root = std::env::var_os("STRIDE_SHARED")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"), PathBuf::from);
-    let root = root.join("data/parity");
-    let Ok(listed) = std::fs::read_dir(&root) else {
-        eprintln!("SKIPPED: no fixtures at {} (set STRIDE_SHARED)", root.display());
-        return Vec::new();
-    };
-    let paths = listed.map(|entry| entry.expect("fixtures can be listed").path());
-    let named = |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(prefix));
-    let mut found: Vec<PathBuf> = paths.filter(|path| path.is_dir()).filter(named).collect();
-    found.sort();
-    assert!(!found.is_empty(), "no fixture in {} starts with {prefix}", root.display());
-    found
-}
-
 fn json(path: &Path) -> Value {
     serde_json::from_slice(&std::fs::read(path).expect("a file of the fixture")).expect("JSON")
 }
@@ -61,7 +44,7 @@ fn cut_at(case: &str) -> usize {
 
 #[test]
 fn captions_become_clips_ids() {
-    for folder in folders("09_text_clip") {
+    for folder in fixtures::parity(&["09_text_clip"]) {
         let captions = captions(&folder);
         let mut tried = 0;
         for (case, expected) in ids(&folder) {
@@ -82,7 +65,7 @@ fn captions_become_clips_ids() {
 
 #[test]
 fn a_folder_without_its_tokenizer_file_is_read_from_vocabulary_and_merges() {
-    for folder in folders("09_text_clip") {
+    for folder in fixtures::parity(&["09_text_clip"]) {
         let copy = copy_of(&folder, &["tokenizer.json"]);
         let request = clip(TokenIds::HuggingFace, 0);
         let (whole, parts) = (EncoderFolder::open(&folder, &request), EncoderFolder::open(copy.path(), &request));
@@ -106,7 +89,7 @@ fn a_folder_without_its_tokenizer_file_is_read_from_vocabulary_and_merges() {
 
 #[test]
 fn the_vision_tower_is_passed_over() {
-    for folder in folders("09_text_clip") {
+    for folder in fixtures::parity(&["09_text_clip"]) {
         let opened = EncoderFolder::open(&folder, &clip(TokenIds::OpenAi, 0)).expect("a fixture");
         let said = opened.skipped_line().expect("a vision tower");
         assert!(
@@ -122,7 +105,7 @@ fn the_vision_tower_is_passed_over() {
 
 #[test]
 fn captions_become_t5s_ids() {
-    for folder in folders("09_text_t5") {
+    for folder in fixtures::parity(&["09_text_t5"]) {
         let captions = captions(&folder);
         let request = Request { kind: Kind::SentenceT5, ids: TokenIds::HuggingFace, most: 0 };
         let opened = EncoderFolder::open(&folder, &request).unwrap_or_else(|e| panic!("{e}"));
@@ -148,7 +131,7 @@ fn captions_become_t5s_ids() {
 /// The dense layer is the same from safetensors and from torch's pickle.
 #[test]
 fn a_dense_layer_is_read_from_either_file() {
-    for folder in folders("09_text_t5") {
+    for folder in fixtures::parity(&["09_text_t5"]) {
         let request = Request { kind: Kind::SentenceT5, ids: TokenIds::HuggingFace, most: 0 };
         let pickled = copy_of(&folder, &["2_Dense/model.safetensors"]);
         let values = |path: &Path| {
@@ -168,7 +151,7 @@ fn a_dense_layer_is_read_from_either_file() {
 /// The older layout, with the network in its own folder and sharded weights, is the same encoder.
 #[test]
 fn shards_in_a_folder_below_are_the_same_encoder() {
-    for folder in folders("09_text_t5") {
+    for folder in fixtures::parity(&["09_text_t5"]) {
         let request = Request { kind: Kind::SentenceT5, ids: TokenIds::HuggingFace, most: 0 };
         let copy = copy_of(&folder, &["model.safetensors", "modules.json"]);
         let below = copy.path().join("0_Transformer");
@@ -205,7 +188,7 @@ fn shards_in_a_folder_below_are_the_same_encoder() {
 
 #[test]
 fn folders_that_lack_something_say_what() {
-    for folder in folders("09_text_t5") {
+    for folder in fixtures::parity(&["09_text_t5"]) {
         let request = Request { kind: Kind::SentenceT5, ids: TokenIds::HuggingFace, most: 0 };
         let refused = |without: &[&str], change: &dyn Fn(&Path)| {
             let copy = copy_of(&folder, without);
