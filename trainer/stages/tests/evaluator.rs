@@ -2,7 +2,7 @@
 //! refused.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use checkpoint::Blobs;
 use checkpoint::model::{self, Parts};

@@ -1,6 +1,6 @@
 //! The metrics against values computed with the reference code, `golden/metrics` and the parity fixture `06_sjpe`.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use serde_json::Value;
 use stages::evaluation::control::ControlErrors;

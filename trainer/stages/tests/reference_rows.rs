@@ -1,6 +1,5 @@
 //! The definitions of the reconstruction metrics against rows of the reference table that need no network.
 
-use std::path::{Path, PathBuf};
 
 use motion::Dataset;
 use protocol::stage::{DataFormat, Split};

@@ -2,7 +2,7 @@
 //! and from an artifact, and models that are trained and sampled with them.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use burn::tensor::Device;

@@ -2,7 +2,6 @@
 //! groups that take turns, a frozen group, and a first step that only gathers sums.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
-use std::path::Path;
 use std::sync::{Arc, Mutex};
 
 use models::optim::{AdamW, LrSchedule};
