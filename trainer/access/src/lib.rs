@@ -7,24 +7,20 @@
 //!
 //! Not its job: which call needs which scope. That stands beside the routes, in the coordinator.
 
-mod caller;
 mod connection;
 pub mod file;
 pub mod local;
-mod names;
 mod options;
 mod scope;
 mod secret;
 pub mod tls;
 mod tokens;
 
-pub use caller::Caller;
 pub use connection::{ConnectError, Server, explain, retry_after};
-pub use names::Names;
 pub use options::{ConnectionOptions, ServerOptions, TokenOptions};
 pub use scope::{Scope, Scopes};
 pub use secret::{FileError, Token, TokenError};
-pub use tokens::Tokens;
+pub use tokens::{Caller, Tokens};
 
 /// Where a server listens unless it is told otherwise.
 pub const PORT: u16 = 7700;

@@ -38,7 +38,7 @@ impl Token {
         Digest::of(self.0.as_bytes())
     }
 
-    /// The one token of a client's file: alone, or as a line `NAME SCOPES TOKEN KEY=VALUE ...` of a server's file.
+    /// The one token of a client's file: alone, or as the line `NAME SCOPES TOKEN` of a server's file.
     pub fn from_file(path: &Path) -> Result<Self, FileError> {
         let text = read_secret(path)?;
         let mut lines = entries(&text);
@@ -47,7 +47,7 @@ impl Token {
                 .hint("a client's file has a line with its own token and nothing else"));
         };
         let word = match words.as_slice() {
-            [token] | [_, _, token, ..] => token,
+            [token] | [_, _, token] => token,
             _ => return Err(FileError::line(path, line, "expected a token, or `NAME SCOPES TOKEN`")),
         };
         word.parse().map_err(|error: TokenError| FileError::line(path, line, error))
@@ -197,7 +197,6 @@ mod tests {
             Token::from_file(&path).map(|token| token.secret().to_owned()).map_err(|error| error.to_string())
         };
         assert_eq!(read("# mine\nw worker 0123456789abcdef\n").unwrap(), "0123456789abcdef");
-        assert_eq!(read("w worker 0123456789abcdef workers=w*\n").unwrap(), "0123456789abcdef");
         assert!(read("").is_err() && read("a read 0123456789abcdef\nb read 0123456789abcdeg\n").is_err());
         assert!(
             read("\n secret\n").unwrap_err().ends_with(

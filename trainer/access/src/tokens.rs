@@ -1,14 +1,13 @@
 //! The server's table of tokens.
 //!
 //! ```text
-//! # NAME   SCOPES          TOKEN    KEY=VALUE ...
+//! # NAME   SCOPES          TOKEN
 //! alice    submit,promote  5f0c...
-//! nodes    worker          91ab...  workers=nodes-*
+//! nodes    worker          91ab...
 //! grafana  read            c2d4...
 //! ```
 //!
 //! A file with a token alone is one of `admin`, named after the file. The name is what the log of promotions shows.
-//! The keys stand at [`Caller`].
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -16,9 +15,17 @@ use std::sync::Arc;
 
 use protocol::Digest;
 
-use crate::caller::Caller;
 use crate::scope::Scopes;
 use crate::secret::{FileError, Token, TokenError, entries, read_secret};
+
+/// Who a token belongs to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Caller {
+    /// A person, a machine or a service; for logs.
+    pub name: String,
+    /// What it may do.
+    pub scopes: Scopes,
+}
 
 /// All tokens that a server knows, by their digests.
 #[derive(Debug, Clone, Default)]
@@ -32,21 +39,19 @@ impl Tokens {
         let mut tokens = Self::default();
         for (line, words) in &lines {
             let wrong = |message: &dyn std::fmt::Display| FileError::line(path, *line, message);
-            let (mut caller, token, settings) = match words.as_slice() {
-                [token] if lines.len() == 1 => (Caller::new(stem(path), Scopes::all()), token, &[][..]),
-                [name, scopes, token, settings @ ..] => {
-                    let scopes = scopes.parse().map_err(|error: String| wrong(&error))?;
-                    (Caller::new(*name, scopes), token, settings)
+            let (name, scopes, token) = match words.as_slice() {
+                [token] if lines.len() == 1 => (stem(path), Scopes::all(), token),
+                [name, scopes, token] => {
+                    ((*name).to_owned(), scopes.parse().map_err(|error: String| wrong(&error))?, token)
                 }
                 _ => return Err(wrong(&"expected `NAME SCOPES TOKEN`, such as `alice submit,promote` and a token")),
             };
-            if !protocol::id::is_name(&caller.name) {
+            if !protocol::id::is_name(&name) {
                 let expected = "expected a letter or digit, then letters, digits, `.`, `_` or `-`, at most 64";
-                return Err(wrong(&format!("`{}` is no name: {expected}", caller.name)));
+                return Err(wrong(&format!("`{name}` is no name: {expected}")));
             }
             let token: Token = token.parse().map_err(|error: TokenError| wrong(&error))?;
-            caller.set_all(settings).map_err(|error| wrong(&error))?;
-            if !tokens.insert(caller, &token) {
+            if !tokens.add(name, scopes, &token) {
                 return Err(wrong(&"this token stands in an earlier line as well"));
             }
         }
@@ -59,11 +64,7 @@ impl Tokens {
 
     /// Adds a token; `false` if it is known already.
     pub fn add(&mut self, name: impl Into<String>, scopes: Scopes, token: &Token) -> bool {
-        self.insert(Caller::new(name, scopes), token)
-    }
-
-    fn insert(&mut self, caller: Caller, token: &Token) -> bool {
-        self.0.insert(token.digest(), Arc::new(caller)).is_none()
+        self.0.insert(token.digest(), Arc::new(Caller { name: name.into(), scopes })).is_none()
     }
 
     /// Whose token this is.
@@ -119,14 +120,6 @@ mod tests {
     }
 
     #[test]
-    fn a_line_may_limit_the_names_of_its_workers() {
-        let tokens = read(&format!("nodes worker {A} workers=nodes-*,gpu1\nlab worker {B}\n")).unwrap();
-        let may_name = |token: &str, worker: &str| tokens.find(token).unwrap().may_name(&worker.into());
-        assert!(may_name(A, "nodes-7") && may_name(A, "gpu1") && !may_name(A, "gpu2"));
-        assert!(may_name(B, "nodes-7"), "without `workers=` every name is allowed");
-    }
-
-    #[test]
     fn mistakes_are_named_with_their_line_and_without_the_token() {
         for (text, expected) in [
             (format!("alice submit {A}\n{B}\n"), "line 2: expected `NAME SCOPES TOKEN`"),
@@ -134,10 +127,6 @@ mod tests {
             (format!("../a read {A}\n"), "line 1: `../a` is no name"),
             ("alice read short\n".to_owned(), "line 1: the token has 5 characters"),
             (format!("a read {A}\nb worker {A}\n"), "line 2: this token stands in an earlier line"),
-            (format!("a worker {A} nodes-*\n"), "line 1: expected `KEY=VALUE` behind the token"),
-            (format!("a worker {A} colour=red\n"), "line 1: `colour=` is not known; expected `workers=`"),
-            (format!("a worker {A} workers=a workers=b\n"), "line 1: `workers=` stands twice"),
-            (format!("a worker {A} workers=\n"), "line 1: `` is no pattern of names"),
             ("# nothing\n".to_owned(), "has no token"),
             ("  \n".to_owned(), "has no token"),
         ] {

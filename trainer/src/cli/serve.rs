@@ -15,9 +15,8 @@ use crate::{client, print};
 
 const TOKENS: &str = "\
 A token file has a line `NAME SCOPES TOKEN` for each caller, such as `alice submit,promote` and what `openssl rand -hex 32`
-prints. Scopes: read, submit, worker, promote, admin. `workers=nodes-*` behind the token limits the names of its workers.
-A token alone, in a file or as --token, may do everything. Without any, one is made for this user at every start and lies
-in the store's folder; beyond this machine a token is required.";
+prints. Scopes: read, submit, worker, promote, admin. A token alone, in a file or as --token, may do everything. Without
+any, one is made for this user at every start and lies in the store's folder; beyond this machine a token is required.";
 
 #[derive(Debug, Args)]
 #[command(after_help = TOKENS)]
