@@ -161,23 +161,6 @@ impl Client {
         self.get("/v1/workers").await
     }
 
-    /// Reports what a worker that has died can no longer report: how its work ended.
-    pub(crate) async fn fail_for(
-        &self,
-        worker: &WorkerId,
-        incarnation: Incarnation,
-        class: FailureClass,
-        message: &str,
-    ) -> Result<()> {
-        let poll = Poll { incarnation, doing: Vec::new(), ready: Vec::new(), version: 0 };
-        let desired: DesiredAssignments = self.post(&format!("/v1/workers/{worker}/poll"), &poll).await?;
-        for assignment in desired.assignments {
-            let outcome = TaskOutcome::Failed { class, message: message.to_owned() };
-            self.post::<()>("/v1/outcomes", &ReportOutcome { grant: assignment.grant, outcome }).await?;
-        }
-        Ok(())
-    }
-
     pub(crate) async fn registry(&self, command: &Command) -> Result<Answer> {
         self.post("/v1/registry", command).await
     }
