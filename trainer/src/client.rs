@@ -5,10 +5,8 @@ use std::path::Path;
 
 use access::{Server, ServerOptions, explain, local};
 use coordinator::{Config, Coordinator, Handle, WorkerView};
-use protocol::message::{
-    ApiError, DesiredAssignments, FailureClass, Poll, ReportOutcome, RunView, Submit, TaskOutcome,
-};
-use protocol::{Digest, Incarnation, RunId, WorkerId};
+use protocol::message::{ApiError, RunView, Submit};
+use protocol::{Digest, RunId};
 use registry::cli::{Answer, Command};
 use registry::{Holder, LogRow, ReadStore, Store};
 use reqwest::{Method, RequestBuilder, Response, StatusCode};
@@ -64,7 +62,7 @@ impl Client {
     }
 
     /// A client of a coordinator in this process.
-    pub(crate) fn of(handle: &Handle) -> Result<Self> {
+    fn of(handle: &Handle) -> Result<Self> {
         let server = Server::new(&handle.local_url(), Some(handle.token().clone()), None)?;
         Ok(Self { server, own: None })
     }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use coordinator::shell::raise_descriptor_limit;
-use coordinator::{Config, Control, Coordinator, Handle, Trouble, WorkerView};
+use coordinator::{Config, Control, Coordinator, Handle, Trouble};
 use protocol::message::{FailureClass, RunState, RunView, StageState, Submit};
 use protocol::pipeline::Pipeline;
 use protocol::{RunId, StageName};

@@ -37,6 +37,7 @@ pub(crate) fn token(name: &str) -> String {
 
 pub(crate) struct Site {
     pub(crate) handle: Handle,
+    #[expect(dead_code, reason = "held so that the folder stays")]
     pub(crate) dir: Option<tempfile::TempDir>,
 }
 
