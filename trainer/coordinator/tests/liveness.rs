@@ -414,7 +414,7 @@ fn what_is_stored_says_of_which_format_it_is() {
         whole.run(&run).is_ok() && whole.executions.values().all(|execution| execution.state == ExecutionState::Open)
     );
     let (_, text) = coordinator.store.recovery.snapshot.as_mut().expect("a snapshot");
-    *text = text.replace("\"format\":[1,1]", "\"format\":[3,1]");
+    *text = text.replace(&now, "\"format\":[3,1]");
     let refused = recover(&coordinator.store.recovery).expect_err("another major version");
     assert!(refused.contains("format 3.1") && refused.contains("snapshot"), "{refused}");
 }

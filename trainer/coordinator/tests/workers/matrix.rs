@@ -139,7 +139,10 @@ async fn every_call_of_workers_is_open_to_the_tasks_own_process_alone() {
     // The same calls by the task's own process: all of them get past the check of whose they are. The last one leaves.
     let own = Actor { what: "itself".into(), server: worker.server.clone(), process: worker.secret, grant: vae.secret };
     let mut calls: Vec<_> = routes().into_iter().filter(|route| route.scopes.contains(&Scope::Worker)).collect();
-    calls.sort_by_key(|route| (route.path.ends_with("/gone"), route.path == "/v1/workers"));
+    calls.sort_by_key(|route| {
+        let ends = route.path.ends_with("/gone");
+        (ends, route.path == "/v1/workers", route.path == "/v1/outcomes")
+    });
     for route in calls {
         let (status, answer) = answer(request(&own.server, route.method, route.path, &held, &own)).await;
         assert!(status != 403 && status != 401, "{} {}: {status} {answer}", route.method, route.path);
