@@ -56,4 +56,16 @@ mutation pipe-as-token-file trainer/access/src/file.rs 's/if file\.metadata\(\)\
 mutation lock-follows-links registry/src/blob/disk.rs 's/OFlag::O_NOFOLLOW \| //' registry
 mutation gang-in-the-clear worker/src/gang/seal.rs 's/Ok\(stream\.local_addr\(\)\?\.ip\(\)\.to_canonical\(\) != .*\)$/Ok(stream.local_addr().is_err())/m' worker
 mutation nonce-that-repeats worker/src/gang/seal.rs 's/bytes\[4\.\.\]\.copy_from_slice\(&number\.to_le_bytes\(\)\);/let _ = number; bytes[4] = 1;/' worker
+mutation name-of-another-token trainer/coordinator/src/state/worker.rs 's/if own\.caller != by\.caller/if own.caller.is_empty()/' coordinator
+mutation name-of-a-live-process trainer/coordinator/src/state/worker.rs 's/if own\.secret == by\.secret =>/if !own.caller.is_empty() =>/' coordinator
+mutation name-beyond-its-pattern trainer/coordinator/src/shell/secrets.rs 's/\|names\| !names\.allow\(worker\.as_str\(\)\)/|_| false/' coordinator
+mutation poll-without-its-secret trainer/coordinator/src/shell/secrets.rs 's/if identity\.secret == Digest::of\(self\.secret\.0\.as_bytes\(\)\)/if !self.secret.0.contains("?")/' coordinator
+mutation grant-without-its-secret trainer/coordinator/src/shell/secrets.rs 's/if is\(secrets\.mac\(&\("grant", &self\.caller\.name, grant\)\), &self\.secret\.0\)/if !secrets.of_grant(&self.caller.name, grant).is_empty()/' coordinator
+mutation grant-of-every-token trainer/coordinator/src/shell/secrets.rs 's/\("grant", caller, grant\)/("grant", "", grant)/; s/\("grant", &self\.caller\.name, grant\)/("grant", "", grant)/' coordinator
+mutation receipt-of-every-process trainer/coordinator/src/shell/secrets.rs 's/\("upload", caller, &grant\.task, &grant\.worker, grant\.incarnation, digest\)/("upload", caller, grant.task.as_str().len(), digest)/' coordinator
+mutation manifest-of-foreign-blobs trainer/coordinator/src/shell/vouching.rs 's/return Ok\(Some\((next|file\.digest)\)\);/continue;/g' coordinator
+mutation mention-of-foreign-blobs trainer/coordinator/src/shell/vouching.rs 's/if leads_somewhere && seen\.insert\(other\)/if leads_somewhere \&\& seen.insert(other) \&\& queue.len() > 99/' coordinator
+mutation staged-of-everybody trainer/coordinator/src/shell/uploads.rs 's/let is_known = receipt\.is_some\(\)/let is_known = receipt.is_none()/' coordinator
+mutation worker-reads-everything trainer/coordinator/src/shell/uploads.rs 's/if !proof\.caller\.scopes\.allow\(Scope::Read\)/if proof.caller.scopes.allow(Scope::Promote)/' coordinator
+mutation poll-in-anothers-name trainer/coordinator/src/observe.rs 's/if \(&doing\.grant\.worker, doing\.grant\.incarnation\) != \(&worker, poll\.incarnation\)/if doing.grant.worker.as_str().is_empty()/' coordinator
 exit $missed

@@ -26,10 +26,10 @@ pub enum QueryError {
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {
     /// Somebody else holds the task now.
-    #[error("stale fence: task `{task}` is at fence {current}, the write carries {carried}")]
+    #[error("stale fence: the grant of task `{task}` with fence {carried} has been superseded")]
     StaleFence {
         task: TaskId,
-        /// The fence in the store.
+        /// The fence in the store. Not part of the message, which the caller sees.
         current: Fence,
         /// The fence of the write.
         carried: Fence,

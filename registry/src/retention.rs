@@ -17,13 +17,14 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use checkpoint::BlobError;
+use protocol::artifact::mentioned;
 use protocol::{Digest, TaskId};
 use serde::{Deserialize, Serialize};
 
 use crate::blob::{BlobStore, ManifestError};
 use crate::catalog::{Needs, Root};
 use crate::lock::CollectionLock;
-use crate::vouched::{Named, mentioned};
+use crate::vouched::Named;
 use crate::{QueryError, ReadStore, Store, WriteError, clock};
 
 /// How long a fresh blob is safe from collection: longer than any upload waits for its row.

@@ -33,6 +33,7 @@ use crate::identity::{self, Found, Marker, MarkerError, Verdict, Witness};
 use crate::lock::{self, Holder, SharedLock, StoreLock, Taken, network_filesystem};
 use crate::open_error::OpenError;
 use crate::reserve::{self, OPEN_NEEDS_BYTES};
+use crate::server_key::{self, ServerKey};
 use crate::sqlite::{Opened, Session, SqliteCatalog, SqliteRecords, Writer};
 use crate::store_id::{StoreId, Stored};
 use crate::versions::{Expect, Pick, Promotion};
@@ -234,6 +235,11 @@ impl Store {
     /// What is kept besides the blobs.
     pub fn catalog(&self) -> &dyn Catalog {
         &*self.0.catalog
+    }
+
+    /// The key of this store's server, made when it is first asked for. Read from the disk each time.
+    pub fn server_key(&self) -> io::Result<ServerKey> {
+        server_key::read_or_make(self.dir())
     }
 
     /// Tells other processes where this one answers requests.
@@ -438,7 +444,7 @@ async fn mark(dir: &Path, blobs: &BlobStore, old: Option<Marker>, stored: &Store
 }
 
 /// Names that a store's folder may have before its database is there.
-const OF_A_STORE: [&str; 6] = ["lock", "blobs", "staging", "witness", "witness.new", "reserve"];
+const OF_A_STORE: [&str; 7] = ["lock", "blobs", "staging", "witness", "witness.new", "reserve", server_key::FILE];
 
 /// A store is not made in a folder that holds something else.
 fn refuse_other_files(dir: &Path) -> Result<(), OpenError> {

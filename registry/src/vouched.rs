@@ -5,8 +5,8 @@ use std::collections::BTreeSet;
 use std::ops::Deref;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use protocol::artifact::mentioned;
 use protocol::{Digest, Manifest};
-use serde_json::Value;
 
 use crate::WriteError;
 use crate::blob::{BlobStore, ManifestError};
@@ -91,14 +91,4 @@ pub(crate) fn complete(blobs: &Vouched, digest: Digest) -> Result<Manifest, Writ
         }
         ManifestError::NotAManifest { .. } | ManifestError::Format { .. } => WriteError::Conflict(e.to_string()),
     })
-}
-
-/// Digests in a manifest's own words, such as the teacher's in a student's.
-pub(crate) fn mentioned(meta: &Value, found: &mut Vec<Digest>) {
-    match meta {
-        Value::String(text) => found.extend(text.parse::<Digest>()),
-        Value::Array(items) => items.iter().for_each(|item| mentioned(item, found)),
-        Value::Object(map) => map.values().for_each(|item| mentioned(item, found)),
-        Value::Null | Value::Bool(_) | Value::Number(_) => {}
-    }
 }

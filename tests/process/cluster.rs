@@ -5,10 +5,11 @@ use std::path::PathBuf;
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use cluster_tests::cluster::{Cluster, TOKEN, stage_of};
+use cluster_tests::cluster::{Cluster, TOKEN, WORKER_TOKEN, stage_of};
 use cluster_tests::network::{Network, SlowLine};
 use cluster_tests::{Bench, Running, digests, wait_for};
 use nix::sys::signal::Signal;
+use protocol::proof::{GRANT_HEADER, SECRET_HEADER};
 use serde_json::{Value, json};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
@@ -220,20 +221,22 @@ fn p4_a_worker_that_is_cut_off_is_gone_without_and_comes_back_by_itself() {
 #[test]
 fn p2_a_worker_that_slept_past_its_lease_writes_nothing() {
     let mut cluster = Cluster::start(TRAINER);
-    cluster.join("a");
+    let secret = "the-secret-of-worker-a-known-to-this-test";
+    cluster.join_by("a", &["env".to_owned(), format!("STRIDE_WORKER_SECRET={secret}")], &[]);
     let sets = [&VAE[..], &["--set", "stages.vae.workers={min: 1, max: 1}"]].concat();
     let run = cluster.submit(&config(), &sets);
     cluster.wait_step(&run, "vae", 20);
     // What the worker holds, as it would be told itself.
     let workers = cluster.get("/v1/workers").expect("the coordinator is there");
-    let orders = cluster
-        .post(
-            "/v1/workers/a/poll",
-            &json!({"incarnation": workers[0]["incarnation"], "doing": [], "ready": [], "version": 0}),
-        )
-        .expect("answered");
+    let post = |cluster: &Cluster, secret: &str, path: &str, body: &Value| {
+        let headers = [("content-type", "application/json"), (SECRET_HEADER, secret)];
+        cluster.call_as(WORKER_TOKEN, "POST", path, &headers, body.to_string().as_bytes()).expect("answered")
+    };
+    let poll = json!({"incarnation": workers[0]["incarnation"], "doing": [], "ready": [], "version": 0});
+    let orders = post(&cluster, secret, "/v1/workers/a/poll", &poll);
     let grant = orders.body["assignments"][0]["grant"].clone();
     assert_eq!(grant["worker"], "a", "{:?}", orders.body);
+    let secret = orders.body["assignments"][0]["secret"].as_str().expect("the grant's secret").to_owned();
     cluster.signal("a", Signal::SIGSTOP);
     let stopped = Instant::now();
     cluster.join("b");
@@ -266,15 +269,18 @@ fn p2_a_worker_that_slept_past_its_lease_writes_nothing() {
         ),
     ];
     for (path, body) in &writes {
-        let reply = cluster.post(path, body).expect("answered");
+        let reply = post(&cluster, &secret, path, body);
         assert_eq!((reply.status, reply.body["code"].as_str()), (409, Some("stale-fence")), "{path}: {:?}", reply.body);
+        let forged = post(&cluster, "", path, body);
+        assert_eq!((forged.status, forged.body["code"].as_str()), (403, Some("unproven")), "{path}: {:?}", forged.body);
     }
     let forged = format!("forged by {}", std::process::id());
     let reply = cluster
-        .call(
+        .call_as(
+            WORKER_TOKEN,
             "PUT",
             &format!("/v1/blobs/sha256:{}", "0".repeat(64)),
-            &[("x-stride-grant", &grant.to_string())],
+            &[(GRANT_HEADER, &grant.to_string()), (SECRET_HEADER, &secret)],
             forged.as_bytes(),
         )
         .expect("answered");

@@ -71,7 +71,7 @@ impl Fleet {
             next_start: now,
         };
         let members = (0..count).map(member).collect();
-        let (url, token) = (coordinator.local_url(), coordinator.token().clone());
+        let (url, token) = (coordinator.local_url(), coordinator.worker_token().clone());
         let mut fleet = Self { members, url, token, backend, store: store.to_owned(), logs, memory: Watch::new() };
         for i in 0..count {
             fleet.spawn(i)?;

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use coordinator::shell::raise_descriptor_limit;
-use coordinator::{Config, Control, Coordinator, Handle, Trouble, WorkerView};
+use coordinator::{Config, Control, Coordinator, Handle, Trouble};
 use protocol::message::{FailureClass, RunState, RunView, StageState, Submit};
 use protocol::pipeline::Pipeline;
 use protocol::{RunId, StageName};
@@ -188,22 +188,14 @@ async fn watch(
 /// Tells the coordinator that a worker has died, and what of.
 async fn report_death(handle: &Handle, death: &Death) {
     if let Some(why) = &death.out_of_memory {
-        // Said in the worker's own name, as it would have said it: with a grant that still holds, and never again with one that does not.
-        let held = handle.workers().into_iter().find(|view| view.worker == death.worker && view.task.is_some());
-        if let Some(view) = held
-            && let Err(problem) = fail_for(handle, &view, why).await
-        {
-            tracing::warn!(worker = %death.worker, "its work is tried again: {}", problem.error);
+        // As it would have said it itself: with a grant that still holds, and never again with one that does not.
+        let message = format!("worker `{}` {why}", death.worker);
+        if let Err(error) = handle.fail_for(&death.worker, FailureClass::OutOfMemory, message).await {
+            tracing::warn!(worker = %death.worker, "its work is tried again: {error}");
         }
     }
     // A worker that never joined is not known; then there is nothing to take from it.
     let _ = handle.worker_gone(&death.worker).await;
-}
-
-async fn fail_for(handle: &Handle, dead: &WorkerView, why: &str) -> Result<()> {
-    let client = client::Client::of(handle)?;
-    let message = format!("worker `{}` {why}", dead.worker);
-    client.fail_for(&dead.worker, dead.incarnation, FailureClass::OutOfMemory, &message).await
 }
 
 /// Whether a stage waits for somebody to do it. A run whose stages are all known needs no workers.

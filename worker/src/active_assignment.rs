@@ -14,6 +14,7 @@ use protocol::message::{Assignment, Doing, Grant, Progress, Role};
 use protocol::{Digest, Generation};
 use tokio::sync::Notify;
 
+use crate::client::Credential;
 use crate::event_count::{EventCount, lock};
 use crate::gang::endpoint::Endpoint;
 use crate::gang::member::{Busy, MeshConfig};
@@ -91,6 +92,12 @@ impl ActiveAssignment {
     /// The right to write, as of the newest orders.
     pub(crate) fn grant(&self) -> Grant {
         lock(&self.state).assignment.grant.clone()
+    }
+
+    /// The same, with its secret.
+    pub(crate) fn credential(&self) -> Credential {
+        let state = lock(&self.state);
+        Credential { grant: state.assignment.grant.clone(), secret: state.assignment.secret.clone() }
     }
 
     pub(crate) fn assignment(&self) -> Assignment {
@@ -272,16 +279,16 @@ impl ActiveAssignment {
         }
     }
 
-    /// A write under `refused` met a newer fence. Waits for the orders that say what became of us: a newer grant to write
+    /// A call under `refused` met a newer fence, or was not recognised. Waits for the orders that say what became of us: a newer grant to write
     /// under, or the end.
-    pub(crate) fn after_stale(&self, refused: &Grant) -> Result<(), String> {
+    pub(crate) fn after_stale(&self, refused: &Credential) -> Result<(), String> {
         let until = Instant::now() + STALE_PATIENCE;
         loop {
             let ticket = self.event_count.ticket();
             if let Some(reason) = self.ended() {
                 return Err(reason);
             }
-            if self.grant() != *refused {
+            if self.credential() != *refused {
                 return Ok(());
             }
             let left = until.saturating_duration_since(Instant::now());

@@ -10,7 +10,7 @@ use std::time::Duration;
 use protocol::Incarnation;
 use protocol::message::{Assignment, DesiredAssignments, Join, Joined, Poll};
 use tokio::sync::Notify;
-use tokio::time::sleep;
+use tokio::time::{Instant, sleep};
 
 use crate::active_assignment::{ActiveAssignment, Flags, Reading};
 use crate::client::{CallError, Client};
@@ -22,6 +22,8 @@ use crate::prepare::Preparation;
 const LONGEST: Duration = Duration::from_secs(1);
 /// Shortest time between two polls.
 const SHORTEST: Duration = Duration::from_millis(20);
+/// How long a name is waited for that another process has: a process that was killed has it until its lease ends.
+const NAME_PATIENCE: Duration = Duration::from_secs(60);
 /// Refusals in a row before they are believed.
 const REFUSALS: u32 = 5;
 
@@ -149,11 +151,17 @@ pub(crate) enum End {
 async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Joined, End> {
     let mut pause = Duration::from_millis(50);
     let mut said = false;
+    let begun = Instant::now();
     loop {
         match client.join(join).await {
             Ok(joined) => {
                 tracing::info!(worker = %join.worker, incarnation = %joined.incarnation, peer_address = join.peer_address, "joined");
                 return Ok(joined);
+            }
+            Err(CallError::NameHeld(message)) if begun.elapsed() < NAME_PATIENCE => {
+                if !std::mem::replace(&mut said, true) {
+                    tracing::warn!("{message}; waiting");
+                }
             }
             Err(error) if error.may_pass() => {
                 if !std::mem::replace(&mut said, true) {

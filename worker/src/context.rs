@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use burn::tensor::Device;
 use checkpoint::{BlobError, Blobs};
 use protocol::message::{CommitCheckpoint, Progress, StageTask};
+use protocol::proof::Vouched;
 use protocol::{ArtifactKind, Digest, Manifest};
 use stages::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
 
@@ -21,6 +22,7 @@ use crate::gang::member::Phase;
 use crate::gang::mesh::{Halt, Mesh};
 use crate::gang::tree;
 use crate::process;
+use crate::receipts::Receipts;
 use crate::retry::{self, GaveUp};
 use crate::telemetry_buffer::{Sender, TelemetryBuffer};
 
@@ -52,7 +54,13 @@ impl HttpContext {
     pub(crate) fn new(held: Arc<ActiveAssignment>, client: Client, cache: Arc<Cache>, device: Device) -> Self {
         let assignment = held.assignment();
         let gang = matches!(assignment.role, protocol::message::Role::Member { .. });
-        let blobs = Arc::new(HttpBlobs { held: held.clone(), client: client.clone(), cache, gang });
+        let blobs = Arc::new(HttpBlobs {
+            held: held.clone(),
+            client: client.clone(),
+            cache,
+            receipts: Receipts::default(),
+            gang,
+        });
         let (telemetry, sender) = TelemetryBuffer::open(held.clone(), client.clone());
         let task = assignment.stage;
         Self { task, device, held, client, blobs, telemetry, mesh: None, behind: None, gang, _sender: sender }
@@ -61,6 +69,11 @@ impl HttpContext {
     /// Waits until everything recorded and logged is stored.
     pub(crate) fn flush(&self) -> Result<(), ContextError> {
         self.telemetry.flush().map_err(given_up)
+    }
+
+    /// What vouches for a manifest that this attempt has uploaded.
+    pub(crate) fn receipts(&self, manifest: Digest) -> BTreeMap<Digest, String> {
+        self.blobs.receipts.for_manifest(manifest)
     }
 
     /// Lets the peers go, saying goodbye: to the next generation, or for good.
@@ -181,7 +194,9 @@ impl AttemptContext for HttpContext {
     }
 
     fn put_manifest(&mut self, manifest: &Manifest) -> Result<Digest, ContextError> {
-        self.blobs.put(manifest.to_bytes()).map_err(blob_error)
+        let digest = self.blobs.put(manifest.to_bytes()).map_err(blob_error)?;
+        self.blobs.receipts.note(digest, manifest);
+        Ok(digest)
     }
 
     fn progress(&mut self, done: u64, total: u64, unit: &str, metrics: &[(&str, f64)]) {
@@ -338,10 +353,13 @@ impl GangContext for HttpContext {
         let digest = self.put_manifest(manifest)?;
         let metrics: BTreeMap<String, f64> =
             metrics.iter().filter(|(_, v)| v.is_finite()).map(|(k, v)| (k.clone(), *v)).collect();
+        let receipts = self.receipts(digest);
         failpoints::hit("checkpoint::before_commit");
-        retry::until_ended(&self.held, &format!("committing the checkpoint of step {step}"), |grant| {
-            let commit = CommitCheckpoint { grant: grant.clone(), step, manifest: digest, metrics: metrics.clone() };
-            self.client.wait(self.client.tell("/v1/checkpoints", &commit))
+        retry::until_ended(&self.held, &format!("committing the checkpoint of step {step}"), |credential| {
+            let (grant, metrics) = (credential.grant.clone(), metrics.clone());
+            let commit = CommitCheckpoint { grant, step, manifest: digest, metrics };
+            let vouched = Vouched { what: commit, receipts: receipts.clone() };
+            self.client.wait(self.client.tell("/v1/checkpoints", credential, &vouched))
         })
         .map_err(given_up)?;
         failpoints::hit("checkpoint::after_commit");

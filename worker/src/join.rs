@@ -168,8 +168,7 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
     match end {
         End::Left => {
             // Spares the coordinator the wait for our lease to run out; if it does not hear it, that is what happens.
-            let path = format!("/v1/workers/{}/gone", offer.worker);
-            let told = runtime.block_on(async { tokio::time::timeout(FAREWELL, client.tell(&path, &())).await });
+            let told = runtime.block_on(async { tokio::time::timeout(FAREWELL, client.leave(&offer.worker)).await });
             if !matches!(told, Ok(Ok(()))) {
                 tracing::debug!("the coordinator did not hear that this worker leaves");
             }

@@ -22,6 +22,7 @@ mod kinds;
 mod mapped;
 mod prepare;
 pub mod process;
+mod receipts;
 mod retry;
 mod stage_thread;
 mod telemetry_buffer;

@@ -2,10 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use protocol::message::Grant;
-
 use crate::active_assignment::ActiveAssignment;
-use crate::client::CallError;
+use crate::client::{CallError, Credential};
 
 /// Why a call in the name of a grant was given up.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -22,11 +20,11 @@ const FAULTS: u32 = 8;
 /// Longest pause between two tries.
 const LONGEST: Duration = Duration::from_secs(1);
 
-/// Calls until it succeeds, is refused for good, or the grant has ended. `call` is given the newest grant each time.
+/// Calls until it succeeds, is refused for good, or the grant has ended. `call` is given the newest credential each time.
 pub(crate) fn until_ended<T>(
     held: &ActiveAssignment,
     what: &str,
-    mut call: impl FnMut(&Grant) -> Result<T, CallError>,
+    mut call: impl FnMut(&Credential) -> Result<T, CallError>,
 ) -> Result<T, GaveUp> {
     let begun = Instant::now();
     let mut warned = begun;
@@ -36,8 +34,8 @@ pub(crate) fn until_ended<T>(
         if let Some(reason) = held.ended() {
             return Err(GaveUp::Ended(reason));
         }
-        let grant = held.grant();
-        match call(&grant) {
+        let credential = held.credential();
+        match call(&credential) {
             Ok(done) => {
                 if warned != begun {
                     tracing::info!("{what}: done after {:.0} s", begun.elapsed().as_secs_f64());
@@ -45,8 +43,8 @@ pub(crate) fn until_ended<T>(
                 return Ok(done);
             }
             Err(CallError::Stale(message)) => {
-                tracing::debug!(task = %grant.task, "{what}: {message}");
-                held.after_stale(&grant).map_err(GaveUp::Ended)?;
+                tracing::debug!(task = %credential.grant.task, "{what}: {message}");
+                held.after_stale(&credential).map_err(GaveUp::Ended)?;
             }
             Err(CallError::Fault(message)) if faults == FAULTS => {
                 return Err(GaveUp::Answer(CallError::Fault(message)));

@@ -3,12 +3,15 @@
 use std::any::Any;
 use std::backtrace::{Backtrace, BacktraceStatus};
 use std::cell::RefCell;
+use std::collections::BTreeMap;
 use std::panic::{self, AssertUnwindSafe};
 use std::sync::Arc;
 use std::time::Duration;
 
 use burn::tensor::Device;
+use protocol::Digest;
 use protocol::message::{FailureClass, ReportOutcome, Role, TaskOutcome};
+use protocol::proof::Vouched;
 use stages::context::{AttemptContext, ContextError, GangContext, Outcome, Part, StageError};
 
 use crate::active_assignment::ActiveAssignment;
@@ -69,7 +72,11 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
     let Some(outcome) = outcome(result, held, &context) else { return };
 
     failpoints::hit("outcome::before_report");
-    let reported = report(held, bench, &outcome);
+    let receipts = match &outcome {
+        TaskOutcome::Finished { output, .. } => context.receipts(*output),
+        TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => BTreeMap::new(),
+    };
+    let reported = report(held, bench, &outcome, &receipts);
     failpoints::hit("outcome::after_report");
     match reported {
         Ok(()) => tracing::info!(task = %grant.task, attempt = %grant.attempt, "end: {}", summary(&outcome)),
@@ -83,17 +90,25 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
                 FailureClass::Infrastructure
             };
             let message = format!("what it made was refused: {error}");
-            if let Err(GaveUp::Answer(error)) = report(held, bench, &TaskOutcome::Failed { class, message }) {
+            if let Err(GaveUp::Answer(error)) =
+                report(held, bench, &TaskOutcome::Failed { class, message }, &BTreeMap::new())
+            {
                 tracing::error!(task = %grant.task, "so was the failure: {error}");
             }
         }
     }
 }
 
-fn report(held: &ActiveAssignment, bench: &Bench, outcome: &TaskOutcome) -> Result<(), GaveUp> {
-    retry::until_ended(held, "reporting the outcome", |grant| {
-        let report = ReportOutcome { grant: grant.clone(), outcome: outcome.clone() };
-        bench.client.wait(bench.client.tell("/v1/outcomes", &report))
+fn report(
+    held: &ActiveAssignment,
+    bench: &Bench,
+    outcome: &TaskOutcome,
+    receipts: &BTreeMap<Digest, String>,
+) -> Result<(), GaveUp> {
+    retry::until_ended(held, "reporting the outcome", |credential| {
+        let report = ReportOutcome { grant: credential.grant.clone(), outcome: outcome.clone() };
+        let vouched = Vouched { what: report, receipts: receipts.clone() };
+        bench.client.wait(bench.client.tell("/v1/outcomes", credential, &vouched))
     })
 }
 

@@ -234,9 +234,9 @@ impl TelemetryBuffer {
             (rows, lines)
         };
         if !rows.is_empty() {
-            retry::until_ended(&self.held, "sending metrics", |grant| {
-                let batch = MetricBatch { grant: grant.clone(), rows: rows.clone() };
-                self.client.wait(self.client.tell("/v1/metrics", &batch))
+            retry::until_ended(&self.held, "sending metrics", |credential| {
+                let batch = MetricBatch { grant: credential.grant.clone(), rows: rows.clone() };
+                self.client.wait(self.client.tell("/v1/metrics", credential, &batch))
             })?;
             let mut state = lock(&self.state);
             for row in &rows {
@@ -247,10 +247,10 @@ impl TelemetryBuffer {
             }
         }
         if let Some((first, _)) = lines.first() {
-            retry::until_ended(&self.held, "sending logs", |grant| {
+            retry::until_ended(&self.held, "sending logs", |credential| {
                 let lines = lines.iter().map(|(_, line)| line.clone()).collect();
-                let batch = LogBatch { grant: grant.clone(), first: *first, lines };
-                self.client.wait(self.client.tell("/v1/logs", &batch))
+                let batch = LogBatch { grant: credential.grant.clone(), first: *first, lines };
+                self.client.wait(self.client.tell("/v1/logs", credential, &batch))
             })?;
             let last = first + lines.len() as u64;
             let mut state = lock(&self.state);

@@ -165,11 +165,9 @@ impl Fences {
             Some(current) if *current > grant.fence => {
                 Err(WriteError::StaleFence { task: grant.task.clone(), current: *current, carried: grant.fence })
             }
-            current => Err(WriteError::Conflict(format!(
-                "the write for task `{}` carries fence {}, which was never granted: the newest is {}",
-                grant.task,
-                grant.fence,
-                current.map_or_else(|| "none".into(), |fence| fence.to_string())
+            _ => Err(WriteError::Conflict(format!(
+                "the write for task `{}` carries fence {}, which was never granted",
+                grant.task, grant.fence
             ))),
         }
     }

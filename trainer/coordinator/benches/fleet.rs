@@ -3,7 +3,7 @@
 //!
 //! A claim is a report of a finished shard: in one transaction it ends the shard and gives its worker the next one.
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, HashMap};
 use std::io::Write as _;
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -12,12 +12,13 @@ use std::time::{Duration, Instant};
 
 use coordinator::{Config, Connections, Coordinator};
 use protocol::message::{
-    Assignment, DesiredAssignments, Grant, Join, Joined, MetricBatch, MetricRow, PROTOCOL_VERSION, Poll, ReportOutcome,
+    Assignment, DesiredAssignments, Join, Joined, MetricBatch, MetricRow, PROTOCOL_VERSION, Poll, ReportOutcome,
     Submit, TaskOutcome,
 };
 use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
+use protocol::proof::{BlobStored, GRANT_HEADER, SECRET_HEADER, Vouched};
 use protocol::stage::{Backend, DataSynthetic, EncodeLatents, Placement, StageSettings, TrainVae, WorkerRange};
-use protocol::{ArtifactKind, Digest, Incarnation, Manifest, Seed};
+use protocol::{ArtifactKind, Digest, Incarnation, Manifest, Seed, TaskId};
 use registry::{Holder, Store};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -78,16 +79,19 @@ impl Connection {
         }
     }
 
-    async fn post<T: DeserializeOwned>(&mut self, path: &str, body: &impl Serialize) -> Result<T> {
+    async fn post<T: DeserializeOwned>(&mut self, path: &str, secret: &str, body: &impl Serialize) -> Result<T> {
         let body = serde_json::to_vec(body)?;
-        let answer = self.send(&format!("POST {path}"), "content-type: application/json\r\n", &body).await?;
+        let headers = format!("content-type: application/json\r\n{SECRET_HEADER}: {secret}\r\n");
+        let answer = self.send(&format!("POST {path}"), &headers, &body).await?;
         Ok(serde_json::from_slice(&answer)?)
     }
 
-    async fn put(&mut self, grant: &Grant, bytes: &[u8]) -> Result<Digest> {
-        let header = format!("x-stride-grant: {}\r\n", serde_json::to_string(grant)?);
+    /// Uploads a blob; its receipt.
+    async fn put(&mut self, assignment: &Assignment, bytes: &[u8]) -> Result<String> {
+        let grant = serde_json::to_string(&assignment.grant)?;
+        let header = format!("{GRANT_HEADER}: {grant}\r\n{SECRET_HEADER}: {}\r\n", assignment.secret);
         let answer = self.send(&format!("PUT /v1/blobs/{}", Digest::of(bytes)), &header, bytes).await?;
-        Ok(serde_json::from_slice::<coordinator::shell::BlobStored>(&answer)?.digest)
+        Ok(serde_json::from_slice::<BlobStored>(&answer)?.receipt.ok_or("a stored blob has a receipt")?)
     }
 }
 
@@ -96,8 +100,12 @@ struct Worker {
     name: String,
     incarnation: Incarnation,
     connection: Connection,
-    uploaded: HashSet<Digest>,
+    /// Receipts by task and blob.
+    uploaded: HashMap<(TaskId, Digest), String>,
 }
+
+/// What every worker of the bench shows.
+const SECRET: &str = "the-secret-of-each-worker-of-this-bench";
 
 impl Worker {
     async fn join(address: SocketAddr, token: &str, i: usize) -> Result<Self> {
@@ -111,15 +119,15 @@ impl Worker {
             instruction_set: "avx2".into(),
             peer_address: "127.0.0.1:1".into(),
         };
-        let joined: Joined = connection.post("/v1/workers", &join).await?;
-        Ok(Self { name, incarnation: joined.incarnation, connection, uploaded: HashSet::new() })
+        let joined: Joined = connection.post("/v1/workers", SECRET, &join).await?;
+        Ok(Self { name, incarnation: joined.incarnation, connection, uploaded: HashMap::new() })
     }
 
     /// A heartbeat that is answered at once.
     async fn poll(&mut self) -> Result<Option<Assignment>> {
         let poll = Poll { incarnation: self.incarnation, doing: vec![], ready: vec![], version: 0 };
         let desired: DesiredAssignments =
-            self.connection.post(&format!("/v1/workers/{}/poll", self.name), &poll).await?;
+            self.connection.post(&format!("/v1/workers/{}/poll", self.name), SECRET, &poll).await?;
         Ok(desired.assignments.into_iter().next())
     }
 
@@ -131,15 +139,20 @@ impl Worker {
             _ => ArtifactKind::Latents,
         };
         let manifest = Manifest::new(kind, serde_json::json!({}));
-        if self.uploaded.insert(manifest.digest()) {
-            self.connection.put(&assignment.grant, &manifest.to_bytes()).await?;
+        let place = (assignment.grant.task.clone(), manifest.digest());
+        if !self.uploaded.contains_key(&place) {
+            let receipt = self.connection.put(assignment, &manifest.to_bytes()).await?;
+            self.uploaded.insert(place, receipt);
         }
         Ok(manifest.digest())
     }
 
-    async fn finish(&mut self, grant: Grant, output: Digest) -> Result {
+    async fn finish(&mut self, assignment: Assignment, output: Digest) -> Result {
+        let Assignment { grant, secret, .. } = assignment;
+        let receipt = self.uploaded.get(&(grant.task.clone(), output)).map(|receipt| (output, receipt.clone()));
         let outcome = TaskOutcome::Finished { output, metrics: BTreeMap::new() };
-        self.connection.post("/v1/outcomes", &ReportOutcome { grant, outcome }).await
+        let report = Vouched { what: ReportOutcome { grant, outcome }, receipts: receipt.into_iter().collect() };
+        self.connection.post("/v1/outcomes", &secret, &report).await
     }
 }
 
@@ -244,7 +257,7 @@ async fn main() -> Result {
                 && assignment.stage.name.as_str() != "latents"
             {
                 let output = worker.output(&assignment).await?;
-                worker.finish(assignment.grant, output).await?;
+                worker.finish(assignment, output).await?;
             }
         }
     }
@@ -256,11 +269,11 @@ async fn main() -> Result {
     for mut worker in workers.drain(..16) {
         let rows = Arc::clone(&rows);
         tasks.push(tokio::spawn(async move {
-            let grant = worker.poll().await?.ok_or("every worker holds a shard")?.grant;
+            let Assignment { grant, secret, .. } = worker.poll().await?.ok_or("every worker holds a shard")?;
             for batch in 0..40u64 {
                 let row = |i: u64| MetricRow { step: batch * 1000 + i, key: "loss".into(), value: 0.5 };
                 let batch = MetricBatch { grant: grant.clone(), rows: (0..1000).map(row).collect() };
-                worker.connection.post::<()>("/v1/metrics", &batch).await?;
+                worker.connection.post::<()>("/v1/metrics", &secret, &batch).await?;
                 rows.fetch_add(1000, Ordering::Relaxed);
             }
             Ok::<_, Box<dyn std::error::Error + Send + Sync>>(worker)
@@ -286,7 +299,7 @@ async fn main() -> Result {
                 for _ in 0..8 {
                     let Some(assignment) = worker.poll().await? else { break };
                     let output = worker.output(&assignment).await?;
-                    worker.finish(assignment.grant, output).await?;
+                    worker.finish(assignment, output).await?;
                     claims.fetch_add(1, Ordering::Relaxed);
                 }
                 Ok::<_, Box<dyn std::error::Error + Send + Sync>>(())

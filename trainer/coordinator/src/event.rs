@@ -12,6 +12,7 @@ use registry::Write;
 
 use crate::state::execution::StageExecution;
 use crate::state::run::{Control, Run};
+use crate::state::worker::Identity;
 use crate::value::{Candidate, Known};
 
 /// Something that happened, or that somebody asks for.
@@ -38,6 +39,8 @@ pub enum Event {
     Join {
         /// What it said.
         join: Join,
+        /// Whose word it is.
+        by: Identity,
     },
     /// A worker that had lost its lease, or whose peers had lost it, was heard again.
     WorkerBack {
@@ -60,10 +63,12 @@ pub enum Event {
         /// Which process.
         incarnation: Incarnation,
     },
-    /// The launcher of the process saw it exit: certain, unlike an expired lease.
+    /// The process has ended: certain, unlike an expired lease.
     WorkerGone {
         /// Who.
         worker: WorkerId,
+        /// Which process said so of itself. `None` is the word of the launcher, which saw the newest one exit.
+        incarnation: Option<Incarnation>,
     },
     /// A gang member could not reach others.
     PeersLost {

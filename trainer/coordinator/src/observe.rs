@@ -56,9 +56,13 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
         let (worker, incarnation) = (worker.clone(), poll.incarnation);
         events.push(Event::WorkerReady { worker, incarnation, tasks: poll.ready });
     }
-    let heard = Arc::make_mut(&mut state.heard.workers).entry(worker).or_default();
+    let heard = Arc::make_mut(&mut state.heard.workers).entry(worker.clone()).or_default();
     *heard = now.max(*heard);
     for doing in poll.doing {
+        if (&doing.grant.worker, doing.grant.incarnation) != (&worker, poll.incarnation) {
+            // A worker speaks for its own grants alone.
+            continue;
+        }
         let Ok((execution, task)) = state.task(&doing.grant.task) else { continue };
         let Ok(rank) = task.check(&doing.grant) else { continue };
         // Shards are counted, not looked into.

@@ -6,14 +6,18 @@ use protocol::{Fence, TaskId};
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Rejected {
     /// The grant has been superseded.
-    #[error("stale fence: task `{task}` is at fence {current}, the call carries {carried}")]
+    #[error("stale fence: the grant of task `{task}` with fence {carried} has been superseded")]
     StaleFence {
         task: TaskId,
-        /// Its fence now.
-        current: Fence,
-        /// The fence of the call.
+        /// The fence of the call. The task's own is not told.
         carried: Fence,
     },
+    /// A worker's name is another process's, whose lease has not ended.
+    #[error("{0}")]
+    NameHeld(String),
+    /// A worker's name belongs to another token.
+    #[error("{0}")]
+    Forbidden(String),
     /// No such thing.
     #[error("{0}")]
     NotFound(String),

@@ -1,10 +1,12 @@
 //! What workers and clients are told. Read-only.
 
+use std::collections::BTreeSet;
+
 use protocol::message::{
     Assignment, DesiredAssignments, Prepare, Progress, Role, RunState, RunView, StageState, StageTask, StageView,
 };
 use protocol::stage::Backend;
-use protocol::{Generation, Incarnation, TaskId, WorkerId, canonical};
+use protocol::{Digest, Generation, Incarnation, TaskId, WorkerId, canonical};
 use serde::{Deserialize, Serialize};
 
 use crate::rejected::Rejected;
@@ -91,6 +93,26 @@ impl State {
             Some(Prepare { task: task.id.clone(), inputs: execution.inputs.clone(), resume })
         });
         open.take(AT_ONCE).collect()
+    }
+
+    /// The artifacts and checkpoints that a task reads.
+    pub fn read_by(&self, task: &TaskId) -> Result<BTreeSet<Digest>, Rejected> {
+        let (execution, task) = self.task(task)?;
+        let mut read: BTreeSet<Digest> = execution.inputs.values().copied().collect();
+        read.extend(task.checkpoints.iter().map(|saved| saved.manifest));
+        if task.part == Part::Merge {
+            read.extend(execution.shards().unwrap_or_default());
+        }
+        Ok(read)
+    }
+
+    /// The artifacts and checkpoints that a worker may read: those of the task that it holds, or of the tasks that it prepares for.
+    pub fn readable_by(&self, worker: &WorkerId) -> BTreeSet<Digest> {
+        if let Some((_, task)) = self.held_by(worker) {
+            return self.read_by(&task.id).unwrap_or_default();
+        }
+        let prepare = self.workers.get(worker).map(|known| self.to_prepare(known)).unwrap_or_default();
+        prepare.iter().flat_map(|task| task.inputs.values().copied().chain(task.resume)).collect()
     }
 
     /// A run as clients see it at `now`.
@@ -230,6 +252,7 @@ fn assignment(
     };
     Some(Assignment {
         grant: task.grant_of(worker, incarnation),
+        secret: String::new(),
         stage: StageTask {
             run: execution.run.clone(),
             name: execution.keyed_as.clone(),

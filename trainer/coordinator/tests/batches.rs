@@ -1,7 +1,7 @@
 //! What is decided together, what the store refuses, and who is answered when, without a disk.
 
 use coordinator::batch::{Ask, Batches, Done, Turn};
-use coordinator::state::worker::Presence;
+use coordinator::state::worker::{Identity, Presence};
 use coordinator::{Effect, Event, Millis, Moment, Observation, Policy, Refused, State};
 use protocol::message::{Join, PROTOCOL_VERSION, Poll};
 use protocol::stage::Backend;
@@ -29,7 +29,8 @@ fn join(name: &str) -> Ask {
         instruction_set: "avx2".into(),
         peer_address: format!("{name}:1"),
     };
-    Ask::Event(Box::new(Event::Join { join }))
+    let by = Identity { caller: "t".into(), secret: Digest::of(name.as_bytes()) };
+    Ask::Event(Box::new(Event::Join { join, by }))
 }
 
 fn poll(incarnation: Incarnation) -> Poll {

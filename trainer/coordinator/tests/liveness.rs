@@ -76,12 +76,12 @@ fn p15_a_task_that_makes_progress_survives_any_number_of_losses() {
     let mut coordinator = PureCoordinator::new(Policy::default());
     let (run, _) = gang_of_three(&mut coordinator);
     for name in ["b", "c"] {
-        coordinator.happen(Event::WorkerGone { worker: name.into() }).expect("taken");
+        coordinator.happen(Event::WorkerGone { worker: name.into(), incarnation: None }).expect("taken");
     }
     for step in 1..=250 {
         let assignment = coordinator.assignment("a").expect("it trains");
         save(&mut coordinator, &assignment, step, &format!("step {step}"));
-        coordinator.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
+        coordinator.happen(Event::WorkerGone { worker: "a".into(), incarnation: None }).expect("taken");
         assert_eq!(coordinator.run_state(&run), RunState::Running, "after loss {step}");
         coordinator.now += 40_000;
         coordinator.join("a");
@@ -91,7 +91,7 @@ fn p15_a_task_that_makes_progress_survives_any_number_of_losses() {
     let budget = Policy::default().infrastructure_budget;
     for loss in 1..=budget {
         assert_eq!(coordinator.run_state(&run), RunState::Running, "after {loss} losses in a row");
-        coordinator.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
+        coordinator.happen(Event::WorkerGone { worker: "a".into(), incarnation: None }).expect("taken");
         coordinator.now += 40_000;
         coordinator.join("a");
         coordinator.tick();
@@ -241,7 +241,7 @@ fn every_generation_has_a_secret_of_its_own() {
                 role => panic!("{role:?}"),
             }
             if coordinator.state.workers.contains_key(&WorkerId::from(next)) {
-                coordinator.happen(Event::WorkerGone { worker: next.into() }).expect("taken");
+                coordinator.happen(Event::WorkerGone { worker: next.into(), incarnation: None }).expect("taken");
             } else {
                 coordinator.join(next);
             }
@@ -339,7 +339,7 @@ fn a_submission_costs_the_same_however_many_runs_have_ended() {
 fn a_worker_that_is_away_for_an_hour_leaves_memory_and_comes_back_as_another_process() {
     let mut coordinator = PureCoordinator::new(Policy::default());
     let old = coordinator.join("a");
-    coordinator.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
+    coordinator.happen(Event::WorkerGone { worker: "a".into(), incarnation: None }).expect("taken");
     coordinator.now += 3_590_000;
     coordinator.tick();
     assert!(coordinator.state.workers.contains_key(&WorkerId::from("a")));
@@ -395,8 +395,10 @@ fn what_is_stored_says_of_which_format_it_is() {
         recover(&stored)
     };
     assert!(recover(&coordinator.store.recovery).is_ok());
-    assert!(with("\"format\":[1,1]", "\"format\":[1,7]").is_ok());
-    let refused = with("\"format\":[1,1]", "\"format\":[2,0]").expect_err("another major version");
+    let (major, minor) = journal::FORMAT;
+    let now = format!("\"format\":[{major},{minor}]");
+    assert!(with(&now, "\"format\":[1,7]").is_ok());
+    let refused = with(&now, "\"format\":[2,0]").expect_err("another major version");
     assert!(refused.contains("format 2.0") && refused.contains("1.x") && refused.contains("decision 2"), "{refused}");
     let refused = with("\"execution-state\"", "\"horoscope\"").expect_err("an unknown kind");
     assert!(refused.contains("horoscope") && refused.contains("decision 2"), "{refused}");
@@ -412,7 +414,7 @@ fn what_is_stored_says_of_which_format_it_is() {
         whole.run(&run).is_ok() && whole.executions.values().all(|execution| execution.state == ExecutionState::Open)
     );
     let (_, text) = coordinator.store.recovery.snapshot.as_mut().expect("a snapshot");
-    *text = text.replace("\"format\":[1,1]", "\"format\":[3,1]");
+    *text = text.replace(&now, "\"format\":[3,1]");
     let refused = recover(&coordinator.store.recovery).expect_err("another major version");
     assert!(refused.contains("format 3.1") && refused.contains("snapshot"), "{refused}");
 }

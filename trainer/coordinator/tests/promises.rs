@@ -381,7 +381,7 @@ fn p4_a_gang_waits_for_nobody_who_fetches_its_inputs() {
     assert_eq!(coordinator.assignment("b").expect("it trains").grant.attempt, held.grant.attempt);
     // With nobody left to hand it over, a worker that begins needs the checkpoint too.
     for name in ["a", "b"] {
-        coordinator.happen(Event::WorkerGone { worker: name.into() }).expect("gone");
+        coordinator.happen(Event::WorkerGone { worker: name.into(), incarnation: None }).expect("gone");
     }
     assert_eq!(coordinator.asked("c")[0].resume, Some(Digest::of(b"state")));
 }
@@ -404,7 +404,7 @@ fn p1_all_that_work_on_a_stage_share_an_instruction_set() {
     assert_eq!(vae(&coordinator).instruction_set.as_deref(), Some("avx2"));
     let over = |coordinator: &mut PureCoordinator, names: &[&str]| {
         for name in names {
-            coordinator.happen(Event::WorkerGone { worker: (*name).into() }).expect("gone");
+            coordinator.happen(Event::WorkerGone { worker: (*name).into(), incarnation: None }).expect("gone");
         }
         for _ in 0..5 {
             coordinator.now += 1_000;

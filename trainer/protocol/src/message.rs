@@ -6,6 +6,8 @@
 //!
 //! Every write carries a [`Grant`]. The coordinator checks its fence in the transaction that stores the write. It
 //! answers 409 with [`ApiError`] code `stale-fence` to an old one.
+//!
+//! Names and grants are not secret. [`proof`](crate::proof) says how a call proves whose it is.
 
 use std::collections::BTreeMap;
 
@@ -16,14 +18,15 @@ use crate::sweep::{SearchKind, Values};
 use crate::{Attempt, Digest, Fence, Generation, Incarnation, RunId, Seed, StageName, TaskId, WorkerId};
 
 /// Version of these messages; a worker with another version is refused.
-pub const PROTOCOL_VERSION: u32 = 4;
+pub const PROTOCOL_VERSION: u32 = 5;
 
 /// `POST /v1/workers`: a process registers as a worker.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Join {
     /// Version of the worker's messages, [`PROTOCOL_VERSION`].
     pub protocol: u32,
-    /// The worker's name, unique among live workers.
+    /// The worker's name, unique among live workers. It stays with the token that joined, and with the process until that leaves
+    /// or its lease ends.
     pub worker: WorkerId,
     /// Process id, for display.
     pub pid: u32,
@@ -84,6 +87,13 @@ pub struct Progress {
     pub metrics: BTreeMap<String, f64>,
 }
 
+/// `POST /v1/workers/{worker}/gone`: the process ends.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Gone {
+    /// Incarnation from [`Joined`].
+    pub incarnation: Incarnation,
+}
+
 /// The answer to [`Poll`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DesiredAssignments {
@@ -126,6 +136,9 @@ pub struct Grant {
 pub struct Assignment {
     /// Grant, carried by every write.
     pub grant: Grant,
+    /// Secret of the grant, shown by every write in [`SECRET_HEADER`](crate::proof::SECRET_HEADER). The server adds it to its
+    /// answer; the state does not hold it.
+    pub secret: String,
     /// Settings and inputs of the stage.
     pub stage: StageTask,
     /// Part of the worker: alone, a shard, or a gang member.
@@ -448,7 +461,8 @@ pub enum StageState {
 /// Answer to every refused call.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ApiError {
-    /// Code for programs: `stale-fence`, `not-found`, `conflict`, `invalid`, `storage`, `gate`, `internal`.
+    /// Code for programs: `stale-fence`, `unproven`, `unvouched`, `name-held`, `forbidden`, `not-found`, `conflict`, `invalid`,
+    /// `storage`, `gate`, `internal`.
     pub code: String,
     /// Description for users.
     pub message: String,

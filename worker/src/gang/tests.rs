@@ -62,7 +62,7 @@ pub(crate) fn assignment(worker: &WorkerId, generation: u64, members: &[Member],
     };
     let role =
         Role::Member { generation: Generation(generation), members: members.to_vec(), secret: secret.to_owned() };
-    Assignment { grant, stage, role, resume: None, drain: false }
+    Assignment { grant, secret: "secret".to_owned(), stage, role, resume: None, drain: false }
 }
 
 /// One worker: where it is dialled, and what it holds once it is a member.

@@ -70,7 +70,7 @@ impl Deciding<'_> {
             Event::Submit { pipeline, source, idempotency_key, until } => {
                 return self.submit(*pipeline, source, idempotency_key, until);
             }
-            Event::Join { join } => self.join(join)?,
+            Event::Join { join, by } => self.join(join, by)?,
             Event::WorkerBack { worker } => return self.sign(&worker, Sign::Back),
             Event::WorkerReady { worker, incarnation, tasks } => return self.ready(worker, incarnation, tasks),
             Event::LeaseExpired { worker, incarnation } => {
@@ -86,7 +86,10 @@ impl Deciding<'_> {
                 }
                 self.record(Fact::WorkerForgotten { worker });
             }
-            Event::WorkerGone { worker } => {
+            Event::WorkerGone { worker, incarnation } => {
+                if let Some(incarnation) = incarnation {
+                    self.state.process(&worker, incarnation)?;
+                }
                 if !self.sign(&worker, Sign::Gone)? {
                     return Ok(false);
                 }

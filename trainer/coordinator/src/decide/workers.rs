@@ -11,15 +11,19 @@ use super::deciding::Deciding;
 use crate::event::Effect;
 use crate::fact::Fact;
 use crate::rejected::Rejected;
-use crate::state::worker::{Sign, Worker};
+use crate::state::worker::{Identity, Sign, Worker};
 
 impl Deciding<'_> {
-    pub(crate) fn join(&mut self, join: Join) -> Result<(), Rejected> {
+    /// Gives the name to a new process, if the old one has ended or is the same.
+    pub(crate) fn join(&mut self, join: Join, by: Identity) -> Result<(), Rejected> {
         if !protocol::id::is_name(join.worker.as_str()) {
             return Err(Rejected::Invalid(format!("`{}` is not a worker name", join.worker)));
         }
+        if let Some(known) = self.state.workers.get(&join.worker) {
+            known.gives_way_to(&join.worker, &by)?;
+        }
         self.drop_worker(&join.worker, Loss::Lost);
-        let process = Worker::joined(&join, self.state.incarnation.next());
+        let process = Worker::joined(&join, by, self.state.incarnation.next());
         self.effects.push(Effect::Joined(process.incarnation));
         let now = self.now();
         Arc::make_mut(&mut self.state.heard.workers).insert(join.worker.clone(), now);

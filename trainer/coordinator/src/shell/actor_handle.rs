@@ -15,7 +15,9 @@ use tokio::task::JoinHandle;
 use super::blocking::blocking;
 use super::clock::Clock;
 use super::records::{Records, read};
+use super::secrets::Secrets;
 use super::versions::resolve_versions;
+use super::vouching::Reach;
 use crate::batch::{Ask, Front, Refused};
 use crate::event::{Effect, Event, Observation};
 use crate::rejected::Rejected;
@@ -43,11 +45,18 @@ pub(crate) struct ActorHandle {
     stop: watch::Sender<bool>,
     clock: Clock,
     pub(crate) store: Store,
+    pub(crate) secrets: Secrets,
+    pub(crate) reach: Arc<Reach>,
 }
 
 impl ActorHandle {
     /// A handle, and the queue of what is asked through it.
-    pub(super) fn new(store: Store, now: Millis, front: Arc<Front>) -> (Self, mpsc::Receiver<(Ask, Reply)>) {
+    pub(super) fn new(
+        store: Store,
+        secrets: Secrets,
+        now: Millis,
+        front: Arc<Front>,
+    ) -> (Self, mpsc::Receiver<(Ask, Reply)>) {
         let (asks, queue) = mpsc::channel(QUEUE);
         let handle = Self {
             asks,
@@ -60,6 +69,8 @@ impl ActorHandle {
             stop: watch::Sender::new(false),
             clock: Clock::new(now),
             store,
+            secrets,
+            reach: Arc::default(),
         };
         (handle, queue)
     }

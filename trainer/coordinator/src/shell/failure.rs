@@ -69,6 +69,8 @@ impl From<Rejected> for Failure {
     fn from(rejected: Rejected) -> Self {
         let (status, code) = match rejected {
             Rejected::StaleFence { .. } => (StatusCode::CONFLICT, "stale-fence"),
+            Rejected::NameHeld(_) => (StatusCode::CONFLICT, "name-held"),
+            Rejected::Forbidden(_) => (StatusCode::FORBIDDEN, "forbidden"),
             Rejected::NotFound(_) => (StatusCode::NOT_FOUND, "not-found"),
             Rejected::Conflict(_) => (StatusCode::CONFLICT, "conflict"),
             Rejected::Invalid(_) => (StatusCode::BAD_REQUEST, "invalid"),

@@ -8,7 +8,7 @@ use axum::http::header;
 use axum::response::IntoResponse;
 use axum::{Extension, Json};
 use protocol::message::{RunView, Submit};
-use protocol::{Digest, RunId, StageName, limits};
+use protocol::{RunId, StageName, limits};
 use registry::LogRow;
 use serde::{Deserialize, Serialize};
 use tokio::sync::SemaphorePermit;
@@ -22,17 +22,6 @@ use super::records::StageMetrics;
 use crate::rejected::Rejected;
 use crate::state::run::Control;
 use crate::view::WorkerView;
-
-/// The answer to `PUT /v1/blobs/{digest}` and `GET /v1/blobs/{digest}/staged`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct BlobStored {
-    /// The blob's name.
-    pub digest: Digest,
-    /// Whether all of it has arrived and is stored.
-    pub stored: bool,
-    /// Bytes that have arrived, if it is not.
-    pub staged: u64,
-}
 
 /// The answer to `POST /v1/runs`.
 #[derive(Debug, Clone, Serialize, Deserialize)]

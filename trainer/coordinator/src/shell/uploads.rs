@@ -1,9 +1,11 @@
 //! What workers write. Every grant is checked twice: here against what the coordinator knows, which refuses most stale
 //! writers before their bytes are read, and again inside the transaction, which is what counts.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
+use access::Scope;
 use axum::Json;
 use axum::body::Body;
 use axum::extract::{Path, State};
@@ -11,7 +13,8 @@ use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::Response;
 use checkpoint::BlobError;
 use futures::{StreamExt as _, stream};
-use protocol::message::{CommitCheckpoint, Grant, LogBatch, MetricBatch, ReportOutcome};
+use protocol::message::{CommitCheckpoint, Grant, LogBatch, MetricBatch, ReportOutcome, TaskOutcome};
+use protocol::proof::{BlobStored, RECEIPT_HEADER, Vouched};
 use protocol::{Digest, limits};
 use registry::blob::{Arriving, PART_BYTES, ResumeError};
 use registry::{Write, WriteError};
@@ -20,11 +23,9 @@ use super::actor_handle::ActorHandle;
 use super::blocking::blocking;
 use super::body::Message;
 use super::failure::Failure;
-use super::queries::BlobStored;
+use super::secrets::{self, Proof};
 use crate::event::Event;
 
-/// The header that carries a blob's grant, as JSON.
-const GRANT_HEADER: &str = "x-stride-grant";
 /// The header with a blob's length.
 const BYTES_HEADER: &str = "x-stride-bytes";
 /// The header that says where in its blob a body begins; 0 without it.
@@ -48,42 +49,83 @@ async fn write(actor_handle: &ActorHandle, write: Write) -> Result<Json<()>, Fai
 
 pub(crate) async fn metrics(
     State(actor_handle): State<Arc<ActorHandle>>,
+    proof: Proof,
     Message(batch, _): Message<MetricBatch>,
 ) -> Result<Json<()>, Failure> {
+    proof.of_grant(&actor_handle.secrets, &batch.grant)?;
     actor_handle.state().check_telemetry(&batch.grant)?;
     write(&actor_handle, Write::Metrics { grant: batch.grant, rows: batch.rows }).await
 }
 
 pub(crate) async fn logs(
     State(actor_handle): State<Arc<ActorHandle>>,
+    proof: Proof,
     Message(batch, _): Message<LogBatch>,
 ) -> Result<Json<()>, Failure> {
+    proof.of_grant(&actor_handle.secrets, &batch.grant)?;
     actor_handle.state().check_telemetry(&batch.grant)?;
     write(&actor_handle, Write::Logs { grant: batch.grant, first: batch.first, lines: batch.lines }).await
 }
 
 pub(crate) async fn checkpoint(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Message(commit, _): Message<CommitCheckpoint>,
+    proof: Proof,
+    Message(vouched, _): Message<Vouched<CommitCheckpoint>>,
 ) -> Result<Json<()>, Failure> {
+    let Vouched { what: commit, receipts } = vouched;
+    proof.of_grant(&actor_handle.secrets, &commit.grant)?;
+    check_blobs(&actor_handle, &proof, &commit.grant, commit.manifest, &receipts).await?;
     actor_handle.decide(Event::Checkpoint { commit }).await?;
     Ok(Json(()))
 }
 
 pub(crate) async fn outcome(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Message(report, _): Message<ReportOutcome>,
+    proof: Proof,
+    Message(vouched, _): Message<Vouched<ReportOutcome>>,
 ) -> Result<Json<()>, Failure> {
+    let Vouched { what: report, receipts } = vouched;
+    proof.of_grant(&actor_handle.secrets, &report.grant)?;
+    if let TaskOutcome::Finished { output, .. } = report.outcome {
+        check_blobs(&actor_handle, &proof, &report.grant, output, &receipts).await?;
+    }
     actor_handle.decide(Event::Outcome { report }).await?;
     Ok(Json(()))
 }
 
-/// Whose upload a request is about. Asked of the state before a byte of the body is read.
-fn granted(actor_handle: &ActorHandle, headers: &HeaderMap) -> Result<Grant, Failure> {
-    let grant =
-        headers.get(GRANT_HEADER).ok_or_else(|| Failure::invalid(format!("header `{GRANT_HEADER}` is missing")))?;
-    let grant: Grant = serde_json::from_slice(grant.as_bytes())
-        .map_err(|e| Failure::invalid(format!("header `{GRANT_HEADER}` is no grant: {e}")))?;
+/// Checks that a manifest names no blobs but those that its worker uploaded for this task or reads.
+async fn check_blobs(
+    actor_handle: &ActorHandle,
+    proof: &Proof,
+    grant: &Grant,
+    manifest: Digest,
+    receipts: &BTreeMap<Digest, String>,
+) -> Result<(), Failure> {
+    let state = actor_handle.state();
+    // What comes of another grant is for the decision to say: fences only grow, so it does not become valid meanwhile.
+    let (Ok(()), Ok(roots)) = (state.check_write(grant), state.read_by(&grant.task)) else { return Ok(()) };
+    let caller = &proof.caller.name;
+    let is_own = |(digest, shown): &(&Digest, &String)| actor_handle.secrets.is_receipt(caller, grant, **digest, shown);
+    let own: BTreeSet<Digest> = receipts.iter().filter(is_own).map(|(digest, _)| *digest).collect();
+    let (blobs, reach) = (actor_handle.store.blobs().clone(), Arc::clone(&actor_handle.reach));
+    let foreign = blocking(move || reach.foreign(&blobs, &roots, |digest| own.contains(&digest), manifest)).await?;
+    match foreign {
+        None => Ok(()),
+        Some(digest) => Err(Failure::new(
+            StatusCode::CONFLICT,
+            "unvouched",
+            format!(
+                "manifest {manifest} names blob {digest}, which this worker neither uploaded for the task nor reads"
+            ),
+        )
+        .hint("upload every blob under the task's grant and send the receipts")),
+    }
+}
+
+/// Whose upload a request is about. Asked before a byte of the body is read.
+fn granted(actor_handle: &ActorHandle, proof: &Proof, headers: &HeaderMap) -> Result<Grant, Failure> {
+    let grant = secrets::grant(headers)?;
+    proof.of_grant(&actor_handle.secrets, &grant)?;
     actor_handle.state().check_write(&grant)?;
     Ok(grant)
 }
@@ -104,15 +146,24 @@ fn named(digest: &str) -> Result<Digest, Failure> {
 pub(crate) async fn staged(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(digest): Path<String>,
+    proof: Proof,
     headers: HeaderMap,
 ) -> Result<Json<BlobStored>, Failure> {
-    let grant = granted(&actor_handle, &headers)?;
+    let grant = granted(&actor_handle, &proof, &headers)?;
     let digest = named(&digest)?;
-    let blobs = actor_handle.store.blobs().clone();
+    let receipt = headers.get(RECEIPT_HEADER).and_then(|shown| shown.to_str().ok()).map(str::to_owned);
+    let receipt = receipt.filter(|shown| actor_handle.secrets.is_receipt(&proof.caller.name, &grant, digest, shown));
+    let roots = actor_handle.state().read_by(&grant.task)?;
+    let (blobs, reach) = (actor_handle.store.blobs().clone(), Arc::clone(&actor_handle.reach));
     blocking(move || {
-        blobs.hold(&grant.task, digest);
-        let stored = blobs.reuse(digest)?;
-        Ok(Json(BlobStored { digest, stored, staged: blobs.staged(&grant, digest)? }))
+        // Of others' blobs it is not told whether they are there: it has their bytes, or has no use for them.
+        let is_known = receipt.is_some() || reach.includes(&blobs, &roots, digest)?;
+        if is_known {
+            blobs.hold(&grant.task, digest);
+        }
+        let stored = is_known && blobs.reuse(digest)?;
+        let receipt = receipt.filter(|_| stored);
+        Ok(Json(BlobStored { digest, stored, staged: blobs.staged(&grant, digest)?, receipt }))
     })
     .await
 }
@@ -121,10 +172,11 @@ pub(crate) async fn staged(
 pub(crate) async fn put_blob(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(digest): Path<String>,
+    proof: Proof,
     headers: HeaderMap,
     body: Body,
 ) -> Result<Json<BlobStored>, Failure> {
-    let grant = granted(&actor_handle, &headers)?;
+    let grant = granted(&actor_handle, &proof, &headers)?;
     let digest = named(&digest)?;
     let missing = || Failure::invalid(format!("header `{BYTES_HEADER}` is missing: the blob's length"));
     let bytes = match number(&headers, BYTES_HEADER)? {
@@ -139,11 +191,13 @@ pub(crate) async fn put_blob(
         )));
     }
     let blobs = actor_handle.store.blobs().clone();
+    let receipt = actor_handle.secrets.receipt(&proof.caller.name, &grant, digest);
     let stored = async {
         let arriving = blocking(move || blobs.take_up(&grant, digest, offset, bytes)).await?;
-        receive(arriving, body, digest).await
+        let (stored, staged) = receive(arriving, body).await?;
+        Ok(Json(BlobStored { digest, stored, staged, receipt: stored.then_some(receipt) }))
     };
-    stored.await.map_err(|error| {
+    stored.await.map_err(|error: Unstored| {
         if let Unstored::Resume(ResumeError::Blob(BlobError::Storage(message))) = &error {
             actor_handle.wrote::<()>(&Err(WriteError::Storage(message.clone())));
         }
@@ -151,7 +205,8 @@ pub(crate) async fn put_blob(
     })
 }
 
-async fn receive(mut arriving: Arriving, body: Body, digest: Digest) -> Result<Json<BlobStored>, Unstored> {
+/// Takes what comes; says whether the blob is stored, and how much of it has arrived.
+async fn receive(mut arriving: Arriving, body: Body) -> Result<(bool, u64), Unstored> {
     let mut body = body.into_data_stream();
     let mut ended = false;
     while !ended {
@@ -183,7 +238,7 @@ async fn receive(mut arriving: Arriving, body: Body, digest: Digest) -> Result<J
     }
     let staged = arriving.written();
     let stored = blocking(move || arriving.finish()).await.map_err(ResumeError::Blob)?;
-    Ok(Json(BlobStored { digest, stored, staged }))
+    Ok((stored, staged))
 }
 
 /// Why a blob was not taken.
@@ -225,10 +280,14 @@ impl From<Unstored> for Failure {
 pub(crate) async fn get_blob(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(digest): Path<String>,
+    proof: Proof,
     headers: HeaderMap,
 ) -> Result<Response, Failure> {
     let digest = named(&digest)?;
     let from = from(&headers)?;
+    if !proof.caller.scopes.allow(Scope::Read) {
+        check_read(&actor_handle, &proof, &headers, digest).await?;
+    }
     let blobs = actor_handle.store.blobs().clone();
     let opened = blocking(move || -> Result<_, BlobError> {
         let mut reader = match from {
@@ -259,6 +318,28 @@ pub(crate) async fn get_blob(
         *response.status_mut() = StatusCode::PARTIAL_CONTENT;
     }
     Ok(response)
+}
+
+/// Checks that a worker reads no blobs but those of its task's inputs and checkpoints, or of the tasks that it prepares for.
+async fn check_read(
+    actor_handle: &ActorHandle,
+    proof: &Proof,
+    headers: &HeaderMap,
+    digest: Digest,
+) -> Result<(), Failure> {
+    let process = secrets::process(headers)?;
+    let state = actor_handle.state();
+    // Whatever is wrong with it: a worker must not take it for an answer about the blob.
+    proof
+        .of_process(&state, &process)
+        .map_err(|_| secrets::unproven("the call does not show the secret of its worker"))?;
+    let roots = state.readable_by(&process.worker);
+    let (blobs, reach) = (actor_handle.store.blobs().clone(), Arc::clone(&actor_handle.reach));
+    if blocking(move || reach.includes(&blobs, &roots, digest)).await? {
+        return Ok(());
+    }
+    let message = format!("blob {digest} is not among what the tasks of worker `{}` read", process.worker);
+    Err(Failure::new(StatusCode::FORBIDDEN, "forbidden", message))
 }
 
 /// Where a download goes on.

@@ -127,8 +127,7 @@ impl State {
             .ok_or_else(|| Rejected::NotFound(format!("worker `{worker}` is not known; join first")))?;
         if known.incarnation != incarnation {
             return Err(Rejected::Conflict(format!(
-                "worker `{worker}` is now another process (incarnation {}, the call is from {incarnation})",
-                known.incarnation
+                "worker `{worker}` is another process than incarnation {incarnation}"
             )));
         }
         Ok(known)

@@ -251,7 +251,7 @@ impl Task {
     /// Checks only that a grant has not been superseded: what a worker says about work that it has just ended still counts.
     pub fn check_fence(&self, grant: &Grant) -> Result<(), Rejected> {
         if grant.fence != self.fence || grant.attempt != self.attempt {
-            return Err(Rejected::StaleFence { task: self.id.clone(), current: self.fence, carried: grant.fence });
+            return Err(Rejected::StaleFence { task: self.id.clone(), carried: grant.fence });
         }
         Ok(())
     }

@@ -52,7 +52,7 @@ fn make_the_store() {
         }
     }
     let lost = world.state().workers.iter().find(|(_, worker)| worker.holds.is_some()).expect("one works").0.clone();
-    world.happen(Event::WorkerGone { worker: lost }).expect("taken");
+    world.happen(Event::WorkerGone { worker: lost, incarnation: None }).expect("taken");
     while !holds_with_a_checkpoint(world.state()) {
         world.step();
     }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use coordinator::batch::Ask;
 use coordinator::state::execution::StageExecution;
 use coordinator::state::run::Status;
+use coordinator::state::worker::Identity;
 use coordinator::{Control, Effect, Event, Millis, Moment, Observation, Refused, Rejected, State, decide, invariants};
 use protocol::message::{Poll, RunState};
 use protocol::{Digest, Incarnation, WorkerId};
@@ -19,7 +20,11 @@ impl World {
     fn deliver(&mut self, i: usize, process: u32, call: Call) {
         let name = self.workers[i].name.clone();
         let ask = match &call {
-            Call::Join(join) => Ask::Event(Box::new(Event::Join { join: join.clone() })),
+            Call::Join(join) => {
+                let secret = Digest::of(format!("{name} {process}").as_bytes());
+                let by = Identity { caller: "t".into(), secret };
+                Ask::Event(Box::new(Event::Join { join: join.clone(), by }))
+            }
             Call::Poll(poll) => match self.poll(&name, poll) {
                 Ok(Some(ask)) => ask,
                 Ok(None) => return self.send_desired(i, process, poll.incarnation),
@@ -152,7 +157,7 @@ impl World {
                 if was_alive && self.up && self.random.chance(50) {
                     let worker = self.workers[i].name.clone();
                     // The launcher tells what it saw; if that is lost, the lease does.
-                    self.ask(Ask::Event(Box::new(Event::WorkerGone { worker })), Ticket::Nobody);
+                    self.ask(Ask::Event(Box::new(Event::WorkerGone { worker, incarnation: None })), Ticket::Nobody);
                 }
             }
             40..48 => {
