@@ -6,6 +6,7 @@
 //!
 //! Not its job: who works on what (the coordinator), what tensors mean (the stages).
 
+pub mod audit;
 pub mod backup;
 pub mod blob;
 pub mod bundle;

@@ -1,6 +1,6 @@
 //! What is refused.
 
-use protocol::{Fence, TaskId};
+use protocol::{Fence, RunId, TaskId};
 
 /// Why an event did not happen. Nothing has changed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -23,4 +23,14 @@ pub enum Rejected {
     /// It cannot be.
     #[error("{0}")]
     Invalid(String),
+    /// The caller may not ask for it.
+    #[error("{0}")]
+    Forbidden(String),
+}
+
+impl Rejected {
+    /// There is no such run, or none that the caller sees.
+    pub fn unknown_run(run: &RunId) -> Self {
+        Self::NotFound(format!("run `{run}` is not known; `trainer status --all` lists runs"))
+    }
 }

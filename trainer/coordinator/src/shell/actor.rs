@@ -14,6 +14,7 @@ use tokio::task::JoinHandle;
 use super::actor_handle::{ActorHandle, Reply};
 use super::blocking::blocking;
 use super::effects;
+use super::token_table::TokenTable;
 use crate::batch::{Ask, Batches, Done, Turn};
 use crate::journal;
 use crate::state::State;
@@ -42,10 +43,10 @@ impl Entropy {
 }
 
 /// Starts the actor on a recovered state.
-pub(crate) fn start(store: Store, state: State) -> (Arc<ActorHandle>, JoinHandle<()>) {
+pub(crate) fn start(store: Store, state: State, tokens: Arc<TokenTable>) -> (Arc<ActorHandle>, JoinHandle<()>) {
     let (now, snapshot_at) = (state.now, state.seq);
     let batches = Batches::new(state);
-    let (actor_handle, queue) = ActorHandle::new(store, now, Arc::clone(batches.front()));
+    let (actor_handle, queue) = ActorHandle::new(store, now, Arc::clone(batches.front()), tokens);
     let actor_handle = Arc::new(actor_handle);
     let moments = Moments { actor_handle: Arc::clone(&actor_handle), entropy: Entropy::new() };
     let actor = Actor { actor_handle: Arc::clone(&actor_handle), batches, moments, snapshot_at, snapshot: None };

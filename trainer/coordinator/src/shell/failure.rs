@@ -72,6 +72,7 @@ impl From<Rejected> for Failure {
             Rejected::NotFound(_) => (StatusCode::NOT_FOUND, "not-found"),
             Rejected::Conflict(_) => (StatusCode::CONFLICT, "conflict"),
             Rejected::Invalid(_) => (StatusCode::BAD_REQUEST, "invalid"),
+            Rejected::Forbidden(_) => (StatusCode::FORBIDDEN, "forbidden"),
         };
         Self::new(status, code, rejected.to_string())
     }

@@ -6,6 +6,7 @@
 mod actor;
 mod actor_handle;
 mod api;
+mod audit;
 mod auth;
 mod blocking;
 mod body;
@@ -19,18 +20,21 @@ mod paced;
 mod polls;
 mod queries;
 mod records;
+mod revocable;
 mod route;
 mod start_error;
+mod token_table;
 mod uploads;
 mod versions;
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 
-use access::{Scopes, Token, Tokens};
+use access::{Caller, Scopes, Token, Tokens};
 use protocol::message::{RunView, Submit};
-use protocol::{RunId, WorkerId};
+use protocol::{Owner, RunId, WorkerId};
 use registry::Store;
+use registry::audit::AuditLog;
 use rustls::ServerConfig;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -52,6 +56,8 @@ pub use self::queries::{BlobStored, Submitted};
 pub use self::records::{Records, RecordsError, StageMetrics};
 pub use self::route::Route;
 pub use self::start_error::StartError;
+pub use self::token_table::Standing;
+use self::token_table::TokenTable;
 pub use self::versions::resolve_versions;
 
 /// How a coordinator is run.
@@ -143,22 +149,25 @@ impl Coordinator {
             local = here.address().map_err(listen(config.listen))?;
             listeners.push(here);
         }
-        let (token, mut tokens) = (Token::random(), config.tokens.clone());
-        tokens.add(user(), Scopes::all(), &token);
+        let token = Token::random();
+        let own = Caller::new(user(), Scopes::all());
+        let tokens = Arc::new(TokenTable::new(config.tokens.clone(), Some((own, token.clone()))));
 
-        let (actor_handle, actor) = actor::start(store, state);
+        let log = AuditLog::of(store.dir());
+        let (actor_handle, actor) = actor::start(store, state, Arc::clone(&tokens));
         actor_handle.decide(Event::Started { alone: config.alone, park: config.park }).await?;
         effects::let_go(&actor_handle);
         let (stop, stopped) = watch::channel(false);
         let tick = effects::tick(actor_handle.clone(), config.policy.tick_ms, stopped.clone());
         let clock = actor_handle.spawn("the clock", tick);
         let gate = Arc::new(Gate::new(tokens, &config.hosts));
+        let audit = actor_handle.spawn("the audit log", audit::write(Arc::clone(&gate.audit), log, stopped.clone()));
         let router = api::router(actor_handle.clone(), &gate);
         let serve = listener::serve(listeners, router, config.connections.clone(), stopped);
         let server = actor_handle.spawn("the server", serve);
         tracing::info!(%address, "coordinator listens");
         let tls = config.tls.is_some();
-        Ok(Handle { address, local, tls, token, actor_handle, stop, tasks: vec![clock, server, actor] })
+        Ok(Handle { address, local, tls, token, actor_handle, stop, tasks: vec![clock, server, audit, actor] })
     }
 }
 
@@ -201,9 +210,14 @@ impl Handle {
         &self.token
     }
 
-    /// Submits a pipeline; durable once this returns.
+    /// Submits a pipeline of this process's user; durable once this returns.
     pub async fn submit(&self, submit: Submit) -> Result<RunId, Refused> {
-        self.actor_handle.submit(submit).await
+        self.actor_handle.submit(submit, Owner::local(user()), None).await
+    }
+
+    /// Takes another table of tokens. Calls under way whose token is not in it any more end.
+    pub fn replace_tokens(&self, tokens: Tokens) {
+        self.actor_handle.tokens.replace(tokens);
     }
 
     /// Pauses, resumes or cancels a run.

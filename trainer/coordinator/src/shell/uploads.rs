@@ -230,10 +230,16 @@ pub(crate) async fn get_blob(
     let digest = named(&digest)?;
     let from = from(&headers)?;
     let blobs = actor_handle.store.blobs().clone();
-    let opened = blocking(move || -> Result<_, BlobError> {
+    let opened = blocking(move || -> Result<_, Failure> {
         let mut reader = match from {
             None => blobs.read(digest)?,
-            Some(from) => blobs.read_from(digest, from)?,
+            Some(from) => {
+                let bytes = blobs.verify(digest)?.bytes;
+                if from > bytes {
+                    return Err(past_the_end(digest, from, bytes));
+                }
+                blobs.read_from(digest, from)?
+            }
         };
         // A small blob is whole by now, or refused.
         let first = reader.next_part()?;
@@ -259,6 +265,11 @@ pub(crate) async fn get_blob(
         *response.status_mut() = StatusCode::PARTIAL_CONTENT;
     }
     Ok(response)
+}
+
+fn past_the_end(digest: Digest, from: u64, bytes: u64) -> Failure {
+    let message = format!("header `range`: blob {digest} has {bytes} bytes; byte {from} is past its end");
+    Failure::new(StatusCode::RANGE_NOT_SATISFIABLE, "invalid", message)
 }
 
 /// Where a download goes on.
