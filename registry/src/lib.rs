@@ -25,6 +25,7 @@ mod lock;
 mod open_error;
 mod reserve;
 pub mod retention;
+mod scoped;
 mod sqlite;
 mod store;
 mod store_id;

@@ -16,7 +16,6 @@
 //! the best, whether a gate holds, where a rollback goes, which attempt's values count.
 
 mod rows;
-mod scoped;
 
 use std::collections::BTreeMap;
 use std::fmt::Debug;
@@ -28,8 +27,6 @@ use protocol::stage::Keep;
 use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 
 pub use rows::{CheckpointRow, EndedRow, LineageNode, LogRow, Needs, Recovery, Root, RunRow, StageResultRow};
-
-pub(crate) use scoped::ScopedRecords;
 
 use crate::curve::Curve;
 use crate::forget::Forgotten;

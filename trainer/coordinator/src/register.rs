@@ -186,7 +186,7 @@ mod tests {
 
     fn pipeline() -> Pipeline {
         let text = "name: p\nseed: 1\ndataset: {format: synthetic}\nstages:\n  vae: {kind: train.vae}\n  latents: {kind: encode.latents}\n  \
-                    mld: {kind: train.mld}\n  release: {kind: register, model: m, from: mld, promote: {to: prod}}\n";
+                    mld: {kind: train.mld}\n  fid: {kind: evaluate.latent_fid, model: mld}\n  release: {kind: register, model: m, from: mld, promote: {to: prod}}\n";
         protocol::pipeline::read("p.yaml", text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"))
     }
 

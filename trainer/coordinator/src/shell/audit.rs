@@ -34,9 +34,14 @@ const KINDS: usize = 1024;
 /// Lines that wait to be written.
 const WAITING: usize = 4096;
 
-/// A name that a call is logged with, for [`AuditEntry::object`]: handlers add it to their answer.
+/// What a call was about; handlers add it to their answer.
 #[derive(Debug, Clone)]
-pub(crate) struct Object(pub(crate) String);
+pub(crate) enum Object {
+    /// It changed what has this name.
+    Changed(String),
+    /// It only read.
+    Read,
+}
 
 /// The caller of a call that was let in, and its route; added to the answer by the gate.
 #[derive(Debug, Clone)]
@@ -75,15 +80,13 @@ struct Pending {
 pub(crate) struct Audit(Mutex<Pending>);
 
 impl Audit {
-    fn note(&self, admitted: Option<&Admitted>, object: String, from: String, status: StatusCode) {
+    fn note(&self, admitted: Option<&Admitted>, object: Option<&Object>, from: String, status: StatusCode) {
         let now_ms = i64::try_from(wall_clock().0).unwrap_or(i64::MAX);
         let refused = status.is_client_error() || status.is_server_error();
         let call = admitted.map_or_else(|| "-".to_owned(), |it| format!("{} {}", it.route.method, it.route.path));
         let who =
             admitted.and_then(|it| it.caller.as_ref()).map_or_else(|| "-".to_owned(), |it| it.owner().to_string());
-        let is_read = admitted.is_none_or(|it| it.route.method == "GET");
-        // Callers choose names; a line has room for some of them.
-        let object = protocol::excerpt(&object);
+        let is_read = matches!(object, Some(Object::Read)) || admitted.is_none_or(|it| it.route.method == "GET");
         let mut pending = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let kind = Kind { who, call, from, status: status.as_u16() };
         if refused {
@@ -92,6 +95,11 @@ impl Audit {
             pending.count(kind, now_ms, READ_MS);
         } else {
             let Kind { who, call, from, status } = kind;
+            // Callers choose names; a line has room for the beginning of one.
+            let object = match object {
+                Some(Object::Changed(name)) => protocol::excerpt(name),
+                Some(Object::Read) | None => String::new(),
+            };
             let line = AuditEntry { at_ms: now_ms, until_ms: None, who, call, object, from, status, count: 1 };
             pending.line(line);
         }
@@ -167,7 +175,7 @@ pub(crate) async fn note(State(audit): State<Arc<Audit>>, request: Request, next
     let admitted = response.extensions().get::<Admitted>();
     let leave_out = response.status().as_u16() < 400 && admitted.is_none_or(|it| is_telemetry(&it.route));
     if !leave_out && !is_health {
-        let object = response.extensions().get::<Object>().map(|object| object.0.clone()).unwrap_or_default();
+        let object = response.extensions().get::<Object>();
         let from = from.map_or_else(|| "-".to_owned(), |from: IpAddr| from.to_canonical().to_string());
         audit.note(admitted, object, from, response.status());
     }
@@ -199,7 +207,7 @@ mod tests {
     use super::*;
 
     fn refused(audit: &Audit, from: u32) {
-        audit.note(None, String::new(), Ipv4Addr::from_bits(from).to_string(), StatusCode::UNAUTHORIZED);
+        audit.note(None, None, Ipv4Addr::from_bits(from).to_string(), StatusCode::UNAUTHORIZED);
     }
 
     #[test]

@@ -102,7 +102,7 @@ pub(crate) async fn submit(
 ) -> Result<(Extension<Object>, Json<Submitted>), Failure> {
     let _place = place(&actor_handle)?;
     let run = actor_handle.submit(submit, caller.owner(), caller.sees()).await?;
-    Ok((Extension(Object(run.to_string())), Json(Submitted { run })))
+    Ok((Extension(Object::Changed(run.to_string())), Json(Submitted { run })))
 }
 
 /// Runs by submission: those in memory, and of those that ended the newest `limit`.
@@ -149,7 +149,7 @@ pub(crate) async fn control(
     let place = place(&actor_handle)?;
     actor_handle.control(&run, action).await?;
     drop(place);
-    let object = Object(format!("{run} {action:?}").to_lowercase());
+    let object = Object::Changed(format!("{run} {action:?}").to_lowercase());
     Ok((Extension(object), Json(actor_handle.run_view(&run).await?)))
 }
 
@@ -181,7 +181,7 @@ pub(crate) async fn registry(
     if !caller.scopes.allow(scope) {
         return Err(auth::forbidden(&caller, &[scope]));
     }
-    let object = Extension(Object(command.in_short()));
+    let object = Extension(if command.only_reads() { Object::Read } else { Object::Changed(command.in_short()) });
     if scope == Scope::Read {
         let seen = actor_handle.seen_store(caller.sees().as_ref());
         return Ok((object, Json(registry::cli::read(command, &seen).await)));

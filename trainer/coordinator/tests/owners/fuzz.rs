@@ -24,7 +24,7 @@ impl Random {
         usize::try_from(self.next() % bound as u64).unwrap()
     }
 
-    fn pick<'a, T: ?Sized>(&mut self, from: &[&'a T]) -> &'a T {
+    fn pick<'a>(&mut self, from: &[&'a str]) -> &'a str {
         from[self.below(from.len())]
     }
 }
@@ -42,26 +42,21 @@ struct Request {
 fn path(lab: &Lab, random: &mut Random, template: &str) -> String {
     let [motion, speech] = Project::ALL.map(|project| lab.runs[&project].to_string());
     let [walks, talks] = Project::ALL.map(|project| lab.artifacts[&project].to_string());
-    let run = random.pick(&[&motion, &speech, "speech-00000000-1", "..", "%2e%2e", "a%2fb", "%00", "@last"]);
-    let digest = random.pick(&[&talks, "sha256:0", &"sha256:00".repeat(4), "x", &walks[..20]]);
-    let query = random.pick(&[
-        "",
-        "?limit=0",
-        "?limit=4294967295&after=-1",
-        "?points=1",
-        "?stage=vae",
-        "?stage=%27--",
-        "?limit=-1",
-        "?x",
-    ]);
-    let path = template.replace("{run}", run).replace("{digest}", digest);
-    let path = path.replace("{action}", random.pick(&["pause", "resume", "cancel", "delete", "Pause", ""]));
-    format!("{}{query}", path.replace("{worker}", random.pick(&["a", "b", "..", "node"])))
+    let runs = [motion.as_str(), speech.as_str(), "speech-00000000-1", "..", "%2e%2e", "a%2fb", "%00", "@last"];
+    let zeros = "sha256:00".repeat(4);
+    let digests = [talks.as_str(), "sha256:0", zeros.as_str(), "x", &walks[..20]];
+    let queries =
+        ["", "?limit=0", "?limit=4294967295&after=-1", "?points=1", "?stage=vae", "?stage=%27--", "?limit=-1", "?x"];
+    let actions = ["pause", "resume", "cancel", "delete", "Pause", ""];
+    let path = template.replace("{run}", random.pick(&runs)).replace("{digest}", random.pick(&digests));
+    let path =
+        path.replace("{action}", random.pick(&actions)).replace("{worker}", random.pick(&["a", "b", "..", "node"]));
+    format!("{path}{}", random.pick(&queries))
 }
 
 fn command(random: &mut Random) -> Value {
     let [walks, talks] = Project::ALL.map(Project::model);
-    let model = random.pick(&[&walks, &talks, "none", "", "*", "zq%"]).to_owned();
+    let model = random.pick(&[walks.as_str(), talks.as_str(), "none", "", "*", "zq%"]).to_owned();
     let reference =
         format!("{model}{}", random.pick(&["", ":1", ":2", "@prod", "@staging", "@best", "@latest", ":0", "@@"]));
     let alias = random.pick(&["prod", "staging", "new", "best", "", "../x"]);
@@ -76,7 +71,7 @@ fn command(random: &mut Random) -> Value {
             json!({"command": "compare", "left": reference, "right": random.pick(&["talks:1", "talks"]), "style": style})
         }
         6 => {
-            json!({"command": "leaderboard", "of": random.pick(&["humanml3d", "kit", "talks", &model]), "published": true, "style": style})
+            json!({"command": "leaderboard", "of": random.pick(&["humanml3d", "kit", "talks", model.as_str()]), "published": true, "style": style})
         }
         7 => json!({"command": "lineage", "reference": reference}),
         8 => json!({"command": random.pick(&["fsck", "audit", "list "]), "limit": 10}),
@@ -97,11 +92,10 @@ fn body(random: &mut Random, template: &str, submissions: &mut usize) -> TestRes
             let mut submit = submission(&pipeline(Project::Speech))?;
             submit.idempotency_key = Some(random.pick(&["once", "twice"]).to_owned());
             // A version that is another's, or a guess.
-            let text = pipeline(Project::Speech)
-                + &format!(
-                    "  more: {{kind: train.mld, vae: {}}}\n",
-                    random.pick(&["vae", "talks:1", &format!("{CANARY}-walks:1")])
-                );
+            let version = format!("{CANARY}-walks:1");
+            let vae = random.pick(&["vae", "talks:1", version.as_str()]);
+            let more = format!("  more: {{kind: train.mld, vae: {vae}}}\n");
+            let text = pipeline(Project::Speech) + &more;
             if let Ok(other) = submission(&text) {
                 submit.pipeline = other.pipeline;
             }
@@ -128,7 +122,7 @@ async fn no_request_changes_or_shows_what_is_anothers() -> TestResult {
     let routes = routes();
     let (mut answers, mut searched, begun) = (0, 0, std::time::Instant::now());
     for kind in KINDS.iter().filter(|kind| !others(kind).is_empty()) {
-        let mut random = Random(seed ^ kind.name.len() as u64 ^ u64::from(kind.name.as_bytes()[0]) << 8);
+        let mut random = Random(seed ^ (kind.name.len() as u64) ^ (u64::from(kind.name.as_bytes()[0]) << 8));
         let (mut submissions, mut done) = (10, 0);
         let mut before = Vec::new();
         for project in others(kind) {

@@ -126,7 +126,7 @@ pub(crate) fn pipeline(project: Project) -> String {
         Motion => (format!("{CANARY}-pipeline"), format!("{CANARY}-vae"), 1),
         Speech => ("speech".to_owned(), "vae".to_owned(), 2),
     };
-    format!("name: {name}\nseed: {seed}\ndataset: {{format: synthetic}}\nstages: {{{stage}: {{kind: train.vae}}}}\n")
+    format!("name: {name}\nseed: {seed}\ndataset: {{format: synthetic}}\nstages:\n  {stage}: {{kind: train.vae}}\n")
 }
 
 impl Lab {
@@ -144,8 +144,9 @@ impl Lab {
         // The worker of this test says nothing for long.
         config.policy.lease_ms = 3_600_000;
         let handle = Coordinator::start(store.clone(), config).await?;
-        let client = |kind: &Kind| {
-            Ok((kind.name.to_owned(), Server::new(&handle.url(), Some(secret(kind.name).parse()?), None)?))
+        let client = |kind: &Kind| -> TestResult<(String, Server)> {
+            let token = secret(kind.name).parse()?;
+            Ok((kind.name.to_owned(), Server::new(&handle.url(), Some(token), None)?))
         };
         let clients = KINDS.iter().map(client).collect::<TestResult<_>>()?;
         let (runs, artifacts) = (BTreeMap::new(), BTreeMap::new());

@@ -10,10 +10,13 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 
-use super::{CheckpointRow, EndedRow, LineageNode, LogRow, Needs, Records, Recovery, Result, RunRow, StageResultRow};
+use crate::QueryError;
+use crate::catalog::{CheckpointRow, EndedRow, LineageNode, LogRow, Needs, Records, Recovery, RunRow, StageResultRow};
 use crate::curve::Curve;
 use crate::store_id::Stored;
 use crate::versions::{Model, Promotion, Version};
+
+type Result<T> = std::result::Result<T, QueryError>;
 
 /// The records that `group` sees.
 #[derive(Debug)]
