@@ -149,7 +149,7 @@ pub(crate) async fn control(
     let place = place(&actor_handle)?;
     actor_handle.control(&run, action).await?;
     drop(place);
-    let object = Object::Changed(format!("{run} {action:?}").to_lowercase());
+    let object = Object::Changed(format!("{run} {}", format!("{action:?}").to_lowercase()));
     Ok((Extension(object), Json(actor_handle.run_view(&run).await?)))
 }
 

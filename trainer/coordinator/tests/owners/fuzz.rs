@@ -1,6 +1,6 @@
 //! Requests at random with each kind of valid token: nothing that is another's changes, and none of its text is answered.
 //!
-//! 1,000 requests a token, or as many as `STRIDE_FUZZ_REQUESTS` says; `STRIDE_FUZZ_SEED` draws others. A run's own name stands in some
+//! 10,000 requests a token (20 s), or as many as `STRIDE_FUZZ_REQUESTS` says; `STRIDE_FUZZ_SEED` draws others. A run's own name stands in some
 //! requests, as a guess: an answer may repeat it, so answers are searched only where the request does not have the text itself.
 
 use coordinator::shell::routes;
@@ -117,7 +117,7 @@ fn others(kind: &Kind) -> Vec<Project> {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn no_request_changes_or_shows_what_is_anothers() -> TestResult {
     let lab = Lab::new().await?;
-    let (requests, seed) = (number("STRIDE_FUZZ_REQUESTS", 1000), number("STRIDE_FUZZ_SEED", 1));
+    let (requests, seed) = (number("STRIDE_FUZZ_REQUESTS", 10_000), number("STRIDE_FUZZ_SEED", 1));
     // Calls of workers are tried with other bodies elsewhere; a worker's token has all calls here too, and only it.
     let routes = routes();
     let (mut answers, mut searched, begun) = (0, 0, std::time::Instant::now());
