@@ -187,7 +187,7 @@ mod tests {
 
     #[test]
     fn names_must_be_ours_and_addresses_may_be_any() {
-        let tokens = Arc::new(TokenTable::new(access::Tokens::default(), None));
+        let tokens = Arc::new(TokenTable::new(access::Tokens::default(), Vec::new()));
         let gate = Gate::new(tokens, &["stride.lab".to_owned()]);
         for ours in ["127.0.0.1:7700", "localhost", "LOCALHOST:1", "[::1]:7700", "10.0.0.7", "stride.lab:7700"] {
             assert!(gate.is_ours(ours), "{ours}");

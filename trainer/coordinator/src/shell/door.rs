@@ -53,7 +53,7 @@ impl Door {
         let failed = |cause| StartError::Listen { address: config.listen, cause };
         let listener = Listener::bind(config.listen, config.tls.clone()).await.map_err(failed)?;
         let address = listener.address().map_err(failed)?;
-        let tokens = Arc::new(TokenTable::new(config.tokens.clone(), None));
+        let tokens = Arc::new(TokenTable::new(config.tokens.clone(), Vec::new()));
         let gate = Arc::new(Gate::new(tokens, &config.hosts));
         Ok(Self { listener, address, tls: config.tls.is_some(), connections: config.connections.clone(), gate })
     }

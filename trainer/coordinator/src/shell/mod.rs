@@ -151,7 +151,7 @@ impl Coordinator {
         }
         let token = Token::random();
         let own = Caller::new(user(), Scopes::all());
-        let tokens = Arc::new(TokenTable::new(config.tokens.clone(), Some((own, token.clone()))));
+        let tokens = Arc::new(TokenTable::new(config.tokens.clone(), vec![(own, token.clone())]));
 
         let log = AuditLog::of(store.dir());
         let (actor_handle, actor) = actor::start(store, state, Arc::clone(&tokens));

@@ -11,11 +11,11 @@ use super::clock::wall_clock;
 /// How often a call under way looks whether its token has expired.
 const LOOK_AGAIN: Duration = Duration::from_secs(10);
 
-/// The newest table, and the token that this process made for its own user.
+/// The newest table, and the tokens that this process made for its own user.
 #[derive(Debug)]
 pub(crate) struct TokenTable {
     tokens: RwLock<Arc<Tokens>>,
-    own: Option<(Caller, Token)>,
+    own: Vec<(Caller, Token)>,
     changed: watch::Sender<u64>,
 }
 
@@ -29,7 +29,7 @@ pub(crate) enum Unknown {
 }
 
 impl TokenTable {
-    pub(crate) fn new(tokens: Tokens, own: Option<(Caller, Token)>) -> Self {
+    pub(crate) fn new(tokens: Tokens, own: Vec<(Caller, Token)>) -> Self {
         let table = Self { tokens: RwLock::default(), own, changed: watch::Sender::new(0) };
         table.replace(tokens);
         table
@@ -37,7 +37,7 @@ impl TokenTable {
 
     /// Takes another table in the place of the one before. Calls under way whose token is not in it end.
     pub(crate) fn replace(&self, mut tokens: Tokens) {
-        if let Some((caller, token)) = &self.own {
+        for (caller, token) in &self.own {
             tokens.insert(caller.clone(), token);
         }
         *self.tokens.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(tokens);
@@ -121,7 +121,7 @@ mod tests {
     async fn a_call_ends_with_its_token_and_with_no_other() {
         let (a, b) = ("0123456789abcdef", "fedcba9876543210");
         let read = Scopes::of(&[Scope::Read]);
-        let tokens = Arc::new(TokenTable::new(table(&[("a", read, a), ("b", read, b)]), None));
+        let tokens = Arc::new(TokenTable::new(table(&[("a", read, a), ("b", read, b)]), Vec::new()));
         let standing = |token| Standing::new(Arc::clone(&tokens), token, tokens.find(token).unwrap());
         let (mut first, second) = (standing(a), standing(b));
         assert!(first.still_holds());
@@ -137,7 +137,7 @@ mod tests {
     fn the_process_keeps_its_own_token() {
         let own: Token = "0123456789abcdef".parse().unwrap();
         let caller = Caller::new("me", Scopes::all());
-        let tokens = TokenTable::new(Tokens::default(), Some((caller.clone(), own.clone())));
+        let tokens = TokenTable::new(Tokens::default(), vec![(caller.clone(), own.clone())]);
         tokens.replace(Tokens::default());
         assert_eq!(tokens.find(own.secret()).as_deref(), Ok(&caller));
     }
