@@ -68,4 +68,14 @@ mutation mention-of-foreign-blobs trainer/coordinator/src/shell/vouching.rs 's/i
 mutation staged-of-everybody trainer/coordinator/src/shell/uploads.rs 's/let is_known = receipt\.is_some\(\)/let is_known = receipt.is_none()/' coordinator
 mutation worker-reads-everything trainer/coordinator/src/shell/uploads.rs 's/if !proof\.caller\.scopes\.allow\(Scope::Read\)/if proof.caller.scopes.allow(Scope::Promote)/' coordinator
 mutation poll-in-anothers-name trainer/coordinator/src/observe.rs 's/if \(&doing\.grant\.worker, doing\.grant\.incarnation\) != \(&worker, poll\.incarnation\)/if doing.grant.worker.as_str().is_empty()/' coordinator
+mutation promotion-without-scope trainer/access/src/tokens.rs 's/if !allow\(Scope::Promote\)/if false/' "access coordinator"
+mutation protected-from-none trainer/access/src/tokens.rs 's/Some\(names\) if !names\.contains\(name\) =>/Some(_) if false =>/' access
+mutation promotion-without-a-second-look trainer/coordinator/src/shell/effects.rs 's/&& let Err\(why\) = actor_handle\.may_promote\(&owner, &alias\)/\&\& let Err::<(), String>(why) = Ok(drop(alias.clone()))/' coordinator
+mutation submission-promotes-unasked trainer/coordinator/src/shell/actor_handle.rs 's/self\.check_registrations\(&pipeline, &owner\)\.await\?;//' coordinator
+mutation runs-of-others-are-shown trainer/coordinator/src/shell/records.rs 's/self\.sees\.as_ref\(\)\.is_none_or\(\|group\| run\.owner\.group\(\) == \*group\)/run.number > 0/' coordinator
+mutation runs-of-others-are-controlled trainer/coordinator/src/shell/queries.rs 's/owner\.is_some\(\) && !caller\.controls\(owner\.as_ref\(\)\)/false/' coordinator
+mutation models-of-others-are-taken registry/src/sqlite/owners.rs 's/if !is_its_own/if false \&\& !is_its_own/' registry
+mutation revoked-and-served trainer/coordinator/src/shell/token_table.rs 's/self\.changed\.send_modify\(\|version\| \*version \+= 1\);//' coordinator
+mutation expired-and-served trainer/access/src/expiry.rs 's/now_ms >= self\.at_ms/now_ms < self.at_ms \&\& false/' "access coordinator"
+mutation refusals-one-by-one trainer/coordinator/src/shell/audit.rs 's/pending\.count\(kind, now_ms, REFUSED_MS\)/pending.line(kind.line(now_ms, now_ms, 1))/' coordinator
 exit $missed

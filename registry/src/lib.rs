@@ -6,6 +6,7 @@
 //!
 //! Not its job: who works on what (the coordinator), what tensors mean (the stages).
 
+pub mod audit;
 pub mod backup;
 pub mod blob;
 pub mod bundle;
@@ -24,6 +25,7 @@ mod lock;
 mod open_error;
 mod reserve;
 pub mod retention;
+mod scoped;
 mod server_key;
 mod sqlite;
 mod store;

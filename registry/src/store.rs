@@ -22,7 +22,7 @@ use std::sync::Arc;
 
 use checkpoint::BlobError;
 use protocol::stage::Keep;
-use protocol::{Alias, Digest, ModelName, RunId, TaskId};
+use protocol::{Alias, Digest, Group, ModelName, RunId, TaskId};
 
 use crate::blob::disk::free_bytes;
 use crate::blob::place::{Looked, Place};
@@ -33,6 +33,7 @@ use crate::identity::{self, Found, Marker, MarkerError, Verdict, Witness};
 use crate::lock::{self, Holder, SharedLock, StoreLock, Taken, network_filesystem};
 use crate::open_error::OpenError;
 use crate::reserve::{self, OPEN_NEEDS_BYTES};
+use crate::scoped::ScopedRecords;
 use crate::server_key::{self, ServerKey};
 use crate::sqlite::{Opened, Session, SqliteCatalog, SqliteRecords, Writer};
 use crate::store_id::{StoreId, Stored};
@@ -53,7 +54,7 @@ struct Reading {
     blobs: BlobStore,
     records: Arc<dyn Records>,
     /// Keeps writers out of a database that is read without its log.
-    _closed: Option<SharedLock>,
+    _closed: Option<Arc<SharedLock>>,
 }
 
 /// A store, held by this process. Clones share it; the last one to go lets it go.
@@ -104,7 +105,21 @@ impl ReadStore {
         let blobs = BlobStore::beside(seen.blobs, &seen.looked.verified());
         let records = Arc::new(SqliteRecords::new(sqlite::open_readers(&dir, closed.is_some())));
         let opened_ms = clock::now_ms();
-        Ok(Self(Arc::new(Reading { dir, id, opened_ms, blobs, records, _closed: closed })))
+        Ok(Self(Arc::new(Reading { dir, id, opened_ms, blobs, records, _closed: closed.map(Arc::new) })))
+    }
+
+    /// The store as `group` sees it: its own runs and models, and no name of any other.
+    #[must_use]
+    pub fn seen_by(&self, group: &Group) -> Self {
+        let Reading { dir, id, opened_ms, blobs, records, _closed } = &*self.0;
+        Self(Arc::new(Reading {
+            dir: dir.clone(),
+            id: id.clone(),
+            opened_ms: *opened_ms,
+            blobs: blobs.clone(),
+            records: Arc::new(ScopedRecords::new(Arc::clone(records), group.clone())),
+            _closed: _closed.clone(),
+        }))
     }
 
     /// Who holds the store in `dir` now, if somebody does. There need be no store.

@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 
 use protocol::message::{Grant, MetricRow};
-use protocol::{Alias, Digest, Fence, ModelName, RunId, StageName, TaskId};
+use protocol::{Alias, Digest, Fence, Group, ModelName, Owner, RunId, StageName, TaskId};
 use serde_json::Value;
 
 /// One row or change.
@@ -45,6 +45,19 @@ pub enum Write {
         state: String,
         /// Unique when given.
         idempotency_key: Option<String>,
+    },
+    /// The group that a run belongs to.
+    RunOwner {
+        /// Which.
+        run: RunId,
+        /// Whose.
+        owner: Group,
+    },
+    /// Makes a new model its owner's. One that is there must be the owner's to control, or the whole transaction is refused.
+    ModelOwner {
+        model: ModelName,
+        /// Who registers.
+        owner: Owner,
     },
     /// A run that goes on in another state.
     RunState {
@@ -166,6 +179,8 @@ impl Write {
             | Self::Snapshot { .. }
             | Self::Fence { .. }
             | Self::Run { .. }
+            | Self::RunOwner { .. }
+            | Self::ModelOwner { .. }
             | Self::RunState { .. }
             | Self::RunEnded { .. }
             | Self::Archive { .. }

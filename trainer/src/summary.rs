@@ -16,6 +16,8 @@ pub(crate) struct Summary {
     schema_version: u32,
     run: String,
     pipeline: String,
+    /// Whose it is.
+    owner: String,
     state: String,
     stages: Vec<StageSummary>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -57,6 +59,7 @@ impl Summary {
             schema_version: 1,
             run: run.run.to_string(),
             pipeline: run.pipeline.clone(),
+            owner: run.owner.to_string(),
             state: if interrupted { "interrupted".to_owned() } else { run_state(run.state).to_owned() },
             stages: run.stages.iter().map(stage).collect(),
             sweeps: run.sweeps.clone(),
@@ -197,6 +200,7 @@ mod tests {
         RunView {
             run: "p-1".into(),
             pipeline: "p".into(),
+            owner: protocol::Owner::default(),
             state: RunState::Finished,
             stages: states.iter().map(stage).collect(),
             sweeps: vec![],

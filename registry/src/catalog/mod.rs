@@ -24,7 +24,7 @@ use std::sync::Arc;
 
 use async_trait::async_trait;
 use protocol::stage::Keep;
-use protocol::{Alias, Digest, ModelName, RunId, StageName, TaskId};
+use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 
 pub use rows::{CheckpointRow, EndedRow, LineageNode, LogRow, Needs, Recovery, Root, RunRow, StageResultRow};
 
@@ -50,6 +50,15 @@ pub trait Records: Debug + Send + Sync {
 
     /// The views of runs that ended, as JSON, with their runs; oldest first. Of more than `limit` the newest.
     async fn ended_views(&self, limit: u32) -> Result<Vec<(RunId, String)>>;
+
+    /// The same, of the runs of one group.
+    async fn ended_views_of(&self, group: &Group, limit: u32) -> Result<Vec<(RunId, String)>>;
+
+    /// The groups that runs belong to; a run of the store's own user, or of none, is missing.
+    async fn run_owners(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Group>>;
+
+    /// The groups that models belong to, or that of one model; a model that was imported by hand is missing.
+    async fn model_owners(&self, model: Option<&ModelName>) -> Result<BTreeMap<ModelName, Group>>;
 
     /// Runs that ended before a time, in milliseconds since 1970; oldest first.
     async fn ended_before(&self, before_ms: i64) -> Result<Vec<RunId>>;

@@ -26,6 +26,7 @@ pub use bundles::import;
 pub use client::{ask, execute};
 pub use print::{render, show_error};
 
+use crate::audit::{self, AuditEntry};
 use crate::backup::{BackupError, Summary};
 use crate::forget::Forgotten;
 use crate::leaderboard::{self, Comparison, Leaderboard, Style};
@@ -121,6 +122,11 @@ pub enum Command {
         /// In milliseconds since 1970.
         before_ms: i64,
     },
+    /// The newest lines of the audit log.
+    Audit {
+        /// How many.
+        limit: usize,
+    },
 }
 
 impl Command {
@@ -135,11 +141,41 @@ impl Command {
             | Self::Lineage { .. } => Scope::Read,
             Self::Promote { .. } | Self::Rollback { .. } => Scope::Promote,
             // Reads every byte of the store.
-            Self::Fsck
+            Self::Audit { .. }
+            | Self::Fsck
             | Self::Gc { .. }
             | Self::Forget { .. }
             | Self::ForgetEnded { .. }
             | Self::ForgetLeftovers { .. } => Scope::Admin,
+        }
+    }
+
+    /// The model and the alias that it moves.
+    pub fn moves(&self) -> Option<(&str, &str)> {
+        match self {
+            Self::Promote { reference, to, .. } => Some((reference, to)),
+            Self::Rollback { model, alias, .. } => Some((model, alias)),
+            _ => None,
+        }
+    }
+
+    /// The command and what it names, for a log.
+    pub fn in_short(&self) -> String {
+        match self {
+            Self::List => "list".into(),
+            Self::Show { reference } => format!("show {reference}"),
+            Self::History { model, .. } => format!("history {model}"),
+            Self::Promote { reference, to, .. } => format!("promote {reference} to {to}"),
+            Self::Rollback { model, alias, .. } => format!("rollback {model}@{alias}"),
+            Self::Compare { left, right, .. } => format!("compare {left} {right}"),
+            Self::Leaderboard { of, .. } => format!("leaderboard {of}"),
+            Self::Lineage { reference } => format!("lineage {reference}"),
+            Self::Fsck => "fsck".into(),
+            Self::Gc { dry_run, .. } => if *dry_run { "gc --dry-run" } else { "gc" }.into(),
+            Self::Forget { run } => format!("forget {run}"),
+            Self::ForgetEnded { before_ms } => format!("forget --ended-before {before_ms}"),
+            Self::ForgetLeftovers { before_ms } => format!("forget --leftovers-before {before_ms}"),
+            Self::Audit { limit } => format!("audit {limit}"),
         }
     }
 
@@ -152,6 +188,7 @@ impl Command {
             | Self::Compare { .. }
             | Self::Leaderboard { .. }
             | Self::Lineage { .. }
+            | Self::Audit { .. }
             | Self::Fsck => true,
             Self::Gc { dry_run, .. } => *dry_run,
             Self::Promote { .. }
@@ -199,6 +236,8 @@ pub enum Data {
     Gc { dry_run: bool, plan: Plan },
     /// Of `adopt`.
     Adopted { store: StoreId },
+    /// Of `audit`.
+    Audit { entries: Vec<AuditEntry> },
     /// Of `forget`.
     Forgotten { runs: Vec<(RunId, Forgotten)> },
     /// Of `backup`.
@@ -390,6 +429,12 @@ async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &st
             }
             Data::Lineage { nodes }
         }
+        Command::Audit { limit } => {
+            let dir = store.dir().to_owned();
+            let read = tokio::task::spawn_blocking(move || audit::read(&dir, limit.min(MOST_LINES))).await;
+            let failed = |e: &dyn std::fmt::Display| QueryError::Storage(format!("the audit log cannot be read: {e}"));
+            Data::Audit { entries: read.map_err(|e| failed(&e))?.map_err(|e| failed(&e))? }
+        }
         Command::Fsck => {
             let report = store.fsck().await?;
             if !report.problems.is_empty() {
@@ -484,6 +529,8 @@ fn exists(store: &ReadStore, digest: Digest) -> Result<bool, Refused> {
 
 /// Versions that are looked at for bases of a control part.
 pub const MOST_BASES: usize = 1_000;
+/// Lines of the audit log that are shown at most.
+const MOST_LINES: usize = 10_000;
 
 async fn show(store: &ReadStore, text: &str) -> Result<Data, Refused> {
     let reference: ModelRef = text.parse().map_err(invalid)?;

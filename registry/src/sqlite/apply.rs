@@ -12,8 +12,8 @@ use sqlx::query_builder::Separated;
 use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 
 use super::error::write_error;
-use super::moves;
 use super::statement::{int, json, one, run};
+use super::{moves, owners};
 use crate::catalog::{PromoteOrder, Which};
 use crate::vouched::{Vouched, complete};
 use crate::write::two_states;
@@ -39,6 +39,8 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
             Write::Run { run, pipeline, source, state, idempotency_key } => {
                 set_run(conn, run.as_str(), &pipeline.to_string(), source, state, idempotency_key.as_deref()).await?;
             }
+            Write::RunOwner { run, owner } => owners::own_run(conn, run, owner).await?,
+            Write::ModelOwner { model, owner } => owners::claim(conn, model, owner).await?,
             Write::RunState { run: of, state } => {
                 let set = sqlx::query("UPDATE runs SET state = ?, updated_ms = ? WHERE run = ?");
                 run(conn, set.bind(state).bind(clock::now_ms()).bind(of.as_str())).await?;

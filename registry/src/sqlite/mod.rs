@@ -9,6 +9,7 @@ mod forget;
 mod models;
 mod moves;
 mod open;
+mod owners;
 mod query;
 mod retention;
 mod rows;

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use async_trait::async_trait;
-use protocol::{Alias, Attempt, Digest, ModelName, RunId, StageName, TaskId, WorkerId};
+use protocol::{Alias, Attempt, Digest, Group, ModelName, RunId, StageName, TaskId, WorkerId};
 use sqlx::pool::PoolConnection;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Connection, Row, Sqlite, SqliteConnection, SqlitePool};
@@ -12,7 +12,7 @@ use sqlx::{Connection, Row, Sqlite, SqliteConnection, SqlitePool};
 use super::open::{open_copy, stored};
 use super::rows::{checkpoints, digest, run_row, stage_result};
 use super::statement::json;
-use super::{models, retention};
+use super::{models, owners, retention};
 use crate::QueryError;
 use crate::catalog::{CheckpointRow, EndedRow, LineageNode, LogRow, Needs, Records, Recovery, RunRow, StageResultRow};
 use crate::curve::{Curve, Curves};
@@ -72,6 +72,22 @@ impl Records for SqliteRecords {
                     ORDER BY rowid DESC LIMIT ?) ORDER BY number";
         let rows = sqlx::query(find).bind(limit).fetch_all(&mut *conn).await?;
         rows.iter().map(|row| Ok((RunId::new(row.try_get::<String, _>(0)?), row.try_get(1)?))).collect()
+    }
+
+    async fn ended_views_of(&self, group: &Group, limit: u32) -> Result<Vec<(RunId, String)>> {
+        let mut conn = self.connection().await?;
+        let find = "SELECT run, view FROM (SELECT runs.rowid AS number, run, view FROM run_owners JOIN runs USING (run) \
+                    WHERE owner = ? AND view IS NOT NULL ORDER BY runs.rowid DESC LIMIT ?) ORDER BY number";
+        let rows = sqlx::query(find).bind(group.as_str()).bind(limit).fetch_all(&mut *conn).await?;
+        rows.iter().map(|row| Ok((RunId::new(row.try_get::<String, _>(0)?), row.try_get(1)?))).collect()
+    }
+
+    async fn run_owners(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Group>> {
+        Ok(owners::of_runs(&mut *self.connection().await?, runs).await?)
+    }
+
+    async fn model_owners(&self, model: Option<&ModelName>) -> Result<BTreeMap<ModelName, Group>> {
+        Ok(owners::of_models(&mut *self.connection().await?, model).await?)
     }
 
     async fn sources(&self, keys: &[Digest]) -> Result<BTreeMap<Digest, (RunId, StageName)>> {

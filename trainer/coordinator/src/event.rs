@@ -7,7 +7,7 @@
 use protocol::message::{CommitCheckpoint, Grant, Join, Poll, ReportOutcome};
 use protocol::pipeline::Pipeline;
 use protocol::stage::Keep;
-use protocol::{Digest, Fence, Incarnation, RunId, StageName, TaskId, WorkerId};
+use protocol::{Alias, Digest, Fence, Incarnation, Owner, RunId, StageName, TaskId, WorkerId};
 use registry::Write;
 
 use crate::state::execution::StageExecution;
@@ -34,6 +34,8 @@ pub enum Event {
         idempotency_key: Option<String>,
         /// Stop after this stage.
         until: Option<StageName>,
+        /// The token that submitted it.
+        owner: Owner,
     },
     /// A worker process offered itself.
     Join {
@@ -177,6 +179,10 @@ pub enum Effect {
         key: Digest,
         /// In the order of the stage's `from`.
         candidates: Vec<Candidate>,
+        /// The alias that moves with it.
+        promotes: Option<Alias>,
+        /// On whose behalf.
+        owner: Owner,
     },
     /// Forget a task's checkpoints but those to keep. Never before the newer one is stored.
     Prune {

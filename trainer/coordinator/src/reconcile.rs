@@ -109,7 +109,7 @@ impl Deciding<'_> {
         };
         match self.state.executions.get(&key).cloned() {
             Some(execution) => {
-                if execution.placement != stage.placement {
+                if execution.placement != stage.placement && self.may_place(run, &execution) {
                     self.record(Fact::ExecutionPlacement { key, placement: stage.placement.clone() });
                 }
                 let lost = match execution.state {
@@ -152,6 +152,12 @@ impl Deciding<'_> {
         }
         self.effects.push(Effect::Lookup { key });
         Status::Active { key }
+    }
+
+    /// Whether `run` says how many workers compute a stage: not while another owner's run waits for the same.
+    fn may_place(&self, run: &Run, execution: &StageExecution) -> bool {
+        let others = execution.users.keys().filter_map(|number| self.state.runs.get(number));
+        others.filter(|other| other.state == RunState::Running).all(|other| run.owner.controls(&other.owner.group()))
     }
 
     /// Wanted again after it was over: the store is asked first, and budgets are whole again.

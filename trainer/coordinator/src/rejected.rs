@@ -1,6 +1,6 @@
 //! What is refused.
 
-use protocol::{Fence, TaskId};
+use protocol::{Fence, RunId, TaskId};
 
 /// Why an event did not happen. Nothing has changed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -15,7 +15,7 @@ pub enum Rejected {
     /// A worker's name is another process's, whose lease has not ended.
     #[error("{0}")]
     NameHeld(String),
-    /// A worker's name belongs to another token.
+    /// The caller may not ask for it: another token's worker, run or alias.
     #[error("{0}")]
     Forbidden(String),
     /// No such thing.
@@ -27,4 +27,11 @@ pub enum Rejected {
     /// It cannot be.
     #[error("{0}")]
     Invalid(String),
+}
+
+impl Rejected {
+    /// There is no such run, or none that the caller sees.
+    pub fn unknown_run(run: &RunId) -> Self {
+        Self::NotFound(format!("run `{run}` is not known; `trainer status --all` lists runs"))
+    }
 }

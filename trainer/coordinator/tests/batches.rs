@@ -17,7 +17,13 @@ fn at(now: u64) -> impl FnMut() -> Moment {
 fn submit() -> Ask {
     let pipeline = protocol::pipeline::read("p.yaml", TEXT, &[]).expect("a pipeline");
     let (pipeline, source) = (Box::new(pipeline), TEXT.to_owned());
-    Ask::Event(Box::new(Event::Submit { pipeline, source, idempotency_key: None, until: None }))
+    Ask::Event(Box::new(Event::Submit {
+        pipeline,
+        source,
+        idempotency_key: None,
+        until: None,
+        owner: protocol::Owner::local("me"),
+    }))
 }
 
 fn join(name: &str) -> Ask {

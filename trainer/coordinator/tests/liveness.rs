@@ -153,6 +153,7 @@ fn a_gang_has_no_more_members_than_a_batch_has_slices() {
             source: String::new(),
             idempotency_key: None,
             until: Some("vae".into()),
+            owner: protocol::Owner::local("me"),
         };
         coordinator.happen(submit).expect("submitted");
         for name in ["a", "b", "c", "d"] {
@@ -163,6 +164,34 @@ fn a_gang_has_no_more_members_than_a_batch_has_slices() {
         coordinator.report(&dataset, TaskOutcome::Finished { output, metrics: Default::default() });
         assert_eq!(members(&coordinator, "a").len(), slices, "{slices} slices and {range:?}");
     }
+}
+
+#[test]
+fn another_owners_run_keeps_its_placement() {
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let mut submit = |name: &str, min| {
+        let event = Event::Submit {
+            pipeline: Box::new(pipelines::quickstart(1, WorkerRange { min, max: min }, &[])),
+            source: String::new(),
+            idempotency_key: None,
+            until: Some("dataset".into()),
+            owner: protocol::Owner { name: name.into(), ..Default::default() },
+        };
+        coordinator.happen(event).expect("submitted");
+        let executions: Vec<_> = coordinator.state.executions.values().collect();
+        assert_eq!(executions.len(), 1, "both want the same stage");
+        executions[0].placement.workers.min
+    };
+    assert_eq!(submit("alice", 1), 1);
+    assert_eq!(submit("bob", 9), 1, "he waits for what she has computed");
+    assert_eq!(submit("alice", 2), 1, "his run waits for it as well");
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let run = coordinator.submit("dataset", WorkerRange { min: 1, max: 1 });
+    coordinator.submit("dataset", WorkerRange { min: 2, max: 2 });
+    let placement =
+        |coordinator: &PureCoordinator| coordinator.state.executions.values().next().expect("one").placement.clone();
+    assert_eq!(placement(&coordinator).workers.min, 2, "its owner's newest wish counts");
+    assert_eq!(coordinator.run_state(&run), RunState::Running);
 }
 
 /// A plain task's end, a gang's end and a gang's checkpoint, whose blobs were collected before they were named.
@@ -259,6 +288,7 @@ fn submit(coordinator: &mut PureCoordinator, seed: u64) -> RunId {
         source: String::new(),
         idempotency_key: None,
         until: None,
+        owner: protocol::Owner::local("me"),
     };
     let effects = coordinator.happen(submit).expect("submitted");
     let run = effects.into_iter().find_map(|effect| match effect {
@@ -365,6 +395,7 @@ fn a_pipeline_of_more_than_a_thousand_stages_is_refused() {
             source: String::new(),
             idempotency_key: None,
             until: Some("nowhere".into()),
+            owner: protocol::Owner::local("me"),
         };
         coordinator.happen(event).expect_err("refused").to_string()
     };

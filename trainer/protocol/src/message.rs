@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::stage::{Backend, CheckpointPolicy, Mode, StageSettings};
 use crate::sweep::{SearchKind, Values};
-use crate::{Attempt, Digest, Fence, Generation, Incarnation, RunId, Seed, StageName, TaskId, WorkerId};
+use crate::{Attempt, Digest, Fence, Generation, Incarnation, Owner, RunId, Seed, StageName, TaskId, WorkerId};
 
 /// Version of these messages; a worker with another version is refused.
 pub const PROTOCOL_VERSION: u32 = 5;
@@ -313,6 +313,9 @@ pub struct RunView {
     pub run: RunId,
     /// The pipeline's name.
     pub pipeline: String,
+    /// The token that submitted it.
+    #[serde(default)]
+    pub owner: Owner,
     pub state: RunState,
     /// Stages in topological order, then the stages made by sweeps.
     pub stages: Vec<StageView>,

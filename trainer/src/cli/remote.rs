@@ -161,9 +161,13 @@ pub(crate) async fn status(args: StatusArgs) -> Result<u8> {
                     let asked = || run.stages.iter().filter(|stage| stage.of.is_none());
                     let done = asked().filter(|stage| !stage.outputs.is_empty()).count();
                     let state = summary::run_state(run.state).to_owned();
-                    vec![run.run.to_string(), run.pipeline.clone(), state, format!("{done}/{}", asked().count())]
+                    let stages = format!("{done}/{}", asked().count());
+                    vec![run.run.to_string(), run.pipeline.clone(), run.owner.to_string(), state, stages]
                 };
-                print::out(&print::table(&["RUN", "PIPELINE", "STATE", "STAGES"], runs.iter().map(row).collect()));
+                print::out(&print::table(
+                    &["RUN", "PIPELINE", "OWNER", "STATE", "STAGES"],
+                    runs.iter().map(row).collect(),
+                ));
             }
         }
     } else {

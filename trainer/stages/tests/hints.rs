@@ -1,7 +1,6 @@
 //! Target positions and their errors, against MotionLCM's loader and metric (fixtures `02_control*` with draws or
 //! sampled motions).
 
-
 use protocol::stage::ControlSetting;
 use safetensors::{Dtype, SafeTensors};
 use serde_json::Value;

@@ -1,6 +1,5 @@
 //! The definitions of the reconstruction metrics against rows of the reference table that need no network.
 
-
 use motion::Dataset;
 use protocol::stage::{DataFormat, Split};
 use stages::evaluation::{joints, reconstruction};

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use protocol::message::RunState;
 use protocol::pipeline::Pipeline;
-use protocol::{RunId, StageName, limits};
+use protocol::{Owner, RunId, StageName, limits};
 use registry::Write;
 
 use super::deciding::Deciding;
@@ -22,6 +22,7 @@ impl Deciding<'_> {
         source: String,
         key: Option<String>,
         until: Option<StageName>,
+        owner: Owner,
     ) -> Result<bool, Rejected> {
         // A run that has ended is found in the tables, before the event.
         let twin = self.state.runs.values().find(|run| key.is_some() && run.idempotency_key == key);
@@ -30,9 +31,11 @@ impl Deciding<'_> {
             return Ok(false);
         }
         check_pipeline(&pipeline, until.as_ref())?;
-        let run = Run::new(self.state.submitted + 1, Arc::new(pipeline), key, until);
+        let run = Run::new(self.state.submitted + 1, owner, Arc::new(pipeline), key, until);
         for old in self.state.runs.values().cloned().collect::<Vec<_>>() {
-            if old.parked && old.state == RunState::Paused && old.submitted.digest() == run.submitted.digest() {
+            let is_left = old.parked && old.state == RunState::Paused;
+            // Another owner's run waits for its owner.
+            if is_left && run.owner.controls(&old.owner.group()) && old.submitted.digest() == run.submitted.digest() {
                 self.change_run(old.number, |old| old.skip_rest(&format!("taken over by run `{}`", run.id)));
                 self.set_run_state(old.number, RunState::Cancelled, old.parked);
             }
@@ -44,6 +47,7 @@ impl Deciding<'_> {
             state: word(run.state),
             idempotency_key: run.idempotency_key.clone(),
         });
+        self.writes.push(Write::RunOwner { run: run.id.clone(), owner: run.owner.group() });
         self.effects.push(Effect::Submitted(run.id.clone()));
         self.record(Fact::Run { run: Box::new(run) });
         Ok(true)

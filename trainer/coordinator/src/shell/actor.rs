@@ -15,6 +15,7 @@ use super::actor_handle::{ActorHandle, Reply};
 use super::blocking::blocking;
 use super::effects;
 use super::secrets::Secrets;
+use super::token_table::TokenTable;
 use crate::batch::{Ask, Batches, Done, Turn};
 use crate::journal;
 use crate::state::State;
@@ -43,10 +44,15 @@ impl Entropy {
 }
 
 /// Starts the actor on a recovered state.
-pub(crate) fn start(store: Store, state: State, secrets: Secrets) -> (Arc<ActorHandle>, JoinHandle<()>) {
+pub(crate) fn start(
+    store: Store,
+    state: State,
+    secrets: Secrets,
+    tokens: Arc<TokenTable>,
+) -> (Arc<ActorHandle>, JoinHandle<()>) {
     let (now, snapshot_at) = (state.now, state.seq);
     let batches = Batches::new(state);
-    let (actor_handle, queue) = ActorHandle::new(store, secrets, now, Arc::clone(batches.front()));
+    let (actor_handle, queue) = ActorHandle::new(store, secrets, now, Arc::clone(batches.front()), tokens);
     let actor_handle = Arc::new(actor_handle);
     let moments = Moments { actor_handle: Arc::clone(&actor_handle), entropy: Entropy::new() };
     let actor = Actor { actor_handle: Arc::clone(&actor_handle), batches, moments, snapshot_at, snapshot: None };

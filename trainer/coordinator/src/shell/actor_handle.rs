@@ -7,15 +7,17 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use futures::FutureExt as _;
 use protocol::message::{Poll, RunView, Submit};
 use protocol::pipeline::Pipeline;
-use protocol::{RunId, WorkerId, limits};
+use protocol::stage::Register;
+use protocol::{Alias, Group, ModelName, Owner, RunId, WorkerId, limits};
 use registry::{QueryError, ReadStore, Store, WriteError};
 use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 
 use super::blocking::blocking;
-use super::clock::Clock;
+use super::clock::{Clock, wall_clock};
 use super::records::{Records, read};
 use super::secrets::Secrets;
+use super::token_table::TokenTable;
 use super::versions::resolve_versions;
 use super::vouching::Reach;
 use crate::batch::{Ask, Front, Refused};
@@ -44,6 +46,8 @@ pub(crate) struct ActorHandle {
     failure: OnceLock<String>,
     stop: watch::Sender<bool>,
     clock: Clock,
+    /// Who may do what now.
+    pub(crate) tokens: Arc<TokenTable>,
     pub(crate) store: Store,
     pub(crate) secrets: Secrets,
     pub(crate) reach: Arc<Reach>,
@@ -56,6 +60,7 @@ impl ActorHandle {
         secrets: Secrets,
         now: Millis,
         front: Arc<Front>,
+        tokens: Arc<TokenTable>,
     ) -> (Self, mpsc::Receiver<(Ask, Reply)>) {
         let (asks, queue) = mpsc::channel(QUEUE);
         let handle = Self {
@@ -68,6 +73,7 @@ impl ActorHandle {
             failure: OnceLock::new(),
             stop: watch::Sender::new(false),
             clock: Clock::new(now),
+            tokens,
             store,
             secrets,
             reach: Arc::default(),
@@ -110,8 +116,9 @@ impl ActorHandle {
         }
     }
 
-    /// Submits a pipeline.
-    pub(crate) async fn submit(&self, submit: Submit) -> Result<RunId, Refused> {
+    /// Submits a pipeline of `owner`, who sees the models of the group `sees`, or all.
+    pub(crate) async fn submit(&self, mut submit: Submit, owner: Owner, sees: Option<Group>) -> Result<RunId, Refused> {
+        submit.idempotency_key = submit.idempotency_key.map(|key| owner.group().key(&key));
         // Beside the threads that answer heartbeats: a large one takes a while.
         let read = blocking(move || {
             let pipeline: Pipeline = serde_json::from_value(submit.pipeline)
@@ -126,7 +133,9 @@ impl ActorHandle {
         {
             return Ok(row.run);
         }
-        resolve_versions(&mut pipeline, &self.store).await.map_err(|error| match error {
+        self.check_registrations(&pipeline, &owner).await?;
+        let seen = self.seen_store(sees.as_ref());
+        resolve_versions(&mut pipeline, &seen).await.map_err(|error| match error {
             QueryError::NotFound(why) | QueryError::Invalid(why) => Refused::from(Rejected::Invalid(why)),
             error => Refused::from(WriteError::from(error)),
         })?;
@@ -135,6 +144,7 @@ impl ActorHandle {
             source: submit.source,
             idempotency_key: submit.idempotency_key.clone(),
             until: submit.until,
+            owner,
         };
         let mut tries = 0;
         loop {
@@ -156,6 +166,54 @@ impl ActorHandle {
                     return Ok(run.expect("a submission gives a run"));
                 }
             }
+        }
+    }
+
+    /// Refuses a pipeline that would move an alias or add to a model that is not its owner's to change.
+    async fn check_registrations(&self, pipeline: &Pipeline, owner: &Owner) -> Result<(), Refused> {
+        for stage in &pipeline.stages {
+            let Some(settings) = stage.settings.get::<Register>() else { continue };
+            let forbidden = |why: &str| Rejected::Forbidden(format!("stage `{}`: {why}", stage.name));
+            let invalid = |e: protocol::id::ParseNameError| Rejected::Invalid(format!("stage `{}`: {e}", stage.name));
+            let model: ModelName = settings.model.parse().map_err(invalid)?;
+            if self.store.model(&model).await.map_err(WriteError::from)?.is_some() {
+                let group = self.model_owner(&model).await?;
+                if !owner.admin && group.as_ref().is_none_or(|group| !owner.controls(group)) {
+                    return Err(forbidden(&format!("model `{model}` belongs to another owner")).into());
+                }
+            }
+            if settings.promote.to.is_empty() {
+                continue;
+            }
+            let alias: Alias = settings.promote.to.parse().map_err(invalid)?;
+            self.may_promote(owner, &alias).map_err(|why| forbidden(&format!("`promote.to: {alias}`: {why}")))?;
+        }
+        Ok(())
+    }
+
+    /// Why the token of a run's owner may not move an alias of its own models now.
+    pub(crate) fn may_promote(&self, owner: &Owner, alias: &Alias) -> Result<(), String> {
+        self.tokens.current().may_move(owner.into(), alias, Some(&owner.group()), wall_clock().0)
+    }
+
+    /// The group that a model belongs to.
+    pub(crate) async fn model_owner(&self, model: &ModelName) -> Result<Option<Group>, WriteError> {
+        Ok(self.store.model_owners(Some(model)).await?.remove(model))
+    }
+
+    /// The group that a run belongs to, whether it is in memory or has ended.
+    pub(crate) async fn run_owner(&self, run: &RunId) -> Result<Option<Group>, WriteError> {
+        match self.state().run(run) {
+            Ok(run) => Ok(Some(run.owner.group())),
+            Err(_) => Ok(self.store.run_owners(std::slice::from_ref(run)).await?.remove(run)),
+        }
+    }
+
+    /// The store as one who sees the group `sees`, or all, sees it.
+    pub(crate) fn seen_store(&self, sees: Option<&Group>) -> ReadStore {
+        match sees {
+            Some(group) => self.store.seen_by(group),
+            None => ReadStore::clone(&self.store),
         }
     }
 
@@ -188,7 +246,13 @@ impl ActorHandle {
     /// What there is to tell of runs now. The state is read before the tables: a run that ends in between is in both, and not in
     /// neither.
     pub(crate) fn records(&self) -> Records {
-        Records::new(ReadStore::clone(&self.store), self.state(), self.now())
+        self.records_for(None)
+    }
+
+    /// The same, for one who sees the group `sees`, or all.
+    pub(crate) fn records_for(&self, sees: Option<Group>) -> Records {
+        let (state, now) = (self.state(), self.now());
+        Records::new(self.seen_store(sees.as_ref()), state, now, sees)
     }
 
     /// The newest stored state.

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use checkpoint::model;
 use protocol::artifact::Role;
-use protocol::{Digest, RunId, StageName, TaskId};
+use protocol::{Alias, Digest, Owner, RunId, StageName, TaskId};
 use registry::blob::{IDLE, Protected};
 use registry::{BlobStore, QueryError};
 use tokio::sync::watch;
@@ -31,8 +31,8 @@ pub(crate) fn perform(actor_handle: &Arc<ActorHandle>, effect: &Effect) {
             let looking = look_up(Arc::clone(&actor_handle), key);
             drop(actor_handle.spawn("a look for a stage's value", looking));
         }
-        Effect::Register { key, candidates } => {
-            let registering = register(Arc::clone(&actor_handle), key, candidates);
+        Effect::Register { key, candidates, promotes, owner } => {
+            let registering = register(Arc::clone(&actor_handle), key, candidates, promotes, owner);
             drop(actor_handle.spawn("the registration of a model", registering));
         }
         Effect::Prune { task, keep } => drop(tokio::spawn(async move {
@@ -105,7 +105,20 @@ async fn known(actor_handle: &ActorHandle, key: Digest) -> Result<Option<(Known,
     Ok(flaw.is_none().then_some((known, (row.run, row.stage))))
 }
 
-async fn register(actor_handle: Arc<ActorHandle>, key: Digest, candidates: Vec<Candidate>) {
+async fn register(
+    actor_handle: Arc<ActorHandle>,
+    key: Digest,
+    candidates: Vec<Candidate>,
+    promotes: Option<Alias>,
+    owner: Owner,
+) {
+    // The token may have been revoked, or the alias protected, since the run was submitted.
+    if let Some(alias) = promotes
+        && let Err(why) = actor_handle.may_promote(&owner, &alias)
+    {
+        let message = format!("`promote.to: {alias}`: {why}; nothing was registered");
+        return tell(&actor_handle, Event::RegisterRefused { key, message }).await;
+    }
     let blobs = actor_handle.store.blobs().clone();
     let event = match blocking(move || bundles(&blobs, &candidates)).await {
         Ok((bundles, protected)) => {

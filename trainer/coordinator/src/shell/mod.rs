@@ -6,6 +6,7 @@
 mod actor;
 mod actor_handle;
 mod api;
+mod audit;
 mod auth;
 mod blocking;
 mod body;
@@ -19,9 +20,11 @@ mod paced;
 mod polls;
 mod queries;
 mod records;
+mod revocable;
 mod route;
 mod secrets;
 mod start_error;
+mod token_table;
 mod uploads;
 mod versions;
 mod vouching;
@@ -29,10 +32,11 @@ mod vouching;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 
-use access::{Scope, Scopes, Token, Tokens};
+use access::{Caller, Scope, Scopes, Token, Tokens};
 use protocol::message::{FailureClass, ReportOutcome, RunView, Submit, TaskOutcome};
-use protocol::{RunId, WorkerId};
+use protocol::{Owner, RunId, WorkerId};
 use registry::Store;
+use registry::audit::AuditLog;
 use rustls::ServerConfig;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -55,6 +59,8 @@ pub use self::records::{Records, RecordsError, StageMetrics};
 pub use self::route::Route;
 use self::secrets::Secrets;
 pub use self::start_error::StartError;
+pub use self::token_table::Standing;
+use self::token_table::TokenTable;
 pub use self::versions::resolve_versions;
 
 /// How a coordinator is run.
@@ -146,24 +152,31 @@ impl Coordinator {
             local = here.address().map_err(listen(config.listen))?;
             listeners.push(here);
         }
-        let (token, worker_token, mut tokens) = (Token::random(), Token::random(), config.tokens.clone());
-        tokens.add(user(), Scopes::all(), &token);
-        tokens.add(OWN_WORKERS, Scopes::of(&[Scope::Worker]), &worker_token);
+        let token = Token::random();
+        let worker_token = Token::random();
+        let own = vec![
+            (Caller::new(user(), Scopes::all()), token.clone()),
+            (Caller::new(OWN_WORKERS, Scopes::of(&[Scope::Worker])), worker_token.clone()),
+        ];
+        let tokens = Arc::new(TokenTable::new(config.tokens.clone(), own));
 
+        let log = AuditLog::of(store.dir());
         let secrets = Secrets::new(store.server_key().map_err(StartError::Key)?);
-        let (actor_handle, actor) = actor::start(store, state, secrets);
+        let (actor_handle, actor) = actor::start(store, state, secrets, Arc::clone(&tokens));
         actor_handle.decide(Event::Started { alone: config.alone, park: config.park }).await?;
         effects::let_go(&actor_handle);
         let (stop, stopped) = watch::channel(false);
         let tick = effects::tick(actor_handle.clone(), config.policy.tick_ms, stopped.clone());
         let clock = actor_handle.spawn("the clock", tick);
         let gate = Arc::new(Gate::new(tokens, &config.hosts));
+        let audit = actor_handle.spawn("the audit log", audit::write(Arc::clone(&gate.audit), log, stopped.clone()));
         let router = api::router(actor_handle.clone(), &gate);
         let serve = listener::serve(listeners, router, config.connections.clone(), stopped);
         let server = actor_handle.spawn("the server", serve);
         tracing::info!(%address, "coordinator listens");
         let tls = config.tls.is_some();
-        Ok(Handle { address, local, tls, token, worker_token, actor_handle, stop, tasks: vec![clock, server, actor] })
+        let tasks = vec![clock, server, audit, actor];
+        Ok(Handle { address, local, tls, token, worker_token, actor_handle, stop, tasks })
     }
 }
 
@@ -217,7 +230,12 @@ impl Handle {
 
     /// Submits a pipeline; durable once this returns.
     pub async fn submit(&self, submit: Submit) -> Result<RunId, Refused> {
-        self.actor_handle.submit(submit).await
+        self.actor_handle.submit(submit, Owner::local(user()), None).await
+    }
+
+    /// Takes another table of tokens. Calls under way whose token is not in it any more end.
+    pub fn replace_tokens(&self, tokens: Tokens) {
+        self.actor_handle.tokens.replace(tokens);
     }
 
     /// Pauses, resumes or cancels a run.

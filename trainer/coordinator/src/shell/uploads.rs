@@ -289,10 +289,16 @@ pub(crate) async fn get_blob(
         check_read(&actor_handle, &proof, &headers, digest).await?;
     }
     let blobs = actor_handle.store.blobs().clone();
-    let opened = blocking(move || -> Result<_, BlobError> {
+    let opened = blocking(move || -> Result<_, Failure> {
         let mut reader = match from {
             None => blobs.read(digest)?,
-            Some(from) => blobs.read_from(digest, from)?,
+            Some(from) => {
+                let bytes = blobs.verify(digest)?.bytes;
+                if from > bytes {
+                    return Err(past_the_end(digest, from, bytes));
+                }
+                blobs.read_from(digest, from)?
+            }
         };
         // A small blob is whole by now, or refused.
         let first = reader.next_part()?;
@@ -340,6 +346,11 @@ async fn check_read(
     }
     let message = format!("blob {digest} is not among what the tasks of worker `{}` read", process.worker);
     Err(Failure::new(StatusCode::FORBIDDEN, "forbidden", message))
+}
+
+fn past_the_end(digest: Digest, from: u64, bytes: u64) -> Failure {
+    let message = format!("header `range`: blob {digest} has {bytes} bytes; byte {from} is past its end");
+    Failure::new(StatusCode::RANGE_NOT_SATISFIABLE, "invalid", message)
 }
 
 /// Where a download goes on.

@@ -89,7 +89,7 @@ impl State {
         run::number_of(run)
             .and_then(|number| self.runs.get(&number))
             .filter(|known| known.id == *run)
-            .ok_or_else(|| Rejected::NotFound(format!("run `{run}` is not known; `trainer status --all` lists runs")))
+            .ok_or_else(|| Rejected::unknown_run(run))
     }
 
     /// The execution and the task that a grant is about.
@@ -131,6 +131,12 @@ impl State {
             )));
         }
         Ok(known)
+    }
+
+    /// The run on whose behalf an execution registers: the one that began it, or the oldest other that waits for it.
+    pub fn registrant(&self, execution: &StageExecution) -> Option<&Arc<Run>> {
+        let users = || execution.users.keys().filter_map(|number| self.runs.get(number));
+        users().find(|run| run.id == execution.run).or_else(|| users().next())
     }
 
     /// The task that a worker holds.

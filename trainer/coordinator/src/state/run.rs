@@ -17,7 +17,7 @@ use std::sync::Arc;
 use protocol::message::{RunState, StageState};
 use protocol::pipeline::{Pipeline, PipelineStage};
 use protocol::sweep::STATE_OUTPUT;
-use protocol::{ArtifactKind, Attempt, Digest, RunId, StageName};
+use protocol::{ArtifactKind, Attempt, Digest, Owner, RunId, StageName};
 use serde::{Deserialize, Serialize};
 
 use crate::search::Search;
@@ -113,6 +113,8 @@ pub struct Run {
     pub id: RunId,
     /// Its place in the order of submission.
     pub number: u64,
+    /// The token that submitted it, and what that allowed then.
+    pub owner: Owner,
     /// What it was asked to execute.
     pub submitted: Arc<Pipeline>,
     /// What it executes: what was submitted, and behind it the stages that sweeps made.
@@ -140,6 +142,8 @@ pub struct Run {
 struct Stored {
     id: RunId,
     number: u64,
+    #[serde(default)]
+    owner: Owner,
     submitted: Pipeline,
     /// Stages that sweeps made.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -162,6 +166,7 @@ impl From<Run> for Stored {
         Self {
             id: run.id,
             number: run.number,
+            owner: run.owner,
             submitted: Arc::unwrap_or_clone(run.submitted),
             made,
             idempotency_key: run.idempotency_key,
@@ -180,6 +185,7 @@ impl From<Stored> for Run {
         let mut run = Self {
             id: stored.id,
             number: stored.number,
+            owner: stored.owner,
             pipeline: Arc::clone(&submitted),
             submitted,
             idempotency_key: stored.idempotency_key,
@@ -212,7 +218,13 @@ fn places(stages: &[PipelineStage], first: usize) -> impl Iterator<Item = (Stage
 
 impl Run {
     /// A run that has just been submitted.
-    pub fn new(number: u64, pipeline: Arc<Pipeline>, key: Option<String>, until: Option<StageName>) -> Self {
+    pub fn new(
+        number: u64,
+        owner: Owner,
+        pipeline: Arc<Pipeline>,
+        key: Option<String>,
+        until: Option<StageName>,
+    ) -> Self {
         let digest = pipeline.digest();
         let id = RunId::new(format!("{}-{}-{number}", pipeline.name, &digest.hex()[..8]));
         let wanted = wanted(&pipeline, until.as_ref());
@@ -222,6 +234,7 @@ impl Run {
         Self {
             id,
             number,
+            owner,
             submitted: Arc::clone(&pipeline),
             places: Arc::new(places(&pipeline.stages, 0).collect()),
             pipeline,
@@ -430,7 +443,7 @@ mod tests {
             stages: vec![stage],
             code_versions: BTreeMap::new(),
         };
-        Run::new(1, Arc::new(pipeline), None, None)
+        Run::new(1, Owner::local("me"), Arc::new(pipeline), None, None)
     }
 
     #[test]

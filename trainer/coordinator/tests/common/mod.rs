@@ -94,6 +94,7 @@ impl PureCoordinator {
             source: String::new(),
             idempotency_key: None,
             until: Some(until.into()),
+            owner: protocol::Owner::local("me"),
         };
         let effects = self.happen(event).expect("submitted");
         let run = effects.into_iter().find_map(|effect| match effect {

@@ -21,6 +21,7 @@ pub(crate) fn events(state: &State, ended: &[Run]) -> Vec<Event> {
             source: String::new(),
             idempotency_key: None,
             until: Some("nowhere".into()),
+            owner: protocol::Owner::local("me"),
         },
     ];
     let nobody: WorkerId = "nobody".into();

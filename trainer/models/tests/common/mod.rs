@@ -1,5 +1,10 @@
 //! Finds, reads and compares the fixtures.
-#![allow(dead_code, unused_imports, unreachable_pub, reason = "each test binary compiles its own copy and uses a part of it")]
+#![allow(
+    dead_code,
+    unused_imports,
+    unreachable_pub,
+    reason = "each test binary compiles its own copy and uses a part of it"
+)]
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};

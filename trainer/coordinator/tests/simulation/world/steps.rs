@@ -317,7 +317,7 @@ impl World {
     fn perform(&mut self, effect: Effect) {
         let event = match &effect {
             Effect::Lookup { key } => self.store.look_up(*key),
-            Effect::Register { key, candidates } => Event::Bundled {
+            Effect::Register { key, candidates, .. } => Event::Bundled {
                 key: *key,
                 bundles: candidates.iter().map(|c| Digest::of(c.stage.as_str().as_bytes())).collect(),
             },
