@@ -56,4 +56,10 @@ mutation pipe-as-token-file trainer/access/src/file.rs 's/if file\.metadata\(\)\
 mutation lock-follows-links registry/src/blob/disk.rs 's/OFlag::O_NOFOLLOW \| //' registry
 mutation gang-in-the-clear worker/src/gang/seal.rs 's/Ok\(stream\.local_addr\(\)\?\.ip\(\)\.to_canonical\(\) != .*\)$/Ok(stream.local_addr().is_err())/m' worker
 mutation nonce-that-repeats worker/src/gang/seal.rs 's/bytes\[4\.\.\]\.copy_from_slice\(&number\.to_le_bytes\(\)\);/let _ = number; bytes[4] = 1;/' worker
+mutation links-out-of-a-data-root trainer/motion/src/roots.rs 's/ResolveFlag::RESOLVE_BENEATH \| //' motion
+mutation a-root-is-no-bound trainer/motion/src/data_access.rs 's/Some\(DataPath::beneath\(Arc::clone\(root\), root\.relative\(path\)\?, path\.to_owned\(\)\)\)/Some(DataPath::local(path))/' motion
+mutation errors-quote-files trainer/protocol/src/printable.rs 's/AtomicBool::new\(false\)/AtomicBool::new(true)/' "protocol hostile"
+mutation digests-on-trust trainer/motion/src/data_access.rs 's/before\.digest != \*expected/false/' motion
+mutation changes-while-read-unseen trainer/motion/src/data_access.rs 's/Ok\(after\) if after == \*before =>/Ok(_) =>/' motion
+mutation keys-without-digests trainer/coordinator/src/state/run.rs 's/inputs\.contains_key\(&folder\.field\)/!folder.field.is_empty() || inputs.is_empty()/' coordinator
 exit $missed

@@ -10,6 +10,7 @@ use checkpoint::{BlobError, Blobs};
 use protocol::message::{CommitCheckpoint, Progress, StageTask};
 use protocol::{ArtifactKind, Digest, Manifest};
 use stages::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
+use stages::external::DataAccess;
 
 use crate::active_assignment::ActiveAssignment;
 use crate::blobs::HttpBlobs;
@@ -29,6 +30,7 @@ use crate::telemetry_buffer::{Sender, TelemetryBuffer};
 pub(crate) struct HttpContext {
     task: StageTask,
     device: Device,
+    data: Arc<DataAccess>,
     held: Arc<ActiveAssignment>,
     client: Client,
     blobs: Arc<HttpBlobs>,
@@ -49,13 +51,19 @@ struct Behind {
 }
 
 impl HttpContext {
-    pub(crate) fn new(held: Arc<ActiveAssignment>, client: Client, cache: Arc<Cache>, device: Device) -> Self {
+    pub(crate) fn new(
+        held: Arc<ActiveAssignment>,
+        client: Client,
+        cache: Arc<Cache>,
+        data: Arc<DataAccess>,
+        device: Device,
+    ) -> Self {
         let assignment = held.assignment();
         let gang = matches!(assignment.role, protocol::message::Role::Member { .. });
         let blobs = Arc::new(HttpBlobs { held: held.clone(), client: client.clone(), cache, gang });
         let (telemetry, sender) = TelemetryBuffer::open(held.clone(), client.clone());
         let task = assignment.stage;
-        Self { task, device, held, client, blobs, telemetry, mesh: None, behind: None, gang, _sender: sender }
+        Self { task, device, data, held, client, blobs, telemetry, mesh: None, behind: None, gang, _sender: sender }
     }
 
     /// Waits until everything recorded and logged is stored.
@@ -160,6 +168,10 @@ impl AttemptContext for HttpContext {
 
     fn device(&self) -> Device {
         self.device.clone()
+    }
+
+    fn data(&self) -> Arc<DataAccess> {
+        self.data.clone()
     }
 
     fn blobs(&self) -> Arc<dyn Blobs> {

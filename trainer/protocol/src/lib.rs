@@ -21,5 +21,5 @@ pub use digest::Digest;
 pub use id::{Alias, Attempt, Fence, Generation, Incarnation, ModelName, RunId, Seed, StageName, TaskId, WorkerId};
 pub use model_ref::{ModelRef, Pick};
 pub use pipeline::Pipeline;
-pub use printable::{excerpt, printable};
+pub use printable::{excerpt, excerpts, json_mistake, printable, show_excerpts};
 pub use units::Steps;

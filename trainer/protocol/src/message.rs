@@ -16,7 +16,7 @@ use crate::sweep::{SearchKind, Values};
 use crate::{Attempt, Digest, Fence, Generation, Incarnation, RunId, Seed, StageName, TaskId, WorkerId};
 
 /// Version of these messages; a worker with another version is refused.
-pub const PROTOCOL_VERSION: u32 = 4;
+pub const PROTOCOL_VERSION: u32 = 5;
 
 /// `POST /v1/workers`: a process registers as a worker.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -163,6 +163,8 @@ pub enum Role {
         /// Number of shards.
         of: u32,
     },
+    /// Digests what the stage's settings name outside the store, before the stage has a key. Answers [`TaskOutcome::Resolved`].
+    Resolve,
     /// Merges the shards of a map stage into its artifact.
     Merge {
         /// Artifacts of the shards, in order.
@@ -246,6 +248,11 @@ pub enum TaskOutcome {
         output: Digest,
         /// Final metrics by name.
         metrics: BTreeMap<String, f64>,
+    },
+    /// The digests that [`Role::Resolve`] asks for.
+    Resolved {
+        /// By the field that names each file or folder.
+        digests: BTreeMap<String, Digest>,
     },
     /// Stopped between steps, with a checkpoint committed.
     Yielded {

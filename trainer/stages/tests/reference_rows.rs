@@ -1,5 +1,6 @@
 //! The definitions of the reconstruction metrics against rows of the reference table that need no network.
 
+use motion::DataPath;
 use std::path::{Path, PathBuf};
 
 use motion::Dataset;
@@ -23,7 +24,7 @@ fn guesses_without_a_network_have_the_errors_of_the_reference_table() {
         eprintln!("SKIPPED: no {}; set STRIDE_SHARED to the folder with the data", folder.display());
         return;
     }
-    let (dataset, _) = Dataset::open(&folder, DataFormat::Humanml3d).expect("the folder opens");
+    let (dataset, _) = Dataset::open(&DataPath::local(&folder), DataFormat::Humanml3d).expect("the folder opens");
     let entries = dataset.entries_of(Split::Test);
     let rows: [Row; 3] = [
         ("zeros", |clip, _| vec![0.0; clip.len()], [1840.0, 117.1, 109.7, 0.378]),
