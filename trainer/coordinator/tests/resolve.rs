@@ -1,5 +1,6 @@
 //! Stages that read files outside the store: a worker digests what a submission names without a digest, before the stage has a key.
 
+#[allow(dead_code, reason = "not every test file uses all of it")]
 mod common;
 
 use std::collections::BTreeMap;
