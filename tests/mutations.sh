@@ -78,4 +78,10 @@ mutation models-of-others-are-taken registry/src/sqlite/owners.rs 's/if !is_its_
 mutation revoked-and-served trainer/coordinator/src/shell/token_table.rs 's/self\.changed\.send_modify\(\|version\| \*version \+= 1\);//' coordinator
 mutation expired-and-served trainer/access/src/expiry.rs 's/now_ms >= self\.at_ms/now_ms < self.at_ms \&\& false/' "access coordinator"
 mutation refusals-one-by-one trainer/coordinator/src/shell/audit.rs 's/pending\.count\(kind, now_ms, REFUSED_MS\)/pending.line(kind.line(now_ms, now_ms, 1))/' coordinator
+mutation links-out-of-a-data-root trainer/motion/src/roots.rs 's/ResolveFlag::RESOLVE_BENEATH \| //' motion
+mutation a-root-is-no-bound trainer/motion/src/data_access.rs 's/Some\(DataPath::beneath\(Arc::clone\(root\), root\.relative\(path\)\?, path\.to_owned\(\)\)\)/Some(DataPath::local(path))/' motion
+mutation errors-quote-files trainer/protocol/src/printable.rs 's/AtomicBool::new\(false\)/AtomicBool::new(true)/' "protocol hostile"
+mutation digests-on-trust trainer/motion/src/data_access.rs 's/before\.digest != \*expected/false/' motion
+mutation changes-while-read-unseen trainer/motion/src/data_access.rs 's/Ok\(after\) if after == \*before =>/Ok(_) =>/' motion
+mutation keys-without-digests trainer/coordinator/src/state/run.rs 's/inputs\.contains_key\(&folder\.field\)/!folder.field.is_empty() || inputs.is_empty()/' coordinator
 exit $missed

@@ -119,7 +119,7 @@ fn the_units_of_systemd() {
     let bench = Bench::new(TRAINER);
     let dir = bench.path();
     let root = dir.join("root");
-    for folder in ["etc/stride", "var/lib/stride", "usr/local"] {
+    for folder in ["etc/stride", "var/lib/stride/data", "usr/local"] {
         fs::create_dir_all(root.join(folder)).expect("a folder");
     }
     let bin = programs(dir);
@@ -165,7 +165,7 @@ fn the_units_of_systemd() {
         .map(|(name, value)| (name.to_owned(), here(value)))
         .filter(|(name, _)| name.starts_with("STRIDE_"))
         .collect();
-    assert_eq!(environment.len(), 3, "{environment:?}");
+    assert_eq!(environment.len(), 4, "{environment:?}");
     let mut join = start(&worker["ExecStart"], &environment, "worker.log");
 
     let url = format!("https://localhost:{port}");

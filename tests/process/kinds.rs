@@ -39,8 +39,8 @@ fn pipeline(bench: &Bench) -> PathBuf {
         }
         text += "  folder: {kind: data.open, format: humanml3d, path: folder}\n";
         text += "  imported: {kind: import.evaluator, path: evaluator}\n";
-        let weights = shared.join("parity/01_vae_v2/weights.ckpt");
-        text += &format!("  released: {{kind: import.model, path: {}, dataset: dataset}}\n", weights.display());
+        fs::copy(shared.join("parity/01_vae_v2/weights.ckpt"), bench.path().join("weights.ckpt")).expect("copied");
+        text += "  released: {kind: import.model, path: weights.ckpt, dataset: dataset}\n";
     }
     let path = bench.path().join("kinds.yaml");
     fs::write(&path, text).expect("written");

@@ -13,6 +13,7 @@ mod damage;
 mod determinism;
 mod documented;
 mod failpoints;
+mod files;
 mod hub;
 mod kinds;
 mod memory;

@@ -166,6 +166,10 @@ impl Cluster {
         if !self.address.ip().is_loopback() {
             arguments.push("--insecure");
         }
+        let folder = self.bench.path().display().to_string();
+        if !more.contains(&"--data-root") {
+            arguments.extend(["--data-root", &folder]);
+        }
         let worker = self.spawn(name, wrap, &arguments);
         if let Some(mut old) = self.workers.insert(name.to_owned(), worker) {
             assert!(!old.alive(), "worker {name} was replaced while it ran");

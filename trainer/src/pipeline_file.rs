@@ -3,8 +3,8 @@
 use std::io::Read as _;
 use std::path::Path;
 
-use motion::Dataset;
 use motion::folder_digest::{files_digest, folder_digest};
+use motion::{DataPath, Dataset};
 use protocol::pipeline::{self, Pipeline, PipelineStage};
 use protocol::stage::{DataFormat, ExternalFolder};
 use protocol::{Digest, StageName, limits};
@@ -97,9 +97,9 @@ fn digest_folders(pipeline: &mut Pipeline) -> Result<()> {
             let content = match format {
                 Some(format) => {
                     check_format(Path::new(&path), format)?;
-                    folder_digest(Path::new(&path), format).map_err(bad_folder)?
+                    folder_digest(&DataPath::local(&path), format).map_err(bad_folder)?
                 }
-                None => files_digest(Path::new(&path))
+                None => files_digest(&DataPath::local(&path))
                     .map_err(|e| Problem::usage(format!("stage `{}`: {path}: {e}", stage.name)))?,
             };
             stage.external.insert(field, content);
@@ -143,7 +143,7 @@ pub(crate) fn check_data(pipeline: &Pipeline, store: &Path) -> Result<()> {
     for (stage, folder, format) in dataset_folders(pipeline) {
         let seen = |digest: &Digest| store.join("seen").join(digest.hex()).exists();
         if !stage.external.get(&folder.field).is_some_and(seen) {
-            Dataset::open(Path::new(&folder.path), format).map_err(bad_folder)?;
+            Dataset::open(&DataPath::local(&folder.path), format).map_err(bad_folder)?;
         }
     }
     Ok(())

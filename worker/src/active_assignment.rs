@@ -238,7 +238,7 @@ impl ActiveAssignment {
             Role::Member { members, .. } => members
                 .first()
                 .is_some_and(|first| (&first.worker, first.incarnation) == (&grant.worker, grant.incarnation)),
-            Role::Alone | Role::Shard { .. } | Role::Merge { .. } => true,
+            Role::Alone | Role::Resolve | Role::Shard { .. } | Role::Merge { .. } => true,
         }
     }
 

@@ -11,6 +11,7 @@ use protocol::message::{CommitCheckpoint, Progress, StageTask};
 use protocol::proof::Vouched;
 use protocol::{ArtifactKind, Digest, Manifest};
 use stages::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
+use stages::external::DataAccess;
 
 use crate::active_assignment::ActiveAssignment;
 use crate::blobs::HttpBlobs;
@@ -31,6 +32,7 @@ use crate::telemetry_buffer::{Sender, TelemetryBuffer};
 pub(crate) struct HttpContext {
     task: StageTask,
     device: Device,
+    data: Arc<DataAccess>,
     held: Arc<ActiveAssignment>,
     client: Client,
     blobs: Arc<HttpBlobs>,
@@ -51,7 +53,13 @@ struct Behind {
 }
 
 impl HttpContext {
-    pub(crate) fn new(held: Arc<ActiveAssignment>, client: Client, cache: Arc<Cache>, device: Device) -> Self {
+    pub(crate) fn new(
+        held: Arc<ActiveAssignment>,
+        client: Client,
+        cache: Arc<Cache>,
+        data: Arc<DataAccess>,
+        device: Device,
+    ) -> Self {
         let assignment = held.assignment();
         let gang = matches!(assignment.role, protocol::message::Role::Member { .. });
         let blobs = Arc::new(HttpBlobs {
@@ -63,7 +71,7 @@ impl HttpContext {
         });
         let (telemetry, sender) = TelemetryBuffer::open(held.clone(), client.clone());
         let task = assignment.stage;
-        Self { task, device, held, client, blobs, telemetry, mesh: None, behind: None, gang, _sender: sender }
+        Self { task, device, data, held, client, blobs, telemetry, mesh: None, behind: None, gang, _sender: sender }
     }
 
     /// Waits until everything recorded and logged is stored.
@@ -173,6 +181,10 @@ impl AttemptContext for HttpContext {
 
     fn device(&self) -> Device {
         self.device.clone()
+    }
+
+    fn data(&self) -> Arc<DataAccess> {
+        self.data.clone()
     }
 
     fn blobs(&self) -> Arc<dyn Blobs> {

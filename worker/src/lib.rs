@@ -30,4 +30,4 @@ mod telemetry_buffer;
 mod tests;
 
 pub use cli::JoinArgs;
-pub use join::{JoinError, Options, init_logging, join};
+pub use join::{Files, JoinError, Options, init_logging, join};

@@ -13,6 +13,8 @@ use protocol::Digest;
 use protocol::message::{FailureClass, ReportOutcome, Role, TaskOutcome};
 use protocol::proof::Vouched;
 use stages::context::{AttemptContext, ContextError, GangContext, Outcome, Part, StageError};
+use stages::external;
+use stages::external::DataAccess;
 
 use crate::active_assignment::ActiveAssignment;
 use crate::assignments::Shared;
@@ -35,6 +37,7 @@ pub(crate) struct Bench {
     pub(crate) kinds: Arc<dyn Kinds>,
     pub(crate) client: Client,
     pub(crate) cache: Arc<Cache>,
+    pub(crate) data: Arc<DataAccess>,
     pub(crate) device: Device,
 }
 
@@ -59,14 +62,20 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
     let assignment = held.assignment();
     let grant = &assignment.grant;
     tracing::info!(task = %grant.task, attempt = %grant.attempt, fence = %grant.fence, kind = assignment.stage.settings.kind(), "begin");
-    let mut context = HttpContext::new(held.clone(), bench.client.clone(), bench.cache.clone(), bench.device.clone());
+    let mut context = HttpContext::new(
+        held.clone(),
+        bench.client.clone(),
+        bench.cache.clone(),
+        bench.data.clone(),
+        bench.device.clone(),
+    );
+    let part = |part, context: &mut HttpContext| bench.kinds.part(context, part).map(Done::Stage);
     let stage = AssertUnwindSafe(|| match assignment.role {
-        Role::Alone => bench.kinds.alone(&mut context),
-        Role::Shard { index, of } => {
-            bench.kinds.part(&mut context, Part::Shard { index: index as usize, of: of as usize })
-        }
-        Role::Merge { shards } => bench.kinds.part(&mut context, Part::Merge { shards }),
-        Role::Member { .. } => bench.kinds.gang(&mut context),
+        Role::Alone => bench.kinds.alone(&mut context).map(Done::Stage),
+        Role::Shard { index, of } => part(Part::Shard { index: index as usize, of: of as usize }, &mut context),
+        Role::Merge { shards } => part(Part::Merge { shards }, &mut context),
+        Role::Member { .. } => bench.kinds.gang(&mut context).map(Done::Stage),
+        Role::Resolve => external::digests(&context).map(Done::Resolved),
     });
     let result = panic::catch_unwind(stage).unwrap_or_else(|payload| Err(StageError::Fault(panic_message(&*payload))));
     let Some(outcome) = outcome(result, held, &context) else { return };
@@ -112,8 +121,16 @@ fn report(
     })
 }
 
+/// The result of an assignment.
+enum Done {
+    /// The outcome of a stage.
+    Stage(Outcome),
+    /// Digests of what a stage's settings name outside the store.
+    Resolved(BTreeMap<String, Digest>),
+}
+
 /// What to report; nothing if the grant has ended, or if it is for rank 0 to say.
-fn outcome(result: Result<Outcome, StageError>, held: &ActiveAssignment, context: &HttpContext) -> Option<TaskOutcome> {
+fn outcome(result: Result<Done, StageError>, held: &ActiveAssignment, context: &HttpContext) -> Option<TaskOutcome> {
     let task = held.grant().task;
     let result = match result {
         // What was recorded belongs to the outcome; without it the outcome is not reported.
@@ -129,11 +146,12 @@ fn outcome(result: Result<Outcome, StageError>, held: &ActiveAssignment, context
             tracing::info!(%task, "end; rank 0 reports");
             None
         }
-        Ok(Outcome::Finished { output, metrics }) => {
+        Ok(Done::Resolved(digests)) => Some(TaskOutcome::Resolved { digests }),
+        Ok(Done::Stage(Outcome::Finished { output, metrics })) => {
             let metrics = metrics.into_iter().filter(|(_, value)| value.is_finite()).collect();
             Some(TaskOutcome::Finished { output, metrics })
         }
-        Ok(Outcome::Yielded { at }) => Some(TaskOutcome::Yielded { at }),
+        Ok(Done::Stage(Outcome::Yielded { at })) => Some(TaskOutcome::Yielded { at }),
         Err(StageError::Context(ContextError::GrantEnded(reason))) => {
             tracing::info!(%task, "dropped: {reason}");
             None
@@ -163,6 +181,7 @@ fn is_out_of_memory(message: &str) -> bool {
 fn summary(outcome: &TaskOutcome) -> String {
     match outcome {
         TaskOutcome::Finished { output, .. } => format!("finished, {}", output.short()),
+        TaskOutcome::Resolved { digests } => format!("{} digests", digests.len()),
         TaskOutcome::Yielded { at } => format!("yielded at {at}"),
         TaskOutcome::Failed { class, .. } => format!("failed, {class:?}"),
     }

@@ -82,8 +82,13 @@ impl Worker {
             let (shared, client, cache) = (shared.clone(), client.clone(), cache.clone());
             thread::spawn(move || shared.preparation.run(&client, &cache))
         };
-        let bench =
-            Bench { kinds: Arc::new(Scripted(script)), client: client.clone(), cache, device: Device::default() };
+        let bench = Bench {
+            kinds: Arc::new(Scripted(script)),
+            client: client.clone(),
+            cache,
+            data: Arc::default(),
+            device: Device::default(),
+        };
         let stage = {
             let shared = shared.clone();
             thread::spawn(move || stage_thread::run(&shared, &bench))

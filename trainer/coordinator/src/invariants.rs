@@ -176,7 +176,7 @@ fn check_task(state: &State, execution: &StageExecution, task: &Task, broken: &m
             let fits = holders.len() <= range.max;
             !holders.is_empty() && (fits || drain_by || state.draining)
         }
-        Part::Alone | Part::Shard { .. } | Part::Merge => holders.len() == 1,
+        Part::Alone | Part::Resolve | Part::Shard { .. } | Part::Merge => holders.len() == 1,
     };
     if !fits || names.len() != holders.len() {
         broken.push(format!("C4: `{}` is held by {holders:?}, with room for {range:?}", task.id));

@@ -3,6 +3,7 @@
 //! | report \ from | rank 0 (or alone) | another member | an old grant |
 //! |---|---|---|---|
 //! | checkpoint | committed | refused | refused: stale fence |
+//! | resolved | done, of a task that resolves | refused | as finished |
 //! | finished | done | refused | refused, unless it is the accepted report sent again |
 //! | yielded | waits | refused | as above |
 //! | failed: infrastructure | tried again | the member leaves the gang | as above |
@@ -11,13 +12,13 @@
 //! | failed: an input is damaged | waits until that is made again | the same | as above |
 //! | failed: input, diverged, memory and alone, storage | final | final | as above |
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use protocol::message::{CommitCheckpoint, FailureClass, Grant, ReportOutcome, TaskOutcome};
 use protocol::stage::{Keep, StageSettings};
 use protocol::sweep::STATE_OUTPUT;
-use protocol::{Digest, WorkerId};
+use protocol::{Digest, WorkerId, canonical};
 use registry::{Write, WriteError};
 
 use crate::decide::attempts::Loss;
@@ -73,7 +74,13 @@ impl Deciding<'_> {
         let rank = task.check(grant)?;
         let (key, i) = self.place(&grant.task)?;
         let worker = grant.worker.clone();
+        let resolves = self.state.executions[&key].resolves;
         match &report.outcome {
+            TaskOutcome::Resolved { digests } => self.resolved(key, i, digests)?,
+            TaskOutcome::Finished { .. } if resolves => {
+                let task = &grant.task;
+                return Err(Rejected::Conflict(format!("task `{task}` digests files; it has no artifact")));
+            }
             TaskOutcome::Finished { output, metrics } => {
                 if rank != 0 {
                     return Err(only_rank_0(&worker, "reports the end"));
@@ -130,6 +137,26 @@ impl Deciding<'_> {
 
     fn accepted(&mut self, key: Digest, i: usize, report: &ReportOutcome) {
         self.change(key, i, |task| task.reported = Some(report.clone()));
+    }
+
+    /// A worker has digested what a stage reads outside the store, which now has a key.
+    fn resolved(&mut self, key: Digest, i: usize, digests: &BTreeMap<String, Digest>) -> Result<(), Rejected> {
+        let execution = Arc::clone(&self.state.executions[&key]);
+        let named: BTreeSet<String> = execution.settings.folders().into_iter().map(|folder| folder.field).collect();
+        if !execution.resolves || named.iter().ne(digests.keys()) {
+            let stage = &execution.stage;
+            return Err(Rejected::Conflict(format!("stage `{stage}` was not to be resolved, or names other files")));
+        }
+        self.change(key, i, |task| task.finish(canonical::digest(digests)));
+        for number in execution.users.keys() {
+            let Some(run) = self.state.runs.get(number).map(Arc::clone) else { continue };
+            for stage in (0..run.stages.len()).filter(|stage| run.stages[*stage].key() == Some(key)) {
+                self.record(Fact::Resolved { run: *number, stage, digests: digests.clone() });
+            }
+        }
+        let known = Arc::new(Known { outputs: BTreeMap::new(), metrics: BTreeMap::new() });
+        self.record(Fact::ExecutionState { key, state: ExecutionState::Done { known, cached: false } });
+        Ok(())
     }
 
     fn finished(

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use protocol::message::{RunState, StageState};
 use protocol::stage::{Register, Shape};
-use protocol::{Digest, StageName};
+use protocol::{Digest, StageName, canonical};
 
 use crate::decide::deciding::Deciding;
 use crate::event::Effect;
@@ -55,6 +55,7 @@ impl Deciding<'_> {
                 | ExecutionState::Mending { .. }
                 | ExecutionState::Bundling => continue,
                 ExecutionState::Failed { message, .. } => Status::Failed { key, message: message.clone() },
+                ExecutionState::Done { .. } if execution.resolves => Status::Waiting,
                 ExecutionState::Done { known, cached } => {
                     let how = match (cached, execution.resumed) {
                         (true, _) => StageState::Cached,
@@ -85,8 +86,12 @@ impl Deciding<'_> {
             {
                 let status = if run.pipeline.stages[j].sweep.is_some() {
                     self.begin_sweep(number, j)
+                } else if run.is_resolved(j, &inputs) {
+                    let key = run.pipeline.identity(&run.pipeline.stages[j], &inputs).key();
+                    self.attach(&run, j, inputs, key, false)
                 } else {
-                    self.attach(&run, j, inputs)
+                    let key = canonical::digest(&("files of a stage", &run.id, &run.pipeline.stages[j].name));
+                    self.attach(&run, j, inputs, key, true)
                 };
                 stages.push((j, status));
             }
@@ -96,9 +101,9 @@ impl Deciding<'_> {
         }
     }
 
-    fn attach(&mut self, run: &Run, j: usize, inputs: BTreeMap<String, Digest>) -> Status {
+    /// Wants the value of a stage under `key`; one that `resolves` is given no value yet, but the digests that its key needs.
+    fn attach(&mut self, run: &Run, j: usize, inputs: BTreeMap<String, Digest>, key: Digest, resolves: bool) -> Status {
         let stage = &run.pipeline.stages[j];
-        let key = run.pipeline.identity(stage, &inputs).key();
         let registration = match stage.settings.get::<Register>().map(|settings| Registration::gather(run, settings)) {
             Some(Ok(registration)) => Some(registration),
             Some(Err(message)) => return Status::Failed { key, message },
@@ -135,6 +140,7 @@ impl Deciding<'_> {
                     keyed_as: protocol::pipeline::keyed_as(stage).clone(),
                     settings: stage.settings.clone(),
                     inputs,
+                    resolves,
                     seed: run.pipeline.seed,
                     backend: run.pipeline.backend,
                     placement: stage.placement.clone(),

@@ -90,7 +90,7 @@ impl State {
             let task = execution.tasks.get(*i)?;
             // A member that joins others is handed their state.
             let resume = if task.is_held() { None } else { task.newest().map(|saved| saved.manifest) };
-            Some(Prepare { task: task.id.clone(), inputs: execution.inputs.clone(), resume })
+            Some(Prepare { task: task.id.clone(), inputs: execution.artifacts(), resume })
         });
         open.take(AT_ONCE).collect()
     }
@@ -251,6 +251,7 @@ fn assignment(
     }
     let role = match task.part {
         Part::Alone => Role::Alone,
+        Part::Resolve => Role::Resolve,
         Part::Shard { index, of } => Role::Shard { index, of },
         Part::Merge => Role::Merge { shards: execution.shards().unwrap_or_default() },
         Part::Gang => {

@@ -24,5 +24,5 @@ pub use id::{Alias, Attempt, Fence, Generation, Incarnation, ModelName, RunId, S
 pub use model_ref::{ModelRef, Pick};
 pub use owner::{Group, Owner};
 pub use pipeline::Pipeline;
-pub use printable::{excerpt, printable};
+pub use printable::{excerpt, excerpts, json_mistake, printable, show_excerpts};
 pub use units::Steps;

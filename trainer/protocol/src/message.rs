@@ -176,6 +176,8 @@ pub enum Role {
         /// Number of shards.
         of: u32,
     },
+    /// Digests what the stage's settings name outside the store, before the stage has a key. Answers [`TaskOutcome::Resolved`].
+    Resolve,
     /// Merges the shards of a map stage into its artifact.
     Merge {
         /// Artifacts of the shards, in order.
@@ -259,6 +261,11 @@ pub enum TaskOutcome {
         output: Digest,
         /// Final metrics by name.
         metrics: BTreeMap<String, f64>,
+    },
+    /// The digests that [`Role::Resolve`] asks for.
+    Resolved {
+        /// By the field that names each file or folder.
+        digests: BTreeMap<String, Digest>,
     },
     /// Stopped between steps, with a checkpoint committed.
     Yielded {

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use mocap::export::{Motion, Outs, numbered};
 use mocap::requests::Request;
-use motion::{Skeleton, npy};
+use motion::{DataPath, Skeleton, npy};
 use protocol::Seed;
 use protocol::stage::Sampler;
 use serde_json::{Value, json};
@@ -390,7 +390,7 @@ struct Edit {
 
 impl Edit {
     fn read(path: &Path, keep: &[Span], generator: &Generator) -> Result<Self> {
-        let array = npy::read(path).map_err(|error| Problem::usage(error.to_string()))?;
+        let array = npy::read(&DataPath::local(path)).map_err(|error| Problem::usage(error.to_string()))?;
         let skeleton = Skeleton::of(generator.format());
         let refuse = |what: String| Problem::usage(format!("{}: {what}", path.display()));
         let [frames, width] = array.shape[..] else {

@@ -183,6 +183,10 @@ pub(crate) fn main(cli: Cli) -> ExitCode {
         };
     }
     init_logging();
+    // What a server says, many read; what another command says, its own user.
+    if !matches!(cli.verb, Verb::Serve(_)) {
+        protocol::show_excerpts();
+    }
     cli.verb.keep_to_oneself();
     let output = cli.verb.output();
     let runtime = match tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build() {

@@ -8,6 +8,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use checkpoint::Blobs;
+use motion::data_access::DataAccess;
 use protocol::message::{FailureClass, StageTask};
 use protocol::{Digest, Manifest};
 
@@ -127,6 +128,8 @@ pub trait AttemptContext {
     fn task(&self) -> &StageTask;
     /// The device to compute on, without autodiff. Training uses its `.autodiff()`.
     fn device(&self) -> burn::tensor::Device;
+    /// Access to files outside the store, for [`external::read`](crate::external::read).
+    fn data(&self) -> Arc<DataAccess>;
     /// Reads and stages blobs; every blob read is verified against its digest.
     fn blobs(&self) -> Arc<dyn Blobs>;
     /// Reads a manifest by digest.

@@ -129,7 +129,7 @@ impl Gang {
         // Nobody is there; nothing in these tests is recorded or uploaded.
         let client = Client::new(crate::tests::server_at("http://127.0.0.1:9"), self.runtime.handle().clone());
         let cache = Arc::new(Cache::new(None, None, Bounds::default()).expect("memory"));
-        HttpContext::new(held, client, cache, Device::default())
+        HttpContext::new(held, client, cache, Arc::default(), Device::default())
     }
 
     /// What the coordinator does: members that somebody cannot reach are dropped. Suspects that are not dead come back.

@@ -25,7 +25,7 @@ impl Deciding<'_> {
         let task = &execution.tasks[i];
         let change = match task.part {
             Part::Gang => gang::without(task.holders(), lost, execution.range()),
-            Part::Alone | Part::Shard { .. } | Part::Merge => Change::Disband,
+            Part::Alone | Part::Resolve | Part::Shard { .. } | Part::Merge => Change::Disband,
         };
         match change {
             Change::Keep => {}

@@ -42,6 +42,13 @@ impl State {
                 stages.iter().for_each(|(_, status)| self.use_execution(*number, status, true));
                 before.iter().for_each(|status| self.use_execution(*number, status, false));
             }
+            Fact::Resolved { run, stage, digests } => {
+                let run = self.run_mut(*run)?;
+                match digests.is_empty() {
+                    true => drop(run.resolved.remove(stage)),
+                    false => drop(run.resolved.insert(*stage, digests.clone())),
+                }
+            }
             Fact::StagesAdded { run, stages } => self.run_mut(*run)?.add_stages(stages.clone()),
             Fact::SweepBegun { run, sweep } => self.run_mut(*run)?.sweeps.push(Arc::new((**sweep).clone())),
             Fact::SweepMoved { run: number, stage, progress, places, failures } => {

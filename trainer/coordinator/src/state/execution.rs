@@ -77,6 +77,10 @@ pub struct StageExecution {
     pub seed: Seed,
     /// Where it must be computed.
     pub backend: Backend,
+    /// It only digests what the settings name outside the store, so that the stage gets a key. No value is stored under its own, which is
+    /// that of one stage of one run.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub resolves: bool,
     /// Workers and checkpoints, as the run that wanted it last asks.
     pub placement: Placement,
     /// What a register stage registers.
@@ -103,6 +107,10 @@ impl StageExecution {
     /// The tasks that it consists of. Their fences begin above `fence`, so that a name that was used before and forgotten never bears a
     /// fence again that somebody may still hold.
     pub fn new_tasks(&self, fence: Fence) -> Vec<Task> {
+        if self.resolves {
+            let id = TaskId::of_resolving(&self.run, &self.stage);
+            return vec![Task { fence, ..Task::new(id, Part::Resolve) }];
+        }
         let task = |shard, part| Task { fence, ..Task::new(TaskId::of(&self.run, &self.stage, shard), part) };
         match self.settings.shape() {
             Shape::Plain => vec![task(None, Part::Alone)],
@@ -115,6 +123,14 @@ impl StageExecution {
             }
             Shape::Registry => panic!("a register stage has no tasks: {self:?}"),
         }
+    }
+
+    /// Its inputs that are in the store.
+    pub fn artifacts(&self) -> BTreeMap<String, Digest> {
+        let folders = self.settings.folders();
+        let is_stored = |field: &String| folders.iter().all(|folder| folder.field != *field);
+        let stored = self.inputs.iter().filter(|(field, _)| is_stored(field));
+        stored.map(|(field, digest)| (field.clone(), *digest)).collect()
     }
 
     /// How many workers may train it together: a member without a slice of the batch would have nothing to do.
@@ -146,7 +162,7 @@ impl StageExecution {
         match task.part {
             // All but the merge itself.
             Part::Merge => self.tasks.open() == 1,
-            Part::Alone | Part::Gang | Part::Shard { .. } => true,
+            Part::Alone | Part::Resolve | Part::Gang | Part::Shard { .. } => true,
         }
     }
 

@@ -131,6 +131,8 @@ pub struct Run {
     pub stages: Vec<Status>,
     /// Sweeps that have begun.
     pub sweeps: Vec<Arc<Sweeping>>,
+    /// Digests that a worker found of what stages read outside the store, by place and field: of stages that were submitted without them.
+    pub resolved: BTreeMap<usize, BTreeMap<String, Digest>>,
     /// Places by name. Follows from the pipeline.
     places: Arc<HashMap<StageName, usize>>,
     /// Places of active stages. Follows from the stages.
@@ -158,6 +160,8 @@ struct Stored {
     stages: Vec<Status>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     sweeps: Vec<Sweeping>,
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    resolved: BTreeMap<usize, BTreeMap<String, Digest>>,
 }
 
 impl From<Run> for Stored {
@@ -175,6 +179,7 @@ impl From<Run> for Stored {
             parked: run.parked,
             stages: run.stages,
             sweeps: run.sweeps.into_iter().map(Arc::unwrap_or_clone).collect(),
+            resolved: run.resolved,
         }
     }
 }
@@ -194,6 +199,7 @@ impl From<Stored> for Run {
             parked: stored.parked,
             stages: Vec::new(),
             sweeps: stored.sweeps.into_iter().map(Arc::new).collect(),
+            resolved: stored.resolved,
             places: Arc::default(),
             active: BTreeSet::new(),
         };
@@ -244,6 +250,7 @@ impl Run {
             parked: false,
             stages,
             sweeps: Vec::new(),
+            resolved: BTreeMap::new(),
             active: BTreeSet::new(),
         }
     }
@@ -298,8 +305,11 @@ impl Run {
 
     /// The values of a stage's inputs by the field that names them, or `None` while one is missing.
     pub fn inputs(&self, stage: usize) -> Option<BTreeMap<String, Digest>> {
+        let resolved = self.resolved.get(&stage);
         let stage = &self.pipeline.stages[stage];
-        let mut inputs = stage.external.clone();
+        let mut inputs = resolved.cloned().unwrap_or_default();
+        // What the submission expects stays expected.
+        inputs.extend(stage.external.iter().map(|(field, digest)| (field.clone(), *digest)));
         for input in &stage.inputs {
             let known = self.status(&input.stage)?.known()?;
             let output = match input.kind {
@@ -309,6 +319,12 @@ impl Run {
             inputs.insert(input.field.clone(), *output?);
         }
         Some(inputs)
+    }
+
+    /// True if `inputs` of a stage have a digest of each file that it reads outside the store.
+    pub fn is_resolved(&self, stage: usize, inputs: &BTreeMap<String, Digest>) -> bool {
+        let folders = self.pipeline.stages[stage].settings.folders();
+        folders.iter().all(|folder| inputs.contains_key(&folder.field))
     }
 
     /// What `action` makes of the run's state; `None` if it is refused.
@@ -382,7 +398,11 @@ impl Run {
         }
         for i in 0..self.stages.len() {
             match self.stages[i] {
-                Status::Failed { .. } | Status::Skipped { .. } if wanted.contains(&i) => self.set(i, Status::Waiting),
+                Status::Failed { .. } | Status::Skipped { .. } if wanted.contains(&i) => {
+                    // What it reads may have been mended since.
+                    self.resolved.remove(&i);
+                    self.set(i, Status::Waiting);
+                }
                 Status::Failed { .. }
                 | Status::Skipped { .. }
                 | Status::Waiting

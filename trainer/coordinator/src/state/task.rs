@@ -38,6 +38,8 @@ pub enum Part {
     },
     /// The merge of a map stage's shards.
     Merge,
+    /// Digesting what a stage's settings name outside the store.
+    Resolve,
 }
 
 /// Who has the right to a task.

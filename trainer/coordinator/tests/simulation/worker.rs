@@ -33,7 +33,7 @@ impl Call {
             Self::Commit(commit) => Some(commit.manifest),
             Self::Report(report) => match report.outcome {
                 TaskOutcome::Finished { output, .. } => Some(output),
-                TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => None,
+                TaskOutcome::Resolved { .. } | TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => None,
             },
         }
     }
@@ -261,6 +261,11 @@ impl FakeWorker {
         }
         let rank = match &assignment.role {
             Role::Member { members, .. } => members.iter().position(|member| member.worker == self.name),
+            Role::Resolve => {
+                let folders = assignment.stage.settings.folders().into_iter();
+                let digests = folders.map(|folder| (folder.field, Digest::of(folder.path.as_bytes()))).collect();
+                return self.report(grant, TaskOutcome::Resolved { digests });
+            }
             Role::Alone | Role::Shard { .. } | Role::Merge { .. } => {
                 if random.chance(40) {
                     self.report(grant.clone(), finished(&assignment));

@@ -116,7 +116,10 @@ impl World {
                 let gates: &[&str] = if random.chance(15) { &["never <= 0"] } else { &["latent_fid <= 1"] };
                 let pipeline = match random.below(4) {
                     0 => pipelines::swept(random.below(2), 4 + random.below(8)),
-                    _ => pipelines::quickstart(random.below(2), range, gates),
+                    _ => match random.below(2) {
+                        0 => pipelines::quickstart(0, range, gates),
+                        seed => pipelines::reading_files(pipelines::quickstart(seed, range, gates)),
+                    },
                 };
                 let event = Event::Submit {
                     pipeline: Box::new(pipeline),

@@ -4,7 +4,6 @@
 //! reason.
 
 use std::collections::BTreeMap;
-use std::path::Path;
 
 use motion::Dataset;
 use motion::dataset::{OpenReport, PackError, Split};
@@ -14,14 +13,16 @@ use protocol::stage::{DataFormat, DataOpen, DataSynthetic};
 use super::Plain;
 use crate::artifacts::{DatasetMeta, Draft, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
+use crate::external;
 
 /// The file that lists the clips and captions left out.
 const REPORT_FILE: &str = "report.txt";
 
 impl Plain for DataOpen {
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
-        let (dataset, report) =
-            Dataset::open(Path::new(&self.path), self.format).map_err(|e| StageError::Input(e.to_string()))?;
+        let (dataset, report) = external::read(cx, |_, given| {
+            Dataset::open(given.path("path")?, self.format).map_err(|e| StageError::Input(e.to_string()))
+        })?;
         log_report(cx, &report);
         pack(cx, &dataset, report.skips.len(), report.to_string(), vec![])
     }
