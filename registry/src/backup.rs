@@ -30,7 +30,7 @@ use crate::blob::fs::Folder;
 use crate::blob::place::Place;
 use crate::identity::Marker;
 use crate::lock::CollectionLock;
-use crate::retention::{self, Rows};
+use crate::retention::{self, Asked, Rows};
 use crate::{BlobStore, QueryError, ReadStore, StoreId, clock, folder, sqlite};
 
 const MANIFEST: &str = "backup.json";
@@ -182,8 +182,8 @@ impl ReadStore {
         sync(&copy)?;
         let (blobs, from, store) = (self.blobs().clone(), self.dir().to_owned(), self.id().clone());
         let ended = |e: tokio::task::JoinError| BackupError::Damaged(format!("the copying ended early: {e}"));
+        let needed = retention::needed(&Asked::of(self), &rows).await?;
         let work = move || {
-            let needed = retention::needed(&blobs, &rows)?;
             let blobs = copy_blobs(&blobs, &from, &to, needed)?;
             let (database_digest, database_bytes) = hashed(&copy).map_err(disk("cannot read", &copy))?;
             let manifest = Manifest { format: FORMAT, store, at_ms, database, database_bytes, database_digest, blobs };
@@ -219,7 +219,7 @@ fn claim(place: &dyn Backend, old: Option<Marker>, store: &StoreId) -> Result<()
     if old.is_some() {
         return Ok(());
     }
-    let written = Marker { store: store.clone(), epoch: 0 }.write(None, place);
+    let written = Marker { store: store.clone(), epoch: 0, held: None }.write(None, place);
     if written.map_err(|e| BackupError::Damaged(e.to_string()))? {
         return Ok(());
     }

@@ -372,7 +372,7 @@ fn blob_error(error: BlobError) -> ContextError {
     match error {
         BlobError::Refused(reason) => ContextError::GrantEnded(reason),
         BlobError::Storage(message) => ContextError::Storage(message),
-        BlobError::Unavailable(message) => ContextError::Unavailable(message),
+        BlobError::Unreachable(message) | BlobError::Unavailable(message) => ContextError::Unavailable(message),
         error @ (BlobError::NotFound(_) | BlobError::Corrupt { .. } | BlobError::Damaged(_)) => {
             ContextError::Damaged(error.to_string())
         }

@@ -97,7 +97,14 @@ impl State {
     pub fn view(&self, run: &Run, now: Millis) -> RunView {
         let stages = (0..run.stages.len()).map(|i| self.stage_view(run, i, now)).collect();
         let sweeps = run.sweeps.iter().map(|sweep| self.sweep_view(run, sweep)).collect();
-        RunView { run: run.id.clone(), pipeline: run.pipeline.name.clone(), state: run.state, stages, sweeps }
+        RunView {
+            run: run.id.clone(),
+            pipeline: run.pipeline.name.clone(),
+            state: run.state,
+            stages,
+            sweeps,
+            storage: None,
+        }
     }
 
     fn stage_view(&self, run: &Run, i: usize, now: Millis) -> StageView {

@@ -21,6 +21,7 @@ mod queries;
 mod records;
 mod route;
 mod start_error;
+mod storage;
 mod uploads;
 mod versions;
 

@@ -14,13 +14,13 @@ use futures::{StreamExt as _, stream};
 use protocol::message::{CommitCheckpoint, Grant, LogBatch, MetricBatch, ReportOutcome};
 use protocol::{Digest, limits};
 use registry::blob::{Arriving, PART_BYTES, ResumeError};
-use registry::{Write, WriteError};
+use registry::{Store, Write, WriteError};
 
 use super::actor_handle::ActorHandle;
-use super::blocking::blocking;
 use super::body::Message;
 use super::failure::Failure;
 use super::queries::BlobStored;
+use super::storage::ask;
 use crate::event::Event;
 
 /// The header that carries a blob's grant, as JSON.
@@ -40,7 +40,7 @@ async fn write(actor_handle: &ActorHandle, write: Write) -> Result<Json<()>, Fai
         let most = limits::BATCHES_WAITING;
         return Err(Failure::busy(format!("{most} batches of values and lines wait for the disk already")));
     };
-    let written = actor_handle.store.write(vec![write]).await;
+    let written = actor_handle.store.write_proven(vec![write]).await;
     actor_handle.wrote(&written);
     written?;
     Ok(Json(()))
@@ -109,12 +109,12 @@ pub(crate) async fn staged(
     let grant = granted(&actor_handle, &headers)?;
     let digest = named(&digest)?;
     let blobs = actor_handle.store.blobs().clone();
-    blocking(move || {
+    let looked = ask(&actor_handle.store, move || -> Result<_, BlobError> {
         blobs.hold(&grant.task, digest);
         let stored = blobs.reuse(digest)?;
         Ok(Json(BlobStored { digest, stored, staged: blobs.staged(&grant, digest)? }))
-    })
-    .await
+    });
+    Ok(looked.await?)
 }
 
 /// Takes a blob, or the next part of one, as it comes.
@@ -138,10 +138,10 @@ pub(crate) async fn put_blob(
             "a blob of {bytes} bytes is too large: at most {MAX_BLOB_BYTES} are taken"
         )));
     }
-    let blobs = actor_handle.store.blobs().clone();
+    let (store, blobs) = (&actor_handle.store, actor_handle.store.blobs().clone());
     let stored = async {
-        let arriving = blocking(move || blobs.take_up(&grant, digest, offset, bytes)).await?;
-        receive(arriving, body, digest).await
+        let arriving = ask(store, move || blobs.take_up(&grant, digest, offset, bytes)).await?;
+        receive(store, arriving, body, digest).await
     };
     stored.await.map_err(|error| {
         if let Unstored::Resume(ResumeError::Blob(BlobError::Storage(message))) = &error {
@@ -151,7 +151,12 @@ pub(crate) async fn put_blob(
     })
 }
 
-async fn receive(mut arriving: Arriving, body: Body, digest: Digest) -> Result<Json<BlobStored>, Unstored> {
+async fn receive(
+    store: &Store,
+    mut arriving: Arriving,
+    body: Body,
+    digest: Digest,
+) -> Result<Json<BlobStored>, Unstored> {
     let mut body = body.into_data_stream();
     let mut ended = false;
     while !ended {
@@ -172,7 +177,7 @@ async fn receive(mut arriving: Arriving, body: Body, digest: Digest) -> Result<J
             }
         }
         // Comes back dropped if this request is: what has arrived is kept.
-        arriving = blocking(move || -> Result<Arriving, BlobError> {
+        arriving = ask(store, move || -> Result<Arriving, BlobError> {
             for part in parts {
                 arriving.write(&part)?;
             }
@@ -182,7 +187,7 @@ async fn receive(mut arriving: Arriving, body: Body, digest: Digest) -> Result<J
         .map_err(ResumeError::Blob)?;
     }
     let staged = arriving.written();
-    let stored = blocking(move || arriving.finish()).await.map_err(ResumeError::Blob)?;
+    let stored = ask(store, move || arriving.finish()).await.map_err(ResumeError::Blob)?;
     Ok(Json(BlobStored { digest, stored, staged }))
 }
 
@@ -230,7 +235,7 @@ pub(crate) async fn get_blob(
     let digest = named(&digest)?;
     let from = from(&headers)?;
     let blobs = actor_handle.store.blobs().clone();
-    let opened = blocking(move || -> Result<_, BlobError> {
+    let opened = ask(&actor_handle.store, move || -> Result<_, BlobError> {
         let mut reader = match from {
             None => blobs.read(digest)?,
             Some(from) => blobs.read_from(digest, from)?,
@@ -242,9 +247,9 @@ pub(crate) async fn get_blob(
     let (first, reader) = opened.await?;
     let bytes = reader.bytes();
     let length = bytes - from.unwrap_or_default();
-    let rest = stream::try_unfold(reader, |mut reader| async {
-        let (part, reader) = blocking(move || (reader.next_part(), reader)).await;
-        Ok::<_, BlobError>(part?.map(|part| (part, reader)))
+    let rest = stream::try_unfold((reader, actor_handle.store.clone()), |(mut reader, store)| async {
+        let (part, reader) = ask(&store, move || Ok::<_, BlobError>((reader.next_part()?, reader))).await?;
+        Ok::<_, BlobError>(part.map(|part| (part, (reader, store))))
     });
     let body = Body::from_stream(stream::iter(first.map(Ok)).chain(rest));
     let mut response = Response::new(body);
