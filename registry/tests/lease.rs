@@ -15,7 +15,7 @@ use registry::{Holder, LeaseTerms, OpenError, Store, WriteError};
 
 /// Short, so that a test waits for as long as the rules say and no longer.
 fn terms() -> LeaseTerms {
-    let [renewed, relied_on, waited_for] = [50, 400, 1_200].map(Duration::from_millis);
+    let [renewed, relied_on, waited_for] = [50, 1_500, 4_000].map(Duration::from_millis);
     LeaseTerms { renewed, relied_on, waited_for }
 }
 
@@ -102,8 +102,14 @@ async fn a_process_that_cannot_renew_its_lease_names_and_removes_nothing() {
     let garbage = store.blobs().put(b"garbage").unwrap();
     let proof = store.prove(made).await.unwrap();
     two.line.silence(true);
-    until("a lease that runs out", async || store.write_proven(vec![result("key", made)]).await.is_err()).await;
-    let refused = store.write_proven(vec![result("other", made)]).await.unwrap_err();
+    // Each time under another key: a value that is stored already names nothing anew.
+    let mut keys = 0;
+    let mut name = async || {
+        keys += 1;
+        store.write_proven(vec![result(&format!("key {keys}"), made)]).await
+    };
+    until("a lease that runs out", async || name().await.is_err()).await;
+    let refused = name().await.unwrap_err();
     assert!(matches!(&refused, WriteError::Unreachable(why) if why.contains("lease")), "{refused}");
     store.write(vec![note("what names no blob is stored")]).await.unwrap();
 
@@ -115,11 +121,8 @@ async fn a_process_that_cannot_renew_its_lease_names_and_removes_nothing() {
     second.write(vec![result("second", kept)]).await.unwrap();
 
     two.line.silence(false);
-    until("the first one to know", async || {
-        matches!(store.write_proven(vec![result("key", made)]).await, Err(WriteError::Storage(_)))
-    })
-    .await;
-    let refused = store.write_proven(vec![result("key", made)]).await.unwrap_err().to_string();
+    until("the first one to know", async || matches!(name().await, Err(WriteError::Storage(_)))).await;
+    let refused = name().await.unwrap_err().to_string();
     assert!(refused.contains("the second") && refused.contains("stop one of the two"), "{refused}");
     let refused = store.gc(-1000).await.unwrap_err().to_string();
     assert!(refused.contains("nothing was collected"), "{refused}");

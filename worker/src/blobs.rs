@@ -138,7 +138,7 @@ impl Blobs for HttpBlobs {
         pieces.iter().for_each(|piece| hasher.update(piece));
         let digest = hasher.finish();
         let bytes = pieces.iter().map(|piece| piece.len() as u64).sum();
-        retry::until_ended(&self.held, &format!("uploading blob {digest}"), |grant| {
+        retry::until_put_off(&self.held, &format!("uploading blob {digest}"), |grant| {
             self.send(grant, digest, bytes, pieces)
         })
         .map_err(|gave_up| error(gave_up, None))?;

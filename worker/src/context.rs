@@ -324,7 +324,11 @@ impl GangContext for HttpContext {
     }
 
     fn can_save(&self) -> bool {
-        !self.held.is_away()
+        !self.held.is_away() && !self.held.is_put_off()
+    }
+
+    fn may_postpone(&mut self, may: bool) {
+        self.held.set_postponable(may);
     }
 
     fn commit_checkpoint(
@@ -339,7 +343,7 @@ impl GangContext for HttpContext {
         let metrics: BTreeMap<String, f64> =
             metrics.iter().filter(|(_, v)| v.is_finite()).map(|(k, v)| (k.clone(), *v)).collect();
         failpoints::hit("checkpoint::before_commit");
-        retry::until_ended(&self.held, &format!("committing the checkpoint of step {step}"), |grant| {
+        retry::until_put_off(&self.held, &format!("committing the checkpoint of step {step}"), |grant| {
             let commit = CommitCheckpoint { grant: grant.clone(), step, manifest: digest, metrics: metrics.clone() };
             self.client.wait(self.client.tell("/v1/checkpoints", &commit))
         })

@@ -79,7 +79,12 @@ impl Slow {
     }
 
     async fn worker(&self, name: &str) -> TestResult<Worker> {
-        Worker::join(Arc::clone(&self.server), name).await
+        Worker::join(Arc::clone(&self.server), name, Backend::Flex).await
+    }
+
+    /// A worker that no run here has work for.
+    async fn idle(&self) -> TestResult<Worker> {
+        Worker::join(Arc::clone(&self.server), "idle", Backend::Ndarray).await
     }
 
     async fn run(&self, run: &RunId) -> TestResult<RunView> {
@@ -107,8 +112,8 @@ struct Worker {
 }
 
 impl Worker {
-    async fn join(server: Arc<Server>, name: &str) -> TestResult<Self> {
-        let join = Join { worker: name.into(), ..offer() };
+    async fn join(server: Arc<Server>, name: &str, backend: Backend) -> TestResult<Self> {
+        let join = Join { worker: name.into(), backend, ..offer() };
         let joined: Joined = post(&server, "/v1/workers", &join).await?;
         Ok(Self { server, name: name.to_owned(), incarnation: joined.incarnation })
     }
@@ -187,7 +192,7 @@ async fn a_bucket_of_30_ms_slows_no_more_than_what_asks_it() -> TestResult {
     const SHARDS: usize = 600;
     let dir = tempfile::tempdir()?;
     let slow = Slow::start(dir.path()).await?;
-    let idle = slow.worker("idle").await?;
+    let idle = slow.idle().await?;
     slow.submit(SHARDS).await?;
     let first = slow.worker("w0").await?;
     slow.up_to_the_shards(&first).await?;
@@ -233,7 +238,7 @@ async fn a_bucket_of_30_ms_slows_no_more_than_what_asks_it() -> TestResult {
 async fn a_bucket_that_never_answers_stops_what_needs_it_and_status_says_so() -> TestResult {
     let dir = tempfile::tempdir()?;
     let slow = Slow::start(dir.path()).await?;
-    let idle = slow.worker("idle").await?;
+    let idle = slow.idle().await?;
     let run = slow.submit(4).await?;
     let worker = slow.worker("w0").await?;
     let assignment = slow.up_to_the_shards(&worker).await?;

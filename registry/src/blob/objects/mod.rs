@@ -21,6 +21,7 @@ use std::fs::OpenOptions;
 use std::io::{self, Cursor, Read};
 use std::path::Path as FilePath;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use checkpoint::BlobError;
 use fail::fail_point;
@@ -52,6 +53,8 @@ const PARTS: usize = 4;
 /// for twice as much, up to [`READ_BYTES`].
 const FIRST_READ_BYTES: usize = 64 << 10;
 const READ_BYTES: usize = 4 << 20;
+/// How long a removal may take: it begins under a lease, and must not be done after another process has taken that.
+const REMOVAL: Duration = Duration::from_secs(10);
 
 /// Blobs in an object store.
 #[derive(Debug)]
@@ -270,7 +273,11 @@ impl Backend for Objects {
     fn remove(&self, digest: Digest) -> Result<(), BlobError> {
         let (store, path) = (self.0.store(), self.0.remote.blob(digest));
         let wanted = path.clone();
-        match self.0.remote.wait(async move { store.delete(&wanted).await }) {
+        let removing = async move {
+            let late = || Error::Generic { store: "blobs", source: "the removal was not answered in time".into() };
+            tokio::time::timeout(REMOVAL, store.delete(&wanted)).await.unwrap_or_else(|_| Err(late()))
+        };
+        match self.0.remote.wait(removing) {
             Ok(()) | Err(Error::NotFound { .. }) => self.0.touched().forget(digest),
             Err(e) => return Err(self.0.remote.error("remove", &path, &e)),
         }
