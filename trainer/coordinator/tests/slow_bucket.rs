@@ -206,7 +206,7 @@ async fn a_bucket_of_30_ms_slows_no_more_than_what_asks_it() -> TestResult {
     let (mut working, begun) = (JoinSet::new(), Instant::now());
     for worker in workers {
         working.spawn(async move {
-            let mut done = 0;
+            let mut done = 0_u32;
             while let Some(assignment) = worker.poll().await? {
                 // The merge comes when all shards are there.
                 if !matches!(assignment.role, protocol::message::Role::Shard { .. }) {
