@@ -24,10 +24,13 @@ impl Store {
         let (manifest, own) =
             self.ask_blobs(move || blobs.stored_manifest(artifact)).await.map_err(|e| unproven(&e))?;
         let found = Artifact::of(artifact, own, &manifest);
-        let listed: Vec<Digest> = found.blobs.keys().copied().collect();
-        let present = self.present(&listed).await?;
-        let unknown = manifest.files.iter().filter(|(_, file)| present.get(&file.digest) != Some(&file.bytes));
-        let unknown: Vec<_> = unknown.map(|(name, file)| (name.clone(), file.clone())).collect();
+        let mut unknown: Vec<_> = manifest.files.iter().map(|(name, file)| (name.clone(), file.clone())).collect();
+        unknown.retain(|(_, file)| self.blobs().just_stored(file.digest) != Some(file.bytes));
+        if !unknown.is_empty() {
+            let listed: Vec<Digest> = unknown.iter().map(|(_, file)| file.digest).collect();
+            let present = self.present(&listed).await?;
+            unknown.retain(|(_, file)| present.get(&file.digest) != Some(&file.bytes));
+        }
         stream::iter(unknown)
             .map(|(name, file)| async move {
                 let blobs = self.blobs().clone();

@@ -598,7 +598,7 @@ async fn needs_name_every_row_that_names_a_blob(place: &impl Place) {
         ])
         .await
         .unwrap();
-    opened.catalog().commit(Order::Pin { digest: pinned, reason: Some("kept".into()) }).await.unwrap();
+    opened.store.pin(pinned, "kept").await.unwrap();
     let needs = opened.records().needs().await.unwrap();
     let found: BTreeSet<_> = needs.roots.iter().map(|root| root.digest).collect();
     assert_eq!(found, [checkpoint, shard, value, model, pinned].into());

@@ -114,10 +114,9 @@ impl BlobStore {
         Ok(manifest)
     }
 
-    /// Makes sure that a file which the manifest `digest` lists is there with the right length. Asks for none that this process has
-    /// just stored or used again.
+    /// Makes sure that a file which the manifest `digest` lists is there with the right length.
     pub(crate) fn check_listed(&self, digest: Digest, name: &str, file: &FileEntry) -> Result<(), ManifestError> {
-        as_listed(digest, name, file, self.stored_size(file.digest).map_err(ManifestError::Blob)?)
+        as_listed(digest, name, file, self.size(file.digest).map_err(ManifestError::Blob)?)
     }
 
     /// The manifest named `digest`, once every blob that it lists is known to be whole. Takes as long as hashing what was
