@@ -1,11 +1,12 @@
 //! Blobs in a bucket that takes 30 ms for each request, or takes requests and never answers: who needs it waits, and nobody else.
 
 #[path = "common/shell.rs"]
+#[allow(dead_code, reason = "not every test that shares this file starts it so")]
 mod shell;
 
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use access::Server;
@@ -15,7 +16,7 @@ use protocol::message::{
 };
 use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::stage::{Backend, DataSynthetic, EncodeLatents, Placement, StageSettings, TrainVae, WorkerRange};
-use protocol::{ArtifactKind, Digest, FileEntry, Incarnation, Manifest, RunId, Seed};
+use protocol::{ArtifactKind, Digest, FileEntry, Incarnation, Manifest, RunId, Seed, TaskId};
 use registry::testing::slow::SlowBucket;
 use registry::{Holder, LeaseTerms, Store};
 use reqwest::{Method, StatusCode};
@@ -109,19 +110,24 @@ struct Worker {
     server: Arc<Server>,
     name: String,
     incarnation: Incarnation,
+    ready: Mutex<Vec<TaskId>>,
 }
 
 impl Worker {
     async fn join(server: Arc<Server>, name: &str, backend: Backend) -> TestResult<Self> {
         let join = Join { worker: name.into(), backend, ..offer() };
         let joined: Joined = post(&server, "/v1/workers", &join).await?;
-        Ok(Self { server, name: name.to_owned(), incarnation: joined.incarnation })
+        Ok(Self { server, name: name.to_owned(), incarnation: joined.incarnation, ready: Mutex::default() })
     }
 
     async fn poll(&self) -> TestResult<Option<Assignment>> {
-        let poll = Poll { incarnation: self.incarnation, doing: vec![], ready: vec![], version: 0 };
+        let ready = self.ready.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        let poll = Poll { incarnation: self.incarnation, doing: vec![], ready, version: 0 };
         let path = format!("/v1/workers/{}/poll", self.name);
         let desired: DesiredAssignments = post(&self.server, &path, &poll).await?;
+        // It fetches nothing, and so has all that it needs.
+        let prepared = desired.prepare.into_iter().map(|prepare| prepare.task).collect();
+        *self.ready.lock().unwrap_or_else(PoisonError::into_inner) = prepared;
         Ok(desired.assignments.into_iter().next())
     }
 
@@ -253,7 +259,7 @@ async fn a_bucket_that_never_answers_stops_what_needs_it_and_status_says_so() ->
     let mut needing = JoinSet::new();
     for i in 0..300 {
         let (server, grant) = (Arc::clone(&slow.server), assignment.grant.clone());
-        let worker = Worker { server, name: "w0".into(), incarnation: worker.incarnation };
+        let worker = Worker { server, name: "w0".into(), incarnation: worker.incarnation, ready: Mutex::default() };
         needing.spawn(async move { worker.put(&grant, format!("blob {i}").into_bytes()).await.is_err() });
     }
     // What needs no bucket goes on, and is done long before anybody gives up on that.
