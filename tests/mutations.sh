@@ -84,4 +84,11 @@ mutation errors-quote-files trainer/protocol/src/printable.rs 's/AtomicBool::new
 mutation digests-on-trust trainer/motion/src/data_access.rs 's/before\.digest != \*expected/false/' motion
 mutation changes-while-read-unseen trainer/motion/src/data_access.rs 's/Ok\(after\) if after == \*before =>/Ok(_) =>/' motion
 mutation keys-without-digests trainer/coordinator/src/state/run.rs 's/inputs\.contains_key\(&folder\.field\)/!folder.field.is_empty() || inputs.is_empty()/' coordinator
+mutation named-without-proof registry/src/proofs.rs 's/(if inner\.is_condemned\(&artifact, proven\.since\)) \{/$1 \&\& false {/' registry
+mutation named-while-removed registry/src/proofs.rs 's/ended\.is_none_or\(\|ended\| ended > since\)/ended.is_some_and(|ended| ended > since)/' registry
+mutation decided-without-proof trainer/coordinator/src/shell/actor_handle.rs 's/if artifacts\.is_empty\(\)/if artifacts.len() < 100/' coordinator
+mutation silence-is-health registry/src/blob/objects/health.rs 's/silent >= SILENCE/silent >= SILENCE * 1000/' coordinator
+mutation lease-not-asked-for-a-name registry/src/proofs.rs 's/lease\.check\(\)\.map_err/Ok(()).map_err/' registry
+mutation lease-not-asked-for-a-removal registry/src/lease.rs 's/self\.check\(\)\.map_err\(\|e\| BlobError/Ok(()).map_err(|e: NoLease| BlobError/' registry
+mutation holder-not-refused registry/src/lease.rs 's/Some\(held\) if held != first => return Ok\(Err\(held\.by\)\),/Some(held) if held != first => return Ok(Ok(())),/' registry
 exit $missed

@@ -49,6 +49,10 @@ impl Records for ScopedRecords {
         self.all.recovery().await
     }
 
+    async fn present(&self, blobs: &[Digest]) -> Result<BTreeMap<Digest, u64>> {
+        self.all.present(blobs).await
+    }
+
     async fn run_owners(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Group>> {
         let mut owners = self.all.run_owners(runs).await?;
         owners.retain(|_, owner| *owner == self.group);

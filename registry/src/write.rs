@@ -167,6 +167,28 @@ pub enum Write {
 }
 
 impl Write {
+    /// The artifacts that it names, which must be proven whole.
+    pub(crate) fn artifacts(&self) -> Vec<Digest> {
+        match self {
+            Self::Checkpoint { manifest, .. } => vec![*manifest],
+            Self::Shard { output, .. } => vec![*output],
+            Self::StageResult { outputs, .. } => outputs.values().copied().collect(),
+            Self::Version { artifact, .. } => vec![*artifact],
+            Self::Facts { .. }
+            | Self::Snapshot { .. }
+            | Self::Fence { .. }
+            | Self::Run { .. }
+            | Self::RunOwner { .. }
+            | Self::ModelOwner { .. }
+            | Self::RunState { .. }
+            | Self::RunEnded { .. }
+            | Self::Archive { .. }
+            | Self::Metrics { .. }
+            | Self::Logs { .. }
+            | Self::Promote { .. } => Vec::new(),
+        }
+    }
+
     /// The grant that vouches for it; the store checks its fence. Who adds a write decides here whether it needs one.
     pub(crate) fn grant(&self) -> Option<&Grant> {
         match self {

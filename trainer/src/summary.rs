@@ -1,8 +1,9 @@
 //! What a run came to: a table for people, one object for programs.
 
 use std::collections::BTreeMap;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use protocol::message::{RunState, RunView, StageState, StageView, SweepView};
+use protocol::message::{RunState, RunView, StageState, StageView, StorageProblem, SweepView};
 use protocol::pipeline::Pipeline;
 use protocol::stage::Register;
 use protocol::{Digest, StageName};
@@ -22,6 +23,9 @@ pub(crate) struct Summary {
     stages: Vec<StageSummary>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     sweeps: Vec<SweepView>,
+    /// What keeps the coordinator from storing or reading what the run needs.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    storage: Option<StorageProblem>,
 }
 
 #[derive(Debug, Serialize)]
@@ -63,6 +67,7 @@ impl Summary {
             state: if interrupted { "interrupted".to_owned() } else { run_state(run.state).to_owned() },
             stages: run.stages.iter().map(stage).collect(),
             sweeps: run.sweeps.clone(),
+            storage: run.storage.clone(),
         }
     }
 }
@@ -108,7 +113,18 @@ pub(crate) fn table(run: &RunView) -> String {
         ]
     });
     let table = print::table(&["STAGE", "KIND", "STATE", "DONE", "TIME", "KEY", "RESULT"], rows.collect());
-    run.sweeps.iter().fold(table, |text, sweep| format!("{text}\n\nsweep of {}", sweep_line(sweep)))
+    let table = run.sweeps.iter().fold(table, |text, sweep| format!("{text}\n\nsweep of {}", sweep_line(sweep)));
+    match &run.storage {
+        Some(problem) => format!("{table}\n\nstorage: {}", storage_line(problem)),
+        None => table,
+    }
+}
+
+/// `for 2m 3s: there was no answer`.
+fn storage_line(problem: &StorageProblem) -> String {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let since = Duration::from_millis(u64::try_from(problem.since_ms).unwrap_or_default());
+    format!("for {}: {}", print::duration(now.saturating_sub(since).as_secs_f64()), problem.what)
 }
 
 /// `pcm: trial 7 is best, latent_fid 0.1234 with adversarial 0.1; 24 trials, 5200 of 21600 steps (24 %)`.
@@ -204,6 +220,7 @@ mod tests {
             state: RunState::Finished,
             stages: states.iter().map(stage).collect(),
             sweeps: vec![],
+            storage: None,
         }
     }
 

@@ -22,6 +22,8 @@ use crate::gang::mesh::{Halt, Mesh};
 
 /// After a refused write, how long to wait for orders that explain it.
 const STALE_PATIENCE: Duration = Duration::from_secs(30);
+/// After a checkpoint that could not be stored, how long to train before the next try.
+const SAVE_PAUSE: Duration = Duration::from_secs(5);
 
 #[derive(Debug)]
 struct State {
@@ -45,6 +47,16 @@ pub(crate) struct ActiveAssignment {
     endpoint: Arc<Endpoint>,
     flags: Arc<Flags>,
     busy: Busy,
+    /// What is stored now is a checkpoint that may be made later.
+    postponable: AtomicBool,
+    put_off: Mutex<PutOff>,
+}
+
+/// Checkpoints that could not be stored: how many in a row, and when the next one is tried.
+#[derive(Debug, Default)]
+struct PutOff {
+    times: u32,
+    until: Option<Instant>,
 }
 
 /// What holds for all that a worker holds.
@@ -84,7 +96,8 @@ impl ActiveAssignment {
             newest: None,
         };
         let (state, busy) = (Mutex::new(state), Busy::default());
-        let held = Self { state, event_count: Arc::default(), wake, endpoint, flags, busy };
+        let (postponable, put_off) = (AtomicBool::new(false), Mutex::default());
+        let held = Self { state, event_count: Arc::default(), wake, endpoint, flags, busy, postponable, put_off };
         held.connect(&mut lock(&held.state));
         Arc::new(held)
     }
@@ -216,6 +229,31 @@ impl ActiveAssignment {
     /// Whether the coordinator did not answer the last poll.
     pub(crate) fn is_away(&self) -> bool {
         self.flags.away.load(Ordering::SeqCst)
+    }
+
+    /// Says whether what is stored from here on may be stored later.
+    pub(crate) fn set_postponable(&self, may: bool) {
+        self.postponable.store(may, Ordering::SeqCst);
+    }
+
+    pub(crate) fn may_put_off(&self) -> bool {
+        self.postponable.load(Ordering::SeqCst)
+    }
+
+    /// Takes note of whether a part of a checkpoint could not be stored: the next one is tried after a pause that doubles.
+    pub(crate) fn was_put_off(&self, was: bool) {
+        let mut put_off = lock(&self.put_off);
+        if was {
+            let pause = SAVE_PAUSE.saturating_mul(1 << put_off.times.min(4));
+            *put_off = PutOff { times: put_off.times + 1, until: Some(Instant::now() + pause) };
+        } else {
+            *put_off = PutOff::default();
+        }
+    }
+
+    /// Whether a checkpoint could not be stored a moment ago.
+    pub(crate) fn is_put_off(&self) -> bool {
+        lock(&self.put_off).until.is_some_and(|until| Instant::now() < until)
     }
 
     /// Why to give up waiting for peers of `generation`, if there is a reason.

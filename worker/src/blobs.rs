@@ -143,7 +143,7 @@ impl Blobs for HttpBlobs {
         pieces.iter().for_each(|piece| hasher.update(piece));
         let digest = hasher.finish();
         let bytes = pieces.iter().map(|piece| piece.len() as u64).sum();
-        retry::until_ended(&self.held, &format!("uploading blob {digest}"), |credential| {
+        retry::until_put_off(&self.held, &format!("uploading blob {digest}"), |credential| {
             self.send(credential, digest, bytes, pieces)
         })
         .map_err(|gave_up| error(gave_up, None))?;

@@ -351,7 +351,11 @@ impl GangContext for HttpContext {
     }
 
     fn can_save(&self) -> bool {
-        !self.held.is_away()
+        !self.held.is_away() && !self.held.is_put_off()
+    }
+
+    fn may_postpone(&mut self, may: bool) {
+        self.held.set_postponable(may);
     }
 
     fn commit_checkpoint(
@@ -367,7 +371,7 @@ impl GangContext for HttpContext {
             metrics.iter().filter(|(_, v)| v.is_finite()).map(|(k, v)| (k.clone(), *v)).collect();
         let receipts = self.receipts(digest);
         failpoints::hit("checkpoint::before_commit");
-        retry::until_ended(&self.held, &format!("committing the checkpoint of step {step}"), |credential| {
+        retry::until_put_off(&self.held, &format!("committing the checkpoint of step {step}"), |credential| {
             let (grant, metrics) = (credential.grant.clone(), metrics.clone());
             let commit = CommitCheckpoint { grant, step, manifest: digest, metrics };
             let vouched = Vouched { what: commit, receipts: receipts.clone() };
@@ -402,7 +406,7 @@ fn blob_error(error: BlobError) -> ContextError {
     match error {
         BlobError::Refused(reason) => ContextError::GrantEnded(reason),
         BlobError::Storage(message) => ContextError::Storage(message),
-        BlobError::Unavailable(message) => ContextError::Unavailable(message),
+        BlobError::Unreachable(message) | BlobError::Unavailable(message) => ContextError::Unavailable(message),
         error @ (BlobError::NotFound(_) | BlobError::Corrupt { .. } | BlobError::Damaged(_)) => {
             ContextError::Damaged(error.to_string())
         }

@@ -83,7 +83,7 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
     failpoints::hit("outcome::before_report");
     let receipts = match &outcome {
         TaskOutcome::Finished { output, .. } => context.receipts(*output),
-        TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => BTreeMap::new(),
+        TaskOutcome::Resolved { .. } | TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => BTreeMap::new(),
     };
     let reported = report(held, bench, &outcome, &receipts);
     failpoints::hit("outcome::after_report");

@@ -81,9 +81,7 @@ impl Store {
         owner: Owner,
     ) -> Result<Version, ImportError> {
         let (blobs, file) = (self.blobs().clone(), file.to_owned());
-        let stored = tokio::task::spawn_blocking(move || store(&blobs, &file)).await;
-        let ended = |e: tokio::task::JoinError| WriteError::Internal(format!("the import ended early: {e}"));
-        let (Bundle { head, .. }, _protected) = stored.map_err(ended)??;
+        let (Bundle { head, .. }, _protected) = self.ask_blobs(move || store(&blobs, &file)).await?;
         let name = model.unwrap_or_else(|| head.model.clone());
         let mut source = json!({
             "imported": {"model": head.model, "version": head.version, "source": head.source},

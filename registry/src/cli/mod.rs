@@ -320,7 +320,10 @@ impl From<WriteError> for Answer {
             ),
             WriteError::NotFound(_) => error("not-found", e, Some("`registry list` shows what there is")),
             WriteError::Storage(_) | WriteError::Superseded { .. } => error("storage", e, None),
-            WriteError::Internal(_) => error("internal", e, Some("`registry fsck` checks the store")),
+            WriteError::Unreachable(_) => error("unreachable", e, None),
+            WriteError::Unproven { .. } | WriteError::Internal(_) => {
+                error("internal", e, Some("`registry fsck` checks the store"))
+            }
         })
     }
 }
@@ -424,7 +427,7 @@ async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &st
                 Err(_) => store.resolve(&reference).await?.artifact,
             };
             let nodes = store.lineage(digest).await?;
-            if nodes.iter().all(|node| node.kind.is_none() && node.inputs.is_empty()) && !exists(store, digest)? {
+            if nodes.iter().all(|node| node.kind.is_none() && node.inputs.is_empty()) && !exists(store, digest).await? {
                 return Err(Refused::from(QueryError::NotFound(format!("no artifact {digest}"))));
             }
             Data::Lineage { nodes }
@@ -491,8 +494,8 @@ async fn one(store: &ReadStore, text: &str) -> Result<Version, Refused> {
 }
 
 /// The data format of a version's motions, which is how the papers name their datasets.
-fn format_of(store: &ReadStore, version: &Version) -> Option<String> {
-    let manifest = store.blobs().manifest(version.artifact).ok()?;
+async fn format_of(store: &ReadStore, version: &Version) -> Option<String> {
+    let manifest = manifest(store, version.artifact).await.ok()?;
     ModelMeta::read(&manifest).ok().map(|model| model.format.name().to_owned())
 }
 
@@ -500,14 +503,20 @@ async fn leaderboard(store: &ReadStore, of: &str, published: bool) -> Result<Lea
     if leaderboard::FORMATS.contains(&of) {
         let mut all = Vec::new();
         for model in store.models().await? {
-            all.extend(store.versions(&model.model).await?);
+            for version in store.versions(&model.model).await? {
+                if format_of(store, &version).await.as_deref() == Some(of) {
+                    all.push(version);
+                }
+            }
         }
-        all.retain(|version| format_of(store, version).as_deref() == Some(of));
         return Ok(leaderboard::leaderboard(of.to_owned(), &all, None, published.then_some(of)));
     }
     let model = known(store, of).await?;
     let versions = store.versions(&model.model).await?;
-    let format = versions.first().and_then(|version| format_of(store, version)).filter(|_| published);
+    let format = match versions.first().filter(|_| published) {
+        Some(version) => format_of(store, version).await,
+        None => None,
+    };
     Ok(leaderboard::leaderboard(of.to_owned(), &versions, model.metric.as_deref(), format.as_deref()))
 }
 
@@ -523,8 +532,14 @@ async fn known(store: &ReadStore, name: &str) -> Result<Model, Refused> {
     }
 }
 
-fn exists(store: &ReadStore, digest: Digest) -> Result<bool, Refused> {
-    store.blobs().exists(digest).map_err(|e| Refused::from(QueryError::Blob(e.to_string())))
+async fn exists(store: &ReadStore, digest: Digest) -> Result<bool, Refused> {
+    let blobs = store.blobs().clone();
+    store.ask_blobs(move || blobs.exists(digest)).await.map_err(|e| Refused::from(QueryError::Blob(e.to_string())))
+}
+
+async fn manifest(store: &ReadStore, digest: Digest) -> Result<Manifest, QueryError> {
+    let blobs = store.blobs().clone();
+    store.ask_blobs(move || blobs.manifest(digest)).await.map_err(|e| QueryError::Blob(e.to_string()))
 }
 
 /// Versions that are looked at for bases of a control part.
@@ -540,8 +555,8 @@ async fn show(store: &ReadStore, text: &str) -> Result<Data, Refused> {
         return Ok(Data::Model { model, versions });
     }
     let version = store.resolve(text).await?;
-    let manifest = store.blobs().manifest(version.artifact).map_err(|e| QueryError::Blob(e.to_string()))?;
-    let fits = fits(store, &manifest)?;
+    let manifest = manifest(store, version.artifact).await?;
+    let fits = fits(store, &manifest).await?;
     let bases = match fits.get(&Role::CONTROL) {
         Some(wanted) => bases(store, &version, wanted).await?,
         None => Vec::new(),
@@ -559,7 +574,7 @@ async fn bases(store: &ReadStore, own: &Version, wanted: &Parts) -> Result<Vec<S
     let mut bases = Vec::new();
     for version in all.iter().take(MOST_BASES).filter(|version| version.artifact != own.artifact) {
         // What is no model, or is damaged, is no base; `fsck` says so.
-        let Ok(manifest) = store.blobs().manifest(version.artifact) else { continue };
+        let Ok(manifest) = manifest(store, version.artifact).await else { continue };
         let Ok(model) = ModelMeta::read(&manifest) else { continue };
         if wanted.iter().all(|(role, digest)| model.parts.get(role) == Some(digest)) {
             bases.push(format!("{}:{}", version.model, version.version));
@@ -569,11 +584,11 @@ async fn bases(store: &ReadStore, own: &Version, wanted: &Parts) -> Result<Vec<S
 }
 
 /// For each part of a model those that it was made for; nothing for what is no model.
-fn fits(store: &ReadStore, manifest: &Manifest) -> Result<BTreeMap<Role, Parts>, Refused> {
-    let Ok(model) = ModelMeta::read(manifest) else { return Ok(BTreeMap::new()) };
+async fn fits(store: &ReadStore, of: &Manifest) -> Result<BTreeMap<Role, Parts>, Refused> {
+    let Ok(model) = ModelMeta::read(of) else { return Ok(BTreeMap::new()) };
     let mut all = BTreeMap::new();
     for (role, digest) in model.parts {
-        let part = store.blobs().manifest(digest).map_err(|e| QueryError::Blob(e.to_string()))?;
+        let part = manifest(store, digest).await?;
         let fits = model::fits(&role, &part).map_err(|e| QueryError::Blob(e.to_string()))?;
         if !fits.is_empty() {
             all.insert(role, fits);

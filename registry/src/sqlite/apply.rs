@@ -5,6 +5,7 @@
 //! stored table by table: a statement for many rows, because with hundreds of workers the statements are what costs.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 use protocol::message::{Grant, MetricRow};
 use protocol::{Digest, Fence, TaskId};
@@ -15,7 +16,7 @@ use super::error::write_error;
 use super::statement::{int, json, one, run};
 use super::{moves, owners};
 use crate::catalog::{PromoteOrder, Which};
-use crate::vouched::{Vouched, complete};
+use crate::proofs::{Artifact, Proofs};
 use crate::write::two_states;
 use crate::{Write, WriteError, clock};
 
@@ -25,7 +26,7 @@ type Result<T> = std::result::Result<T, WriteError>;
 const ROWS: usize = 250;
 
 /// Does all of `writes`, or says why one of them is refused; then the caller rolls back.
-pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: &[Write]) -> Result<()> {
+pub(super) async fn apply(conn: &mut SqliteConnection, proofs: &Proofs, writes: &[Write]) -> Result<()> {
     let mut fences = Fences::read(conn, writes).await?;
     let (mut decisions, mut shards) = (Vec::new(), BTreeMap::new());
     for write in writes {
@@ -56,7 +57,7 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
             Write::Metrics { grant, rows } => add_metrics(conn, grant, rows).await?,
             Write::Logs { grant, first, lines } => add_logs(conn, grant, *first, lines).await?,
             Write::Checkpoint { grant, step, manifest, metrics } => {
-                complete(blobs, *manifest)?;
+                proven(conn, proofs, *manifest).await?;
                 one_checkpoint_a_step(conn, &grant.task, *step, *manifest).await?;
                 let insert = sqlx::query(
                     "INSERT INTO checkpoints (task, attempt, step, manifest, metrics, at_ms) VALUES (?, ?, ?, ?, ?, ?) \
@@ -66,7 +67,7 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
                 run(conn, insert.bind(manifest.to_string()).bind(json(metrics)).bind(clock::now_ms())).await?;
             }
             Write::Shard { grant, output } => {
-                complete(blobs, *output)?;
+                proven(conn, proofs, *output).await?;
                 add_shard(&mut shards, &grant.task, *output)?;
             }
             Write::StageResult { grant: _, key, run, stage, kind, outputs, metrics, inputs, wall_s } => {
@@ -80,11 +81,11 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
                     inputs,
                     wall_s: *wall_s,
                 };
-                set_result(conn, blobs, &made).await?;
+                set_result(conn, proofs, &made).await?;
             }
             Write::Version { model, artifact, metrics, source } => {
-                let manifest = complete(blobs, *artifact)?;
-                moves::register(conn, model, *artifact, manifest.kind, metrics, source).await?;
+                let kind = proven(conn, proofs, *artifact).await?.kind;
+                moves::register(conn, model, *artifact, kind, metrics, source).await?;
             }
             Write::Promote { model, alias, artifact, require, reason, actor } => {
                 let order = PromoteOrder {
@@ -103,6 +104,18 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
     add_facts(conn, &decisions).await?;
     add_shards(conn, &shards).await?;
     fences.write(conn).await
+}
+
+/// An artifact that a row is about to name: its blobs are known to be in their place from here on.
+pub(super) async fn proven(conn: &mut SqliteConnection, proofs: &Proofs, digest: Digest) -> Result<Arc<Artifact>> {
+    let artifact = proofs.name(digest)?;
+    let now = clock::now_ms();
+    let rows: Vec<(&Digest, &u64)> = artifact.blobs.iter().collect();
+    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (digest, bytes): &(&Digest, &u64)| {
+        row.push_bind(digest.to_string()).push_bind(int(**bytes)).push_bind(now);
+    };
+    insert(conn, "INSERT INTO blobs (digest, bytes, verified_ms) ", &rows, values, " ON CONFLICT DO NOTHING").await?;
+    Ok(artifact)
 }
 
 /// Runs `begin` with a tuple of values for each row, and `end`, as few statements as there may be.
@@ -365,7 +378,7 @@ struct Made<'a> {
     wall_s: f64,
 }
 
-async fn set_result(conn: &mut SqliteConnection, blobs: &Vouched, made: &Made<'_>) -> Result<()> {
+async fn set_result(conn: &mut SqliteConnection, proofs: &Proofs, made: &Made<'_>) -> Result<()> {
     let (key, outputs) = (made.key.to_string(), json(made.outputs));
     let stored = one(conn, sqlx::query("SELECT outputs FROM stage_results WHERE key = ?").bind(&key)).await?;
     match stored.map(|row| row.get::<String, _>(0)) {
@@ -378,7 +391,7 @@ async fn set_result(conn: &mut SqliteConnection, blobs: &Vouched, made: &Made<'_
         }
         None => {}
     }
-    blobs.named.note(made.inputs.values().copied());
+    proofs.note(made.inputs.values().copied());
     let now = clock::now_ms();
     let add = sqlx::query(
         "INSERT INTO stage_results (key, run, stage, kind, outputs, metrics, inputs, wall_s, at_ms) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -386,14 +399,13 @@ async fn set_result(conn: &mut SqliteConnection, blobs: &Vouched, made: &Made<'_
     let add = add.bind(&key).bind(made.run).bind(made.stage).bind(made.kind).bind(outputs).bind(json(made.metrics));
     run(conn, add.bind(json(made.inputs)).bind(made.wall_s).bind(now)).await?;
     for output in made.outputs.values() {
-        let manifest = complete(blobs, *output)?;
+        let artifact = proven(conn, proofs, *output).await?;
         let kind =
-            serde_json::to_value(manifest.kind).ok().and_then(|k| k.as_str().map(str::to_owned)).unwrap_or_default();
-        let bytes: u64 = manifest.files.values().map(|file| file.bytes).sum();
+            serde_json::to_value(artifact.kind).ok().and_then(|k| k.as_str().map(str::to_owned)).unwrap_or_default();
         let add = sqlx::query(
             "INSERT INTO artifacts (digest, kind, bytes, run, stage, key, at_ms) VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING",
         );
-        let add = add.bind(output.to_string()).bind(kind).bind(int(bytes)).bind(made.run).bind(made.stage);
+        let add = add.bind(output.to_string()).bind(kind).bind(int(artifact.bytes)).bind(made.run).bind(made.stage);
         run(conn, add.bind(&key).bind(now)).await?;
         for (role, input) in made.inputs {
             let add = sqlx::query("INSERT INTO edges (parent, child, role) VALUES (?, ?, ?) ON CONFLICT DO NOTHING");

@@ -224,6 +224,13 @@ impl Records for SqliteRecords {
         Ok(curves.finish(points))
     }
 
+    async fn present(&self, blobs: &[Digest]) -> Result<BTreeMap<Digest, u64>> {
+        let mut conn = self.connection().await?;
+        let find = "SELECT digest, bytes FROM blobs WHERE digest IN (SELECT value FROM json_each(?))";
+        let rows = sqlx::query(find).bind(json(&blobs)).fetch_all(&mut *conn).await?;
+        rows.iter().map(|row| Ok((digest(row, "digest")?, row.try_get::<i64, _>("bytes")?.unsigned_abs()))).collect()
+    }
+
     async fn needs(&self) -> Result<Needs> {
         let mut conn = self.connection().await?;
         // A transaction that reads sees one moment of the database.

@@ -4,7 +4,7 @@
 //! merely says (a poll, a tick of the clock) is an [`Observation`]; [`observe`](crate::observe) turns it into events when
 //! it means something, so that heartbeats cost no disk write.
 
-use protocol::message::{CommitCheckpoint, Grant, Join, Poll, ReportOutcome};
+use protocol::message::{CommitCheckpoint, Grant, Join, Poll, ReportOutcome, TaskOutcome};
 use protocol::pipeline::Pipeline;
 use protocol::stage::Keep;
 use protocol::{Alias, Digest, Fence, Incarnation, Owner, RunId, StageName, TaskId, WorkerId};
@@ -143,6 +143,35 @@ pub enum Event {
         /// Why, for the user.
         message: String,
     },
+}
+
+impl Event {
+    /// The artifacts that rows are to name because of it. They are proven whole before it is decided.
+    pub(crate) fn artifacts(&self) -> Vec<Digest> {
+        match self {
+            Self::Checkpoint { commit } => vec![commit.manifest],
+            Self::Outcome { report } => match report.outcome {
+                TaskOutcome::Finished { output, .. } => vec![output],
+                TaskOutcome::Resolved { .. } | TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => Vec::new(),
+            },
+            Self::Bundled { bundles, .. } => bundles.clone(),
+            Self::Started { .. }
+            | Self::Submit { .. }
+            | Self::Join { .. }
+            | Self::WorkerBack { .. }
+            | Self::WorkerReady { .. }
+            | Self::LeaseExpired { .. }
+            | Self::WorkerGone { .. }
+            | Self::PeersLost { .. }
+            | Self::Control { .. }
+            | Self::WorkerForgotten { .. }
+            | Self::Drain
+            | Self::BackoffOver { .. }
+            | Self::GraceOver { .. }
+            | Self::LookedUp { .. }
+            | Self::RegisterRefused { .. } => Vec::new(),
+        }
+    }
 }
 
 /// What was merely heard.

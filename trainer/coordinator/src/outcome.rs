@@ -224,6 +224,8 @@ pub fn refused_for_good(event: &Event, error: &WriteError) -> Option<Event> {
         WriteError::StaleFence { .. }
         | WriteError::Superseded { .. }
         | WriteError::Storage(_)
+        | WriteError::Unproven { .. }
+        | WriteError::Unreachable(_)
         | WriteError::Internal(_) => return None,
     };
     let failed = |grant: &Grant| {

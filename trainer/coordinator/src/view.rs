@@ -126,6 +126,7 @@ impl State {
             state: run.state,
             stages,
             sweeps,
+            storage: None,
         }
     }
 

@@ -29,7 +29,8 @@ fn pipeline(digest: Option<&[u8]>) -> Pipeline {
 fn submit(coordinator: &mut PureCoordinator, pipeline: Pipeline) -> RunId {
     let pipeline = Box::new(pipeline);
     let until = pipeline.stage(&"vae".into()).is_some().then(|| "dataset".into());
-    let event = Event::Submit { pipeline, source: String::new(), idempotency_key: None, until };
+    let owner = protocol::Owner::local("me");
+    let event = Event::Submit { pipeline, source: String::new(), idempotency_key: None, until, owner };
     let effects = coordinator.happen(event).expect("submitted");
     let run = effects.into_iter().find_map(|effect| match effect {
         Effect::Submitted(run) => Some(run),

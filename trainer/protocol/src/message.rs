@@ -329,6 +329,18 @@ pub struct RunView {
     /// Sweeps that have started.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub sweeps: Vec<SweepView>,
+    /// What keeps the coordinator from storing or reading what the run needs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub storage: Option<StorageProblem>,
+}
+
+/// Why a store does not take or give what it should.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct StorageProblem {
+    /// Since when, in milliseconds since 1970.
+    pub since_ms: i64,
+    /// What is wrong, in words.
+    pub what: String,
 }
 
 /// State of a run.

@@ -171,7 +171,8 @@ pub(crate) async fn status(args: StatusArgs) -> Result<u8> {
             }
         }
     } else {
-        let view = reader.find(&args.run).await?;
+        // Asked for by itself: a list says nothing of what stands in a run's way.
+        let view = reader.run(&reader.find(&args.run).await?.run).await?;
         if let Some(path) = &args.spectrum {
             check_parent(path)?;
             spectrum::draw(&reader, &view, args.stage.as_deref(), path).await?;

@@ -184,6 +184,12 @@ pub trait GangContext: AttemptContext {
         true
     }
 
+    /// Whether what is stored from here on is a checkpoint that may be made later: then an upload that cannot be taken now fails instead of
+    /// being waited for, and [`can_save`](Self::can_save) is `false` for a while.
+    fn may_postpone(&mut self, may: bool) {
+        let _ = may;
+    }
+
     /// Commits an uploaded manifest as the newest checkpoint; returns once it is durable. Rank 0 only.
     fn commit_checkpoint(
         &mut self,

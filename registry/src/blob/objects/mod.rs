@@ -12,6 +12,7 @@
 //! need not be: equal names are equal bytes. A part that fails is sent again by itself; parts of an upload that was given up
 //! cost space until the bucket's own rule removes them.
 
+mod health;
 mod remote;
 mod touched;
 
@@ -20,6 +21,7 @@ use std::fs::OpenOptions;
 use std::io::{self, Cursor, Read};
 use std::path::Path as FilePath;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use checkpoint::BlobError;
 use fail::fail_point;
@@ -36,11 +38,11 @@ use tokio::task::JoinSet;
 pub use self::remote::Remote;
 pub(super) use self::remote::check_url;
 
-use self::remote::innermost;
+use self::remote::LOCAL;
 use self::touched::Touched;
 use super::disk::{Os, regular};
 use super::staging::{Part, Staging};
-use super::{Backend, Entry, Staged, Stat};
+use super::{Backend, Entry, Problem, Staged, Stat};
 use crate::clock;
 
 /// How much goes out at once. The limit of 10,000 parts to an object allows 80 GB.
@@ -51,6 +53,8 @@ const PARTS: usize = 4;
 /// for twice as much, up to [`READ_BYTES`].
 const FIRST_READ_BYTES: usize = 64 << 10;
 const READ_BYTES: usize = 4 << 20;
+/// How long a removal may take: it begins under a lease, and must not be done after another process has taken that.
+const REMOVAL: Duration = Duration::from_secs(10);
 
 /// Blobs in an object store.
 #[derive(Debug)]
@@ -131,7 +135,7 @@ impl Inner {
     fn send(&self, path: &Path, bytes: u64, mut source: impl Read + Send + 'static) -> Result<bool, Error> {
         let (store, path, parts) = (self.store(), path.clone(), Arc::clone(&self.parts));
         if bytes > PART_BYTES as u64 {
-            return self.remote.wait(async move {
+            return self.remote.wait_long(async move {
                 let mut upload = store.put_multipart(&path).await?;
                 let sent = send_parts(&mut *upload, parts, source).await;
                 if sent.is_err() {
@@ -142,7 +146,7 @@ impl Inner {
             });
         }
         let whole = read_part(&mut source).map_err(local)?;
-        let put = self.remote.wait(async move {
+        let put = self.remote.wait_long(async move {
             let _one = parts.acquire().await;
             store.put_opts(&path, PutPayload::from(whole), PutOptions::from(PutMode::Create)).await
         });
@@ -181,7 +185,7 @@ impl Inner {
 }
 
 fn local(source: io::Error) -> Error {
-    Error::Generic { store: "staging", source: source.into() }
+    Error::Generic { store: LOCAL, source: source.into() }
 }
 
 async fn send_parts(
@@ -269,7 +273,11 @@ impl Backend for Objects {
     fn remove(&self, digest: Digest) -> Result<(), BlobError> {
         let (store, path) = (self.0.store(), self.0.remote.blob(digest));
         let wanted = path.clone();
-        match self.0.remote.wait(async move { store.delete(&wanted).await }) {
+        let removing = async move {
+            let late = || Error::Generic { store: "blobs", source: "the removal was not answered in time".into() };
+            tokio::time::timeout(REMOVAL, store.delete(&wanted)).await.unwrap_or_else(|_| Err(late()))
+        };
+        match self.0.remote.wait(removing) {
             Ok(()) | Err(Error::NotFound { .. }) => self.0.touched().forget(digest),
             Err(e) => return Err(self.0.remote.error("remove", &path, &e)),
         }
@@ -314,6 +322,10 @@ impl Backend for Objects {
 
     fn aside(&self) -> Result<Vec<String>, BlobError> {
         Ok(self.0.list("quarantine")?.iter().map(|meta| self.0.remote.shown(&meta.location)).collect())
+    }
+
+    fn problem(&self) -> Option<Problem> {
+        self.0.remote.problem()
     }
 
     fn marker_place(&self) -> String {
@@ -365,12 +377,12 @@ impl Staged for StagedObject {
         fail_point!("blob::after_write");
         let here = |e: io::Error| super::fs::error("read", &self.part.path, &e);
         io::Write::flush(&mut self.part.file).map_err(here)?;
-        if self.objects.head(digest)?.is_some() {
-            return Ok(false);
-        }
-        let here = |e: io::Error| super::fs::error("read", &self.part.path, &e);
         let file = regular(OpenOptions::new().read(true), &self.part.path).map_err(here)?;
         let bytes = file.metadata().map_err(here)?.len();
+        // A put in one request fails if the name is taken.
+        if bytes > PART_BYTES as u64 && self.objects.head(digest)?.is_some() {
+            return Ok(false);
+        }
         // Noted first: a collection that sees the object must see that it is young, whatever the other side's clock says.
         self.objects.note(digest)?;
         let path = self.objects.remote.blob(digest);
@@ -401,9 +413,11 @@ impl Read for Ranges {
         self.next = length.saturating_mul(2);
         let range = self.at..self.end.min(self.at + length as u64);
         let (store, path, wanted) = (Arc::clone(&self.remote.store), self.path.clone(), range.clone());
-        let part = self.remote.wait(async move { store.get_range(&path, wanted).await });
-        let part =
-            part.map_err(|e| io::Error::other(format!("`{}`: {}", self.remote.shown(&self.path), innermost(&e))))?;
+        let part = self.remote.wait_long(async move { store.get_range(&path, wanted).await });
+        let part = part.map_err(|e| match self.remote.error("read", &self.path, &e) {
+            BlobError::Unreachable(message) => io::Error::new(io::ErrorKind::HostUnreachable, message),
+            e => io::Error::other(e.to_string()),
+        })?;
         if part.is_empty() {
             return Err(io::ErrorKind::UnexpectedEof.into());
         }

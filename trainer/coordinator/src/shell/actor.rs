@@ -104,7 +104,7 @@ impl Actor {
             fail::fail_point!("actor::decide");
             let mut turn = self.batches.decide(|| self.moments.next());
             while let Turn::Store(writes) = turn {
-                let written = self.actor_handle.store.write(writes).await;
+                let written = self.actor_handle.store.write_proven(writes).await;
                 self.actor_handle.wrote(&written);
                 turn = self.batches.stored(written, || self.moments.next());
             }
@@ -143,7 +143,7 @@ impl Actor {
 pub(crate) async fn snapshot(store: Store, state: Arc<State>) {
     let seq = state.seq;
     let text = blocking(move || journal::snapshot(&state)).await;
-    match store.write(vec![Write::Snapshot { seq, state: text }]).await {
+    match store.write_proven(vec![Write::Snapshot { seq, state: text }]).await {
         Ok(()) => tracing::debug!(seq, "stored a snapshot"),
         // The facts are there; only the next start takes longer.
         Err(error) => tracing::warn!(seq, %error, "no snapshot"),

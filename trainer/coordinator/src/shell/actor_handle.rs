@@ -5,23 +5,25 @@ use std::panic::AssertUnwindSafe;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use futures::FutureExt as _;
-use protocol::message::{Poll, RunView, Submit};
+use protocol::message::{Poll, RunView, StorageProblem, Submit};
 use protocol::pipeline::Pipeline;
 use protocol::stage::Register;
-use protocol::{Alias, Group, ModelName, Owner, RunId, WorkerId, limits};
-use registry::{QueryError, ReadStore, Store, WriteError};
+use protocol::{Alias, Digest, Group, ModelName, Owner, RunId, WorkerId, limits};
+use registry::{Proof, QueryError, ReadStore, Store, WriteError};
 use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 
 use super::blocking::blocking;
-use super::clock::{Clock, wall_clock};
+use super::clock::{Clock, wall_clock, wall_ms};
 use super::records::{Records, read};
 use super::secrets::Secrets;
+use super::storage::{self, unless_away};
 use super::token_table::TokenTable;
 use super::versions::resolve_versions;
 use super::vouching::Reach;
 use crate::batch::{Ask, Front, Refused};
 use crate::event::{Effect, Event, Observation};
+use crate::outcome::refused_for_good;
 use crate::rejected::Rejected;
 use crate::state::State;
 use crate::state::run::Control;
@@ -42,7 +44,7 @@ pub(crate) struct ActorHandle {
     pub(crate) batches: Semaphore,
     front: Arc<Front>,
     changed: watch::Sender<u64>,
-    trouble: Mutex<Option<String>>,
+    trouble: Mutex<Option<StorageProblem>>,
     failure: OnceLock<String>,
     stop: watch::Sender<bool>,
     clock: Clock,
@@ -98,9 +100,46 @@ impl ActorHandle {
         self.failure.get().map_or(Refused::Stopped, |failure| Refused::Failed(failure.clone()))
     }
 
-    /// Decides an event; returns once it is stored.
+    /// Decides an event; returns once it is stored. What rows are to name is proven whole before it is queued, so that nobody but the
+    /// asker waits for the place where the blobs lie.
     pub(crate) async fn decide(&self, event: Event) -> Result<Vec<Effect>, Refused> {
-        self.ask(Ask::Event(Box::new(event))).await
+        let mut artifacts = event.artifacts();
+        if artifacts.is_empty() {
+            return self.ask(Ask::Event(Box::new(event))).await;
+        }
+        loop {
+            let mut proofs = Vec::with_capacity(artifacts.len());
+            for artifact in &artifacts {
+                match self.prove(*artifact).await {
+                    Ok(proof) => proofs.push(proof),
+                    Err(error) => return Err(self.refused(&event, error).await),
+                }
+            }
+            match self.ask(Ask::Event(Box::new(event.clone()))).await {
+                // It names what was committed before; or a collection has come between.
+                Err(Refused::Write(WriteError::Unproven { artifact })) => {
+                    if !artifacts.contains(&artifact) {
+                        artifacts.push(artifact);
+                    }
+                }
+                decided => return decided,
+            }
+        }
+    }
+
+    async fn prove(&self, artifact: Digest) -> Result<Proof, WriteError> {
+        let proven = unless_away(&self.store, self.store.prove(artifact)).await;
+        proven.map_err(|away| WriteError::Unreachable(away.to_string()))?
+    }
+
+    /// What is decided instead of an event that names what is not whole, and never will be; gives why it was refused.
+    async fn refused(&self, event: &Event, error: WriteError) -> Refused {
+        let Some(instead) = refused_for_good(event, &error) else { return error.into() };
+        tracing::warn!(%error, "refused, for what it names is not whole");
+        match self.ask(Ask::Event(Box::new(instead))).await {
+            Ok(_) => error.into(),
+            Err(refused) => refused,
+        }
     }
 
     /// Takes note of what was heard, and decides what follows from it.
@@ -272,7 +311,14 @@ impl ActorHandle {
 
     /// Why the store takes no writes, if it does not.
     pub(crate) fn trouble(&self) -> Option<String> {
-        self.trouble.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        let trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner);
+        trouble.as_ref().map(|problem| problem.what.clone())
+    }
+
+    /// What is wrong with the store's disk or with the place where its blobs lie.
+    pub(crate) fn storage(&self) -> Option<StorageProblem> {
+        let trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        trouble.or_else(|| storage::problem(&self.store))
     }
 
     /// What has panicked, if something has.
@@ -310,8 +356,10 @@ impl ActorHandle {
         let mut trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner);
         match result {
             Ok(_) => *trouble = None,
-            Err(WriteError::Storage(message)) => *trouble = Some(message.clone()),
-            Err(error @ WriteError::Superseded { .. }) => *trouble = Some(error.to_string()),
+            Err(error @ (WriteError::Storage(_) | WriteError::Superseded { .. })) => {
+                let since_ms = trouble.as_ref().map_or_else(wall_ms, |problem| problem.since_ms);
+                *trouble = Some(StorageProblem { since_ms, what: error.to_string() });
+            }
             Err(_) => {}
         }
     }

@@ -89,8 +89,11 @@ impl From<WriteError> for Failure {
             WriteError::NotFound(_) => Self::new(StatusCode::NOT_FOUND, "not-found", message),
             WriteError::Storage(_) => Self::new(StatusCode::INSUFFICIENT_STORAGE, "storage", message)
                 .hint("free some space or make the store writable, then `trainer resume`"),
+            WriteError::Unreachable(_) => Self::new(StatusCode::SERVICE_UNAVAILABLE, "unreachable", message),
             WriteError::Superseded { .. } => Self::new(StatusCode::SERVICE_UNAVAILABLE, "storage", message),
-            WriteError::Internal(_) => Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", message),
+            WriteError::Unproven { .. } | WriteError::Internal(_) => {
+                Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", message)
+            }
         }
     }
 }
@@ -131,6 +134,7 @@ impl From<BlobError> for Failure {
             BlobError::Corrupt { .. } | BlobError::Damaged(_) => Self::new(StatusCode::CONFLICT, "damaged", message)
                 .hint("run the pipeline again: the stage that made it is computed anew, which mends it"),
             BlobError::Refused(_) => Self::new(StatusCode::CONFLICT, "stale-fence", message),
+            BlobError::Unreachable(_) => Self::new(StatusCode::SERVICE_UNAVAILABLE, "unreachable", message),
             BlobError::Unavailable(_) => Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", message),
         }
     }

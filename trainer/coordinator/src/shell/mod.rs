@@ -24,6 +24,7 @@ mod revocable;
 mod route;
 mod secrets;
 mod start_error;
+mod storage;
 mod token_table;
 mod uploads;
 mod versions;

@@ -17,13 +17,13 @@ use protocol::message::{CommitCheckpoint, Grant, LogBatch, MetricBatch, ReportOu
 use protocol::proof::{BlobStored, RECEIPT_HEADER, Vouched};
 use protocol::{Digest, limits};
 use registry::blob::{Arriving, PART_BYTES, ResumeError};
-use registry::{Write, WriteError};
+use registry::{Store, Write, WriteError};
 
 use super::actor_handle::ActorHandle;
-use super::blocking::blocking;
 use super::body::Message;
 use super::failure::Failure;
 use super::secrets::{self, Proof};
+use super::storage::ask;
 use crate::event::Event;
 
 /// The header with a blob's length.
@@ -41,7 +41,7 @@ async fn write(actor_handle: &ActorHandle, write: Write) -> Result<Json<()>, Fai
         let most = limits::BATCHES_WAITING;
         return Err(Failure::busy(format!("{most} batches of values and lines wait for the disk already")));
     };
-    let written = actor_handle.store.write(vec![write]).await;
+    let written = actor_handle.store.write_proven(vec![write]).await;
     actor_handle.wrote(&written);
     written?;
     Ok(Json(()))
@@ -108,8 +108,8 @@ async fn check_blobs(
     let is_own = |(digest, shown): &(&Digest, &String)| actor_handle.secrets.is_receipt(caller, grant, **digest, shown);
     let own: BTreeSet<Digest> = receipts.iter().filter(is_own).map(|(digest, _)| *digest).collect();
     let (blobs, reach) = (actor_handle.store.blobs().clone(), Arc::clone(&actor_handle.reach));
-    let foreign = blocking(move || reach.foreign(&blobs, &roots, |digest| own.contains(&digest), manifest)).await?;
-    match foreign {
+    let looking = move || reach.foreign(&blobs, &roots, |digest| own.contains(&digest), manifest);
+    match ask(&actor_handle.store, looking).await? {
         None => Ok(()),
         Some(digest) => Err(Failure::new(
             StatusCode::CONFLICT,
@@ -155,7 +155,7 @@ pub(crate) async fn staged(
     let receipt = receipt.filter(|shown| actor_handle.secrets.is_receipt(&proof.caller.name, &grant, digest, shown));
     let roots = actor_handle.state().read_by(&grant.task)?;
     let (blobs, reach) = (actor_handle.store.blobs().clone(), Arc::clone(&actor_handle.reach));
-    blocking(move || {
+    let looked = ask(&actor_handle.store, move || -> Result<_, Failure> {
         // Of others' blobs it is not told whether they are there: it has their bytes, or has no use for them.
         let is_known = receipt.is_some() || reach.includes(&blobs, &roots, digest)?;
         if is_known {
@@ -164,8 +164,8 @@ pub(crate) async fn staged(
         let stored = is_known && blobs.reuse(digest)?;
         let receipt = receipt.filter(|_| stored);
         Ok(Json(BlobStored { digest, stored, staged: blobs.staged(&grant, digest)?, receipt }))
-    })
-    .await
+    });
+    looked.await
 }
 
 /// Takes a blob, or the next part of one, as it comes.
@@ -190,11 +190,11 @@ pub(crate) async fn put_blob(
             "a blob of {bytes} bytes is too large: at most {MAX_BLOB_BYTES} are taken"
         )));
     }
-    let blobs = actor_handle.store.blobs().clone();
+    let (store, blobs) = (&actor_handle.store, actor_handle.store.blobs().clone());
     let receipt = actor_handle.secrets.receipt(&proof.caller.name, &grant, digest);
     let stored = async {
-        let arriving = blocking(move || blobs.take_up(&grant, digest, offset, bytes)).await?;
-        let (stored, staged) = receive(arriving, body).await?;
+        let arriving = ask(store, move || blobs.take_up(&grant, digest, offset, bytes)).await?;
+        let (stored, staged) = receive(store, arriving, body).await?;
         Ok(Json(BlobStored { digest, stored, staged, receipt: stored.then_some(receipt) }))
     };
     stored.await.map_err(|error: Unstored| {
@@ -206,7 +206,7 @@ pub(crate) async fn put_blob(
 }
 
 /// Takes what comes; says whether the blob is stored, and how much of it has arrived.
-async fn receive(mut arriving: Arriving, body: Body) -> Result<(bool, u64), Unstored> {
+async fn receive(store: &Store, mut arriving: Arriving, body: Body) -> Result<(bool, u64), Unstored> {
     let mut body = body.into_data_stream();
     let mut ended = false;
     while !ended {
@@ -227,7 +227,7 @@ async fn receive(mut arriving: Arriving, body: Body) -> Result<(bool, u64), Unst
             }
         }
         // Comes back dropped if this request is: what has arrived is kept.
-        arriving = blocking(move || -> Result<Arriving, BlobError> {
+        arriving = ask(store, move || -> Result<Arriving, BlobError> {
             for part in parts {
                 arriving.write(&part)?;
             }
@@ -237,7 +237,7 @@ async fn receive(mut arriving: Arriving, body: Body) -> Result<(bool, u64), Unst
         .map_err(ResumeError::Blob)?;
     }
     let staged = arriving.written();
-    let stored = blocking(move || arriving.finish()).await.map_err(ResumeError::Blob)?;
+    let stored = ask(store, move || arriving.finish()).await.map_err(ResumeError::Blob)?;
     Ok((stored, staged))
 }
 
@@ -289,7 +289,7 @@ pub(crate) async fn get_blob(
         check_read(&actor_handle, &proof, &headers, digest).await?;
     }
     let blobs = actor_handle.store.blobs().clone();
-    let opened = blocking(move || -> Result<_, Failure> {
+    let opened = ask(&actor_handle.store, move || -> Result<_, Failure> {
         let mut reader = match from {
             None => blobs.read(digest)?,
             Some(from) => {
@@ -307,9 +307,9 @@ pub(crate) async fn get_blob(
     let (first, reader) = opened.await?;
     let bytes = reader.bytes();
     let length = bytes - from.unwrap_or_default();
-    let rest = stream::try_unfold(reader, |mut reader| async {
-        let (part, reader) = blocking(move || (reader.next_part(), reader)).await;
-        Ok::<_, BlobError>(part?.map(|part| (part, reader)))
+    let rest = stream::try_unfold((reader, actor_handle.store.clone()), |(mut reader, store)| async {
+        let (part, reader) = ask(&store, move || Ok::<_, BlobError>((reader.next_part()?, reader))).await?;
+        Ok::<_, BlobError>(part.map(|part| (part, (reader, store))))
     });
     let body = Body::from_stream(stream::iter(first.map(Ok)).chain(rest));
     let mut response = Response::new(body);
@@ -341,7 +341,7 @@ async fn check_read(
         .map_err(|_| secrets::unproven("the call does not show the secret of its worker"))?;
     let roots = state.readable_by(&process.worker);
     let (blobs, reach) = (actor_handle.store.blobs().clone(), Arc::clone(&actor_handle.reach));
-    if blocking(move || reach.includes(&blobs, &roots, digest)).await? {
+    if ask(&actor_handle.store, move || reach.includes(&blobs, &roots, digest)).await? {
         return Ok(());
     }
     let message = format!("blob {digest} is not among what the tasks of worker `{}` read", process.worker);

@@ -214,8 +214,16 @@ pub fn train(
         save_is_due |= every > 0 && state.step.is_multiple_of(every);
         stop = drain;
         if cx.leads() && state.step < steps && save_is_due && !stop && cx.can_save() {
-            save(&mut state, config, &recent, cx)?;
-            (saved_at, save_is_due) = (Some(state.step), false);
+            cx.may_postpone(true);
+            let saved = save(&mut state, config, &recent, cx);
+            cx.may_postpone(false);
+            match saved {
+                Ok(()) => (saved_at, save_is_due) = (Some(state.step), false),
+                Err(StageError::Context(ContextError::Unavailable(why))) if !cx.can_save() => {
+                    cx.log(&format!("the checkpoint after step {} is put off: {why}", state.step));
+                }
+                Err(error) => return Err(error),
+            }
         }
     }
 }
