@@ -47,7 +47,8 @@ use crate::clock;
 
 /// How much goes out at once. The limit of 10,000 parts to an object allows 80 GB.
 const PART_BYTES: usize = 8 << 20;
-/// Parts that are under way at once, of all blobs together: this bounds the memory that sending takes.
+/// How many such parts are under way at once, of all blobs together, or as many bytes of small ones: this bounds the memory that sending
+/// takes.
 const PARTS: usize = 4;
 /// A blob that is read begins with a request for as little as the reader asked for, at least this much; each further one asks
 /// for twice as much, up to [`READ_BYTES`].
@@ -65,6 +66,7 @@ struct Inner {
     remote: Arc<Remote>,
     staging: Staging,
     touched: Mutex<Touched>,
+    /// Room for what is under way, in KiB.
     parts: Arc<Semaphore>,
 }
 
@@ -84,7 +86,7 @@ impl Objects {
     }
 
     fn with(remote: Arc<Remote>, staging: Staging, touched: Touched) -> Self {
-        let parts = Arc::new(Semaphore::new(PARTS));
+        let parts = Arc::new(Semaphore::new((PARTS * PART_BYTES) >> 10));
         Self(Arc::new(Inner { remote, staging, touched: Mutex::new(touched), parts }))
     }
 }
@@ -147,7 +149,7 @@ impl Inner {
         }
         let whole = read_part(&mut source).map_err(local)?;
         let put = self.remote.wait_long(async move {
-            let _one = parts.acquire().await;
+            let _room = parts.acquire_many(kib(whole.len())).await;
             store.put_opts(&path, PutPayload::from(whole), PutOptions::from(PutMode::Create)).await
         });
         match put {
@@ -184,6 +186,11 @@ impl Inner {
     }
 }
 
+/// How much room bytes take among those that are under way.
+fn kib(bytes: usize) -> u32 {
+    u32::try_from(bytes.div_ceil(1 << 10).max(1)).unwrap_or(u32::MAX)
+}
+
 fn local(source: io::Error) -> Error {
     Error::Generic { store: LOCAL, source: source.into() }
 }
@@ -195,7 +202,8 @@ async fn send_parts(
 ) -> Result<(), Error> {
     let mut under_way = JoinSet::new();
     loop {
-        let slot = Arc::clone(&slots).acquire_owned().await.map_err(|e| local(io::Error::other(e)))?;
+        let slot =
+            Arc::clone(&slots).acquire_many_owned(kib(PART_BYTES)).await.map_err(|e| local(io::Error::other(e)))?;
         let (read, next) = tokio::task::spawn_blocking(move || (read_part(&mut source), source)).await?;
         source = next;
         let part = read.map_err(local)?;
