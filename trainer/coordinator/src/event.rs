@@ -4,7 +4,7 @@
 //! merely says (a poll, a tick of the clock) is an [`Observation`]; [`observe`](crate::observe) turns it into events when
 //! it means something, so that heartbeats cost no disk write.
 
-use protocol::message::{CommitCheckpoint, Grant, Join, Poll, ReportOutcome};
+use protocol::message::{CommitCheckpoint, Join, Poll, ReportOutcome};
 use protocol::pipeline::Pipeline;
 use protocol::stage::Keep;
 use protocol::{Digest, Fence, Incarnation, RunId, StageName, TaskId, WorkerId};
@@ -39,7 +39,7 @@ pub enum Event {
         /// What it said.
         join: Join,
     },
-    /// A worker that had lost its lease, or whose peers had lost it, was heard again.
+    /// A worker that had lost its lease, or that had to leave a gang some time ago, was heard again.
     WorkerBack {
         /// Who.
         worker: WorkerId,
@@ -65,12 +65,17 @@ pub enum Event {
         /// Who.
         worker: WorkerId,
     },
-    /// A gang member could not reach others.
-    PeersLost {
-        /// The reporter's grant.
-        grant: Grant,
-        /// Whom.
-        lost: Vec<WorkerId>,
+    /// Members of a gang complain of each other, as [`Heard::words`](crate::state::Heard::words) says.
+    GangDivided {
+        task: TaskId,
+        /// The generation.
+        fence: Fence,
+    },
+    /// No member of a gang has had a step more for too long.
+    GangStalled {
+        task: TaskId,
+        /// The generation.
+        fence: Fence,
     },
     /// A checkpoint was uploaded and shall count.
     Checkpoint {

@@ -19,7 +19,7 @@ use crate::time::Millis;
 
 /// The version of what is stored. Another major version is refused. A later minor one has kinds or fields that this build does not know:
 /// it is read for as long as none of them occurs.
-pub const FORMAT: (u32, u32) = (1, 1);
+pub const FORMAT: (u32, u32) = (1, 2);
 
 /// What cannot be recovered.
 #[derive(Debug, thiserror::Error)]

@@ -395,8 +395,8 @@ fn what_is_stored_says_of_which_format_it_is() {
         recover(&stored)
     };
     assert!(recover(&coordinator.store.recovery).is_ok());
-    assert!(with("\"format\":[1,1]", "\"format\":[1,7]").is_ok());
-    let refused = with("\"format\":[1,1]", "\"format\":[2,0]").expect_err("another major version");
+    assert!(with("\"format\":[1,2]", "\"format\":[1,7]").is_ok());
+    let refused = with("\"format\":[1,2]", "\"format\":[2,0]").expect_err("another major version");
     assert!(refused.contains("format 2.0") && refused.contains("1.x") && refused.contains("decision 2"), "{refused}");
     let refused = with("\"execution-state\"", "\"horoscope\"").expect_err("an unknown kind");
     assert!(refused.contains("horoscope") && refused.contains("decision 2"), "{refused}");
@@ -412,7 +412,7 @@ fn what_is_stored_says_of_which_format_it_is() {
         whole.run(&run).is_ok() && whole.executions.values().all(|execution| execution.state == ExecutionState::Open)
     );
     let (_, text) = coordinator.store.recovery.snapshot.as_mut().expect("a snapshot");
-    *text = text.replace("\"format\":[1,1]", "\"format\":[3,1]");
+    *text = text.replace("\"format\":[1,2]", "\"format\":[3,1]");
     let refused = recover(&coordinator.store.recovery).expect_err("another major version");
     assert!(refused.contains("format 3.1") && refused.contains("snapshot"), "{refused}");
 }
