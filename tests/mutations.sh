@@ -56,4 +56,15 @@ mutation pipe-as-token-file trainer/access/src/file.rs 's/if file\.metadata\(\)\
 mutation lock-follows-links registry/src/blob/disk.rs 's/OFlag::O_NOFOLLOW \| //' registry
 mutation gang-in-the-clear worker/src/gang/seal.rs 's/Ok\(stream\.local_addr\(\)\?\.ip\(\)\.to_canonical\(\) != .*\)$/Ok(stream.local_addr().is_err())/m' worker
 mutation nonce-that-repeats worker/src/gang/seal.rs 's/bytes\[4\.\.\]\.copy_from_slice\(&number\.to_le_bytes\(\)\);/let _ = number; bytes[4] = 1;/' worker
+mutation joiner-outvotes-holder trainer/coordinator/src/state/evidence.rs 's/\(Self::Absent \| Self::Empty \| Self::Late, Self::Holds\(_\)\) => 0/(Self::Holds(_), Self::Empty) => 0/' coordinator
+mutation one-complaint-is-enough trainer/coordinator/src/state/evidence.rs 's/let over = at\.since\(since\) >= hearing_ms;/let over = true;/' coordinator
+mutation liar-stays trainer/coordinator/src/state/evidence.rs 's/Reverse\(degree\(rank\)\)/degree(rank)/' coordinator
+mutation word-outlives-membership trainer/coordinator/src/state/apply.rs 's/drop\(words\.remove\(&member\.worker\)\)/drop(words.get(\&member.worker))/' coordinator
+mutation suspicion-never-fades trainer/coordinator/src/decide/gangs.rs 's/saturating_sub\(u32::try_from\(faded\)[^)]*\)\)/saturating_sub(u32::try_from(faded * 0).unwrap_or(0))/' coordinator
+mutation too-few-lose-their-state trainer/coordinator/src/decide/attempts.rs 's/!left\.is_empty\(\) && self\.may_hold/left.is_empty() \&\& self.may_hold/' coordinator
+mutation failing-lead-ends-the-try trainer/coordinator/src/outcome.rs 's/&& self\.goes_on_without/\&\& !self.goes_on_without/' coordinator
+mutation joins-without-reaching worker/src/prepare.rs 's/for Member \{ worker, peer_address, \.\. \} in &task\.peers \{/for Member { worker, peer_address, .. } in task.peers.iter().take(0) {/' worker
+mutation only-whole-frames-count worker/src/gang/link.rs 's/if count > 0 \{/if count > 1 << 20 {/' worker
+mutation signs-behind-frames worker/src/gang/link.rs 's/writer\.sign\(sign, patience, abort\)\?;/let _ = sign;/' worker
+mutation slow-is-not-named worker/src/gang/pace.rs 's/const FAR_OVER: u32 = 3;/const FAR_OVER: u32 = 3_000_000;/' worker
 exit $missed
