@@ -67,7 +67,7 @@ mutation manifest-of-foreign-blobs trainer/coordinator/src/shell/vouching.rs 's/
 mutation mention-of-foreign-blobs trainer/coordinator/src/shell/vouching.rs 's/if leads_somewhere && seen\.insert\(other\)/if leads_somewhere \&\& seen.insert(other) \&\& queue.len() > 99/' coordinator
 mutation staged-of-everybody trainer/coordinator/src/shell/uploads.rs 's/let is_known = receipt\.is_some\(\)/let is_known = receipt.is_none()/' coordinator
 mutation worker-reads-everything trainer/coordinator/src/shell/uploads.rs 's/if !proof\.caller\.scopes\.allow\(Scope::Read\)/if proof.caller.scopes.allow(Scope::Promote)/' coordinator
-mutation poll-in-anothers-name trainer/coordinator/src/observe.rs 's/if \(&doing\.grant\.worker, doing\.grant\.incarnation\) != \(&worker, poll\.incarnation\)/if doing.grant.worker.as_str().is_empty()/' coordinator
+mutation poll-in-anothers-name trainer/coordinator/src/observe.rs 's/if \(&said\.grant\.worker, said\.grant\.incarnation\) != \(&worker, poll\.incarnation\)/if said.grant.worker.as_str().is_empty()/' coordinator
 mutation promotion-without-scope trainer/access/src/tokens.rs 's/if !allow\(Scope::Promote\)/if false/' "access coordinator"
 mutation protected-from-none trainer/access/src/tokens.rs 's/Some\(names\) if !names\.contains\(name\) =>/Some(_) if false =>/' access
 mutation promotion-without-a-second-look trainer/coordinator/src/shell/effects.rs 's/&& let Err\(why\) = actor_handle\.may_promote\(&owner, &alias\)/\&\& let Err::<(), String>(why) = Ok(drop(alias.clone()))/' coordinator
@@ -91,4 +91,15 @@ mutation silence-is-health registry/src/blob/objects/health.rs 's/silent >= SILE
 mutation lease-not-asked-for-a-name registry/src/proofs.rs 's/lease\.check\(\)\.map_err/Ok(()).map_err/' registry
 mutation lease-not-asked-for-a-removal registry/src/lease.rs 's/self\.check\(\)\.map_err\(\|e\| BlobError/Ok(()).map_err(|e: NoLease| BlobError/' registry
 mutation holder-not-refused registry/src/lease.rs 's/Some\(held\) if held != first => return Ok\(Err\(held\.by\)\),/Some(held) if held != first => return Ok(Ok(())),/' registry
+mutation joiner-outvotes-holder trainer/coordinator/src/state/evidence.rs 's/\(Self::Absent \| Self::Empty \| Self::Late, Self::Holds\(_\)\) => 0/(Self::Holds(_), Self::Empty) => 0/' coordinator
+mutation one-complaint-is-enough trainer/coordinator/src/state/evidence.rs 's/let over = at\.since\(since\) >= hearing_ms;/let over = true;/' coordinator
+mutation liar-stays trainer/coordinator/src/state/evidence.rs 's/Reverse\(degree\(rank\)\)/degree(rank)/' coordinator
+mutation word-outlives-membership trainer/coordinator/src/state/apply.rs 's/drop\(words\.remove\(&member\.worker\)\)/drop(words.get(\&member.worker))/' coordinator
+mutation suspicion-never-fades trainer/coordinator/src/decide/gangs.rs 's/saturating_sub\(u32::try_from\(faded\)[^)]*\)\)/saturating_sub(u32::try_from(faded * 0).unwrap_or(0))/' coordinator
+mutation too-few-lose-their-state trainer/coordinator/src/decide/attempts.rs 's/!left\.is_empty\(\) && self\.may_hold/left.is_empty() \&\& self.may_hold/' coordinator
+mutation failing-lead-ends-the-try trainer/coordinator/src/outcome.rs 's/&& self\.goes_on_without/\&\& !self.goes_on_without/' coordinator
+mutation joins-without-reaching worker/src/prepare.rs 's/for Member \{ worker, peer_address, \.\. \} in &task\.peers \{/for Member { worker, peer_address, .. } in task.peers.iter().take(0) {/' worker
+mutation only-whole-frames-count worker/src/gang/link.rs 's/if count > 0 \{/if count > 1 << 20 {/' worker
+mutation signs-behind-frames worker/src/gang/link.rs 's/writer\.sign\(sign, patience, abort\)\?;/let _ = sign;/' worker
+mutation slow-is-not-named worker/src/gang/pace.rs 's/const FAR_OVER: u32 = 3;/const FAR_OVER: u32 = 3_000_000;/' worker
 exit $missed

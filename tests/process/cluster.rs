@@ -591,3 +591,58 @@ fn p4_a_slow_joiner_holds_nobody_up() {
     assert_eq!(stage_of(&view, "vae")["attempt"], 1);
     cluster.fsck();
 }
+
+/// Sampled: a worker to whose peer port nobody can connect trains alone, with nothing saved; another one joins the cluster. The first keeps
+/// its steps and its rate.
+#[test]
+fn p20_a_worker_that_refuses_its_peers_keeps_its_steps_and_its_rate() {
+    let sets = [
+        "--set",
+        "stages.vae.steps=1500",
+        "--set",
+        "stages.vae.windows.until=1",
+        "--set",
+        "stages.vae.checkpoint.every=0",
+        "--until",
+        "vae",
+    ];
+    let mut cluster = Cluster::start(TRAINER);
+    // It listens on the other kind of address alone.
+    let port = Cluster::free_address().port();
+    cluster.join_by("w1", &[], &["--peer-address", &format!("[::1]:{port}")]);
+    let run = cluster.submit(&config(), &sets);
+    let at = |cluster: &Cluster| {
+        let stage = cluster.stage(&run, "vae");
+        (stage["progress"]["done"].as_u64().unwrap_or_default(), stage["attempt"].clone(), stage["workers"].clone())
+    };
+    // Steps in so many seconds, none of which goes back.
+    let rate = |cluster: &Cluster, seconds: u64| {
+        let (begun, first) = (Instant::now(), at(cluster).0);
+        let mut last = first;
+        while begun.elapsed() < Duration::from_secs(seconds) {
+            let (done, attempt, _) = at(cluster);
+            assert!(
+                done >= last && attempt == 1,
+                "step {last} became {done} in attempt {attempt}\n{}",
+                cluster.everything()
+            );
+            last = done;
+            std::thread::sleep(Duration::from_millis(100));
+        }
+        (last - first) as f64 / begun.elapsed().as_secs_f64()
+    };
+    cluster.wait_step(&run, "vae", 50);
+    let alone = rate(&cluster, 8);
+    cluster.join("w2");
+    wait_for("the second worker to be there", || {
+        let workers = cluster.get("/v1/workers")?;
+        workers.as_array()?.iter().any(|worker| worker["worker"] == "w2").then_some(())
+    });
+    let beside = rate(&cluster, 15);
+    eprintln!("{alone:.1} steps a second alone, {beside:.1} beside a worker that cannot reach it");
+    assert!(beside >= 0.8 * alone, "{beside:.1} steps a second, {alone:.1} alone\n{}", cluster.everything());
+    assert_eq!(at(&cluster).2, json!(["w1"]));
+    let view = cluster.wait_end(&run);
+    assert_eq!(stage_of(&view, "vae")["attempt"], 1);
+    cluster.fsck();
+}

@@ -84,6 +84,15 @@ impl Network {
         tool("tc", &shape).map_err(|error| fixtures::skip(&format!("a slow link: {error}"))).is_ok()
     }
 
+    /// Nothing that host `i` sends reaches the other hosts, while it hears them and the coordinator hears it; or so no more.
+    pub fn mute(&self, i: usize, is_mute: bool) {
+        let (verb, space) = (if is_mute { "add" } else { "del" }, self.space(i));
+        for other in (0..self.hosts).filter(|other| *other != i) {
+            ip(&format!("-n {space} route {verb} blackhole 10.77.{}.{}/32", self.id, other + 2))
+                .unwrap_or_else(|e| panic!("{e}"));
+        }
+    }
+
     /// The host is back, and so are its connections.
     pub fn mend(&self, i: usize) {
         ip(&format!("link set sv{0}-{i} master stride{0}", self.id)).unwrap_or_else(|e| panic!("{e}"));

@@ -32,6 +32,8 @@ struct State {
     /// The stage has returned; nothing runs under this grant any more.
     done: bool,
     progress: Progress,
+    /// Steps of the training state in memory.
+    holds: Option<u64>,
     committed: Option<Digest>,
     /// The newest generation's connections, until the stage takes them.
     offered: Option<Arc<Mesh>>,
@@ -91,6 +93,7 @@ impl ActiveAssignment {
             ended: None,
             done: false,
             progress: Progress::default(),
+            holds: None,
             committed: None,
             offered: None,
             newest: None,
@@ -297,8 +300,14 @@ impl ActiveAssignment {
     /// For the poll.
     pub(crate) fn doing(&self) -> Doing {
         let state = lock(&self.state);
-        let lost = state.newest.as_ref().map(|mesh| mesh.lost().into_iter().collect()).unwrap_or_default();
-        Doing { grant: state.assignment.grant.clone(), progress: state.progress.clone(), lost }
+        let (lost, waits_for) = state.newest.as_ref().map(|mesh| (mesh.lost(), mesh.waits_for())).unwrap_or_default();
+        let holds = state.holds;
+        Doing { holds, waits_for, lost, ..Doing::new(state.assignment.grant.clone(), state.progress.clone()) }
+    }
+
+    /// Notes how many steps the state in memory has seen; `None` if it is worth nothing to others.
+    pub(crate) fn set_holds(&self, steps: Option<u64>) {
+        lock(&self.state).holds = steps;
     }
 
     /// Sleeps until something changes, at most so long; returns why the grant has ended, if it has.

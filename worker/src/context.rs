@@ -39,6 +39,8 @@ pub(crate) struct HttpContext {
     telemetry: Arc<TelemetryBuffer>,
     mesh: Option<Arc<Mesh>>,
     behind: Option<Behind>,
+    /// When the last exchange or rendezvous ended.
+    computes_since: Instant,
     gang: bool,
     _sender: Sender,
 }
@@ -48,6 +50,8 @@ pub(crate) struct HttpContext {
 struct Behind {
     mesh: Arc<Mesh>,
     source: usize,
+    /// Steps of that state.
+    step: u64,
     applied: Option<u64>,
     begun: Instant,
 }
@@ -71,7 +75,8 @@ impl HttpContext {
         });
         let (telemetry, sender) = TelemetryBuffer::open(held.clone(), client.clone());
         let task = assignment.stage;
-        Self { task, device, data, held, client, blobs, telemetry, mesh: None, behind: None, gang, _sender: sender }
+        let (mesh, behind, computes_since) = (None, None, Instant::now());
+        Self { task, device, data, held, client, blobs, telemetry, mesh, behind, computes_since, gang, _sender: sender }
     }
 
     /// Waits until everything recorded and logged is stored.
@@ -136,13 +141,14 @@ impl HttpContext {
                 self.part();
                 Err(ContextError::GrantEnded(reason))
             }
-            Halt::Disagree(message) => Err(ContextError::Unavailable(message)),
-            Halt::Regroup | Halt::Peer => self.await_regroup(mesh),
+            Halt::Fault(message) => Err(ContextError::Fault(message)),
+            Halt::Regroup | Halt::Peer | Halt::Disagree(_) => self.await_regroup(mesh),
         }
     }
 
     /// Says that the members are at one state, of which `adopted` bytes came here in so many seconds.
-    fn met(&self, mesh: &Mesh, adopted: Option<(usize, f64)>) {
+    fn met(&mut self, mesh: &Mesh, adopted: Option<(usize, f64)>) {
+        self.computes_since = Instant::now();
         tracing::info!(
             task = %mesh.config.task,
             generation = %mesh.config.generation,
@@ -243,6 +249,7 @@ impl GangContext for HttpContext {
 
     fn rendezvous(&mut self, applied: Option<u64>, state: &[&[u8]]) -> Result<Rendezvous, ContextError> {
         self.held.busy().set(Phase::Working);
+        self.held.set_holds(applied);
         loop {
             self.check()?;
             if let Some(newer) = self.held.take_mesh() {
@@ -259,8 +266,8 @@ impl GangContext for HttpContext {
             let length = (kept.len() as u64).to_le_bytes();
             let offered: Vec<&[u8]> = state.iter().copied().chain([&kept[..], &length[..]]).collect();
             match exchange::rendezvous(&mesh, applied, &offered, &|| held.halt(generation)) {
-                Ok(Met::Behind(source)) => {
-                    self.behind = Some(Behind { mesh, source, applied, begun: Instant::now() });
+                Ok(Met::Behind(source, step)) => {
+                    self.behind = Some(Behind { mesh, source, step, applied, begun: Instant::now() });
                     return Ok(Rendezvous::Behind);
                 }
                 Ok(Met::Keep) => {
@@ -273,14 +280,17 @@ impl GangContext for HttpContext {
     }
 
     fn adopt(&mut self, state: &mut [&mut [u8]]) -> Result<Adopted, ContextError> {
-        let Some(Behind { mesh, source, applied, begun }) = self.behind.take() else { return Ok(Adopted::Cut) };
+        let Some(Behind { mesh, source, step, applied, begun }) = self.behind.take() else { return Ok(Adopted::Cut) };
         let held = self.held.clone();
         let generation = mesh.config.generation;
         let directly = applied.is_none();
         match exchange::adopt(&mesh, source, state, directly, &|| held.halt(generation)) {
             Ok(rest) => {
-                let rows = rows(&rest).ok_or_else(|| malformed("is cut short"))?;
-                self.telemetry.take_over(rows, applied).map_err(|e| malformed(&e.to_string()))?;
+                let rows = rows(&rest).ok_or_else(|| "is cut short".to_owned());
+                let taken = rows.and_then(|rows| self.telemetry.take_over(rows, applied).map_err(|e| e.to_string()));
+                // It may lie over a state of this member's own already, so this try is over.
+                taken.map_err(|why| ContextError::Fault(format!("a peer's list of recorded values {why}")))?;
+                self.held.set_holds(Some(step));
                 let bytes = state.iter().map(|piece| piece.len()).sum::<usize>() + rest.len();
                 self.met(&mesh, Some((bytes, begun.elapsed().as_secs_f64())));
                 Ok(Adopted::Whole)
@@ -298,8 +308,10 @@ impl GangContext for HttpContext {
 
     fn exchange(&mut self, step: u64, slices: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError> {
         self.check()?;
+        let saved = self.held.busy().phase() == Phase::Saving;
         self.held.busy().set(Phase::Working);
         failpoints::pace();
+        let computed = self.computes_since.elapsed();
         let Some(mesh) = self.mesh.clone() else { return Ok(Exchange::Regroup) };
         let generation = mesh.config.generation;
         if self.held.halt(generation).is_some() {
@@ -312,17 +324,20 @@ impl GangContext for HttpContext {
             let part = parts.iter().find(|(at, _)| *at == slice).map(|(_, part)| part.as_slice());
             let part = part.filter(|part| own.first().is_none_or(|(_, first): &(_, &[f32])| first.len() == part.len()));
             let Some(part) = part else {
-                return Err(ContextError::Unavailable(format!(
+                return Err(ContextError::Fault(format!(
                     "step {step}: slice {slice} of this member's {share:?} is missing or of another length; a fault of the stage"
                 )));
             };
             own.push((slice..slice + 1, part));
         }
-        let contribution =
-            Contribution { step, slices, parts: own, drain: self.held.drain(), durable: self.telemetry.durable() };
+        let (drain, durable) = (self.held.drain(), self.telemetry.durable());
+        let contribution = Contribution { step, slices, parts: own, drain, saved, computed, durable };
         let held = self.held.clone();
-        match exchange::exchange(&mesh, &contribution, &|| held.halt(generation)) {
+        let exchanged = exchange::exchange(&mesh, &contribution, &|| held.halt(generation));
+        self.computes_since = Instant::now();
+        match exchanged {
             Ok(total) => {
+                self.held.set_holds(Some(step + 1));
                 self.telemetry.forget(total.durable);
                 Ok(Exchange::Sum { sum: total.sum, drain: total.drain })
             }
@@ -388,10 +403,6 @@ impl GangContext for HttpContext {
 fn rows(behind: &[u8]) -> Option<&[u8]> {
     let (rows, length) = behind.split_at_checked(behind.len().checked_sub(8)?)?;
     (u64::from_le_bytes(length.try_into().ok()?) == rows.len() as u64).then_some(rows)
-}
-
-fn malformed(why: &str) -> ContextError {
-    ContextError::Unavailable(format!("a peer's list of recorded values {why}; is it the same build?"))
 }
 
 fn given_up(gave_up: GaveUp) -> ContextError {

@@ -4,7 +4,7 @@
 //! merely says (a poll, a tick of the clock) is an [`Observation`]; [`observe`](crate::observe) turns it into events when
 //! it means something, so that heartbeats cost no disk write.
 
-use protocol::message::{CommitCheckpoint, Grant, Join, Poll, ReportOutcome, TaskOutcome};
+use protocol::message::{CommitCheckpoint, Join, Poll, ReportOutcome, TaskOutcome};
 use protocol::pipeline::Pipeline;
 use protocol::stage::Keep;
 use protocol::{Alias, Digest, Fence, Incarnation, Owner, RunId, StageName, TaskId, WorkerId};
@@ -44,7 +44,7 @@ pub enum Event {
         /// Whose word it is.
         by: Identity,
     },
-    /// A worker that had lost its lease, or whose peers had lost it, was heard again.
+    /// A worker that had lost its lease, or that had to leave a gang some time ago, was heard again.
     WorkerBack {
         /// Who.
         worker: WorkerId,
@@ -72,12 +72,17 @@ pub enum Event {
         /// Which process said so of itself. `None` is the word of the launcher, which saw the newest one exit.
         incarnation: Option<Incarnation>,
     },
-    /// A gang member could not reach others.
-    PeersLost {
-        /// The reporter's grant.
-        grant: Grant,
-        /// Whom.
-        lost: Vec<WorkerId>,
+    /// Members of a gang complain of each other, as [`Heard::words`](crate::state::Heard::words) says.
+    GangDivided {
+        task: TaskId,
+        /// The generation.
+        fence: Fence,
+    },
+    /// No member of a gang has had a step more for too long.
+    GangStalled {
+        task: TaskId,
+        /// The generation.
+        fence: Fence,
     },
     /// A checkpoint was uploaded and shall count.
     Checkpoint {
@@ -162,7 +167,8 @@ impl Event {
             | Self::WorkerReady { .. }
             | Self::LeaseExpired { .. }
             | Self::WorkerGone { .. }
-            | Self::PeersLost { .. }
+            | Self::GangDivided { .. }
+            | Self::GangStalled { .. }
             | Self::Control { .. }
             | Self::WorkerForgotten { .. }
             | Self::Drain

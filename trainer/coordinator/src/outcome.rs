@@ -6,16 +6,20 @@
 //! | resolved | done, of a task that resolves | refused | as finished |
 //! | finished | done | refused | refused, unless it is the accepted report sent again |
 //! | yielded | waits | refused | as above |
+//! | failed: infrastructure, fault, damaged, another holds the state | the member leaves the gang | the same | as above |
 //! | failed: infrastructure | tried again | the member leaves the gang | as above |
 //! | failed: fault | tried again | tried again | as above |
 //! | failed: memory, others in the gang | tried without the member | tried without the member | as above |
 //! | failed: an input is damaged | waits until that is made again | the same | as above |
+//! | failed: input, diverged, storage, only another holds the state | the member leaves the gang | the same | as above |
 //! | failed: input, diverged, memory and alone, storage | final | final | as above |
+//!
+//! So a member that fails costs its gang no step while another one holds the state.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use protocol::message::{CommitCheckpoint, FailureClass, Grant, ReportOutcome, TaskOutcome};
+use protocol::message::{CommitCheckpoint, FailureClass, Grant, LossCause, ReportOutcome, TaskOutcome};
 use protocol::stage::{Keep, StageSettings};
 use protocol::sweep::STATE_OUTPUT;
 use protocol::{Digest, WorkerId, canonical};
@@ -99,6 +103,15 @@ impl Deciding<'_> {
                 });
             }
             TaskOutcome::Failed { class, message } => {
+                let task = &self.state.executions[&key].tasks[i];
+                if *class != FailureClass::OutOfMemory
+                    && self.goes_on_without(task, &worker)
+                    && !(class.is_final() && self.has_state(task, &worker))
+                {
+                    self.leave(key, i, &worker, LossCause::Unreachable);
+                    self.accepted(key, i, &report);
+                    return Ok(true);
+                }
                 let fault = match class {
                     FailureClass::Fault => true,
                     FailureClass::Infrastructure => false,
@@ -125,7 +138,7 @@ impl Deciding<'_> {
                     }
                 };
                 if rank != 0 && !fault {
-                    self.suspect(&grant.task.clone(), &[worker])?;
+                    self.leave(key, i, &worker, LossCause::Unreachable);
                 } else {
                     self.try_again(key, i, message, fault);
                 }

@@ -188,7 +188,8 @@ impl Deciding<'_> {
                 continue;
             }
             self.state.visits += 1;
-            let carry_on = !self.state.draining && self.state.is_wanted(&execution);
+            let enough = execution.is_enough();
+            let carry_on = !self.state.draining && enough && self.state.is_wanted(&execution);
             if !execution.tasks.all_draining(!carry_on) {
                 for i in execution.tasks.held() {
                     self.change(key, i, |task| task.drain((!carry_on).then_some(deadline)));

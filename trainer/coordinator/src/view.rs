@@ -87,10 +87,11 @@ impl State {
         }
         let open = self.open_gangs.iter().filter_map(|(key, i)| {
             let execution = self.executions.get(key).filter(|execution| execution.takes(worker))?;
-            let task = execution.tasks.get(*i)?;
+            let task = execution.tasks.get(*i).filter(|task| !task.is_held() || worker.shunned.is_none())?;
             // A member that joins others is handed their state.
             let resume = if task.is_held() { None } else { task.newest().map(|saved| saved.manifest) };
-            Some(Prepare { task: task.id.clone(), inputs: execution.artifacts(), resume })
+            let (inputs, peers) = (execution.artifacts(), task.holders().to_vec());
+            Some(Prepare { task: task.id.clone(), inputs, resume, peers })
         });
         open.take(AT_ONCE).collect()
     }

@@ -325,7 +325,7 @@ async fn polls_alone_keep_a_lease_and_show_progress() -> TestResult {
         for (i, (name, joined)) in [("a", &first), ("b", &second)].into_iter().enumerate() {
             done += 1;
             let progress = Progress { done, total: 100, ..Progress::default() };
-            let doing = Doing { grant: held.clone(), progress, lost: vec![] };
+            let doing = Doing::new(held.clone(), progress);
             let doing = if name == "a" { vec![doing] } else { vec![] };
             let poll = Poll { incarnation: joined.incarnation, doing, ready: vec![], version: version[i] };
             let desired: DesiredAssignments = client.call("POST", &format!("/v1/workers/{name}/poll"), poll).await?;

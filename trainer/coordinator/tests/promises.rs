@@ -8,7 +8,8 @@ mod common;
 use coordinator::state::task::{Lease, Part};
 use coordinator::{Control, Event, Millis, Observation, Policy, Rejected, observe};
 use protocol::message::{
-    CommitCheckpoint, Doing, FailureClass, Grant, Poll, Progress, ReportOutcome, RunState, StageState, TaskOutcome,
+    CommitCheckpoint, Doing, FailureClass, Grant, LossCause, LostPeer, Poll, Progress, ReportOutcome, RunState,
+    StageState, TaskOutcome,
 };
 use protocol::stage::WorkerRange;
 use protocol::{Digest, RunId, WorkerId};
@@ -97,9 +98,10 @@ fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
     }
     assert_eq!(gang(&coordinator), ["b", "c"].map(WorkerId::from));
 
-    let lost = vec!["b".into(), "c".into()];
+    let lost = |name: &str| LostPeer { worker: name.into(), cause: LossCause::Unreachable };
     let progress = Progress { done: 999, total: 1000, ..Progress::default() };
-    let doing = vec![Doing { grant: old.clone(), progress, lost: lost.clone() }];
+    let doing = Doing { holds: Some(999), lost: ["b", "c"].map(lost).into(), ..Doing::new(old.clone(), progress) };
+    let doing = vec![doing];
     let poll = Poll { incarnation: a, doing, ready: Vec::new(), version: 0 };
     let heard =
         observe(&mut coordinator.state, Millis(coordinator.now), Observation::Poll { worker: "a".into(), poll });
@@ -109,8 +111,8 @@ fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
     let told: Vec<u64> = view.stages.iter().map(|stage| stage.progress.done).collect();
     assert!(!told.contains(&999), "{told:?}");
 
-    let refused = coordinator.happen(Event::PeersLost { grant: old.clone(), lost });
-    assert!(matches!(refused, Err(Rejected::StaleFence { .. })), "{refused:?}");
+    let event = Event::GangDivided { task: old.task.clone(), fence: old.fence };
+    assert_eq!(coordinator.happen(event), Ok(Vec::new()), "the generation is over");
     assert_eq!(gang(&coordinator), ["b", "c"].map(WorkerId::from));
 }
 

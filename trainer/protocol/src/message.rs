@@ -70,8 +70,38 @@ pub struct Doing {
     /// Grant of the assignment.
     pub grant: Grant,
     pub progress: Progress,
-    /// Gang members that this one could not reach in this generation. The coordinator drops them from the gang.
-    pub lost: Vec<WorkerId>,
+    /// Steps applied in the training state that this member holds in memory; `None` while it has only initialised itself.
+    pub holds: Option<u64>,
+    /// The member that this one waits for now.
+    pub waits_for: Option<WorkerId>,
+    /// Gang members that this one cannot go on with in this generation. The coordinator decides who of them leaves the gang.
+    pub lost: Vec<LostPeer>,
+}
+
+impl Doing {
+    /// Work on `grant` that has come so far, with no state in memory and nothing to complain of.
+    pub fn new(grant: Grant, progress: Progress) -> Self {
+        Self { grant, progress, holds: None, waits_for: None, lost: Vec::new() }
+    }
+}
+
+/// A gang member that another cannot go on with.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct LostPeer {
+    pub worker: WorkerId,
+    pub cause: LossCause,
+}
+
+/// The reason for which a member cannot go on with a peer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum LossCause {
+    /// No connection, or no byte of it for too long.
+    Unreachable,
+    /// Reachable, but training alone would be faster.
+    Slow,
+    /// It sends what this build does not expect.
+    Disagrees,
 }
 
 /// Progress of a task.
@@ -116,6 +146,8 @@ pub struct Prepare {
     pub inputs: BTreeMap<String, Digest>,
     /// Checkpoint to continue from, unless a member would supply its state.
     pub resume: Option<Digest>,
+    /// The members that it would join. It is ready once it reaches all of them.
+    pub peers: Vec<Member>,
 }
 
 /// The right to write for a task.
@@ -299,6 +331,16 @@ pub enum FailureClass {
     Fault,
     /// A lost peer or a network error: counts against the infrastructure budget.
     Infrastructure,
+}
+
+impl FailureClass {
+    /// Returns true if another try on another worker would fail the same way.
+    pub fn is_final(self) -> bool {
+        match self {
+            Self::Input | Self::Diverged | Self::OutOfMemory | Self::Storage => true,
+            Self::Damaged | Self::Fault | Self::Infrastructure => false,
+        }
+    }
 }
 
 /// `POST /v1/runs`: submits a pipeline.

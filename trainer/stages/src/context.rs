@@ -30,6 +30,9 @@ pub enum ContextError {
     /// A stored object is damaged or missing.
     #[error("{0}")]
     Damaged(String),
+    /// What was asked for makes no sense: a fault of ours.
+    #[error("{0}")]
+    Fault(String),
 }
 
 /// An error of a stage. The message does not name the stage; the caller adds the name.
@@ -65,8 +68,8 @@ impl StageError {
             Self::Context(ContextError::Storage(_)) => FailureClass::Storage,
             Self::Context(ContextError::Corrupt(_)) => FailureClass::Storage,
             Self::Context(ContextError::Damaged(_)) => FailureClass::Damaged,
-            Self::Context(_) => FailureClass::Infrastructure,
-            Self::Fault(_) => FailureClass::Fault,
+            Self::Fault(_) | Self::Context(ContextError::Fault(_)) => FailureClass::Fault,
+            Self::Context(ContextError::GrantEnded(_) | ContextError::Unavailable(_)) => FailureClass::Infrastructure,
         }
     }
 }

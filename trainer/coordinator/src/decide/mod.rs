@@ -15,6 +15,7 @@ pub(crate) mod attempts;
 pub(crate) mod deciding;
 pub(crate) mod executions;
 mod forget;
+mod gangs;
 mod mending;
 mod runs;
 mod start;
@@ -95,7 +96,8 @@ impl Deciding<'_> {
                 }
                 self.drop_worker(&worker, Loss::Lost);
             }
-            Event::PeersLost { grant, lost } => return self.peers_lost(&grant, &lost),
+            Event::GangDivided { task, fence } => return self.gang_divided(&task, fence),
+            Event::GangStalled { task, fence } => return self.gang_stalled(&task, fence),
             Event::Checkpoint { commit } => return self.checkpoint(commit),
             Event::Outcome { report } => return self.outcome(report),
             Event::Control { run, action, archived } => return self.control(&run, action, archived),

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use protocol::message::{Grant, Join};
+use protocol::message::Join;
 use protocol::{Incarnation, TaskId, WorkerId};
 
 use super::attempts::Loss;
@@ -52,7 +52,8 @@ impl Deciding<'_> {
     pub(crate) fn sign(&mut self, worker: &WorkerId, sign: Sign) -> Result<bool, Rejected> {
         let known = self.state.workers.get(worker);
         let known = known.ok_or_else(|| Rejected::NotFound(format!("worker `{worker}` is not known")))?;
-        if known.presence.after(sign, self.now()) == known.presence {
+        let is_over = known.shunned.is_some_and(|until| until <= self.now()) && sign == Sign::Back;
+        if known.presence.after(sign, self.now()) == known.presence && !is_over {
             return Ok(false);
         }
         self.set_presence(worker, sign);
@@ -64,34 +65,10 @@ impl Deciding<'_> {
         let Some(known) = self.state.workers.get(worker) else { return };
         let mut process = known.clone();
         process.presence = process.presence.after(sign, now);
-        process.suspicions += u32::from(sign == Sign::PeersLost);
+        process.shunned = process.shunned.filter(|until| sign != Sign::Back || *until > now);
         if process != *known {
             self.record(Fact::Worker { worker: worker.clone(), process });
         }
-    }
-
-    /// A member of a gang says whom it cannot reach; `false` if those are no members any more.
-    pub(crate) fn peers_lost(&mut self, grant: &Grant, lost: &[WorkerId]) -> Result<bool, Rejected> {
-        let (_, task) = self.state.task(&grant.task)?;
-        task.check(grant)?;
-        let members = task.holders().iter().map(|member| &member.worker);
-        let lost: Vec<WorkerId> =
-            members.filter(|worker| **worker != grant.worker && lost.contains(worker)).cloned().collect();
-        if lost.is_empty() {
-            return Ok(false);
-        }
-        self.suspect(&grant.task, &lost)?;
-        Ok(true)
-    }
-
-    /// Takes members out of a gang whose peers cannot reach them.
-    pub(crate) fn suspect(&mut self, task: &TaskId, lost: &[WorkerId]) -> Result<(), Rejected> {
-        for worker in lost {
-            self.set_presence(worker, Sign::PeersLost);
-        }
-        let (key, i) = self.place(task)?;
-        self.take_from(key, i, lost, Loss::Lost);
-        Ok(())
     }
 
     pub(crate) fn drop_worker(&mut self, worker: &WorkerId, loss: Loss) {

@@ -211,6 +211,13 @@ impl State {
                 };
             };
             before.iter().for_each(|member| set(&member.worker, None));
+            if before.iter().any(|member| !after.contains(member) && self.heard.words.contains_key(&member.worker)) {
+                let words = Arc::make_mut(&mut self.heard.words);
+                before
+                    .iter()
+                    .filter(|member| !after.contains(member))
+                    .for_each(|member| drop(words.remove(&member.worker)));
+            }
             after.iter().for_each(|member| set(&member.worker, Some((key, i))));
         }
     }

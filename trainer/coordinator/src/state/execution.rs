@@ -142,6 +142,12 @@ impl StageExecution {
         WorkerRange { min: min.min(slices), max }
     }
 
+    /// Whether its gang, if it has one, has as many members as it needs. One that has fewer saves and ends its try.
+    pub fn is_enough(&self) -> bool {
+        let min = self.range().min.max(1);
+        self.tasks.held().all(|i| self.tasks[i].part != Part::Gang || self.tasks[i].holders().len() >= min)
+    }
+
     /// The instruction set that all who work on it must have: that of those who work on it now, or of what an earlier try left.
     pub fn bound_to(&self) -> Option<&str> {
         self.instruction_set.as_deref().filter(|_| self.is_busy() || self.has_something())

@@ -9,6 +9,7 @@
 //! that nothing that was forgotten is mistaken for something new.
 
 mod apply;
+pub mod evidence;
 pub mod execution;
 pub mod gang;
 pub mod run;
@@ -24,6 +25,7 @@ use protocol::message::{Grant, Progress};
 use protocol::{Digest, Fence, Incarnation, RunId, StageName, TaskId, WorkerId};
 
 pub use self::apply::Misfit;
+use self::evidence::Words;
 use self::execution::{ExecutionState, StageExecution};
 use self::run::Run;
 use self::task::Task;
@@ -39,6 +41,8 @@ pub struct Heard {
     pub workers: Arc<BTreeMap<WorkerId, Millis>>,
     /// What was last said about each task that is all of its work.
     pub progress: Arc<BTreeMap<TaskId, Arc<Progress>>>,
+    /// What members of gangs have said about their state and about each other. A worker that loses its task loses its word.
+    pub words: Arc<Words>,
 }
 
 /// All that the coordinator knows. What may be large is shared between copies until one changes it, so a copy is cheap.

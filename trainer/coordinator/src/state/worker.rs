@@ -111,8 +111,15 @@ pub struct Worker {
     pub peer_address: String,
     /// Whether it can be given work.
     pub presence: Presence,
-    /// How often peers could not reach this process; each time it stays out for longer.
+    /// How often this process was taken out of a gang, or complained alone of a member that left; each time it is shunned for longer.
+    /// Fades with time.
     pub suspicions: u32,
+    /// When it was last suspected.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub suspected: Option<Millis>,
+    /// Until when it does not join other members of a gang. It may do what it does alone.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub shunned: Option<Millis>,
     /// Gang tasks whose inputs it has said that it has. Some may be over.
     #[serde(default, skip_serializing_if = "BTreeSet::is_empty")]
     pub ready: BTreeSet<TaskId>,
@@ -133,6 +140,8 @@ impl Worker {
             peer_address: join.peer_address.clone(),
             presence: Presence::Here,
             suspicions: 0,
+            suspected: None,
+            shunned: None,
             ready: BTreeSet::new(),
             holds: None,
         }

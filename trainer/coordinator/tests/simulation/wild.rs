@@ -80,7 +80,8 @@ pub(crate) fn events(state: &State, ended: &[Run]) -> Vec<Event> {
         events.push(Event::BackoffOver { task: task.clone() });
         for grant in grants(state, task, &nobody) {
             events.push(Event::GraceOver { task: task.clone(), fence: grant.fence });
-            events.push(Event::PeersLost { grant: grant.clone(), lost: state.workers.keys().cloned().collect() });
+            events.push(Event::GangDivided { task: task.clone(), fence: grant.fence });
+            events.push(Event::GangStalled { task: task.clone(), fence: grant.fence });
             let commit = CommitCheckpoint {
                 grant: grant.clone(),
                 step: 2,
