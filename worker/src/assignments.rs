@@ -5,7 +5,7 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use protocol::Incarnation;
 use protocol::message::{Assignment, DesiredAssignments, Join, Joined, Poll};
@@ -22,6 +22,8 @@ use crate::prepare::Preparation;
 const LONGEST: Duration = Duration::from_secs(1);
 /// Shortest time between two polls.
 const SHORTEST: Duration = Duration::from_millis(20);
+/// Time after which a worker says again that it waits for its coordinator.
+const REMIND: Duration = Duration::from_secs(60);
 /// Refusals in a row before they are believed.
 const REFUSALS: u32 = 5;
 
@@ -148,7 +150,7 @@ pub(crate) enum End {
 /// Offers this process until the coordinator takes it, or gives how the worker ends instead.
 async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Joined, End> {
     let mut pause = Duration::from_millis(50);
-    let mut said = false;
+    let mut said: Option<Instant> = None;
     loop {
         match client.join(join).await {
             Ok(joined) => {
@@ -156,8 +158,13 @@ async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Joined, E
                 return Ok(joined);
             }
             Err(error) if error.may_pass() => {
-                if !std::mem::replace(&mut said, true) {
-                    tracing::warn!("the coordinator cannot take this worker yet: {error}; trying again");
+                if said.is_none_or(|said| said.elapsed() > REMIND) {
+                    said = Some(Instant::now());
+                    let help = match error {
+                        CallError::Away(_) => "; `trainer serve` starts one there, Ctrl-C ends this worker",
+                        _ => "",
+                    };
+                    tracing::warn!("waiting for the coordinator at {}: {error}{help}", client.url());
                 }
             }
             Err(error) => {

@@ -12,6 +12,7 @@ pub mod message;
 pub mod model_ref;
 pub mod pipeline;
 pub mod printable;
+pub mod spelling;
 pub mod stage;
 pub mod sweep;
 pub mod units;

@@ -20,6 +20,7 @@ mod spectrum;
 mod stream;
 pub(crate) mod sweep;
 mod time;
+mod words;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -30,6 +31,7 @@ use protocol::StageName;
 use registry::{OpenError, ReadStore};
 
 use self::args::{BlobArgs, PipelineArgs};
+use crate::advice::advice;
 use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result, exit};
@@ -38,7 +40,7 @@ use crate::{cost, pipeline_file, plan, run, verify};
 
 /// Trains text-to-motion models across workers and keeps what came out of it
 #[derive(Debug, Parser)]
-#[command(name = "trainer", version, propagate_version = true)]
+#[command(name = "trainer", version = env!("STRIDE_VERSION"), propagate_version = true, after_help = exit::HELP)]
 pub(crate) struct Cli {
     #[command(subcommand)]
     verb: Verb,
@@ -207,9 +209,11 @@ pub(crate) fn main(cli: Cli) -> ExitCode {
 /// Warnings on stderr, more by `RUST_LOG`. A log line that nobody reads any more is dropped: told of it, the subscriber would print that, fail
 /// again, and panic in the middle of what it logs for.
 fn init_logging() {
+    // The database warns of each statement that waits for a slow disk, in lines of SQL.
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).log_internal_errors(false).init();
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn,sqlx=error"));
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    log.with_ansi(print::on_terminal()).log_internal_errors(false).init();
 }
 
 impl Verb {
@@ -320,6 +324,7 @@ async fn show_plan(args: PlanArgs) -> Result<u8> {
     if !args.no_time && plan.stages.iter().any(|step| step.action != "cached") {
         plan.estimate(&cost::estimates(&file.pipeline));
     }
+    advice(&file.pipeline).iter().for_each(|note| print::note(&format!("note: {note}")));
     match args.output {
         Output::Json => print::json(&plan),
         Output::Table => print::out(&plan.screen(&file.pipeline)),
