@@ -286,3 +286,35 @@ fn a_version_says_what_was_built_and_under_which_licence() {
         assert!(text.contains(words) && readme.contains(&format!("]({name})")), "{name}");
     }
 }
+
+/// What needs no model, of the examples that `--help` shows, and what they write.
+#[test]
+fn a_shell_and_a_manual_get_what_they_read() {
+    let bench = Bench::new(TRAINER);
+    for (shell, part) in [("bash", "complete -F"), ("zsh", "#compdef trainer"), ("fish", "complete -c trainer")] {
+        let script = bench.run(&["completions", shell]).expect_code(0).stdout;
+        assert!(script.contains(part) && script.contains("generate"), "{shell}: {} bytes", script.len());
+    }
+    bench.run(&["man", "pages"]).expect_code(0);
+    for page in ["trainer.1", "trainer-run.1", "trainer-worker-join.1"] {
+        let text = fs::read_to_string(bench.path().join("pages").join(page)).expect("a page");
+        assert!(text.contains(".TH"), "{page}");
+    }
+}
+
+#[test]
+fn a_doctor_says_what_is_missing_and_what_to_do() {
+    let bench = Bench::new(TRAINER);
+    let said = bench.run(&["doctor"]).expect_code(0).stdout;
+    assert!(said.contains("warn  store    there is none in `.stride`; `trainer run PIPELINE` makes one"), "{said}");
+    assert!(said.contains("ok    device   `flex`") && said.contains("  disk  "), "{said}");
+    bench.run(&["run", &Bench::config("smoke.yaml"), "--until", "dataset", "--workers", "1"]).expect_code(0);
+    let said = bench.run(&["doctor", "-o", "json"]).expect_code(0).json();
+    let findings = said["findings"].as_array().expect("findings");
+    let store = findings.iter().find(|finding| finding["what"] == "store").expect("the store");
+    assert_eq!((&store["state"], &store["hint"]), (&"ok".into(), &serde_json::Value::Null));
+    let said = bench.run(&["doctor", "--server", "http://127.0.0.1:1"]).expect_code(1).stdout;
+    let line = said.lines().find(|line| line.contains("server")).expect("the server");
+    assert!(line.starts_with("FAIL") && line.contains("trainer serve"), "{line}");
+    assert!(bench.path().read_dir().expect("a folder").count() == 1, "it writes nothing but what the run wrote");
+}

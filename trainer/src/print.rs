@@ -29,6 +29,11 @@ pub(crate) fn out(text: &str) {
     let _ = writeln!(std::io::stdout().lock(), "{}", printable(text));
 }
 
+/// Bytes of ours as they are, such as a script for a shell.
+pub(crate) fn raw(bytes: &[u8]) {
+    let _ = std::io::stdout().lock().write_all(bytes);
+}
+
 /// One line of a stream; ends the process quietly when nobody reads any more.
 pub(crate) fn line(text: &str) {
     if writeln!(std::io::stdout().lock(), "{}", printable(text)).is_err() {

@@ -4,6 +4,7 @@ mod args;
 mod config;
 mod control;
 mod data;
+mod doctor;
 mod door;
 mod export;
 mod gallery;
@@ -16,6 +17,7 @@ mod remote;
 mod sampler;
 mod sentences;
 mod serve;
+mod shell;
 mod spectrum;
 mod stream;
 pub(crate) mod sweep;
@@ -49,45 +51,74 @@ pub(crate) struct Cli {
 #[derive(Debug, Subcommand)]
 enum Verb {
     /// Runs a pipeline on this machine; run it again to go on where it stopped
+    #[command(
+        after_help = "Examples:\n  trainer run configs/quickstart.yaml\n  trainer run configs/smoke.yaml --until vae --workers 2 -o json"
+    )]
     Run(RunArgs),
     /// Shows what `run` would do, and why
+    #[command(
+        after_help = "Examples:\n  trainer plan configs/quickstart.yaml\n  trainer plan configs/motionpcm.yaml --no-time"
+    )]
     Plan(PlanArgs),
     /// Sends a pipeline to a server
+    #[command(after_help = "Example:\n  trainer submit configs/quickstart.yaml --follow")]
     Submit(remote::SubmitArgs),
     /// Coordinates runs for clients and workers elsewhere
     Serve(serve::ServeArgs),
     /// Shows a run, or all runs
+    #[command(after_help = "Examples:\n  trainer status\n  trainer status --all")]
     Status(remote::StatusArgs),
     /// Shows what workers said
+    #[command(after_help = "Example:\n  trainer logs @last --stage vae --follow")]
     Logs(remote::LogsArgs),
     /// What the sweeps of a run have tried, and what came of it
     #[command(subcommand)]
     Sweep(sweep::SweepVerb),
     /// Ends a run
+    #[command(after_help = "Example:\n  trainer cancel @last")]
     Cancel(remote::ControlArgs),
     /// Holds a run back: its workers save and stop
+    #[command(after_help = "Example:\n  trainer pause @last")]
     Pause(remote::ControlArgs),
     /// Takes a paused, failed or cancelled run up again
+    #[command(after_help = "Example:\n  trainer resume @last")]
     Resume(ResumeArgs),
     /// Makes motions from sentences
+    #[command(
+        after_help = "Examples:\n  trainer generate \"a person walks in a circle\" --model quickstart@staging -o walk.gif\n  trainer generate \"a person jumps\" -n 4 --seconds 4s --model quickstart@staging -o jump.html -o json"
+    )]
     Generate(Box<generate::GenerateArgs>),
     /// Recordings of motion
     #[command(subcommand)]
     Data(data::DataVerb),
     /// Makes one page of what a run's models draw, side by side
+    #[command(after_help = "Example:\n  trainer gallery @last -n 2 -o gallery.html")]
     Gallery(Box<gallery::GalleryArgs>),
     /// Turns a motion or a recording into another form: BVH, GLB, a page, a picture, an array
+    #[command(after_help = "Example:\n  trainer export walk.npy -o walk.glb -o walk.mp4")]
     Export(export::ExportArgs),
     /// Makes a version of a model of weights that others have published
+    #[command(
+        after_help = "Example:\n  trainer import motionlcm.ckpt --as motionlcm --part lcm --statistics deps/motionlcm/meta --text sentence-t5=data/sentence-t5-large"
+    )]
     Import(Box<import::ImportArgs>),
     /// Measures how long models take for a sentence (AITS), side by side
+    #[command(after_help = "Example:\n  trainer time quickstart@staging --stage mld --steps 50,4,1")]
     Time(time::TimeArgs),
     /// Lists what this build and machine can compute on
+    #[command(after_help = "Example:\n  trainer devices")]
     Devices(config::DevicesArgs),
+    /// Looks at store, disk, devices and server, and says what to do about what is missing
+    Doctor(doctor::DoctorArgs),
+    /// Prints what a shell needs to complete commands and options
+    Completions(shell::CompletionsArgs),
+    /// Writes manual pages, one for each command
+    Man(shell::ManArgs),
     /// Pipeline files
     #[command(subcommand)]
     Config(config::ConfigVerb),
     /// Prints the JSON Schema of pipelines, for editors
+    #[command(after_help = "Example:\n  trainer schema --markdown")]
     Schema(config::SchemaArgs),
     /// Workers
     #[command(subcommand)]
@@ -248,8 +279,11 @@ impl Verb {
             Self::Import(args) => args.output,
             Self::Time(args) => args.output,
             Self::Devices(args) => args.output,
+            Self::Doctor(args) => args.output,
             Self::Worker(WorkerVerb::List(args)) => args.output,
             Self::Serve(_)
+            | Self::Completions(_)
+            | Self::Man(_)
             | Self::Config(_)
             | Self::Schema(_)
             | Self::Worker(WorkerVerb::Join(_))
@@ -277,6 +311,9 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Import(args) => import::import(*args, command_line()).await,
         Verb::Time(args) => time::time(args).await,
         Verb::Devices(args) => Ok(config::devices(&args)),
+        Verb::Doctor(args) => doctor::doctor(args).await,
+        Verb::Completions(args) => Ok(shell::completions(&args)),
+        Verb::Man(args) => shell::man(&args),
         Verb::Config(verb) => config::config(&verb),
         Verb::Schema(args) => Ok(config::schema(&args)),
         Verb::Worker(WorkerVerb::List(args)) => remote::workers(args).await,
@@ -367,6 +404,28 @@ mod tests {
         for words in commands {
             if let Err(error) = Cli::try_parse_from(&words) {
                 panic!("{}: {error}", words.join(" "));
+            }
+        }
+    }
+
+    /// The examples of a command's `--help` and of those below it.
+    fn examples(command: &clap::Command) -> Vec<String> {
+        let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
+        let lines = help.lines().filter_map(|line| Some(line[line.find("trainer ")?..].to_owned()));
+        let own = lines.filter(|_| help.starts_with("Example")).collect::<Vec<_>>();
+        own.into_iter().chain(command.get_subcommands().flat_map(examples)).collect()
+    }
+
+    #[test]
+    fn the_examples_of_every_help_parse() {
+        let command = <Cli as clap::CommandFactory>::command();
+        let examples = examples(&command);
+        assert!(examples.len() >= 20, "{examples:#?}");
+        for example in examples {
+            let words = cluster_tests::documented::words(&example);
+            let words: Vec<&String> = words.iter().take_while(|word| *word != ">").collect();
+            if let Err(error) = Cli::try_parse_from(words) {
+                panic!("{example}: {error}");
             }
         }
     }
