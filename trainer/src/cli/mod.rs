@@ -28,7 +28,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use access::ServerOptions;
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use protocol::StageName;
 use registry::{OpenError, ReadStore};
 
@@ -312,8 +312,8 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Time(args) => time::time(args).await,
         Verb::Devices(args) => Ok(config::devices(&args)),
         Verb::Doctor(args) => doctor::doctor(args).await,
-        Verb::Completions(args) => Ok(shell::completions(&args)),
-        Verb::Man(args) => shell::man(&args),
+        Verb::Completions(args) => Ok(shell::completions(&args, Cli::command())),
+        Verb::Man(args) => shell::man(&args, Cli::command()),
         Verb::Config(verb) => config::config(&verb),
         Verb::Schema(args) => Ok(config::schema(&args)),
         Verb::Worker(WorkerVerb::List(args)) => remote::workers(args).await,
@@ -418,7 +418,7 @@ mod tests {
 
     #[test]
     fn the_examples_of_every_help_parse() {
-        let command = <Cli as clap::CommandFactory>::command();
+        let command = Cli::command();
         let examples = examples(&command);
         assert!(examples.len() >= 20, "{examples:#?}");
         for example in examples {
@@ -432,7 +432,7 @@ mod tests {
 
     #[test]
     fn options_are_consistent() {
-        <Cli as clap::CommandFactory>::command().debug_assert();
+        Cli::command().debug_assert();
     }
 
     #[test]

@@ -2,10 +2,9 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, CommandFactory};
+use clap::{Args, Command};
 use clap_complete::Shell;
 
-use super::Cli;
 use crate::print;
 use crate::problem::{Problem, Result};
 
@@ -31,17 +30,17 @@ pub(crate) struct ManArgs {
     folder: PathBuf,
 }
 
-pub(crate) fn completions(args: &CompletionsArgs) -> u8 {
+pub(crate) fn completions(args: &CompletionsArgs, mut command: Command) -> u8 {
     let mut script = Vec::new();
-    clap_complete::generate(args.shell, &mut Cli::command(), "trainer", &mut script);
+    clap_complete::generate(args.shell, &mut command, "trainer", &mut script);
     print::raw(&script);
     0
 }
 
-pub(crate) fn man(args: &ManArgs) -> Result<u8> {
+pub(crate) fn man(args: &ManArgs, command: Command) -> Result<u8> {
     let failed = |error| Problem::failed(format!("cannot write to `{}`: {error}", args.folder.display()));
     std::fs::create_dir_all(&args.folder).map_err(failed)?;
-    clap_mangen::generate_to(Cli::command(), &args.folder).map_err(failed)?;
+    clap_mangen::generate_to(command, &args.folder).map_err(failed)?;
     print::note(&format!("the pages are in `{}`", args.folder.display()));
     Ok(0)
 }
