@@ -1,4 +1,4 @@
-//! What a sound pipeline probably does not mean: said before it runs, and no reason to refuse it.
+//! Advice on settings of a valid pipeline that are probably not meant. It is printed before a run and refuses nothing.
 
 use protocol::pipeline::{Pipeline, PipelineStage};
 use protocol::units::grouped;

@@ -200,7 +200,7 @@ impl State {
         }
     }
 
-    /// Whether a stage could begin if there were workers for it.
+    /// Returns true if a stage could begin and lacks only workers.
     fn wants_workers(&self, run: &Run, execution: &StageExecution) -> bool {
         execution.state == ExecutionState::Open
             && run.state == RunState::Running

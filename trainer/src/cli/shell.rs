@@ -1,4 +1,4 @@
-//! What shells and `man` read of the command line: completions and pages, made from the same arguments.
+//! Completions for shells and pages for `man`, made from the declared arguments.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! What a run looks like while it runs: on a terminal a bar for each stage at work and a line for each that ended, else a line for each
+//! Shows a run while it runs: on a terminal a bar for each stage at work and a line for each that ended, else a line for each
 //! change and one a minute for each stage at work.
 
 mod curve;

@@ -108,7 +108,7 @@ impl Generator {
         self.sampler.clone().unwrap_or_else(|| self.model.family().published())
     }
 
-    /// What the model was trained to do.
+    /// Returns the family of the model, which says what it was trained to do.
     pub fn family(&self) -> &Family {
         self.model.family()
     }
