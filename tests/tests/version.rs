@@ -1,6 +1,6 @@
 //! The commit in `--version` is that of the checkout which is built.
 
-#[allow(dead_code, reason = "the rest is for build scripts")]
+#[allow(dead_code, clippy::print_stdout, reason = "the rest is for build scripts, which print")]
 #[path = "../../ops/version.rs"]
 mod version;
 
