@@ -89,7 +89,7 @@ fn draws_the_spectrum(bench: &Bench) {
     let picture = fs::read_to_string(bench.path().join("spectrum.svg")).expect("the picture");
     assert_eq!((picture.matches("<polyline").count(), picture.matches("<circle").count()), (10, 80));
     assert!(picture.contains("1: 0-0.5 Hz") && picture.contains("5: over 4 Hz"), "{picture}");
-    let said = bench.run(&["status", "--spectrum", "spectrum.svg", "--stage", "t2m"]).expect_code(3);
+    let said = bench.run(&["status", "--spectrum", "spectrum.svg", "--stage", "t2m"]).expect_code(7);
     assert!(said.stderr.contains("no finished stage"), "{}", said.stderr);
     bench.run(&["status", "--spectrum", "spectrum.jpeg"]).expect_code(2);
 }

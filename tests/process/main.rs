@@ -23,6 +23,7 @@ mod reading;
 mod registry;
 mod released;
 mod results;
+mod running;
 mod storage;
 mod streaming;
 mod sweeps;

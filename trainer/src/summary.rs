@@ -6,6 +6,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use protocol::message::{RunState, RunView, StageState, StageView, StorageProblem, SweepView};
 use protocol::pipeline::Pipeline;
 use protocol::stage::Register;
+use protocol::units::grouped;
 use protocol::{Digest, StageName};
 use serde::Serialize;
 
@@ -58,13 +59,13 @@ impl Summary {
             message: stage.message.clone(),
             of: stage.of.clone(),
         };
-        let interrupted = interrupted && !run.state.is_final();
+        let interrupted = run.interrupted || (interrupted && !run.state.is_final());
         Self {
             schema_version: 1,
             run: run.run.to_string(),
             pipeline: run.pipeline.clone(),
             owner: run.owner.to_string(),
-            state: if interrupted { "interrupted".to_owned() } else { run_state(run.state).to_owned() },
+            state: if interrupted { "interrupted".to_owned() } else { run_state(run).to_owned() },
             stages: run.stages.iter().map(stage).collect(),
             sweeps: run.sweeps.clone(),
             storage: run.storage.clone(),
@@ -87,8 +88,9 @@ pub(crate) fn state(state: StageState) -> &'static str {
 }
 
 /// A run's state in one word.
-pub(crate) fn run_state(state: RunState) -> &'static str {
-    match state {
+pub(crate) fn run_state(run: &RunView) -> &'static str {
+    match run.state {
+        RunState::Paused if run.interrupted => "interrupted",
         RunState::Running => "running",
         RunState::Paused => "paused",
         RunState::Finished => "finished",
@@ -97,11 +99,13 @@ pub(crate) fn run_state(state: RunState) -> &'static str {
     }
 }
 
-/// The stages of a run, one a line, and a line for each sweep. Trials are for `trainer sweep status`.
+/// The stages that were asked for, one a line, and a line for each sweep. Trials are for `trainer sweep status`.
 pub(crate) fn table(run: &RunView) -> String {
-    let rows = run.stages.iter().filter(|stage| stage.of.is_none()).map(|stage| {
+    let asked_for = run.stages.iter().filter(|stage| stage.of.is_none() && stage.is_asked_for());
+    let rows = asked_for.map(|stage| {
         let progress = &stage.progress;
-        let steps = if progress.total > 0 { format!("{}/{}", progress.done, progress.total) } else { String::new() };
+        let (done, total) = (grouped(progress.done), grouped(progress.total));
+        let steps = if progress.total > 0 { format!("{done}/{total}") } else { String::new() };
         vec![
             stage.name.to_string(),
             stage.kind.clone(),
@@ -167,7 +171,7 @@ fn headline(stage: &StageView) -> String {
     if matches!(stage.state, StageState::Failed | StageState::Skipped) {
         return stage.message.clone().unwrap_or_default().lines().next().unwrap_or_default().chars().take(90).collect();
     }
-    if let (StageState::Running, Some(message)) = (stage.state, &stage.message) {
+    if let (StageState::Running | StageState::Ready, Some(message)) = (stage.state, &stage.message) {
         return message.clone();
     }
     let first = ["latent_fid", "fid", "mpjpe", "mpjpe_mm", "loss"]
@@ -211,6 +215,7 @@ mod tests {
             workers: vec![],
             instruction_set: None,
             message: None,
+            wants_workers: None,
             of: None,
         };
         RunView {
@@ -218,6 +223,7 @@ mod tests {
             pipeline: "p".into(),
             owner: protocol::Owner::default(),
             state: RunState::Finished,
+            interrupted: false,
             stages: states.iter().map(stage).collect(),
             sweeps: vec![],
             storage: None,
@@ -245,6 +251,22 @@ mod tests {
         let lines: Vec<&str> = table.lines().collect();
         assert!(lines[0].starts_with("STAGE") && lines[1].starts_with("fid"), "{table}");
         assert!(lines[1].contains("resumed") && lines[1].contains("latent_fid 0.2500"), "{table}");
+    }
+
+    #[test]
+    fn an_interrupted_run_is_not_called_paused_and_what_was_not_asked_for_has_no_row() {
+        let mut run = view(&[("vae", "train.vae", StageState::Ready), ("mld", "train.mld", StageState::Skipped)]);
+        run.state = RunState::Paused;
+        assert_eq!(run_state(&run), "paused");
+        run.interrupted = true;
+        assert_eq!(run_state(&run), "interrupted");
+        assert_eq!(serde_json::to_value(Summary::of(&run, false)).unwrap()["state"], "interrupted");
+        run.stages[0].message = Some("interrupted at 1,204 of 6,000 steps".to_owned());
+        run.stages[0].progress = Progress { done: 1204, total: 6000, ..Progress::default() };
+        run.stages[1].message = Some(StageView::NOT_ASKED_FOR.to_owned());
+        let table = table(&run);
+        assert!(table.contains("1,204/6,000") && table.contains("interrupted at 1,204 of 6,000 steps"), "{table}");
+        assert!(!table.contains("mld"), "{table}");
     }
 
     #[test]

@@ -24,6 +24,8 @@ const LONGEST: Duration = Duration::from_secs(1);
 const SHORTEST: Duration = Duration::from_millis(20);
 /// How long a name is waited for that another process has: a process that was killed has it until its lease ends.
 const NAME_PATIENCE: Duration = Duration::from_secs(60);
+/// Time after which a worker says again that it waits for its coordinator.
+const REMIND: Duration = Duration::from_secs(60);
 /// Refusals in a row before they are believed.
 const REFUSALS: u32 = 5;
 
@@ -150,8 +152,8 @@ pub(crate) enum End {
 /// Offers this process until the coordinator takes it, or gives how the worker ends instead.
 async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Joined, End> {
     let mut pause = Duration::from_millis(50);
-    let mut said = false;
     let begun = Instant::now();
+    let mut said: Option<Instant> = None;
     loop {
         match client.join(join).await {
             Ok(joined) => {
@@ -159,13 +161,19 @@ async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Joined, E
                 return Ok(joined);
             }
             Err(CallError::NameHeld(message)) if begun.elapsed() < NAME_PATIENCE => {
-                if !std::mem::replace(&mut said, true) {
+                if said.is_none_or(|said| said.elapsed() > REMIND) {
+                    said = Some(Instant::now());
                     tracing::warn!("{message}; waiting");
                 }
             }
             Err(error) if error.may_pass() => {
-                if !std::mem::replace(&mut said, true) {
-                    tracing::warn!("the coordinator cannot take this worker yet: {error}; trying again");
+                if said.is_none_or(|said| said.elapsed() > REMIND) {
+                    said = Some(Instant::now());
+                    let help = match error {
+                        CallError::Away(_) => "; `trainer serve` starts one there, Ctrl-C ends this worker",
+                        _ => "",
+                    };
+                    tracing::warn!("waiting for the coordinator at {}: {error}{help}", client.url());
                 }
             }
             Err(error) => {

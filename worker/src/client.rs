@@ -96,6 +96,11 @@ impl Client {
         Self { server, runtime, secret, process: Arc::default() }
     }
 
+    /// The coordinator's address.
+    pub(crate) fn url(&self) -> &str {
+        self.server.url()
+    }
+
     fn request(&self, method: reqwest::Method, path: &str, timeout: Duration) -> RequestBuilder {
         self.server.request(method, path).timeout(timeout)
     }

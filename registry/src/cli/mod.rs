@@ -3,8 +3,7 @@
 //!
 //! [`Command`] is what may be asked and [`Answer`] what comes back, both plain data, so that a client can send the one and
 //! show the other. A command never names a place on the machine that runs it: what `export` writes, the client fetches and
-//! writes itself. Exit codes: 0 done, 1 other errors, 2 wrong usage or an unusable store, 3 not found, 4 conflict, 5 the token
-//! is refused, 6 the holder of the store does not answer, 9 damage found, 10 a gate does not hold.
+//! writes itself. [`EXIT_CODES`] lists what the process exits with.
 
 mod args;
 mod bundles;
@@ -33,6 +32,19 @@ use crate::leaderboard::{self, Comparison, Leaderboard, Style};
 use crate::retention::{GRACE_MS, Plan};
 use crate::versions::{BEST, Expect, Gate, LATEST, Model, ModelRef, Promotion, Version};
 use crate::{LineageNode, OpenError, QueryError, ReadStore, Store, StoreId, WriteError, fsck};
+
+/// The table of exit codes for `--help`. They mean the same in `trainer`.
+pub const EXIT_CODES: &str = "\
+Exit codes:
+    0  done
+    1  what was asked for failed
+    2  wrong usage, or a store that cannot be used; nothing was changed
+    4  a conflict with what is stored
+    5  the token is missing or not enough
+    6  the process that holds the store does not answer
+    7  there is no such model, version, run or artifact
+    9  stored data is damaged
+   10  a gate does not hold; nothing was changed";
 
 /// What may be asked of a registry.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -277,7 +289,7 @@ impl Answer {
     pub fn refused(error: ApiError) -> Self {
         let exit = match error.code.as_str() {
             "invalid" | "store" => 2,
-            "not-found" => 3,
+            "not-found" => 7,
             "conflict" | "stale-fence" => 4,
             "unauthorized" | "forbidden" => 5,
             "unreachable" => 6,

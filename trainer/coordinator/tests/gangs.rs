@@ -30,6 +30,7 @@ impl Gang {
             }
         }
         let submit = coordinator::Event::Submit {
+            owner: protocol::Owner::local("me"),
             pipeline: Box::new(pipeline),
             source: String::new(),
             idempotency_key: None,
@@ -224,7 +225,7 @@ fn a_gang_below_its_minimum_saves_first() {
     let mut gang = Gang::new(WorkerRange { min: 2, max: 8 }, &["w1", "w2"]);
     gang.say("w1", Some(7), &[]);
     gang.say("w2", Some(7), &[]);
-    gang.coordinator.happen(coordinator::Event::WorkerGone { worker: "w1".into() }).expect("taken");
+    gang.coordinator.happen(coordinator::Event::WorkerGone { worker: "w1".into(), incarnation: None }).expect("taken");
     assert_eq!(gang.members(), (vec!["w2".into()], 1));
     let left = gang.coordinator.assignment("w2").expect("it saves");
     assert!(left.drain);
@@ -289,7 +290,7 @@ fn a_shunned_worker_begins_alone_what_nobody_else_does() {
     gang.say("w1", Some(5), &[]);
     gang.say("w2", None, &[]);
     assert_eq!(gang.names(), ["w1"]);
-    gang.coordinator.happen(coordinator::Event::WorkerGone { worker: "w1".into() }).expect("taken");
+    gang.coordinator.happen(coordinator::Event::WorkerGone { worker: "w1".into(), incarnation: None }).expect("taken");
     gang.pass(1_000);
     gang.say("w2", None, &[]);
     assert_eq!(gang.members(), (vec!["w2".into()], 2));

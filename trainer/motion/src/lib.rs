@@ -23,6 +23,7 @@ pub mod skeleton;
 pub mod synthetic;
 pub mod text;
 mod values;
+pub mod vocabulary;
 pub mod waypoints;
 
 pub use dataset::Dataset;

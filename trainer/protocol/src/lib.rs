@@ -14,6 +14,7 @@ pub mod owner;
 pub mod pipeline;
 pub mod printable;
 pub mod proof;
+pub mod spelling;
 pub mod stage;
 pub mod sweep;
 pub mod units;

@@ -366,6 +366,9 @@ pub struct RunView {
     #[serde(default)]
     pub owner: Owner,
     pub state: RunState,
+    /// It is paused because the process that worked on it ended, not because a user paused it.
+    #[serde(default)]
+    pub interrupted: bool,
     /// Stages in topological order, then the stages made by sweeps.
     pub stages: Vec<StageView>,
     /// Sweeps that have started.
@@ -433,9 +436,22 @@ pub struct StageView {
     pub instruction_set: Option<String>,
     /// Reason of a failure, or of waiting.
     pub message: Option<String>,
+    /// Idle workers that it lacks, if that is what it waits for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub wants_workers: Option<usize>,
     /// Swept stage that it belongs to, if a sweep made it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub of: Option<StageName>,
+}
+
+impl StageView {
+    /// The message of a stage that the submission left out (`until`).
+    pub const NOT_ASKED_FOR: &str = "not asked for";
+
+    /// Returns false for a stage that the submission left out (`until`).
+    pub fn is_asked_for(&self) -> bool {
+        self.state != StageState::Skipped || self.message.as_deref() != Some(Self::NOT_ASKED_FOR)
+    }
 }
 
 /// A sweep as clients see it.

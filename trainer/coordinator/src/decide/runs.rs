@@ -32,10 +32,15 @@ impl Deciding<'_> {
         }
         check_pipeline(&pipeline, until.as_ref())?;
         let run = Run::new(self.state.submitted + 1, owner, Arc::new(pipeline), key, until);
+        if let Some(id) = self.interrupted_twin(&run) {
+            self.control(&id, Control::Resume, None)?;
+            self.effects.push(Effect::Submitted(id));
+            return Ok(true);
+        }
         for old in self.state.runs.values().cloned().collect::<Vec<_>>() {
-            let is_left = old.parked && old.state == RunState::Paused;
             // Another owner's run waits for its owner.
-            if is_left && run.owner.controls(&old.owner.group()) && old.submitted.digest() == run.submitted.digest() {
+            let is_its_own = run.owner.controls(&old.owner.group());
+            if is_its_own && old.is_interrupted() && old.submitted.digest() == run.submitted.digest() {
                 self.change_run(old.number, |old| old.skip_rest(&format!("taken over by run `{}`", run.id)));
                 self.set_run_state(old.number, RunState::Cancelled, old.parked);
             }
@@ -51,6 +56,18 @@ impl Deciding<'_> {
         self.effects.push(Effect::Submitted(run.id.clone()));
         self.record(Fact::Run { run: Box::new(run) });
         Ok(true)
+    }
+
+    /// The newest interrupted run that asks for the same as `run`, which has no client's key.
+    fn interrupted_twin(&self, run: &Run) -> Option<RunId> {
+        let same = |old: &&Arc<Run>| {
+            old.is_interrupted()
+                && run.owner.controls(&old.owner.group())
+                && old.until == run.until
+                && old.submitted.digest() == run.submitted.digest()
+        };
+        let twin = self.state.runs.values().rev().filter(|_| run.idempotency_key.is_none()).find(same);
+        twin.map(|old| old.id.clone())
     }
 
     pub(crate) fn control(

@@ -14,7 +14,7 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
-use protocol::message::{RunState, StageState};
+use protocol::message::{RunState, StageState, StageView};
 use protocol::pipeline::{Pipeline, PipelineStage};
 use protocol::sweep::STATE_OUTPUT;
 use protocol::{ArtifactKind, Attempt, Digest, Owner, RunId, StageName};
@@ -358,6 +358,11 @@ impl Run {
         }
     }
 
+    /// Returns true if a restart of the coordinator paused it, not a user.
+    pub fn is_interrupted(&self) -> bool {
+        self.parked && self.state == RunState::Paused
+    }
+
     /// The stages of the pipeline as submitted: what counts for the run. A failed trial is a result of its sweep.
     pub fn asked(&self) -> &[Status] {
         &self.stages[..self.submitted.stages.len()]
@@ -420,7 +425,7 @@ pub(crate) fn value(known: &Known) -> Option<&Digest> {
 }
 
 fn not_asked_for() -> Status {
-    Status::Skipped { key: None, reason: "not asked for".to_owned() }
+    Status::Skipped { key: None, reason: StageView::NOT_ASKED_FOR.to_owned() }
 }
 
 /// `until` and all that it needs; everything without it.

@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use protocol::message::{
-    CommitCheckpoint, Doing, FailureClass, Gone, Grant, LogBatch, MetricBatch, MetricRow, Poll, Progress,
-    ReportOutcome, RunState, StageState, TaskOutcome,
+    CommitCheckpoint, Doing, FailureClass, Gone, Grant, LogBatch, LossCause, LostPeer, MetricBatch, MetricRow, Poll,
+    Progress, ReportOutcome, RunState, StageState, TaskOutcome,
 };
 use protocol::proof::{GRANT_HEADER, PROCESS_HEADER, Process, SECRET_HEADER, Vouched};
 use protocol::{ArtifactKind, Attempt, Digest, Fence, Incarnation, RunId};
@@ -88,7 +88,9 @@ impl Known {
             0 => post("/v1/workers").json(&join_of(&name)),
             1 => {
                 let progress = Progress { done: 99, total: 99, unit: "fuzz".into(), ..Progress::default() };
-                let doing = vec![Doing { grant, progress, lost: vec![random.one_of(&self.names).as_str().into()] }];
+                let worker = random.one_of(&self.names).as_str().into();
+                let lost = vec![LostPeer { worker, cause: LossCause::Unreachable }];
+                let doing = vec![Doing { lost, ..Doing::new(grant, progress) }];
                 let poll = Poll { incarnation, doing, ready: vec![], version: 0 };
                 post(&format!("/v1/workers/{name}/poll")).json(&poll)
             }

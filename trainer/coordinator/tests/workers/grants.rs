@@ -3,8 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::message::{
-    CommitCheckpoint, Doing, FailureClass, Grant, LogBatch, MetricBatch, Poll, Progress, ReportOutcome, StageState,
-    TaskOutcome,
+    CommitCheckpoint, Doing, FailureClass, Grant, LogBatch, LossCause, LostPeer, MetricBatch, Poll, Progress,
+    ReportOutcome, StageState, TaskOutcome,
 };
 use protocol::{ArtifactKind, Attempt, Fence};
 
@@ -96,7 +96,8 @@ async fn a_poll_says_nothing_about_anothers_grant() {
     let held = worker.given("vae").await;
     let thief = Worker::join(&site, "nodes", "nodes-2").await;
     let progress = Progress { done: 77, total: 77, unit: "forged".into(), ..Progress::default() };
-    let doing = Doing { grant: held.grant.clone(), progress, lost: vec!["nodes-1".into()] };
+    let lost = vec![LostPeer { worker: "nodes-1".into(), cause: LossCause::Unreachable }];
+    let doing = Doing { lost, ..Doing::new(held.grant.clone(), progress) };
     let poll = Poll { doing: vec![doing], ..thief.poll_of(vec![], 0) };
     let polled = post(&thief.server, &thief.secret, &thief.poll_path(), &poll).await;
     assert_eq!(polled.0, 200, "{polled:?}");
