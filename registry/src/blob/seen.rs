@@ -17,8 +17,15 @@ pub(super) struct Seen(Mutex<Inner>);
 
 #[derive(Debug, Default)]
 struct Inner {
-    blobs: HashMap<Digest, (u64, Option<Arc<[u8]>>)>,
+    blobs: HashMap<Digest, Known>,
     kept: usize,
+}
+
+#[derive(Debug)]
+struct Known {
+    bytes: u64,
+    /// The bytes of a short blob.
+    content: Option<Arc<[u8]>>,
 }
 
 impl Seen {
@@ -32,7 +39,7 @@ impl Seen {
         if inner.blobs.len() >= BLOBS {
             *inner = Inner::default();
         }
-        inner.blobs.entry(digest).or_insert((bytes, None));
+        inner.blobs.entry(digest).or_insert(Known { bytes, content: None });
     }
 
     /// Adds the bytes of a short blob, if it was not forgotten since it was noted.
@@ -40,30 +47,32 @@ impl Seen {
         let mut inner = self.lock();
         let Some(content) = content else { return };
         if inner.kept + content.len() > BYTES {
-            inner.blobs.values_mut().for_each(|known| known.1 = None);
+            inner.blobs.values_mut().for_each(|known| known.content = None);
             inner.kept = 0;
         }
         let more = content.len();
-        if let Some((_, known @ None)) = inner.blobs.get_mut(&digest) {
-            *known = Some(content.into());
+        if let Some(known) = inner.blobs.get_mut(&digest)
+            && known.content.is_none()
+        {
+            known.content = Some(content.into());
             inner.kept += more;
         }
     }
 
     /// The length of a blob that is in its place.
     pub(super) fn bytes(&self, digest: Digest) -> Option<u64> {
-        self.lock().blobs.get(&digest).map(|(bytes, _)| *bytes)
+        self.lock().blobs.get(&digest).map(|known| known.bytes)
     }
 
     /// The bytes of a short blob that is in its place.
     pub(super) fn content(&self, digest: Digest) -> Option<Arc<[u8]>> {
-        self.lock().blobs.get(&digest).and_then(|(_, content)| content.clone())
+        self.lock().blobs.get(&digest).and_then(|known| known.content.clone())
     }
 
     /// A blob is about to go, or is not what it should be.
     pub(super) fn forget(&self, digest: Digest) {
         let mut inner = self.lock();
-        if let Some((_, Some(content))) = inner.blobs.remove(&digest) {
+        if let Some(Known { content: Some(content), .. }) = inner.blobs.remove(&digest) {
             inner.kept -= content.len();
         }
     }
@@ -83,7 +92,7 @@ mod tests {
             seen.note(name(i), 1 << 16);
             seen.complete(name(i), Some(part.clone()));
             let inner = seen.lock();
-            let kept: usize = inner.blobs.values().filter_map(|(_, content)| Some(content.as_ref()?.len())).sum();
+            let kept: usize = inner.blobs.values().filter_map(|known| Some(known.content.as_ref()?.len())).sum();
             assert!(kept == inner.kept && kept <= BYTES);
         }
         assert_eq!(seen.bytes(name(1999)), Some(1 << 16));

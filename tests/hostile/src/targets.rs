@@ -233,7 +233,7 @@ fn tokenizer(bytes: &[u8]) -> bool {
 /// Opens an encoder's folder and reads all of it.
 fn opened(root: &str, kind: Kind) -> bool {
     let request = Request { kind, ids: TokenIds::HuggingFace, most: 0 };
-    let Some(folder) = read(EncoderFolder::open(&DataPath::local(&scratch::folder().join(root)), &request)) else {
+    let Some(folder) = read(EncoderFolder::open(&DataPath::local(scratch::folder().join(root)), &request)) else {
         return false;
     };
     folder.description.check().expect("it was checked");

@@ -78,11 +78,11 @@ impl Gang {
     /// The members by rank, with the try.
     fn members(&self) -> (Vec<String>, u64) {
         let task = self.coordinator.state.executions.values().flat_map(|execution| &execution.tasks);
-        let held = task.filter(|task| task.is_held()).map(|task| {
+        let mut held = task.filter(|task| task.is_held()).map(|task| {
             let names = task.holders().iter().map(|member| member.worker.to_string()).collect();
             (names, task.attempt.0)
         });
-        held.last().unwrap_or_default()
+        held.next_back().unwrap_or_default()
     }
 
     fn names(&self) -> Vec<String> {

@@ -20,7 +20,7 @@ fn recipe(format: DataFormat, target: Option<Vec<f64>>) -> Recipe {
 }
 
 fn target(folder: &Path, format: DataFormat) -> Option<Vec<f64>> {
-    Some(read_target(&DataPath::local(&folder.join("tgt_offsets.npy")), Skeleton::of(format)).expect("well formed"))
+    Some(read_target(&DataPath::local(folder.join("tgt_offsets.npy")), Skeleton::of(format)).expect("well formed"))
 }
 
 /// Makes all clips of a folder, in order.

@@ -90,7 +90,7 @@ fn missing_parts_are_named() {
 fn every_bad_clip_is_named_at_once() {
     let (folder, ids) = folder();
     let motion = |i: usize| folder.path().join(format!("new_joint_vecs/{}.npy", ids[i]));
-    let rows = |i: usize| npy::read(&DataPath::local(&motion(i))).unwrap();
+    let rows = |i: usize| npy::read(&DataPath::local(motion(i))).unwrap();
     npy::write(&motion(0), &[50, 251], &vec![0.0; 50 * 251]).unwrap();
     let mut nan = rows(1);
     nan.data[7 * 263 + 5] = f32::NAN;

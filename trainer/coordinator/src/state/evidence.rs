@@ -167,7 +167,7 @@ impl<'a> Quarrel<'a> {
         let over = at.since(since) >= hearing_ms;
         // Work goes on meanwhile if it is only slow, and the other side may say the same.
         let is_urgent = self.pairs.values().any(|cause| *cause != LossCause::Slow);
-        if !over && !(is_urgent && ranks.clone().all(|rank| is_heard(rank) || self.is_clear_about(rank, is_heard))) {
+        if !(over || is_urgent && ranks.clone().all(|rank| is_heard(rank) || self.is_clear_about(rank, is_heard))) {
             return Verdict::Open;
         }
         let standing = |rank: usize| match self.words[rank] {

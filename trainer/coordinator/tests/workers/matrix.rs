@@ -134,7 +134,7 @@ async fn every_call_of_workers_is_open_to_the_tasks_own_process_alone() {
     println!("{tried} calls by {} callers on two tasks", actors.len());
     assert_eq!(before, site.view(&run).await);
     assert_eq!(workers, state(&site));
-    assert_eq!(worker.holds().await, [vae.clone()]);
+    assert_eq!(worker.holds().await, std::slice::from_ref(&vae));
 
     // The same calls by the task's own process: all of them get past the check of whose they are. The last one leaves.
     let own = Actor { what: "itself".into(), server: worker.server.clone(), process: worker.secret, grant: vae.secret };

@@ -10,7 +10,7 @@
 //!   frames `trunc(from * fps) .. trunc(to * fps)`, under the same length rule. The loaders name such entries with
 //!   random letters; ours are named by their frames, so that the same folder always gives the same dataset.
 //! * A time range that is inverted, empty, negative or not finite cuts no frames upstream, and its caption is dropped.
-//! Fields after the times are ignored. Both are reported with file and line.
+//!   Fields after the times are ignored. Both are reported with file and line.
 //! * KIT times are read at KIT's 12.5 fps. (Some loaders use 20 for both. Published KIT texts have no times, so no
 //!   published number depends on it, and seconds should be seconds.)
 //! * `007975` and `M007975` of HumanML3D are known to hold NaN in some builds. They are then skipped by name; NaN in

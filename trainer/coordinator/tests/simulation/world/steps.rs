@@ -398,10 +398,9 @@ impl World {
             let peers: Vec<&FakeWorker> =
                 self.workers.iter().filter(|w| members.iter().any(|member| member.worker == w.name)).collect();
             let apart = |peer: &&FakeWorker| peers.iter().any(|other| is_cut(&peer.name, &other.name));
-            let together = !peers.is_empty()
-                && !peers.iter().any(apart)
-                && peers.iter().all(|peer| peer.runs(now) && peer.grant().is_some_and(|g| g.fence == grant.fence))
-                && !(peers.len() > 1 && peers.iter().any(|peer| peer.is_stuck(now)));
+            let hangs = peers.len() > 1 && peers.iter().any(|peer| peer.is_stuck(now));
+            let in_step = |peer: &&FakeWorker| peer.runs(now) && peer.grant().is_some_and(|g| g.fence == grant.fence);
+            let together = !hangs && !peers.is_empty() && !peers.iter().any(apart) && peers.iter().all(in_step);
             let furthest = together.then(|| peers.iter().filter_map(|peer| peer.live(&grant)).max());
             let saved = task.and_then(|task| task.newest()).map_or(0, |saved| saved.step);
             let chaos = self.chaos();
