@@ -54,9 +54,9 @@ async fn models_are_compared_and_ranked_in_tables_to_paste() {
     assert!(kit.contains("MotionPCM, 1 step [MotionPCM] & $0.031$ & $0.433^{\\pm0.007}$"), "{kit}");
 
     let absent = registry(store, &["compare", "quickstart:1", "quickstart:9"]);
-    assert_eq!(code(&absent), 3, "{}", stderr(&absent));
+    assert_eq!(code(&absent), 7, "{}", stderr(&absent));
     let absent = registry(store, &["leaderboard", "nobody"]);
-    assert_eq!(code(&absent), 3);
+    assert_eq!(code(&absent), 7);
     assert!(stderr(&absent).contains("nobody"), "{}", stderr(&absent));
 }
 
@@ -114,19 +114,19 @@ async fn a_promotion_from_the_first_gate_to_the_rollback() {
 async fn what_is_wrong_has_a_code_and_a_hint() {
     let dir = tempfile::tempdir().unwrap();
     let missing = registry(&dir.path().join("nothing"), &["list"]);
-    assert_eq!(code(&missing), 3);
+    assert_eq!(code(&missing), 7);
     assert!(stderr(&missing).contains("there is no store") && stderr(&missing).contains("\n\nhint: "));
     assert!(!dir.path().join("nothing").exists());
 
     with_models(dir.path()).await;
     for (args, expected) in [
-        (&["show", "other"][..], 3),
-        (&["show", "quickstart:9"], 3),
+        (&["show", "other"][..], 7),
+        (&["show", "quickstart:9"], 7),
         (&["show", "not a name"], 2),
         (&["promote", "quickstart", "--to", "prod", "--reason", "r"], 2),
         (&["promote", "quickstart:1", "--to", "prod", "--reason", "r", "--require", "latent_fid"], 2),
         (&["promote", "quickstart:1", "--to", "prod"], 2),
-        (&["rollback", "quickstart", "--alias", "prod"], 3),
+        (&["rollback", "quickstart", "--alias", "prod"], 7),
         (&["no-such-verb"], 2),
     ] {
         let output = registry(dir.path(), args);

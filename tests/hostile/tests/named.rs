@@ -38,6 +38,7 @@ impl ReadAt for Bytes {
 /// What is said names the file or the place, what was found and what was expected.
 #[test]
 fn what_is_wrong_is_said() {
+    protocol::show_excerpts();
     let file =
         |all: Vec<named::Named>, what: &str| all.into_iter().find(|(name, _)| *name == what).expect("a named file").1;
     let bvh = |what: &str| Bvh::parse(Path::new("x.bvh"), &file(named::bvh(), what)).expect_err(what).to_string();

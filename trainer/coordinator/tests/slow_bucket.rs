@@ -12,9 +12,10 @@ use std::time::{Duration, Instant};
 use access::Server;
 use coordinator::{Config, Coordinator, Handle};
 use protocol::message::{
-    Assignment, DesiredAssignments, Grant, Join, Joined, Poll, ReportOutcome, RunView, Submit, TaskOutcome,
+    Assignment, DesiredAssignments, Join, Joined, Poll, ReportOutcome, RunView, Submit, TaskOutcome,
 };
 use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
+use protocol::proof::{BlobStored, GRANT_HEADER, SECRET_HEADER, Vouched};
 use protocol::stage::{Backend, DataSynthetic, EncodeLatents, Placement, StageSettings, TrainVae, WorkerRange};
 use protocol::{ArtifactKind, Digest, FileEntry, Incarnation, Manifest, RunId, Seed, TaskId};
 use registry::testing::slow::SlowBucket;
@@ -24,7 +25,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tokio::task::JoinSet;
 
-use self::shell::{TestResult, offer};
+use self::shell::{SECRET, TestResult, offer};
 
 fn pipeline(shards: usize) -> Pipeline {
     let stage = |name: &str, settings: StageSettings| {
@@ -105,6 +106,13 @@ impl Slow {
     }
 }
 
+/// An artifact that was uploaded.
+#[derive(Clone)]
+struct Output {
+    digest: Digest,
+    receipts: BTreeMap<Digest, String>,
+}
+
 /// A worker that does not compute.
 struct Worker {
     server: Arc<Server>,
@@ -131,16 +139,18 @@ impl Worker {
         Ok(desired.assignments.into_iter().next())
     }
 
-    async fn put(&self, grant: &Grant, bytes: Vec<u8>) -> TestResult<Digest> {
+    /// Uploads a blob; returns its digest with its receipt.
+    async fn put(&self, assignment: &Assignment, bytes: Vec<u8>) -> TestResult<(Digest, String)> {
         let digest = Digest::of(&bytes);
         let request = self.server.request(Method::PUT, &format!("/v1/blobs/{digest}"));
-        let request = request.header("x-stride-grant", serde_json::to_string(grant)?);
-        request.body(bytes).send().await?.error_for_status()?;
-        Ok(digest)
+        let request = request.header(GRANT_HEADER, serde_json::to_string(&assignment.grant)?);
+        let request = request.header(SECRET_HEADER, &assignment.secret);
+        let stored: BlobStored = request.body(bytes).send().await?.error_for_status()?.json().await?;
+        Ok((digest, stored.receipt.ok_or("an upload gives a receipt")?))
     }
 
-    /// Uploads an artifact of one file.
-    async fn output(&self, assignment: &Assignment) -> TestResult<Digest> {
+    /// Uploads an artifact of one file; returns its digest with the receipts of its blobs.
+    async fn output(&self, assignment: &Assignment) -> TestResult<Output> {
         let kind = match assignment.stage.name.as_str() {
             "dataset" => ArtifactKind::Dataset,
             "vae" => ArtifactKind::Vae,
@@ -149,25 +159,28 @@ impl Worker {
         let content = assignment.grant.task.as_str().as_bytes().to_vec();
         let bytes = content.len() as u64;
         let mut manifest = Manifest::new(kind, serde_json::json!({}));
-        let digest = self.put(&assignment.grant, content).await?;
-        manifest.files.insert("content".into(), FileEntry { digest, bytes });
-        self.put(&assignment.grant, manifest.to_bytes()).await
+        let file = self.put(assignment, content).await?;
+        manifest.files.insert("content".into(), FileEntry { digest: file.0, bytes });
+        let own = self.put(assignment, manifest.to_bytes()).await?;
+        Ok(Output { digest: own.0, receipts: [file, own].into() })
     }
 
-    async fn report(&self, grant: &Grant, output: Digest) -> TestResult<reqwest::Response> {
-        let outcome = TaskOutcome::Finished { output, metrics: BTreeMap::new() };
-        let report = ReportOutcome { grant: grant.clone(), outcome };
-        Ok(self.server.request(Method::POST, "/v1/outcomes").json(&report).send().await?)
+    async fn report(&self, assignment: &Assignment, output: Output) -> TestResult<reqwest::Response> {
+        let outcome = TaskOutcome::Finished { output: output.digest, metrics: BTreeMap::new() };
+        let report = ReportOutcome { grant: assignment.grant.clone(), outcome };
+        let vouched = Vouched { what: report, receipts: output.receipts };
+        let request = self.server.request(Method::POST, "/v1/outcomes").header(SECRET_HEADER, &assignment.secret);
+        Ok(request.json(&vouched).send().await?)
     }
 
     async fn finish(&self, assignment: &Assignment) -> TestResult<reqwest::Response> {
         let output = self.output(assignment).await?;
-        self.report(&assignment.grant, output).await
+        self.report(assignment, output).await
     }
 }
 
 async fn post<T: DeserializeOwned>(server: &Server, path: &str, body: &impl Serialize) -> TestResult<T> {
-    let sent = server.request(Method::POST, path).json(body).send().await?;
+    let sent = server.request(Method::POST, path).header(SECRET_HEADER, SECRET).json(body).send().await?;
     let (status, text) = (sent.status(), sent.text().await?);
     if !status.is_success() {
         return Err(format!("{path}: {status} {text}").into());
@@ -258,9 +271,9 @@ async fn a_bucket_that_never_answers_stops_what_needs_it_and_status_says_so() ->
     // As many as have something to store.
     let mut needing = JoinSet::new();
     for i in 0..300 {
-        let (server, grant) = (Arc::clone(&slow.server), assignment.grant.clone());
+        let (server, assignment) = (Arc::clone(&slow.server), assignment.clone());
         let worker = Worker { server, name: "w0".into(), incarnation: worker.incarnation, ready: Mutex::default() };
-        needing.spawn(async move { worker.put(&grant, format!("blob {i}").into_bytes()).await.is_err() });
+        needing.spawn(async move { worker.put(&assignment, format!("blob {i}").into_bytes()).await.is_err() });
     }
     // What needs no bucket goes on, and is done long before anybody gives up on that.
     let other = slow.submit(4).await?;
@@ -282,7 +295,7 @@ async fn a_bucket_that_never_answers_stops_what_needs_it_and_status_says_so() ->
         assert!(refused?, "a blob was stored nowhere");
     }
     // What was found whole before is named all the same, for as long as the lease holds; else it is to come again.
-    let report = worker.report(&assignment.grant, output).await?.status();
+    let report = worker.report(&assignment, output.clone()).await?.status();
     assert!(report.is_success() || report == StatusCode::SERVICE_UNAVAILABLE, "{report}");
     stop.send(true)?;
     let times = beats.await??;
@@ -291,7 +304,7 @@ async fn a_bucket_that_never_answers_stops_what_needs_it_and_status_says_so() ->
 
     slow.bucket.silence(false);
     let again = Instant::now();
-    while worker.report(&assignment.grant, output).await?.status() == StatusCode::SERVICE_UNAVAILABLE {
+    while worker.report(&assignment, output.clone()).await?.status() == StatusCode::SERVICE_UNAVAILABLE {
         assert!(again.elapsed() < Duration::from_secs(60), "the bucket answers, and nobody asks");
         tokio::time::sleep(Duration::from_millis(50)).await;
     }

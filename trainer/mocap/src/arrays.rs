@@ -175,6 +175,7 @@ mod tests {
         }
         let kit = npy::to_bytes(&[2, 63], &data[..126]).unwrap();
         assert_eq!(read_bytes(&kit).unwrap(), Joints { data: data[..126].to_vec(), joints: 21, rate: None });
+        protocol::show_excerpts();
         let said = |members: &[(&str, Vec<u8>)]| read_bytes(&archive(members)).unwrap_err();
         assert!(said(&[("poses", kit.clone()), ("trans", kit.clone())]).contains("body parameters"));
         assert!(said(&[("x", kit.clone())]).contains("has x, expected joints"));

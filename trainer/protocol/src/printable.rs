@@ -78,7 +78,8 @@ pub fn json_mistake(error: &serde_json::Error) -> String {
     }
 }
 
-fn beginning(text: &str) -> String {
+/// The first 120 characters of a text, escaped. Only for texts that are no part of a file.
+pub fn beginning(text: &str) -> String {
     let begins: String = text.chars().take(SHOWN).collect();
     let more = if begins.len() < text.len() { "..." } else { "" };
     format!("{}{more}", begins.escape_debug())

@@ -97,7 +97,7 @@ impl Audit {
             let Kind { who, call, from, status } = kind;
             // Callers choose names; a line has room for the beginning of one.
             let object = match object {
-                Some(Object::Changed(name)) => protocol::excerpt(name),
+                Some(Object::Changed(name)) => protocol::printable::beginning(name),
                 Some(Object::Read) | None => String::new(),
             };
             let line = AuditEntry { at_ms: now_ms, until_ms: None, who, call, object, from, status, count: 1 };

@@ -5,13 +5,14 @@ use std::os::unix::fs::PermissionsExt as _;
 
 use access::{Server, Tokens};
 use coordinator::{Config, Coordinator, Handle};
-use protocol::message::{DesiredAssignments, Joined, LogBatch, Poll, Submit};
+use protocol::message::{Assignment, DesiredAssignments, Joined, LogBatch, Poll, Submit};
+use protocol::proof::SECRET_HEADER;
 use protocol::{ArtifactKind, Digest, Manifest, Owner, RunId};
 use registry::{Holder, Store, Write};
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
 
-use super::shell::offer;
+use super::shell::{SECRET, offer};
 
 pub(crate) type TestResult<T = ()> = Result<T, Box<dyn std::error::Error + Send + Sync>>;
 
@@ -191,17 +192,17 @@ impl Lab {
         let joined: Joined =
             serde_json::from_value(self.call("node", "POST", "/v1/workers", &serde_json::to_value(offer())?).await?.1)?;
         let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0 };
-        let grant = loop {
+        let Assignment { grant, secret, .. } = loop {
             let answer = self.call("node", "POST", "/v1/workers/a/poll", &serde_json::to_value(&poll)?).await?;
             let desired: DesiredAssignments = serde_json::from_value(answer.1)?;
             if let Some(assignment) = desired.assignments.into_iter().next() {
-                break assignment.grant;
+                break assignment;
             }
         };
         assert!(grant.task.as_str().contains(CANARY), "the oldest run is served first: {}", grant.task);
         let lines = vec![format!("the log of {CANARY}")];
         let logs = serde_json::to_value(LogBatch { grant, first: 0, lines })?;
-        assert_eq!(self.call("node", "POST", "/v1/logs", &logs).await?.0, StatusCode::OK);
+        assert_eq!(self.call_with(&secret, "node", "POST", "/v1/logs", &logs).await?.0, StatusCode::OK);
         Ok(())
     }
 
@@ -213,7 +214,19 @@ impl Lab {
         path: &str,
         body: &Value,
     ) -> TestResult<(StatusCode, Value)> {
-        let (status, text) = self.send(name, method, path, &body.to_string()).await?;
+        self.call_with(SECRET, name, method, path, body).await
+    }
+
+    /// A worker's call, which shows `secret`.
+    async fn call_with(
+        &self,
+        secret: &str,
+        name: &str,
+        method: &str,
+        path: &str,
+        body: &Value,
+    ) -> TestResult<(StatusCode, Value)> {
+        let (status, text) = self.send_with(secret, name, method, path, &body.to_string()).await?;
         Ok((status, serde_json::from_str(&text).unwrap_or(Value::String(text))))
     }
 
@@ -225,8 +238,19 @@ impl Lab {
         path: &str,
         body: &str,
     ) -> TestResult<(StatusCode, String)> {
+        self.send_with(SECRET, name, method, path, body).await
+    }
+
+    async fn send_with(
+        &self,
+        secret: &str,
+        name: &str,
+        method: &str,
+        path: &str,
+        body: &str,
+    ) -> TestResult<(StatusCode, String)> {
         let request = self.clients[name].request(Method::from_bytes(method.as_bytes())?, path);
-        let request = request.header("content-type", "application/json");
+        let request = request.header("content-type", "application/json").header(SECRET_HEADER, secret);
         let request = if method == "GET" { request } else { request.body(body.to_owned()) };
         let answer = request.send().await?;
         let status = answer.status();

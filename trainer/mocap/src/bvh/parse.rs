@@ -364,6 +364,7 @@ mod tests {
 
     #[test]
     fn a_mistake_is_told_with_its_line() {
+        protocol::show_excerpts();
         for (from, to, part) in [
             ("HIERARCHY", "", "x.bvh:2: `ROOT`, expected `HIERARCHY`"),
             ("yrotation", "yturn", "followed by 1 names of channels, then `yturn`"),
