@@ -43,6 +43,11 @@ impl Holds {
         }
     }
 
+    /// True if a task has stored a blob and is still held.
+    pub(super) fn has(&self, task: &TaskId, digest: Digest) -> bool {
+        self.tasks.get(task).is_some_and(|digests| digests.contains(&digest))
+    }
+
     pub(super) fn all(&self) -> BTreeSet<Digest> {
         match &self.path {
             Some(path) if self.is_others => read(path).into_values().flatten().collect(),

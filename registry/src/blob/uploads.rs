@@ -154,6 +154,11 @@ impl BlobStore {
         lock(&self.uploads().held).hold(task, digest);
     }
 
+    /// True if a held task has stored the blob.
+    pub fn has_stored(&self, task: &TaskId, digest: Digest) -> bool {
+        lock(&self.uploads().held).has(task, digest)
+    }
+
     /// Keeps a blob, which need not be there yet, for as long as what is returned lives: until the row that names it is stored.
     #[must_use = "the blob is kept only as long as this lives"]
     pub fn protect(&self, digest: Digest) -> Protected {

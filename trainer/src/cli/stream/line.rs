@@ -125,6 +125,7 @@ mod tests {
 
     #[test]
     fn mistakes_are_named_with_the_line() {
+        protocol::show_excerpts();
         for (text, controlled, words) in [
             ("walks#soon", true, &["line 3: `soon` is no length"][..]),
             ("{\"caption\": \"a\"", true, &["line 3: is no JSON object"]),
