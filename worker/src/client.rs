@@ -194,6 +194,7 @@ async fn check(sent: Result<Response, reqwest::Error>) -> Result<Response, CallE
         (_, "storage") | (StatusCode::INSUFFICIENT_STORAGE, _) => CallError::Full(message),
         (_, "not-found") | (StatusCode::NOT_FOUND, _) => CallError::NotFound(message),
         (_, "damaged") => CallError::Damaged(message),
+        (_, "arrived-damaged") => CallError::Fault(message),
         // What has arrived is asked for again.
         (StatusCode::RANGE_NOT_SATISFIABLE, "offset") => CallError::Away(message),
         (StatusCode::TOO_MANY_REQUESTS, _) => CallError::Busy(message, after),

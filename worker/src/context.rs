@@ -115,7 +115,7 @@ impl HttpContext {
                 self.part();
                 Err(ContextError::GrantEnded(reason))
             }
-            Halt::Disagree(message) => Err(ContextError::Unavailable(message)),
+            Halt::Disagree(message) => Err(ContextError::Refused(message)),
             Halt::Regroup | Halt::Peer => self.await_regroup(mesh),
         }
     }
@@ -285,7 +285,7 @@ impl GangContext for HttpContext {
             let part = parts.iter().find(|(at, _)| *at == slice).map(|(_, part)| part.as_slice());
             let part = part.filter(|part| own.first().is_none_or(|(_, first): &(_, &[f32])| first.len() == part.len()));
             let Some(part) = part else {
-                return Err(ContextError::Unavailable(format!(
+                return Err(ContextError::Refused(format!(
                     "step {step}: slice {slice} of this member's {share:?} is missing or of another length; a fault of the stage"
                 )));
             };
@@ -357,13 +357,14 @@ fn rows(behind: &[u8]) -> Option<&[u8]> {
 }
 
 fn malformed(why: &str) -> ContextError {
-    ContextError::Unavailable(format!("a peer's list of recorded values {why}; is it the same build?"))
+    ContextError::Refused(format!("a peer's list of recorded values {why}; is it the same build?"))
 }
 
 fn given_up(gave_up: GaveUp) -> ContextError {
     match gave_up {
         GaveUp::Ended(reason) | GaveUp::Answer(CallError::Stale(reason)) => ContextError::GrantEnded(reason),
         GaveUp::Answer(CallError::Storage(message)) => ContextError::Storage(message),
+        GaveUp::Answer(CallError::Refused(message)) => ContextError::Refused(message),
         GaveUp::Answer(error) => ContextError::Unavailable(error.to_string()),
     }
 }
@@ -371,6 +372,7 @@ fn given_up(gave_up: GaveUp) -> ContextError {
 fn blob_error(error: BlobError) -> ContextError {
     match error {
         BlobError::Refused(reason) => ContextError::GrantEnded(reason),
+        BlobError::Unfit(message) => ContextError::Refused(message),
         BlobError::Storage(message) => ContextError::Storage(message),
         BlobError::Unavailable(message) => ContextError::Unavailable(message),
         error @ (BlobError::NotFound(_) | BlobError::Corrupt { .. } | BlobError::Damaged(_)) => {

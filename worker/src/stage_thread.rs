@@ -77,10 +77,10 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
         Err(GaveUp::Answer(error)) => {
             tracing::error!(task = %grant.task, "the outcome was refused: {error}");
             // Said by nobody, the end would be waited for as long as this worker lives.
-            let class = if matches!(error, CallError::Storage(_)) {
-                FailureClass::Storage
-            } else {
-                FailureClass::Infrastructure
+            let class = match error {
+                CallError::Storage(_) => FailureClass::Storage,
+                CallError::Refused(_) => FailureClass::Refused,
+                _ => FailureClass::Infrastructure,
             };
             let message = format!("what it made was refused: {error}");
             if let Err(GaveUp::Answer(error)) = report(held, bench, &TaskOutcome::Failed { class, message }) {

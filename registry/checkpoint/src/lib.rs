@@ -34,6 +34,9 @@ pub enum BlobError {
     /// The grant has ended.
     #[error("write refused: {0}")]
     Refused(String),
+    /// The store does not take such bytes, whoever brings them and when.
+    #[error("{0}")]
+    Unfit(String),
     /// Full or not writable.
     #[error("{0}")]
     Storage(String),

@@ -9,7 +9,7 @@
 //! | failed: fault | tried again | tried again | as above |
 //! | failed: memory, others in the gang | tried without the member | tried without the member | as above |
 //! | failed: an input is damaged | waits until that is made again | the same | as above |
-//! | failed: input, diverged, memory and alone, storage | final | final | as above |
+//! | failed: input, diverged, memory and alone, refused, storage | final | final | as above |
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -110,6 +110,7 @@ impl Deciding<'_> {
                     FailureClass::Input
                     | FailureClass::Diverged
                     | FailureClass::OutOfMemory
+                    | FailureClass::Refused
                     | FailureClass::Storage => {
                         let own = *class != FailureClass::Storage;
                         self.fail_execution(key, message.clone(), own);

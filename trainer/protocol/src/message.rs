@@ -271,6 +271,8 @@ pub enum FailureClass {
     Diverged,
     /// The memory was exhausted: final.
     OutOfMemory,
+    /// The coordinator or the other members refuse something, and would do so each time: too large, of another build. Final.
+    Refused,
     /// The store is full or not writable: final; after freeing space, `resume` continues.
     Storage,
     /// The store has no intact copy of an input: its producer runs again, within the restart budget.

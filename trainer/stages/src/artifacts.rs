@@ -188,6 +188,7 @@ pub fn blob_error(error: BlobError) -> StageError {
         BlobError::NotFound(_) | BlobError::Corrupt { .. } | BlobError::Damaged(_) => ContextError::Damaged(text),
         BlobError::Refused(_) => ContextError::GrantEnded(text),
         BlobError::Storage(_) => ContextError::Storage(text),
+        BlobError::Unfit(_) => ContextError::Refused(text),
         BlobError::Unavailable(_) => ContextError::Unavailable(text),
     })
 }

@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use checkpoint::Blobs;
 use protocol::message::{FailureClass, StageTask};
-use protocol::{Digest, Manifest};
+use protocol::{Digest, Manifest, limits};
 
 /// An error of the context.
 #[derive(Debug, thiserror::Error)]
@@ -20,6 +20,9 @@ pub enum ContextError {
     /// The store or the network failed after retries.
     #[error("{0}")]
     Unavailable(String),
+    /// The coordinator or the other members refuse it, and would do so each time.
+    #[error("{0}")]
+    Refused(String),
     /// The store is full or not writable.
     #[error("{0}")]
     Storage(String),
@@ -61,6 +64,7 @@ impl StageError {
         match self {
             Self::Input(_) => FailureClass::Input,
             Self::Diverged { .. } => FailureClass::Diverged,
+            Self::Context(ContextError::Refused(_)) => FailureClass::Refused,
             Self::Context(ContextError::Storage(_)) => FailureClass::Storage,
             Self::Context(ContextError::Corrupt(_)) => FailureClass::Storage,
             Self::Context(ContextError::Damaged(_)) => FailureClass::Damaged,
@@ -139,6 +143,10 @@ pub trait AttemptContext {
     fn record(&mut self, step: u64, metrics: &[(&str, f64)]);
     /// Writes a line to the user's log.
     fn log(&mut self, line: &str);
+    /// Bytes of the largest file that the store takes.
+    fn most_blob_bytes(&self) -> u64 {
+        limits::BLOB_BYTES as u64
+    }
     /// Returns true if the grant has ended or a stop was requested. Long loops without steps check it regularly.
     fn interrupted(&self) -> bool;
 }

@@ -76,5 +76,5 @@ fn unread(error: &axum::Error, limit: usize) -> Failure {
         }
         cause = inner.source();
     }
-    Failure::invalid(format!("the body was cut off: {error}"))
+    Failure::new(StatusCode::REQUEST_TIMEOUT, "cut", format!("the body was cut off: {error}"))
 }

@@ -129,6 +129,7 @@ impl From<BlobError> for Failure {
             BlobError::Corrupt { .. } | BlobError::Damaged(_) => Self::new(StatusCode::CONFLICT, "damaged", message)
                 .hint("run the pipeline again: the stage that made it is computed anew, which mends it"),
             BlobError::Refused(_) => Self::new(StatusCode::CONFLICT, "stale-fence", message),
+            BlobError::Unfit(_) => Self::new(StatusCode::PAYLOAD_TOO_LARGE, "too-large", message),
             BlobError::Unavailable(_) => Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", message),
         }
     }

@@ -134,9 +134,9 @@ pub(crate) async fn put_blob(
     };
     let offset = number(&headers, OFFSET_HEADER)?.unwrap_or_default();
     if bytes > MAX_BLOB_BYTES {
-        return Err(Failure::invalid(format!(
-            "a blob of {bytes} bytes is too large: at most {MAX_BLOB_BYTES} are taken"
-        )));
+        let message = format!("a blob of {bytes} bytes is too large: expected at most {MAX_BLOB_BYTES}");
+        let failure = Failure::new(StatusCode::PAYLOAD_TOO_LARGE, "too-large", message);
+        return Err(failure.hint("train a smaller network: its state is one file"));
     }
     let blobs = actor_handle.store.blobs().clone();
     let stored = async {
@@ -214,7 +214,7 @@ impl From<Unstored> for Failure {
             Unstored::Resume(ResumeError::Busy | ResumeError::TooMany(_)) => Self::busy(message),
             // These bytes came damaged, which says nothing about what is stored.
             Unstored::Resume(ResumeError::Blob(BlobError::Corrupt { .. } | BlobError::Refused(_))) => {
-                Self::invalid(message)
+                Self::new(StatusCode::UNPROCESSABLE_ENTITY, "arrived-damaged", message)
             }
             Unstored::Resume(ResumeError::Blob(error)) => error.into(),
         }

@@ -140,7 +140,9 @@ pub fn train(
     // The digest excludes names of other stages, which do not affect a state; the key of the next rung depends on it.
     let config = cx.task().settings.digest();
     let accelerator = Some(cx.device()).filter(models::device::is_accelerator);
-    let mut state = TrainState::new(objective.groups(), objective.buffers());
+    let (groups, buffers) = (objective.groups(), objective.buffers());
+    check_size(TrainState::bytes_of(&groups, &buffers), cx.most_blob_bytes())?;
+    let mut state = TrainState::new(groups, buffers);
     let mut saved_at = begin(objective, &mut state, cx)?;
     let mut save_is_due = false;
     let mut stop = false;
@@ -218,6 +220,20 @@ pub fn train(
             (saved_at, save_is_due) = (Some(state.step), false);
         }
     }
+}
+
+/// Refuses a state that the store would not take at the first checkpoint.
+fn check_size(bytes: u64, most: u64) -> Result<(), StageError> {
+    let file = bytes + state::HEADER_BYTES;
+    if file <= most {
+        return Ok(());
+    }
+    let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
+    Err(StageError::Input(format!(
+        "the state of this training is one file of {:.1} GiB, expected at most {:.1} GiB; use a smaller `network`, or no `ema`",
+        gib(file),
+        gib(most)
+    )))
 }
 
 /// Brings `state` to the gang's position or the task's last one. Only rank 0 reads the checkpoint, or the state of the
