@@ -20,7 +20,15 @@ pub enum Write {
         /// JSON; what it says is the coordinator's business.
         facts: String,
     },
-    /// The coordinator's state after decision `seq`. Older snapshots and the facts that it stands for go.
+    /// Parts of the snapshot of decision `seq`, which follows; until then they do not count.
+    SnapshotParts {
+        /// As below.
+        seq: u64,
+        /// What has changed since the snapshot before, by name: JSON, or `None` for what is there no more.
+        parts: Vec<(String, Option<String>)>,
+    },
+    /// The coordinator's state after decision `seq`, but for what is in its parts. The facts that it stands for go, and of each part all
+    /// but the newest.
     Snapshot {
         /// The newest decision that it holds.
         seq: u64,
@@ -163,6 +171,7 @@ impl Write {
             | Self::Shard { grant, .. } => Some(grant),
             Self::StageResult { grant, .. } => grant.as_ref(),
             Self::Facts { .. }
+            | Self::SnapshotParts { .. }
             | Self::Snapshot { .. }
             | Self::Fence { .. }
             | Self::Run { .. }

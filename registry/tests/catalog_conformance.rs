@@ -73,6 +73,7 @@ conformance![
     the_last_to_open_is_the_only_one_that_writes,
     what_was_acknowledged_is_there_for_who_opens_next,
     facts_are_numbered_and_go_behind_a_snapshot,
+    a_snapshot_is_its_parts_as_they_were_last_written,
     a_write_carries_the_newest_fence,
     values_and_lines_that_come_twice_count_once,
     the_newest_attempt_takes_over_from_its_first_step,
@@ -211,6 +212,33 @@ async fn facts_are_numbered_and_go_behind_a_snapshot(place: &impl Place) {
     let recovery = opened.records().recovery().await.unwrap();
     assert_eq!((recovery.snapshot.unwrap().0, recovery.facts.len(), recovery.facts[0].0), (5, 1, 6));
     assert!(opened.write(vec![facts(2)]).await.is_err(), "what a snapshot stands for is taken");
+}
+
+async fn a_snapshot_is_its_parts_as_they_were_last_written(place: &impl Place) {
+    let opened = place.open().await;
+    opened.write((1..=9).map(facts).collect()).await.unwrap();
+    let text = |text: &str| Some(json!(text).to_string());
+    let parts = |seq, parts: &[(&str, Option<String>)]| {
+        let parts = parts.iter().map(|(part, state)| ((*part).to_owned(), state.clone())).collect();
+        Write::SnapshotParts { seq, parts }
+    };
+    let whole = |seq| Write::Snapshot { seq, state: json!(seq).to_string() };
+    opened.write(vec![parts(2, &[("a", text("a2")), ("b", text("b2")), ("c", text("c2"))]), whole(2)]).await.unwrap();
+    // A snapshot that is not complete does not count, whoever opens next.
+    opened.write(vec![parts(4, &[("a", text("a4")), ("b", None), ("d", text("d4"))])]).await.unwrap();
+    let read = async |opened: &Opened| opened.records().recovery().await.unwrap().parts;
+    let known = |parts: &[(&str, &str)]| {
+        parts.iter().map(|(part, state)| ((*part).to_owned(), json!(state).to_string())).collect::<BTreeMap<_, _>>()
+    };
+    assert_eq!(read(&opened).await, known(&[("a", "a2"), ("b", "b2"), ("c", "c2")]));
+    // Nor does what it had count later.
+    opened.write(vec![parts(6, &[("c", None), ("e", text("e6"))])]).await.unwrap();
+    opened.write(vec![whole(6)]).await.unwrap();
+    assert_eq!(read(&opened).await, known(&[("a", "a2"), ("b", "b2"), ("e", "e6")]));
+    opened.write(vec![parts(8, &[("a", text("a8"))]), whole(8)]).await.unwrap();
+    assert_eq!(read(&opened).await, known(&[("a", "a8"), ("b", "b2"), ("e", "e6")]));
+    let recovery = opened.records().recovery().await.unwrap();
+    assert_eq!((recovery.snapshot, recovery.facts.len()), (Some((8, "8".to_owned())), 1));
 }
 
 async fn a_write_carries_the_newest_fence(place: &impl Place) {

@@ -30,6 +30,8 @@ pub struct RunRow {
 pub struct Recovery {
     /// The newest snapshot.
     pub snapshot: Option<(u64, String)>,
+    /// Its parts by name.
+    pub parts: BTreeMap<String, String>,
     /// Facts, oldest first; those after the snapshot count.
     pub facts: Vec<(u64, String)>,
 }

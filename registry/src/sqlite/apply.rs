@@ -34,6 +34,7 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
         }
         match write {
             Write::Facts { seq, facts } => decisions.push((*seq, facts.as_str())),
+            Write::SnapshotParts { seq, parts } => set_parts(conn, *seq, parts).await?,
             Write::Snapshot { seq, state } => set_snapshot(conn, *seq, state).await?,
             Write::Fence { task, fence } => fences.raise(task, *fence)?,
             Write::Run { run, pipeline, source, state, idempotency_key } => {
@@ -212,8 +213,23 @@ async fn add_facts(conn: &mut SqliteConnection, decisions: &[(u64, &str)]) -> Re
     insert(conn, "INSERT INTO facts (seq, at_ms, facts) ", decisions, values, "").await
 }
 
-/// Facts that a snapshot stands for go with the snapshot before it.
+async fn set_parts(conn: &mut SqliteConnection, seq: u64, parts: &[(String, Option<String>)]) -> Result<()> {
+    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (part, state): &(String, Option<String>)| {
+        row.push_bind(part.clone()).push_bind(int(seq)).push_bind(state.clone());
+    };
+    let begin = "INSERT INTO snapshot_parts (part, seq, state) ";
+    insert(conn, begin, parts, values, " ON CONFLICT DO UPDATE SET state = excluded.state").await
+}
+
+/// Facts that a snapshot stands for go with the snapshot before it, and parts with those that take their place.
 async fn set_snapshot(conn: &mut SqliteConnection, seq: u64, state: &str) -> Result<()> {
+    // Parts of a snapshot that never came to its end.
+    let given_up = "DELETE FROM snapshot_parts WHERE seq < ? AND seq > (SELECT coalesce(max(seq), 0) FROM snapshots WHERE seq < ?)";
+    run(conn, sqlx::query(given_up).bind(int(seq)).bind(int(seq))).await?;
+    let superseded = "DELETE FROM snapshot_parts WHERE (part, seq) IN (SELECT old.part, old.seq FROM snapshot_parts new \
+                      JOIN snapshot_parts old ON old.part = new.part AND old.seq < new.seq WHERE new.seq = ?)";
+    run(conn, sqlx::query(superseded).bind(int(seq))).await?;
+    run(conn, sqlx::query("DELETE FROM snapshot_parts WHERE seq = ? AND state IS NULL").bind(int(seq))).await?;
     let set = sqlx::query(
         "INSERT INTO snapshots (seq, at_ms, state) VALUES (?, ?, ?) ON CONFLICT (seq) DO UPDATE SET state = excluded.state",
     );

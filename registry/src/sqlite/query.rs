@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use async_trait::async_trait;
+use futures::TryStreamExt as _;
 use protocol::{Alias, Attempt, Digest, ModelName, RunId, StageName, TaskId, WorkerId};
 use sqlx::pool::PoolConnection;
 use sqlx::sqlite::SqliteRow;
@@ -44,17 +45,27 @@ impl Records for SqliteRecords {
 
     async fn recovery(&self) -> Result<Recovery> {
         let mut conn = self.connection().await?;
-        // One statement is one moment of the database; two might see a snapshot and no longer the facts before it.
-        let all = "SELECT 0 AS kind, seq, state AS text FROM (SELECT * FROM snapshots ORDER BY seq DESC LIMIT 1) \
-                   UNION ALL SELECT 1, seq, facts FROM facts ORDER BY kind, seq";
+        // One transaction is one moment of the database; two might see a snapshot and no longer the facts before it.
+        let mut moment = conn.begin().await?;
         let mut recovery = Recovery::default();
-        for row in sqlx::query(all).fetch_all(&mut *conn).await? {
-            let (kind, seq, text): (i64, i64, String) = (row.try_get(0)?, row.try_get(1)?, row.try_get(2)?);
-            match kind {
-                0 => recovery.snapshot = Some((seq.unsigned_abs(), text)),
-                _ => recovery.facts.push((seq.unsigned_abs(), text)),
+        let newest = "SELECT seq, state FROM snapshots ORDER BY seq DESC LIMIT 1";
+        if let Some(row) = sqlx::query(newest).fetch_optional(&mut *moment).await? {
+            let seq: i64 = row.try_get(0)?;
+            recovery.snapshot = Some((seq.unsigned_abs(), row.try_get(1)?));
+            // Of the columns of a group, SQLite gives those of the row with the maximum.
+            let parts = "SELECT part, state, max(seq) FROM snapshot_parts WHERE seq <= ? GROUP BY part";
+            let mut rows = sqlx::query(parts).bind(seq).fetch(&mut *moment);
+            while let Some(row) = rows.try_next().await? {
+                if let Some(state) = row.try_get(1)? {
+                    recovery.parts.insert(row.try_get(0)?, state);
+                }
             }
         }
+        let facts = "SELECT seq, facts FROM facts ORDER BY seq";
+        for row in sqlx::query(facts).fetch_all(&mut *moment).await? {
+            recovery.facts.push((row.try_get::<i64, _>(0)?.unsigned_abs(), row.try_get(1)?));
+        }
+        moment.rollback().await?;
         Ok(recovery)
     }
 

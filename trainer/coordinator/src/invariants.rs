@@ -16,7 +16,7 @@
 //! | C11 | While a small task is ready and not backing off, no worker of its backend is idle. |
 //! | C12 | A checkpoint's steps grow within a task. |
 //! | C13 | A stage that is swept has a searcher that is not over, and a place for each of its tickets. |
-//! | C14 | What is known twice agrees: which tasks are held or wait, where a task is, what a worker holds, who holds nothing, which stages are active, who uses an execution. |
+//! | C14 | What is known twice agrees: which tasks are held or wait, where a task is, what a worker holds, who holds nothing, which stages are active, who uses an execution, what is served in which order. |
 //! | C15 | Memory holds what may still matter: no ended run, and no execution that no run uses and nobody works on. |
 //! | C16 | What must survive a restart changes only together with a write. |
 
@@ -29,6 +29,7 @@ use crate::schedule;
 use crate::state::State;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::run::Status;
+use crate::state::shared::Map;
 use crate::state::task::{Lease, Part, Task};
 use crate::state::worker::Presence;
 
@@ -120,30 +121,50 @@ fn check_index(state: &State) -> Vec<String> {
         if !run.is_indexed() {
             broken.push(format!("C14: the index of `{}` is wrong", run.id));
         }
-        for (_, key) in run.all_active() {
-            let uses = run.all_active().filter(|(_, other)| *other == key).count();
-            let known = state.executions.get(&key).and_then(|execution| execution.users.get(&run.number));
-            if known.is_none_or(|known| *known < uses) {
-                broken.push(format!("C14: `{}` waits {uses} times for {key}, which knows of {known:?}", run.id));
+        for (stage, key) in run.all_active() {
+            if state.executions.get(&key).is_none_or(|execution| !execution.users.contains(&(run.number, stage))) {
+                broken.push(format!("C14: stage {stage} of `{}` waits for {key}, which does not know of it", run.id));
             }
         }
     }
     for (key, execution) in &state.executions {
-        for (number, known) in &execution.users {
-            let uses = state.runs.get(number).map(|run| run.stages.iter().filter(|s| s.key() == Some(*key)).count());
-            if uses.is_none_or(|uses| uses < *known) {
-                broken.push(format!("C14: execution {key} is used {uses:?} times by run {number}, known is {known}"));
+        for (number, stage) in &execution.users {
+            let status = state.runs.get(number).and_then(|run| run.stages.get(*stage));
+            if status.and_then(Status::key) != Some(*key) {
+                broken.push(format!(
+                    "C14: execution {key} is used by stage {stage} of run {number}, which is {status:?}"
+                ));
             }
         }
     }
     if !places.iter().map(|(task, place)| (*task, place)).eq(state.tasks.iter()) {
         broken.push("C14: tasks are not where the index says".to_owned());
     }
+    broken.extend(check_queue(state));
     for (name, worker) in state.workers.iter() {
         let found = holds.get(name).copied();
         if worker.holds != found || state.unused.contains(name) != found.is_none() {
             broken.push(format!("C14: worker `{name}` holds {found:?}, known is {:?}", worker.holds));
         }
+    }
+    broken
+}
+
+/// C14, of what is served in which order.
+fn check_queue(state: &State) -> Vec<String> {
+    let mut broken = Vec::new();
+    let mut anew = state.clone();
+    anew.index();
+    let indices =
+        |state: &State| (state.queue.clone(), state.mends.clone(), state.idempotent.clone(), state.parked.clone());
+    if indices(state) != indices(&anew) {
+        broken.push(format!("C14: the queue is {:?}, and should be {:?}", indices(state), indices(&anew)));
+    }
+    let ranked = state.executions.keys().filter_map(|key| Some((state.queue.rank(key)?, *key)));
+    let in_order: BTreeSet<_> = ranked.collect();
+    let known = state.wanted().into_iter().filter(|key| state.executions.contains_key(key));
+    if !in_order.iter().map(|(_, key)| *key).eq(known) {
+        broken.push(format!("C14: what runs wait for is {in_order:?} and not {:?}", state.wanted()));
     }
     broken
 }
@@ -251,15 +272,15 @@ pub fn check_unchanged(before: &State, after: &State) -> Vec<String> {
         }
     };
     same("numbers", numbers(before) == numbers(after));
-    same("workers", Arc::ptr_eq(&before.workers, &after.workers) || before.workers == after.workers);
-    same("unused workers", Arc::ptr_eq(&before.unused, &after.unused) || before.unused == after.unused);
+    same("workers", before.workers.ptr_eq(&after.workers) || before.workers == after.workers);
+    same("unused workers", before.unused.ptr_eq(&after.unused) || before.unused == after.unused);
     same("runs", is_same_map(&before.runs, &after.runs));
     same("executions", is_same_map(&before.executions, &after.executions));
-    same("tasks", Arc::ptr_eq(&before.tasks, &after.tasks) || before.tasks == after.tasks);
+    same("tasks", before.tasks.ptr_eq(&after.tasks) || before.tasks == after.tasks);
     broken
 }
 
-fn is_same_map<K: Ord, V: PartialEq>(before: &BTreeMap<K, Arc<V>>, after: &BTreeMap<K, Arc<V>>) -> bool {
+fn is_same_map<K: Ord, V: PartialEq>(before: &Map<K, Arc<V>>, after: &Map<K, Arc<V>>) -> bool {
     let pairs = || before.iter().zip(after);
-    before.len() == after.len() && pairs().all(|(a, b)| a.0 == b.0 && (Arc::ptr_eq(a.1, b.1) || a.1 == b.1))
+    before.size() == after.size() && pairs().all(|(a, b)| a.0 == b.0 && (Arc::ptr_eq(a.1, b.1) || a.1 == b.1))
 }

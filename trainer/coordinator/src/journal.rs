@@ -1,4 +1,5 @@
-//! The coordinator's memory on disk: the facts of each decision, and a snapshot of the state every so many of them.
+//! The coordinator's memory on disk: the facts of each decision, and a snapshot of the state every so many of them. A snapshot is kept in
+//! parts, of which the next one writes those that have changed.
 //!
 //! Recovery is the newest snapshot and the facts after it, applied in order; nothing is decided again. Both carry [`FORMAT`].
 
@@ -14,12 +15,13 @@ use crate::policy::Policy;
 use crate::state::State;
 use crate::state::execution::StageExecution;
 use crate::state::run::Run;
+use crate::state::shared::Map;
 use crate::state::worker::Worker;
 use crate::time::Millis;
 
 /// The version of what is stored. Another major version is refused. A later minor one has kinds or fields that this build does not know:
 /// it is read for as long as none of them occurs.
-pub const FORMAT: (u32, u32) = (1, 1);
+pub const FORMAT: (u32, u32) = (2, 0);
 
 /// What cannot be recovered.
 #[derive(Debug, thiserror::Error)]
@@ -101,8 +103,9 @@ fn check_format((major, minor): (u32, u32)) -> Result<(), String> {
     Err(format!("is of format {major}.{minor}, this build reads {}.x; use the build that wrote it", FORMAT.0))
 }
 
-#[derive(Serialize)]
-struct SnapshotOf<'a> {
+/// The numbers of a state. Everything else is in parts.
+#[derive(Serialize, Deserialize)]
+struct Numbers {
     format: (u32, u32),
     seq: u64,
     now: Millis,
@@ -110,28 +113,11 @@ struct SnapshotOf<'a> {
     incarnation: Incarnation,
     fence: Fence,
     draining: bool,
-    workers: &'a BTreeMap<WorkerId, Worker>,
-    runs: Vec<&'a Run>,
-    executions: Vec<&'a StageExecution>,
 }
 
-#[derive(Deserialize)]
-struct Snapshot {
-    format: (u32, u32),
-    seq: u64,
-    now: Millis,
-    submitted: u64,
-    incarnation: Incarnation,
-    fence: Fence,
-    draining: bool,
-    workers: BTreeMap<WorkerId, Worker>,
-    runs: Vec<Run>,
-    executions: Vec<StageExecution>,
-}
-
-/// The state as it is stored, after decision [`State::seq`].
+/// The state as it is stored after decision [`State::seq`], without its parts.
 pub fn snapshot(state: &State) -> String {
-    let snapshot = SnapshotOf {
+    let numbers = Numbers {
         format: FORMAT,
         seq: state.seq,
         now: state.now,
@@ -139,31 +125,121 @@ pub fn snapshot(state: &State) -> String {
         incarnation: state.incarnation,
         fence: state.fence,
         draining: state.draining,
-        workers: &state.workers,
-        runs: state.runs.values().map(|run| &**run).collect(),
-        executions: state.executions.values().map(|execution| &**execution).collect(),
     };
-    serde_json::to_string(&snapshot).expect("a state serialises")
+    serde_json::to_string(&numbers).expect("numbers serialise")
+}
+
+/// A part of a state.
+#[derive(Debug, Clone)]
+enum Part {
+    Run(Arc<Run>),
+    Execution(Arc<StageExecution>),
+    Worker(Box<Worker>),
+}
+
+/// A part that one state has otherwise than another, or has no more.
+#[derive(Debug, Clone)]
+pub struct ChangedPart {
+    name: String,
+    content: Option<Part>,
+}
+
+impl ChangedPart {
+    /// Its name and its text, as they are stored.
+    pub fn stored(&self) -> (String, Option<String>) {
+        let text = self.content.as_ref().map(|part| match part {
+            Part::Run(run) => serde_json::to_string(&**run),
+            Part::Execution(execution) => serde_json::to_string(&**execution),
+            Part::Worker(worker) => serde_json::to_string(worker),
+        });
+        (self.name.clone(), text.map(|text| text.expect("a part of a state serialises")))
+    }
+}
+
+const RUN: &str = "run/";
+const EXECUTION: &str = "execution/";
+const WORKER: &str = "worker/";
+
+/// The parts in which `after` is not `before`. What the two share is not looked into.
+pub fn changed_parts(before: &State, after: &State) -> Vec<ChangedPart> {
+    let mut parts = Vec::new();
+    for (number, run) in changed(&before.runs, &after.runs, is_same) {
+        parts.push(ChangedPart { name: format!("{RUN}{number}"), content: run.cloned().map(Part::Run) });
+    }
+    for (key, execution) in changed(&before.executions, &after.executions, is_same) {
+        let content = execution.cloned().map(Part::Execution);
+        parts.push(ChangedPart { name: format!("{EXECUTION}{key}"), content });
+    }
+    for (name, worker) in changed(&before.workers, &after.workers, PartialEq::eq) {
+        let content = worker.cloned().map(|worker| Part::Worker(Box::new(worker)));
+        parts.push(ChangedPart { name: format!("{WORKER}{name}"), content });
+    }
+    parts
+}
+
+fn is_same<T: PartialEq>(before: &Arc<T>, after: &Arc<T>) -> bool {
+    Arc::ptr_eq(before, after) || before == after
+}
+
+/// The entries of `after` that `before` has not, and the keys of those that only `before` has.
+fn changed<'a, K: Ord, V>(
+    before: &'a Map<K, V>,
+    after: &'a Map<K, V>,
+    is_same: impl Fn(&V, &V) -> bool,
+) -> Vec<(&'a K, Option<&'a V>)> {
+    let mut changed = Vec::new();
+    let mut old = before.iter().peekable();
+    for (key, value) in after {
+        while let Some((gone, _)) = old.next_if(|(old, _)| *old < key) {
+            changed.push((gone, None));
+        }
+        match old.next_if(|(old, _)| *old == key) {
+            Some((_, known)) if is_same(known, value) => {}
+            Some(_) | None => changed.push((key, Some(value))),
+        }
+    }
+    changed.extend(old.map(|(gone, _)| (gone, None)));
+    changed
 }
 
 /// The state of a snapshot.
-fn restore(policy: Policy, text: &str) -> Result<State, String> {
-    let snapshot: Snapshot = read(text)?;
-    check_format(snapshot.format)?;
+fn restore(policy: Policy, text: &str, parts: &BTreeMap<String, String>) -> Result<State, String> {
+    let numbers: Numbers = read(text)?;
+    check_format(numbers.format)?;
     let mut state = State {
-        seq: snapshot.seq,
-        now: snapshot.now,
-        submitted: snapshot.submitted,
-        incarnation: snapshot.incarnation,
-        fence: snapshot.fence,
-        draining: snapshot.draining,
-        workers: Arc::new(snapshot.workers),
-        runs: snapshot.runs.into_iter().map(|run| (run.number, Arc::new(run))).collect(),
-        executions: snapshot.executions.into_iter().map(|execution| (execution.key, Arc::new(execution))).collect(),
+        seq: numbers.seq,
+        now: numbers.now,
+        submitted: numbers.submitted,
+        incarnation: numbers.incarnation,
+        fence: numbers.fence,
+        draining: numbers.draining,
         ..State::new(policy)
     };
+    for (name, text) in parts {
+        let at = |error| format!("has the part `{name}`, which cannot be read: {error}");
+        if name.starts_with(RUN) {
+            let run: Run = serde_json::from_str(text).map_err(at)?;
+            state.runs.insert_mut(run.number, Arc::new(run));
+        } else if name.starts_with(EXECUTION) {
+            let execution: StageExecution = serde_json::from_str(text).map_err(at)?;
+            state.executions.insert_mut(execution.key, Arc::new(execution));
+        } else if let Some(worker) = name.strip_prefix(WORKER) {
+            state.workers.insert_mut(WorkerId::new(worker), serde_json::from_str(text).map_err(at)?);
+        } else {
+            return Err(format!("has the part `{name}`, which this build does not know; use the build that wrote it"));
+        }
+    }
     state.index();
     Ok(state)
+}
+
+/// What is stored.
+#[derive(Debug)]
+pub struct Recovered {
+    /// The state of the newest snapshot.
+    pub snapshot: State,
+    /// The state after all that is stored.
+    pub state: State,
 }
 
 /// The state after all that is stored.
@@ -171,13 +247,22 @@ fn restore(policy: Policy, text: &str) -> Result<State, String> {
 /// # Errors
 /// What does not read, does not follow on what is before it, or was written in another format.
 pub fn recover(policy: Policy, stored: &Recovery) -> Result<State, RecoverError> {
-    let mut state = match &stored.snapshot {
+    recover_both(policy, stored).map(|recovered| recovered.state)
+}
+
+/// As [`recover`], with what later snapshots follow on.
+///
+/// # Errors
+/// As there.
+pub fn recover_both(policy: Policy, stored: &Recovery) -> Result<Recovered, RecoverError> {
+    let snapshot = match &stored.snapshot {
         Some((seq, text)) => {
             let at = |problem| RecoverError { what: format!("the snapshot of decision {seq}"), problem };
-            restore(policy, text).map_err(at)?
+            restore(policy, text, &stored.parts).map_err(at)?
         }
         None => State::new(policy),
     };
+    let mut state = snapshot.clone();
     for (seq, text) in stored.facts.iter().filter(|(seq, _)| *seq > stored.snapshot.as_ref().map_or(0, |(seq, _)| *seq))
     {
         let at = |problem| RecoverError { what: format!("decision {seq}"), problem };
@@ -190,5 +275,5 @@ pub fn recover(policy: Policy, stored: &Recovery) -> Result<State, RecoverError>
         }
         (state.seq, state.now) = (*seq, decision.now);
     }
-    Ok(state)
+    Ok(Recovered { snapshot, state })
 }

@@ -56,15 +56,15 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
         let (worker, incarnation) = (worker.clone(), poll.incarnation);
         events.push(Event::WorkerReady { worker, incarnation, tasks: poll.ready });
     }
-    let heard = Arc::make_mut(&mut state.heard.workers).entry(worker).or_default();
-    *heard = now.max(*heard);
+    let before = state.heard.workers.get(&worker).copied().unwrap_or_default();
+    state.heard.workers.insert_mut(worker, now.max(before));
     for doing in poll.doing {
         let Ok((execution, task)) = state.task(&doing.grant.task) else { continue };
         let Ok(rank) = task.check(&doing.grant) else { continue };
         // Shards are counted, not looked into.
         if rank == 0 && execution.tasks.len() == 1 {
             let progress = Arc::new(doing.progress);
-            Arc::make_mut(&mut state.heard.progress).insert(doing.grant.task.clone(), progress);
+            state.heard.progress.insert_mut(doing.grant.task.clone(), progress);
         }
         if !doing.lost.is_empty() {
             events.push(Event::PeersLost { grant: doing.grant, lost: doing.lost });
@@ -80,15 +80,14 @@ fn tick(state: &mut State, at: Millis, overslept: u64) -> Vec<Event> {
     // Who sleeps through his own alarm was not listening either: that is not the workers' fault. Who was heard meanwhile all the same
     // gets no more than a lease from now.
     if overslept > state.policy.lease_ms / 3 {
-        for heard in Arc::make_mut(&mut state.heard.workers).values_mut() {
-            *heard = heard.after(overslept).min(at);
-        }
+        let later = |(name, heard): (&WorkerId, &Millis)| (name.clone(), heard.after(overslept).min(at));
+        state.heard.workers = state.heard.workers.iter().map(later).collect();
     }
     let mut events = Vec::new();
     let unheard: Vec<WorkerId> =
         state.workers.keys().filter(|name| !state.heard.workers.contains_key(*name)).cloned().collect();
-    if !unheard.is_empty() {
-        Arc::make_mut(&mut state.heard.workers).extend(unheard.into_iter().map(|name| (name, at)));
+    for name in unheard {
+        state.heard.workers.insert_mut(name, at);
     }
     for (name, worker) in state.workers.iter() {
         let (worker, incarnation, silent) = (name.clone(), worker.incarnation, at.since(state.heard.workers[name]));
@@ -102,11 +101,9 @@ fn tick(state: &mut State, at: Millis, overslept: u64) -> Vec<Event> {
             Presence::Here | Presence::Suspect { .. } | Presence::Silent | Presence::Gone => {}
         }
     }
-    let open = state
-        .executions
-        .values()
-        .flat_map(|execution| execution.tasks.held().chain(execution.tasks.waiting()).map(|i| &execution.tasks[i]));
-    for task in open {
+    let due = state.queue.due(now).filter_map(|key| state.executions.get(&key));
+    let due = due.flat_map(|execution| execution.tasks.due(now).map(|i| &execution.tasks[i]));
+    for task in due {
         match task.lease {
             Lease::Waiting { not_before: Some(time) } if time <= now => {
                 events.push(Event::BackoffOver { task: task.id.clone() });

@@ -14,6 +14,7 @@ use crate::fact::Fact;
 use crate::register::Registration;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::run::{Run, Status};
+use crate::state::shared::Set;
 use crate::state::tasks::Tasks;
 use crate::time::Millis;
 
@@ -145,7 +146,7 @@ impl Deciding<'_> {
                     busy_since: None,
                     resumed: false,
                     instruction_set: None,
-                    users: BTreeMap::new(),
+                    users: Set::default(),
                 };
                 self.record(Fact::Execution { execution: Box::new(execution) });
             }

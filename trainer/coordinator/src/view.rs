@@ -193,9 +193,9 @@ impl State {
         let shards = execution.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. })).count();
         let done =
             execution.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. }) && task.output().is_some());
-        match &*execution.tasks {
-            [] => Progress::default(),
-            [task] => of(task).unwrap_or_default(),
+        match (execution.tasks.len(), execution.tasks.first()) {
+            (1, Some(task)) => of(task).unwrap_or_default(),
+            (_, None) => Progress::default(),
             _ => Progress {
                 done: done.count() as u64,
                 total: shards as u64,

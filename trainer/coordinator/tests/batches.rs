@@ -86,7 +86,7 @@ fn what_is_refused_together_is_tried_alone_and_only_one_is_at_fault() {
     to_store(batches.decide(at(1)));
     let second = over(batches.stored(Ok(()), at(1)));
     assert!(matches!(&second.answers[..], [("second", Ok(_))]) && second.durable, "{second:?}");
-    assert_eq!(batches.front().state().runs.len(), 1);
+    assert_eq!(batches.front().state().runs.size(), 1);
     assert!(matches!(batches.decide(at(1)), Turn::Idle));
 }
 
@@ -100,7 +100,7 @@ fn nobody_sees_what_is_not_stored_and_quiet_polls_do_not_wait_for_it() {
     let asked = batches.front().poll(Millis(9_000), worker.clone(), poll(incarnation)).expect("known");
     assert!(asked.is_none(), "answered beside the queue");
     assert_eq!(over(batches.stored(Ok(()), at(9_500))).answers.len(), 1);
-    assert_eq!(batches.front().state().runs.len(), 1);
+    assert_eq!(batches.front().state().runs.size(), 1);
     // What was noted counts before the clock does: 15 s after it began, but 7 s after the poll, the lease is good.
     batches.ask(Ask::Observation(Observation::Tick { overslept: 0 }, Millis(16_000)), "tick");
     over(batches.decide(at(16_000)));

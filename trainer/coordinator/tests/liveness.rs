@@ -4,7 +4,7 @@
 mod common;
 
 use coordinator::state::execution::ExecutionState;
-use coordinator::{Control, Event, Observation, Policy, journal, refused_for_good};
+use coordinator::{Control, Event, Observation, Policy, State, journal, refused_for_good};
 use protocol::message::{
     Assignment, CommitCheckpoint, FailureClass, ReportOutcome, Role, RunState, StageState, TaskOutcome,
 };
@@ -309,6 +309,13 @@ fn an_ended_run_leaves_memory_and_is_taken_up_where_it_was() {
     assert!(coordinator.state.executions.is_empty());
 }
 
+/// Bytes of a snapshot with all of its parts.
+fn stored_bytes(state: &State) -> usize {
+    let parts = journal::changed_parts(&State::new(Policy::default()), state);
+    let texts = parts.iter().filter_map(|part| part.stored().1);
+    journal::snapshot(state).len() + texts.map(|text| text.len()).sum::<usize>()
+}
+
 /// What a submission costs, counted: runs, executions and workers that decisions look at, and the size of the state.
 #[test]
 fn a_submission_costs_the_same_however_many_runs_have_ended() {
@@ -319,7 +326,7 @@ fn a_submission_costs_the_same_however_many_runs_have_ended() {
             let run = submit(coordinator, seed);
             coordinator.control(&run, Control::Cancel).expect("taken");
         }
-        ((coordinator.state.visits - before) / count, journal::snapshot(&coordinator.state).len())
+        ((coordinator.state.visits - before) / count, stored_bytes(&coordinator.state))
     };
     let (visits, size) = cost(&mut coordinator, 0..10);
     cost(&mut coordinator, 10..150);
@@ -395,9 +402,9 @@ fn what_is_stored_says_of_which_format_it_is() {
         recover(&stored)
     };
     assert!(recover(&coordinator.store.recovery).is_ok());
-    assert!(with("\"format\":[1,1]", "\"format\":[1,7]").is_ok());
-    let refused = with("\"format\":[1,1]", "\"format\":[2,0]").expect_err("another major version");
-    assert!(refused.contains("format 2.0") && refused.contains("1.x") && refused.contains("decision 2"), "{refused}");
+    assert!(with("\"format\":[2,0]", "\"format\":[2,7]").is_ok());
+    let refused = with("\"format\":[2,0]", "\"format\":[3,0]").expect_err("another major version");
+    assert!(refused.contains("format 3.0") && refused.contains("2.x") && refused.contains("decision 2"), "{refused}");
     let refused = with("\"execution-state\"", "\"horoscope\"").expect_err("an unknown kind");
     assert!(refused.contains("horoscope") && refused.contains("decision 2"), "{refused}");
     let mut stored = coordinator.store.recovery.clone();
@@ -412,7 +419,7 @@ fn what_is_stored_says_of_which_format_it_is() {
         whole.run(&run).is_ok() && whole.executions.values().all(|execution| execution.state == ExecutionState::Open)
     );
     let (_, text) = coordinator.store.recovery.snapshot.as_mut().expect("a snapshot");
-    *text = text.replace("\"format\":[1,1]", "\"format\":[3,1]");
+    *text = text.replace("\"format\":[2,0]", "\"format\":[3,1]");
     let refused = recover(&coordinator.store.recovery).expect_err("another major version");
     assert!(refused.contains("format 3.1") && refused.contains("snapshot"), "{refused}");
 }

@@ -104,12 +104,6 @@ impl Deciding<'_> {
     pub(crate) fn backoff_over(&mut self, task: &TaskId) -> Result<bool, Rejected> {
         let now = self.now();
         let (key, i) = self.place(task)?;
-        Ok(self.change(key, i, |task| match &mut task.lease {
-            Lease::Waiting { not_before } if not_before.is_some_and(|time| time <= now) => {
-                *not_before = None;
-                true
-            }
-            Lease::Waiting { .. } | Lease::Held { .. } | Lease::Done { .. } => false,
-        }))
+        Ok(self.change(key, i, |task| task.end_backoff(now)))
     }
 }

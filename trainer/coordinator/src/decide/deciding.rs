@@ -88,7 +88,14 @@ impl<'a> Deciding<'a> {
             Fact::ExecutionState { key, .. } => {
                 self.touched.insert(*key);
                 self.touched.extend(self.state.mended_for(*key));
-                runs.extend(self.state.executions.get(key).into_iter().flat_map(|execution| execution.users.keys()));
+                runs.extend(
+                    self.state
+                        .executions
+                        .get(key)
+                        .into_iter()
+                        .flat_map(|execution| execution.users.iter())
+                        .map(|(run, _)| *run),
+                );
             }
             Fact::ExecutionPlacement { key, .. }
             | Fact::ExecutionSource { key, .. }

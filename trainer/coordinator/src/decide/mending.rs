@@ -48,10 +48,9 @@ impl Deciding<'_> {
     fn givers(&self, key: Digest) -> BTreeMap<Digest, (u64, StageName)> {
         let execution = &self.state.executions[&key];
         let mut givers = BTreeMap::new();
-        for run in execution.users.keys().filter_map(|number| self.state.runs.get(number)) {
-            // One that is made again itself is done, as its run has it.
-            let readers = run.stages.iter().enumerate().filter(|(_, status)| status.key() == Some(key));
-            for input in readers.flat_map(|(stage, _)| &run.pipeline.stages[stage].inputs) {
+        for (number, stage) in &execution.users {
+            let Some(run) = self.state.runs.get(number) else { continue };
+            for input in &run.pipeline.stages[*stage].inputs {
                 let Some(status) = run.status(&input.stage) else { continue };
                 let (Some(giver), Some(known)) = (status.key(), status.known()) else { continue };
                 let is_read = known.outputs.values().any(|output| execution.inputs.values().any(|read| read == output));

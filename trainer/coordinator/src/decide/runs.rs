@@ -24,15 +24,16 @@ impl Deciding<'_> {
         until: Option<StageName>,
     ) -> Result<bool, Rejected> {
         // A run that has ended is found in the tables, before the event.
-        let twin = self.state.runs.values().find(|run| key.is_some() && run.idempotency_key == key);
-        if let Some(twin) = twin {
+        let twin = key.as_ref().and_then(|key| self.state.idempotent.get(key));
+        if let Some(twin) = twin.and_then(|number| self.state.runs.get(number)) {
             self.effects.push(Effect::Submitted(twin.id.clone()));
             return Ok(false);
         }
         check_pipeline(&pipeline, until.as_ref())?;
         let run = Run::new(self.state.submitted + 1, Arc::new(pipeline), key, until);
-        for old in self.state.runs.values().cloned().collect::<Vec<_>>() {
-            if old.parked && old.state == RunState::Paused && old.submitted.digest() == run.submitted.digest() {
+        let parked: Vec<u64> = self.state.parked.iter().copied().collect();
+        for old in parked.iter().filter_map(|number| self.state.runs.get(number).cloned()).collect::<Vec<_>>() {
+            if old.state == RunState::Paused && old.submitted.digest() == run.submitted.digest() {
                 self.change_run(old.number, |old| old.skip_rest(&format!("taken over by run `{}`", run.id)));
                 self.set_run_state(old.number, RunState::Cancelled, old.parked);
             }

@@ -48,7 +48,7 @@ impl Deciding<'_> {
                 self.drop_worker(&worker, Loss::Restart);
                 self.record(Fact::WorkerForgotten { worker });
             } else {
-                Arc::make_mut(&mut self.state.heard.workers).insert(worker, now);
+                self.state.heard.workers.insert_mut(worker, now);
             }
         }
         if park {

@@ -1,7 +1,6 @@
 //! Worker processes: that they come, are heard, fall silent and go.
 
 use std::collections::BTreeSet;
-use std::sync::Arc;
 
 use protocol::message::{Grant, Join};
 use protocol::{Incarnation, TaskId, WorkerId};
@@ -22,7 +21,7 @@ impl Deciding<'_> {
         let process = Worker::joined(&join, self.state.incarnation.next());
         self.effects.push(Effect::Joined(process.incarnation));
         let now = self.now();
-        Arc::make_mut(&mut self.state.heard.workers).insert(join.worker.clone(), now);
+        self.state.heard.workers.insert_mut(join.worker.clone(), now);
         self.record(Fact::Worker { worker: join.worker, process });
         Ok(())
     }

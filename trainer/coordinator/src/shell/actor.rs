@@ -7,7 +7,7 @@
 use std::sync::Arc;
 
 use protocol::Digest;
-use registry::{Store, Write};
+use registry::{Store, Write, WriteError};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
@@ -15,9 +15,12 @@ use super::actor_handle::{ActorHandle, Reply};
 use super::blocking::blocking;
 use super::effects;
 use crate::batch::{Ask, Batches, Done, Turn};
-use crate::journal;
+use crate::journal::{self, Recovered};
 use crate::state::State;
 use crate::time::Moment;
+
+/// Bytes of a snapshot that are stored in one transaction.
+const SNAPSHOT_BYTES: usize = 256 << 10;
 
 /// Unpredictable bytes: a secret of the process, drawn once, and a counter.
 #[derive(Debug)]
@@ -42,10 +45,11 @@ impl Entropy {
 }
 
 /// Starts the actor on a recovered state.
-pub(crate) fn start(store: Store, state: State) -> (Arc<ActorHandle>, JoinHandle<()>) {
+pub(crate) fn start(store: Store, recovered: Recovered) -> (Arc<ActorHandle>, JoinHandle<()>) {
+    let Recovered { snapshot, state } = recovered;
     let (now, snapshot_at) = (state.now, state.seq);
     let batches = Batches::new(state);
-    let (actor_handle, queue) = ActorHandle::new(store, now, Arc::clone(batches.front()));
+    let (actor_handle, queue) = ActorHandle::new(store, now, Arc::clone(batches.front()), snapshot);
     let actor_handle = Arc::new(actor_handle);
     let moments = Moments { actor_handle: Arc::clone(&actor_handle), entropy: Entropy::new() };
     let actor = Actor { actor_handle: Arc::clone(&actor_handle), batches, moments, snapshot_at, snapshot: None };
@@ -126,19 +130,52 @@ impl Actor {
         let is_over = self.snapshot.as_ref().is_none_or(JoinHandle::is_finished);
         if is_over && state.seq >= self.snapshot_at + state.policy.snapshot_every {
             self.snapshot_at = state.seq;
-            let storing = snapshot(self.actor_handle.store.clone(), Arc::clone(state));
+            let (actor_handle, state) = (Arc::clone(&self.actor_handle), Arc::clone(state));
+            let storing = async move { snapshot(&actor_handle, &state).await };
             self.snapshot = Some(self.actor_handle.spawn("the storing of a snapshot", storing));
         }
     }
 }
 
-/// Stores `state` as a whole. Whatever happens meanwhile follows on it.
-pub(crate) async fn snapshot(store: Store, state: Arc<State>) {
-    let seq = state.seq;
-    let text = blocking(move || journal::snapshot(&state)).await;
-    match store.write(vec![Write::Snapshot { seq, state: text }]).await {
-        Ok(()) => tracing::debug!(seq, "stored a snapshot"),
-        // The facts are there; only the next start takes longer.
-        Err(error) => tracing::warn!(seq, %error, "no snapshot"),
+/// Stores what of `state` has changed since the snapshot before. Whatever happens meanwhile follows on it.
+pub(crate) async fn snapshot(actor_handle: &ActorHandle, state: &Arc<State>) {
+    let mut stored = actor_handle.snapshot.lock().await;
+    if state.seq == stored.seq {
+        return;
     }
+    match store_snapshot(&actor_handle.store, &stored, state).await {
+        Ok(()) => {
+            tracing::debug!(state.seq, "stored a snapshot");
+            *stored = Arc::clone(state);
+        }
+        // The facts are there; only the next start takes longer.
+        Err(error) => tracing::warn!(state.seq, %error, "no snapshot"),
+    }
+}
+
+async fn store_snapshot(store: &Store, before: &Arc<State>, state: &Arc<State>) -> Result<(), WriteError> {
+    let seq = state.seq;
+    let (old, new) = (Arc::clone(before), Arc::clone(state));
+    let mut changed = blocking(move || journal::changed_parts(&old, &new)).await.into_iter();
+    // Between two of these transactions others have their turn.
+    loop {
+        let (parts, rest) = blocking(move || {
+            let (mut parts, mut bytes) = (Vec::new(), 0);
+            while bytes < SNAPSHOT_BYTES
+                && let Some(part) = changed.next()
+            {
+                let (name, text) = part.stored();
+                bytes += name.len() + text.as_ref().map_or(0, String::len);
+                parts.push((name, text));
+            }
+            (parts, changed)
+        })
+        .await;
+        if parts.is_empty() {
+            break;
+        }
+        changed = rest;
+        store.write(vec![Write::SnapshotParts { seq, parts }]).await?;
+    }
+    store.write(vec![Write::Snapshot { seq, state: journal::snapshot(state) }]).await
 }

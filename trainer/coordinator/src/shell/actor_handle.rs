@@ -37,6 +37,8 @@ pub(crate) struct ActorHandle {
     pub(crate) clients: Semaphore,
     pub(crate) batches: Semaphore,
     front: Arc<Front>,
+    /// The state of the newest snapshot that is stored.
+    pub(super) snapshot: tokio::sync::Mutex<Arc<State>>,
     changed: watch::Sender<u64>,
     trouble: Mutex<Option<String>>,
     failure: OnceLock<String>,
@@ -47,13 +49,19 @@ pub(crate) struct ActorHandle {
 
 impl ActorHandle {
     /// A handle, and the queue of what is asked through it.
-    pub(super) fn new(store: Store, now: Millis, front: Arc<Front>) -> (Self, mpsc::Receiver<(Ask, Reply)>) {
+    pub(super) fn new(
+        store: Store,
+        now: Millis,
+        front: Arc<Front>,
+        snapshot: State,
+    ) -> (Self, mpsc::Receiver<(Ask, Reply)>) {
         let (asks, queue) = mpsc::channel(QUEUE);
         let handle = Self {
             asks,
             clients: Semaphore::new(limits::CLIENTS_WAITING),
             batches: Semaphore::new(limits::BATCHES_WAITING),
             front,
+            snapshot: tokio::sync::Mutex::new(Arc::new(snapshot)),
             changed: watch::Sender::new(0),
             trouble: Mutex::new(None),
             failure: OnceLock::new(),

@@ -131,7 +131,7 @@ impl Coordinator {
     /// Recovers from the snapshot and the facts in `store`, then listens.
     pub async fn start(store: Store, config: Config) -> Result<Handle, StartError> {
         config.check()?;
-        let state = journal::recover(config.policy.clone(), &store.recovery().await?)?;
+        let recovered = journal::recover_both(config.policy.clone(), &store.recovery().await?)?;
         let listen = |address| move |cause| StartError::Listen { address, cause };
         let main = Listener::bind(config.listen, config.tls.clone()).await.map_err(listen(config.listen))?;
         let address = main.address().map_err(listen(config.listen))?;
@@ -146,7 +146,7 @@ impl Coordinator {
         let (token, mut tokens) = (Token::random(), config.tokens.clone());
         tokens.add(user(), Scopes::all(), &token);
 
-        let (actor_handle, actor) = actor::start(store, state);
+        let (actor_handle, actor) = actor::start(store, recovered);
         actor_handle.decide(Event::Started { alone: config.alone, park: config.park }).await?;
         effects::let_go(&actor_handle);
         let (stop, stopped) = watch::channel(false);
@@ -275,7 +275,7 @@ impl Handle {
             let _ = task.await;
         }
         effects::let_go(&self.actor_handle);
-        actor::snapshot(self.actor_handle.store.clone(), self.actor_handle.state()).await;
+        actor::snapshot(&self.actor_handle, &self.actor_handle.state()).await;
     }
 }
 

@@ -21,6 +21,7 @@ use protocol::stage::{Backend, Placement, Shape, StageSettings, WorkerRange};
 use protocol::{Attempt, Digest, Fence, RunId, Seed, StageName, TaskId};
 use serde::{Deserialize, Serialize};
 
+use super::shared::Set;
 use super::task::{Part, Task};
 use super::tasks::Tasks;
 use super::worker::Worker;
@@ -94,9 +95,9 @@ pub struct StageExecution {
     /// The instruction set of who worked on it last.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub instruction_set: Option<String>,
-    /// The runs in memory that have stages with this key, and how many: those that came to it while it was in memory itself.
-    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    pub users: BTreeMap<u64, usize>,
+    /// Stages of runs in memory that have this key, by run and place: those that came to it while it was in memory itself.
+    #[serde(default, skip_serializing_if = "Set::is_empty")]
+    pub users: Set<(u64, usize)>,
 }
 
 impl StageExecution {
@@ -148,6 +149,11 @@ impl StageExecution {
             Part::Merge => self.tasks.open() == 1,
             Part::Alone | Part::Gang | Part::Shard { .. } => true,
         }
+    }
+
+    /// Whether a gang does it.
+    pub fn is_gang(&self) -> bool {
+        self.tasks.first().is_some_and(|task| task.part == Part::Gang)
     }
 
     /// Whether somebody works on it.

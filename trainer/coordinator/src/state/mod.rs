@@ -2,7 +2,10 @@
 //! `observe`; read by everybody.
 //!
 //! What is known twice, for speed, follows from the facts as well: who waits and who is held in an execution (`tasks::Tasks`), what a
-//! worker holds and which workers hold nothing, which runs use an execution, which stages of a run are active. Invariant C14.
+//! worker holds and which workers hold nothing, which runs use an execution, which stages of a run are active, which executions need
+//! workers (`queue::Queue`), which runs are parked or have an idempotency key. Invariant C14.
+//!
+//! Copies share what neither changes (`shared::Map`): a decision on a copy costs what it changes, however much there is.
 //!
 //! In memory is what may still matter: runs that have not ended, executions that one of them uses or that somebody works on, workers that
 //! were heard of lately. The rest is in the store's tables. Numbers of runs, incarnations and fences come from counters that only grow, so
@@ -11,13 +14,14 @@
 mod apply;
 pub mod execution;
 pub mod gang;
+pub mod queue;
 pub mod run;
-pub(crate) mod shared;
+pub mod shared;
 pub mod task;
 pub mod tasks;
 pub mod worker;
 
-use std::collections::{BTreeMap, BTreeSet, HashSet};
+use std::collections::HashSet;
 use std::sync::Arc;
 
 use protocol::message::{Grant, Progress};
@@ -25,7 +29,9 @@ use protocol::{Digest, Fence, Incarnation, RunId, StageName, TaskId, WorkerId};
 
 pub use self::apply::Misfit;
 use self::execution::{ExecutionState, StageExecution};
+use self::queue::Queue;
 use self::run::Run;
+use self::shared::{Map, Set};
 use self::task::Task;
 use self::worker::Worker;
 use crate::policy::Policy;
@@ -36,12 +42,12 @@ use crate::time::Millis;
 #[derive(Debug, Clone, Default)]
 pub struct Heard {
     /// When each worker was last heard of.
-    pub workers: Arc<BTreeMap<WorkerId, Millis>>,
+    pub workers: Map<WorkerId, Millis>,
     /// What was last said about each task that is all of its work.
-    pub progress: Arc<BTreeMap<TaskId, Arc<Progress>>>,
+    pub progress: Map<TaskId, Arc<Progress>>,
 }
 
-/// All that the coordinator knows. What may be large is shared between copies until one changes it, so a copy is cheap.
+/// All that the coordinator knows. A copy is cheap: it shares what is in the maps.
 #[derive(Debug, Clone, Default)]
 pub struct State {
     /// Times and budgets.
@@ -57,15 +63,23 @@ pub struct State {
     /// The newest fence of any task.
     pub fence: Fence,
     /// Workers by name.
-    pub workers: Arc<BTreeMap<WorkerId, Worker>>,
+    pub workers: Map<WorkerId, Worker>,
     /// Those of them that hold no task.
-    pub unused: Arc<BTreeSet<WorkerId>>,
+    pub unused: Set<WorkerId>,
     /// Runs that have not ended, by number, which is the order of submission.
-    pub runs: BTreeMap<u64, Arc<Run>>,
+    pub runs: Map<u64, Arc<Run>>,
     /// Executions by the stage's key.
-    pub executions: BTreeMap<Digest, Arc<StageExecution>>,
+    pub executions: Map<Digest, Arc<StageExecution>>,
     /// Which execution a task is of, and its place there.
-    pub tasks: Arc<BTreeMap<TaskId, (Digest, usize)>>,
+    pub tasks: Map<TaskId, (Digest, usize)>,
+    /// Executions that running runs wait for, by what they need.
+    pub queue: Queue,
+    /// By an execution that is made again: those that wait for it.
+    pub mends: Map<Digest, Set<Digest>>,
+    /// Runs by the client's key.
+    pub idempotent: Map<String, u64>,
+    /// Runs that a restart has paused.
+    pub parked: Set<u64>,
     /// About to stop: no grants, workers save and leave.
     pub draining: bool,
     /// What was merely heard.
@@ -159,9 +173,7 @@ impl State {
 
     /// Whether a running run waits for an execution.
     pub fn is_wanted(&self, execution: &StageExecution) -> bool {
-        let waits_for = |key| key == execution.key || self.mended_for(key).contains(&execution.key);
-        let waits = |run: &Arc<Run>| run.active().any(|(_, key)| waits_for(key));
-        execution.users.keys().filter_map(|number| self.runs.get(number)).any(waits)
+        self.queue.rank(&execution.key).is_some()
     }
 
     /// What is made again so that an execution can go on, and what for that; what comes first is waited for by what comes later. Mostly

@@ -183,6 +183,17 @@ impl Task {
         fence
     }
 
+    /// Waits no longer if its back-off is over at `now`; whether it was.
+    pub fn end_backoff(&mut self, now: Millis) -> bool {
+        match &mut self.lease {
+            Lease::Waiting { not_before } if not_before.is_some_and(|time| time <= now) => {
+                *not_before = None;
+                true
+            }
+            Lease::Waiting { .. } | Lease::Held { .. } | Lease::Done { .. } => false,
+        }
+    }
+
     /// Takes it away: its holders can write no more.
     pub fn release(&mut self, not_before: Option<Millis>) -> Write {
         assert!(self.is_held(), "release of {self:?}");

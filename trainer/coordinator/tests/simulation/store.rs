@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use coordinator::event::Event;
+use coordinator::journal::ChangedPart;
 use coordinator::state::run::Run;
 use coordinator::value::Known;
 use coordinator::{State, journal};
@@ -75,7 +76,9 @@ impl FakeStore {
     fn apply(&mut self, write: &Write) {
         match write {
             Write::Facts { seq, facts } => self.recovery.facts.push((*seq, facts.clone())),
-            Write::Snapshot { .. } => unreachable!("the world takes snapshots by `snapshot`"),
+            Write::SnapshotParts { .. } | Write::Snapshot { .. } => {
+                unreachable!("the world takes snapshots by `snapshot`")
+            }
             Write::Fence { task, fence } => {
                 let before = self.fences.insert(task.clone(), *fence);
                 assert!(before.is_none_or(|before| before < *fence), "the fence of {task} fell to {fence}");
@@ -156,6 +159,14 @@ impl FakeStore {
 
     /// The state as a whole; the facts before it go.
     pub(crate) fn snapshot(&mut self, state: &State) {
+        let stored = Recovery { facts: Vec::new(), ..self.recovery.clone() };
+        let before = journal::recover(state.policy.clone(), &stored).expect("the snapshot before");
+        for (part, text) in journal::changed_parts(&before, state).iter().map(ChangedPart::stored) {
+            match text {
+                Some(text) => drop(self.recovery.parts.insert(part, text)),
+                None => assert!(self.recovery.parts.remove(&part).is_some(), "{part} was there"),
+            }
+        }
         self.recovery.snapshot = Some((state.seq, journal::snapshot(state)));
         self.recovery.facts.retain(|(seq, _)| *seq > state.seq);
     }
@@ -176,7 +187,7 @@ impl FakeStore {
         let results: Vec<_> = self.results.iter().map(|(key, (known, run, stage))| (key, known, run, stage)).collect();
         let checkpoints: Vec<_> = self.checkpoints.iter().map(|((task, step), digest)| (task, step, digest)).collect();
         let stored = serde_json::json!({
-            "snapshot": self.recovery.snapshot, "facts": self.recovery.facts, "fences": self.fences, "results": results,
+            "snapshot": self.recovery.snapshot, "parts": self.recovery.parts, "facts": self.recovery.facts, "fences": self.fences, "results": results,
             "runs": self.runs, "keys": self.keys, "ended": self.ended, "executions": self.executions, "shards": self.shards,
             "accepted": self.accepted, "checkpoints": checkpoints,
         });
@@ -193,7 +204,11 @@ impl FakeStore {
         let results = part::<Vec<Result>>(&mut stored, "results").into_iter();
         let checkpoints = part::<Vec<(TaskId, u64, Digest)>>(&mut stored, "checkpoints").into_iter();
         Self {
-            recovery: Recovery { snapshot: part(&mut stored, "snapshot"), facts: part(&mut stored, "facts") },
+            recovery: Recovery {
+                snapshot: part(&mut stored, "snapshot"),
+                parts: part(&mut stored, "parts"),
+                facts: part(&mut stored, "facts"),
+            },
             fences: part(&mut stored, "fences"),
             results: results.map(|(key, known, run, stage)| (key, (known, run, stage))).collect(),
             runs: part(&mut stored, "runs"),

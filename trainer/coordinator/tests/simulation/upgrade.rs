@@ -57,7 +57,7 @@ fn make_the_store() {
         world.step();
     }
     let first = world.store.recovery.facts.len() / 2;
-    let half = registry::Recovery { snapshot: None, facts: world.store.recovery.facts[..first].to_vec() };
+    let half = registry::Recovery { facts: world.store.recovery.facts[..first].to_vec(), ..Default::default() };
     let half = journal::recover(world.policy.clone(), &half).expect("half of it");
     world.store.snapshot(&half);
     std::fs::create_dir_all(file().parent().expect("a folder")).expect("a folder");

@@ -276,7 +276,7 @@ impl World {
         }
         self.recovered();
         let held: usize = self.state().executions.values().map(|execution| execution.tasks.held().count()).sum();
-        assert!(self.state().executions.len() <= held, "all that is left in memory is what workers are leaving");
+        assert!(self.state().executions.size() <= held, "all that is left in memory is what workers are leaving");
     }
 
     /// All runs, whether they go on or have ended, by submission.

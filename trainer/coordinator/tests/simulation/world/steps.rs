@@ -393,7 +393,7 @@ impl World {
 
 /// Whether what gave an input is in memory, in a run of its reader.
 fn is_given_here(state: &State, reader: &StageExecution, input: Digest) -> bool {
-    let runs = reader.users.keys().filter_map(|number| state.runs.get(number));
+    let runs = reader.users.iter().filter_map(|(number, _)| state.runs.get(number));
     let gave = |status: &Status| status.known().is_some_and(|known| known.outputs.values().any(|it| *it == input));
     let mut givers = runs.flat_map(|run| &run.stages).filter(|status| gave(status)).filter_map(Status::key);
     givers.any(|giver| state.executions.contains_key(&giver))

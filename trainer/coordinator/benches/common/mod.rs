@@ -1,0 +1,130 @@
+//! Callers over TCP, and workers that do not compute.
+#![allow(dead_code, reason = "not every bench uses all of it")]
+
+use std::collections::{BTreeMap, HashSet};
+use std::net::SocketAddr;
+
+use protocol::message::{
+    Assignment, DesiredAssignments, Grant, Join, Joined, PROTOCOL_VERSION, Poll, ReportOutcome, TaskOutcome,
+};
+use protocol::stage::Backend;
+use protocol::{ArtifactKind, Digest, Incarnation, Manifest};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+
+pub(crate) type Result<T = ()> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>>;
+
+/// One connection that is kept.
+pub(crate) struct Connection {
+    stream: TcpStream,
+    buffer: Vec<u8>,
+    token: String,
+}
+
+impl Connection {
+    pub(crate) async fn open(address: SocketAddr, token: &str) -> Result<Self> {
+        let stream = TcpStream::connect(address).await?;
+        stream.set_nodelay(true)?;
+        Ok(Self { stream, buffer: Vec::new(), token: token.to_owned() })
+    }
+
+    pub(crate) async fn send(&mut self, what: &str, headers: &str, body: &[u8]) -> Result<Vec<u8>> {
+        let length = body.len();
+        let token = &self.token;
+        let headers = format!("authorization: Bearer {token}\r\n{headers}content-length: {length}");
+        let head = format!("{what} HTTP/1.1\r\nhost: localhost\r\n{headers}\r\n\r\n");
+        let mut request = head.into_bytes();
+        request.extend_from_slice(body);
+        self.stream.write_all(&request).await?;
+        self.buffer.clear();
+        let (mut end, mut length) = (None, 0);
+        loop {
+            if end.is_none()
+                && let Some(at) = self.buffer.windows(4).position(|w| w == b"\r\n\r\n")
+            {
+                let head = std::str::from_utf8(&self.buffer[..at])?.to_lowercase();
+                let value = head.lines().find_map(|line| line.strip_prefix("content-length: "));
+                length = value.ok_or("no length")?.trim().parse()?;
+                end = Some(at + 4);
+            }
+            if let Some(end) = end
+                && self.buffer.len() >= end + length
+            {
+                let answer = self.buffer[end..end + length].to_vec();
+                if &self.buffer[9..12] == b"200" {
+                    return Ok(answer);
+                }
+                return Err(String::from_utf8_lossy(&answer).into_owned().into());
+            }
+            if self.stream.read_buf(&mut self.buffer).await? == 0 {
+                return Err("the server closed the connection".into());
+            }
+        }
+    }
+
+    pub(crate) async fn post<T: DeserializeOwned>(&mut self, path: &str, body: &impl Serialize) -> Result<T> {
+        let body = serde_json::to_vec(body)?;
+        let answer = self.send(&format!("POST {path}"), "content-type: application/json\r\n", &body).await?;
+        Ok(serde_json::from_slice(&answer)?)
+    }
+
+    pub(crate) async fn put(&mut self, grant: &Grant, bytes: &[u8]) -> Result<Digest> {
+        let header = format!("x-stride-grant: {}\r\n", serde_json::to_string(grant)?);
+        let answer = self.send(&format!("PUT /v1/blobs/{}", Digest::of(bytes)), &header, bytes).await?;
+        Ok(serde_json::from_slice::<coordinator::shell::BlobStored>(&answer)?.digest)
+    }
+}
+
+/// A worker that does not compute.
+pub(crate) struct Worker {
+    pub(crate) name: String,
+    pub(crate) incarnation: Incarnation,
+    pub(crate) connection: Connection,
+    uploaded: HashSet<Digest>,
+}
+
+impl Worker {
+    pub(crate) async fn join(address: SocketAddr, token: &str, i: usize) -> Result<Self> {
+        let mut connection = Connection::open(address, token).await?;
+        let name = format!("w{i}");
+        let join = Join {
+            protocol: PROTOCOL_VERSION,
+            worker: name.as_str().into(),
+            pid: 1,
+            backend: Backend::Flex,
+            instruction_set: "avx2".into(),
+            peer_address: "127.0.0.1:1".into(),
+        };
+        let joined: Joined = connection.post("/v1/workers", &join).await?;
+        Ok(Self { name, incarnation: joined.incarnation, connection, uploaded: HashSet::new() })
+    }
+
+    /// A heartbeat that is answered at once.
+    pub(crate) async fn poll(&mut self) -> Result<Option<Assignment>> {
+        let poll = Poll { incarnation: self.incarnation, doing: vec![], ready: vec![], version: 0 };
+        let desired: DesiredAssignments =
+            self.connection.post(&format!("/v1/workers/{}/poll", self.name), &poll).await?;
+        Ok(desired.assignments.into_iter().next())
+    }
+
+    /// Something of the right kind, uploaded once by each worker.
+    pub(crate) async fn output(&mut self, assignment: &Assignment) -> Result<Digest> {
+        let kind = match assignment.stage.name.as_str() {
+            "dataset" => ArtifactKind::Dataset,
+            "vae" => ArtifactKind::Vae,
+            _ => ArtifactKind::Latents,
+        };
+        let manifest = Manifest::new(kind, serde_json::json!({}));
+        if self.uploaded.insert(manifest.digest()) {
+            self.connection.put(&assignment.grant, &manifest.to_bytes()).await?;
+        }
+        Ok(manifest.digest())
+    }
+
+    pub(crate) async fn finish(&mut self, grant: Grant, output: Digest) -> Result {
+        let outcome = TaskOutcome::Finished { output, metrics: BTreeMap::new() };
+        self.connection.post("/v1/outcomes", &ReportOutcome { grant, outcome }).await
+    }
+}
