@@ -56,4 +56,12 @@ mutation pipe-as-token-file trainer/access/src/file.rs 's/if file\.metadata\(\)\
 mutation lock-follows-links registry/src/blob/disk.rs 's/OFlag::O_NOFOLLOW \| //' registry
 mutation gang-in-the-clear worker/src/gang/seal.rs 's/Ok\(stream\.local_addr\(\)\?\.ip\(\)\.to_canonical\(\) != .*\)$/Ok(stream.local_addr().is_err())/m' worker
 mutation nonce-that-repeats worker/src/gang/seal.rs 's/bytes\[4\.\.\]\.copy_from_slice\(&number\.to_le_bytes\(\)\);/let _ = number; bytes[4] = 1;/' worker
+mutation every-queued-run-is-visited trainer/coordinator/src/schedule.rs 's/(let prepared = )(prepared_gangs)/cx.state.visits += cx.state.runs.size() as u64;\n    $1$2/' coordinator
+mutation a-rank-is-not-brought-up-to-date trainer/coordinator/src/state/apply.rs 's/(concerned\.append\(&mut self\.concerned\(fact\)\);)/$1\n        concerned.clear();/' coordinator
+mutation parts-of-a-given-up-snapshot-count registry/src/sqlite/apply.rs 's/run\(conn, sqlx::query\(given_up\)\.bind\(int\(seq\)\)\.bind\(int\(seq\)\)\)\.await\?;/let _ = given_up;/' registry
+mutation readers-take-all-connections trainer/coordinator/src/shell/listener.rs 's/own >= limits\.of_token/own > limits.most/' coordinator
+mutation no-limit-of-calls trainer/coordinator/src/shell/rate.rs 's/bucket\.left < 1\.0/bucket.left < -1.0e9/' coordinator
+mutation no-limit-of-live-runs trainer/coordinator/src/decide/runs.rs 's/if live < most \{/if live < most || most > 0 {/' coordinator
+mutation no-limit-of-a-runs-lines registry/src/sqlite/usage.rs 's/bind\(int\(log_bytes\)\)/bind(0)/' coordinator
+mutation a-refused-blob-is-tried-again worker/src/blobs.rs 's/BlobError::Unfit\(message\)/BlobError::Unavailable(message)/' worker
 exit $missed

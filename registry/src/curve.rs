@@ -33,7 +33,7 @@ pub struct Curve {
 /// Makes curves of stored values.
 #[derive(Debug, Default)]
 pub(crate) struct Curves {
-    all: BTreeMap<String, Vec<Point>>,
+    all: BTreeMap<String, Values>,
     /// The series being read: key, task, attempt.
     reading: Option<(String, String, i64)>,
     /// The first step of the newer attempts, and of the one being read.
@@ -41,37 +41,59 @@ pub(crate) struct Curves {
     first: u64,
 }
 
+#[derive(Debug, Default)]
+struct Values {
+    points: Vec<Point>,
+    /// Values that count and are not among the points.
+    left_out: u64,
+}
+
 impl Curves {
-    /// Adds a value. They come by key, by task, by attempt with the newest first, and by step.
-    pub(crate) fn push(&mut self, key: &str, task: &str, attempt: i64, step: u64, value: Option<f64>) {
-        match &self.reading {
-            Some((k, t, a)) if (k.as_str(), t.as_str(), *a) == (key, task, attempt) => {}
-            Some((k, t, _)) if (k.as_str(), t.as_str()) == (key, task) => {
-                self.superseded_from = self.superseded_from.min(self.first);
-                self.first = step;
-                self.reading = Some((key.to_owned(), task.to_owned(), attempt));
-            }
-            _ => {
-                (self.superseded_from, self.first) = (u64::MAX, step);
-                self.reading = Some((key.to_owned(), task.to_owned(), attempt));
-            }
+    /// Begins a series; they come by key, by task, by attempt with the newest first. Returns the step before which its values count.
+    pub(crate) fn begin(&mut self, key: &str, task: &str, attempt: i64) -> u64 {
+        let goes_on = self.reading.as_ref().is_some_and(|(k, t, _)| (k.as_str(), t.as_str()) == (key, task));
+        self.superseded_from = if goes_on { self.superseded_from.min(self.first) } else { u64::MAX };
+        self.first = u64::MAX;
+        self.reading = Some((key.to_owned(), task.to_owned(), attempt));
+        self.superseded_from
+    }
+
+    /// Says which step is the first of the series, whether its value counts or not.
+    pub(crate) fn begins_at(&mut self, step: u64) {
+        self.first = step;
+    }
+
+    /// Adds a value of the series that counts.
+    pub(crate) fn push(&mut self, step: u64, value: Option<f64>) {
+        let point = Point { step, value: value.unwrap_or(f64::NAN) };
+        if let Some(values) = self.values() {
+            values.points.push(point);
         }
-        if step < self.superseded_from {
-            let point = Point { step, value: value.unwrap_or(f64::NAN) };
-            match self.all.get_mut(key) {
-                Some(points) => points.push(point),
-                None => drop(self.all.insert(key.to_owned(), vec![point])),
-            }
+    }
+
+    /// Adds so many values of the series that lie between those that were pushed, and no further out.
+    pub(crate) fn left_out(&mut self, count: u64) {
+        if let Some(values) = self.values() {
+            values.left_out += count;
         }
+    }
+
+    fn values(&mut self) -> Option<&mut Values> {
+        let (key, ..) = self.reading.as_ref()?;
+        if !self.all.contains_key(key) {
+            self.all.insert(key.clone(), Values::default());
+        }
+        self.all.get_mut(key)
     }
 
     /// The curves by key, of at most about `points` each; 0 for all.
     pub(crate) fn finish(self, points: usize) -> BTreeMap<String, Curve> {
-        let curve = |mut all: Vec<Point>| {
-            all.sort_by_key(|point| point.step);
-            Curve { total: all.len() as u64, points: downsample(all, points) }
+        let curve = |mut values: Values| {
+            values.points.sort_by_key(|point| point.step);
+            let total = values.points.len() as u64 + values.left_out;
+            Curve { total, points: downsample(values.points, points) }
         };
-        self.all.into_iter().map(|(key, all)| (key, curve(all))).collect()
+        self.all.into_iter().map(|(key, values)| (key, curve(values))).collect()
     }
 }
 

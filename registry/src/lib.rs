@@ -34,7 +34,7 @@ mod write;
 
 pub use blob::BlobStore;
 pub use blob::place::Place;
-pub use catalog::{CheckpointRow, EndedRow, LineageNode, LogRow, Recovery, RunRow, StageResultRow};
+pub use catalog::{CheckpointRow, EndedRow, LineageNode, LogRow, Recovery, RunRow, StageResultRow, Usage};
 pub use curve::{Curve, Point};
 pub use error::{QueryError, WriteError};
 pub use identity::Mismatch;

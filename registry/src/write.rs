@@ -24,7 +24,7 @@ pub enum Write {
     SnapshotParts {
         /// As below.
         seq: u64,
-        /// What has changed since the snapshot before, by name: JSON, or `None` for what is there no more.
+        /// The parts that changed since the previous snapshot, by name: JSON, or `None` for a part that is gone.
         parts: Vec<(String, Option<String>)>,
     },
     /// The coordinator's state after decision `seq`, but for what is in its parts. The facts that it stands for go, and of each part all

@@ -224,7 +224,7 @@ async fn a_snapshot_is_its_parts_as_they_were_last_written(place: &impl Place) {
     };
     let whole = |seq| Write::Snapshot { seq, state: json!(seq).to_string() };
     opened.write(vec![parts(2, &[("a", text("a2")), ("b", text("b2")), ("c", text("c2"))]), whole(2)]).await.unwrap();
-    // A snapshot that is not complete does not count, whoever opens next.
+    // An incomplete snapshot does not count.
     opened.write(vec![parts(4, &[("a", text("a4")), ("b", None), ("d", text("d4"))])]).await.unwrap();
     let read = async |opened: &Opened| opened.records().recovery().await.unwrap().parts;
     let known = |parts: &[(&str, &str)]| {
@@ -380,9 +380,9 @@ async fn a_run_that_ended_answers_from_its_view_until_it_is_forgotten(place: &im
     let refused = opened.catalog().commit(Order::Forget("a".into())).await;
     assert!(matches!(refused, Err(WriteError::Conflict(_))), "it is running");
     opened.write(vec![ended("a", "finished"), ended("b", "failed")]).await.unwrap();
-    let views = records.ended_views(10).await.unwrap();
+    let views = records.ended_views(None, 10).await.unwrap();
     assert_eq!(views.iter().map(|(run, _)| run.as_str()).collect::<Vec<_>>(), ["a", "b"]);
-    assert_eq!(records.ended_views(1).await.unwrap()[0].0.as_str(), "b", "of more than asked for the newest");
+    assert_eq!(records.ended_views(None, 1).await.unwrap()[0].0.as_str(), "b", "of more than asked for the newest");
     assert!(records.ended(&"a".into()).await.unwrap().unwrap().archive.contains("archived"));
     assert_eq!(records.ended_before(i64::MAX).await.unwrap().len(), 2);
     assert!(records.ended_before(0).await.unwrap().is_empty());

@@ -137,9 +137,10 @@ impl Client {
         Ok(self.post::<coordinator::shell::Submitted>("/v1/runs", submit).await?.run)
     }
 
-    /// Runs that go on, and of those that ended the newest `ended`.
-    pub(crate) async fn newest_runs(&self, ended: u32) -> Result<Vec<RunView>> {
-        self.get(&format!("/v1/runs?limit={ended}")).await
+    /// The newest runs by submission, or those before a run: at most `limit`, and at most as many as the server gives at a time.
+    pub(crate) async fn runs_before(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<RunView>> {
+        let before = before.map(|run| format!("&before={run}")).unwrap_or_default();
+        self.get(&format!("/v1/runs?limit={limit}{before}")).await
     }
 
     pub(crate) async fn run(&self, run: &RunId) -> Result<RunView> {

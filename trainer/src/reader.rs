@@ -3,7 +3,7 @@
 
 use coordinator::{Records, WorkerView};
 use protocol::message::RunView;
-use protocol::{Digest, RunId, StageName};
+use protocol::{Digest, RunId, StageName, limits};
 use registry::LogRow;
 use registry::cli::{Answer, Command};
 
@@ -45,13 +45,23 @@ impl Reader {
 
     /// All runs by submission.
     pub(crate) async fn runs(&self) -> Result<Vec<RunView>> {
-        self.newest_runs(1_000_000).await
+        let mut all = Vec::new();
+        loop {
+            let before = all.last().map(|run: &RunView| run.run.clone());
+            let mut part = self.runs_before(before.as_ref(), limits::RUNS_LISTED).await?;
+            if part.is_empty() {
+                all.reverse();
+                return Ok(all);
+            }
+            part.reverse();
+            all.append(&mut part);
+        }
     }
 
-    /// Runs that go on, and of those that ended the newest `ended`.
-    async fn newest_runs(&self, ended: u32) -> Result<Vec<RunView>> {
+    /// The newest runs by submission, or those before a run.
+    async fn runs_before(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<RunView>> {
         let records = match self {
-            Self::Server(client) => return client.newest_runs(ended).await,
+            Self::Server(client) => return client.runs_before(before, limit).await,
             Self::Store(records) => records,
         };
         let read = |view: String| {
@@ -60,7 +70,7 @@ impl Reader {
                     .hint("use the build that wrote it")
             })
         };
-        records.run_views(ended).await?.into_iter().map(read).collect()
+        records.run_views(before, limit).await?.into_iter().map(read).collect()
     }
 
     pub(crate) async fn run(&self, run: &RunId) -> Result<RunView> {
@@ -105,7 +115,7 @@ impl Reader {
 
     /// The run that `text` means: its name, a unique beginning of it, or `@last`.
     pub(crate) async fn find(&self, text: &str) -> Result<RunView> {
-        let runs = if text == "@last" { self.newest_runs(1).await? } else { self.runs().await? };
+        let runs = if text == "@last" { self.runs_before(None, 1).await? } else { self.runs().await? };
         let not_found = |message: String| Problem::new(exit::NOT_FOUND, anyhow::anyhow!("{message}"));
         if text == "@last" {
             return runs.into_iter().next_back().ok_or_else(|| {

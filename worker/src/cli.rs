@@ -7,7 +7,7 @@ use access::ConnectionOptions;
 use protocol::WorkerId;
 use protocol::stage::Backend;
 
-use crate::{JoinError, Options};
+use crate::{JoinError, Options, StageLimits};
 
 /// Offer this machine to a coordinator.
 #[derive(Debug, Clone, clap::Args)]
@@ -38,6 +38,12 @@ pub struct JoinArgs {
     /// Be killed when the parent process dies, and leave Ctrl-C to it
     #[arg(long)]
     pub die_with_parent: bool,
+    /// A stage may use so many GiB of memory; beyond it fails [default: nine tenths of the machine's]
+    #[arg(long, env = "STRIDE_STAGE_MEMORY", value_name = "GIB")]
+    pub stage_memory: Option<f64>,
+    /// A stage that is no training may take so many minutes; beyond it fails [default: any time]
+    #[arg(long, env = "STRIDE_STAGE_TIME", value_name = "MINUTES")]
+    pub stage_time: Option<u64>,
     /// After SIGTERM, end at the latest after so many seconds, saved or not
     #[arg(long, value_name = "SECONDS", default_value_t = 30)]
     pub leave_within: u64,
@@ -49,6 +55,11 @@ impl TryFrom<JoinArgs> for Options {
     fn try_from(args: JoinArgs) -> Result<Self, JoinError> {
         let unusable = |error: &dyn std::fmt::Display| JoinError::Usage(error.to_string());
         let server = args.connection.connect(&args.url).map_err(|error| unusable(&error))?;
+        let mut limits = StageLimits::default();
+        if let Some(gib) = args.stage_memory {
+            limits.memory = Some((gib * f64::from(1 << 30)) as u64);
+        }
+        limits.time = args.stage_time.map(|minutes| Duration::from_secs(60 * minutes));
         Ok(Self {
             server,
             name: args.name.map(WorkerId::new),
@@ -58,6 +69,7 @@ impl TryFrom<JoinArgs> for Options {
             store: args.store,
             peer_address: args.peer_address,
             die_with_parent: args.die_with_parent,
+            limits,
             leave_within: Duration::from_secs(args.leave_within),
         })
     }

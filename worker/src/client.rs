@@ -40,6 +40,9 @@ pub(crate) enum CallError {
     /// The store has the blob, and its bytes are wrong.
     #[error("{0}")]
     Damaged(String),
+    /// The run has had all that it may have of this.
+    #[error("{0}")]
+    UsedUp(String),
     /// Wrong, and will stay so.
     #[error("{0}")]
     Refused(String),
@@ -195,6 +198,7 @@ async fn check(sent: Result<Response, reqwest::Error>) -> Result<Response, CallE
         (_, "not-found") | (StatusCode::NOT_FOUND, _) => CallError::NotFound(message),
         (_, "damaged") => CallError::Damaged(message),
         (_, "arrived-damaged") => CallError::Fault(message),
+        (_, "used-up") => CallError::UsedUp(message),
         // What has arrived is asked for again.
         (StatusCode::RANGE_NOT_SATISFIABLE, "offset") => CallError::Away(message),
         (StatusCode::TOO_MANY_REQUESTS, _) => CallError::Busy(message, after),

@@ -19,6 +19,7 @@ use crate::cache::{Bounds, Cache};
 use crate::client::Client;
 use crate::gang::endpoint::Endpoint;
 use crate::gang::member::Timing;
+use crate::stage_limits::StageLimits;
 use crate::stage_thread::{self, Bench, Kinds};
 use crate::{failpoints, kinds, process};
 
@@ -44,6 +45,8 @@ pub struct Options {
     pub peer_address: Option<String>,
     /// Be killed when the parent dies, and leave Ctrl-C to it.
     pub die_with_parent: bool,
+    /// Limits of a stage.
+    pub limits: StageLimits,
     /// How long saving and saying goodbye may take once the process was asked to end; then it ends at once.
     pub leave_within: Duration,
 }
@@ -139,7 +142,7 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
         let run = move || shared.preparation.run(&client, &cache);
         thread::Builder::new().name("prepare".to_owned()).spawn(run).map_err(system("the thread that fetches ahead"))?
     };
-    let bench = Bench { kinds, client: client.clone(), cache, device };
+    let bench = Bench { kinds, client: client.clone(), cache, device, limits: options.limits.clone() };
     let stage = {
         let shared = shared.clone();
         let run = move || {

@@ -23,6 +23,7 @@ mod mapped;
 mod prepare;
 pub mod process;
 mod retry;
+mod stage_limits;
 mod stage_thread;
 mod telemetry_buffer;
 #[cfg(test)]
@@ -30,3 +31,4 @@ mod tests;
 
 pub use cli::JoinArgs;
 pub use join::{JoinError, Options, init_logging, join};
+pub use stage_limits::StageLimits;

@@ -55,6 +55,22 @@ pub(crate) fn belong_to_parent() {
     }
 }
 
+/// The memory that this process has resident, in bytes, without mapped files, where the system says so.
+pub(crate) fn memory() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let resident = status.lines().find_map(|line| line.strip_prefix("RssAnon:"))?;
+    Some(resident.trim().strip_suffix(" kB")?.parse::<u64>().ok()? << 10)
+}
+
+/// The memory of this machine in bytes, or of the container that this process is in, where the system says so.
+pub(crate) fn machine_memory() -> Option<u64> {
+    let machine = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let machine = machine.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
+    let machine = machine.trim().strip_suffix(" kB")?.parse::<u64>().ok()? << 10;
+    let container = std::fs::read_to_string("/sys/fs/cgroup/memory.max").ok().and_then(|text| text.trim().parse().ok());
+    Some(container.map_or(machine, |container: u64| container.min(machine)))
+}
+
 /// The most memory that this process has had resident, in bytes, where the system says so.
 pub(crate) fn peak_memory() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;

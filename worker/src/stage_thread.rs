@@ -19,6 +19,7 @@ use crate::context::HttpContext;
 use crate::failpoints;
 use crate::process;
 use crate::retry::{self, GaveUp};
+use crate::stage_limits::{self, StageLimits};
 
 /// The stage kinds, as far as a worker knows them. Tests bring their own.
 pub(crate) trait Kinds: Send + Sync {
@@ -33,6 +34,7 @@ pub(crate) struct Bench {
     pub(crate) client: Client,
     pub(crate) cache: Arc<Cache>,
     pub(crate) device: Device,
+    pub(crate) limits: StageLimits,
 }
 
 /// Runs assignments until the poll says that it is over.
@@ -65,7 +67,8 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
         Role::Merge { shards } => bench.kinds.part(&mut context, Part::Merge { shards }),
         Role::Member { .. } => bench.kinds.gang(&mut context),
     });
-    let result = panic::catch_unwind(stage).unwrap_or_else(|payload| Err(StageError::Fault(panic_message(&*payload))));
+    let caught = stage_limits::within(&bench.limits, held, &bench.client, || panic::catch_unwind(stage));
+    let result = caught.unwrap_or_else(|payload| Err(StageError::Fault(panic_message(&*payload))));
     let Some(outcome) = outcome(result, held, &context) else { return };
 
     failpoints::hit("outcome::before_report");

@@ -29,6 +29,8 @@ const MAX_LINES: usize = 1 << 17;
 const MAX_LINE: usize = 64 << 10;
 /// Rows in one batch.
 const BATCH_ROWS: usize = 2000;
+/// Lines in one batch.
+const BATCH_LINES: usize = 5000;
 /// Bytes of lines in one batch.
 const BATCH_BYTES: usize = 512 << 10;
 /// How often what has gathered is sent.
@@ -227,17 +229,18 @@ impl TelemetryBuffer {
                 .take_while(|&(i, (number, line))| {
                     bytes += line.len();
                     // Numbers of a batch are without gaps; another attempt's line in between ends it.
-                    (i == 0 || bytes <= BATCH_BYTES) && *number == state.lines[0].0 + i as u64
+                    (i == 0 || bytes <= BATCH_BYTES && i < BATCH_LINES) && *number == state.lines[0].0 + i as u64
                 })
                 .map(|(_, line)| line.clone())
                 .collect();
             (rows, lines)
         };
         if !rows.is_empty() {
-            retry::until_ended(&self.held, "sending metrics", |grant| {
+            let sent = retry::until_ended(&self.held, "sending metrics", |grant| {
                 let batch = MetricBatch { grant: grant.clone(), rows: rows.clone() };
                 self.client.wait(self.client.tell("/v1/metrics", &batch))
-            })?;
+            });
+            stored_or_left_out(sent)?;
             let mut state = lock(&self.state);
             for row in &rows {
                 // A drop for lack of room may have been faster.
@@ -247,11 +250,12 @@ impl TelemetryBuffer {
             }
         }
         if let Some((first, _)) = lines.first() {
-            retry::until_ended(&self.held, "sending logs", |grant| {
+            let sent = retry::until_ended(&self.held, "sending logs", |grant| {
                 let lines = lines.iter().map(|(_, line)| line.clone()).collect();
                 let batch = LogBatch { grant: grant.clone(), first: *first, lines };
                 self.client.wait(self.client.tell("/v1/logs", &batch))
-            })?;
+            });
+            stored_or_left_out(sent)?;
             let last = first + lines.len() as u64;
             let mut state = lock(&self.state);
             while state.lines.front().is_some_and(|(number, _)| *number < last) {
@@ -263,6 +267,17 @@ impl TelemetryBuffer {
             self.held.event_count().notify();
         }
         Ok(more)
+    }
+}
+
+/// Drops a batch beyond the run's limit; the work continues without it.
+fn stored_or_left_out(sent: Result<(), GaveUp>) -> Result<(), GaveUp> {
+    match sent {
+        Err(GaveUp::Answer(CallError::UsedUp(why))) => {
+            tracing::warn!("left out: {why}");
+            Ok(())
+        }
+        sent => sent,
     }
 }
 

@@ -28,6 +28,8 @@ use crate::client::Client;
 use crate::event_count::lock;
 use crate::gang::endpoint::Endpoint;
 use crate::gang::member::Timing;
+use crate::process;
+use crate::stage_limits::StageLimits;
 use crate::stage_thread::{self, Bench, Kinds};
 
 pub(crate) use self::fake::server_at;
@@ -64,6 +66,10 @@ struct Worker {
 
 impl Worker {
     fn start(script: Script) -> Self {
+        Self::start_within(script, StageLimits { memory: None, ..StageLimits::default() })
+    }
+
+    fn start_within(script: Script, limits: StageLimits) -> Self {
         let fake: Arc<Fake> = Arc::default();
         let server = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
         let server = server.expect("a runtime");
@@ -82,8 +88,13 @@ impl Worker {
             let (shared, client, cache) = (shared.clone(), client.clone(), cache.clone());
             thread::spawn(move || shared.preparation.run(&client, &cache))
         };
-        let bench =
-            Bench { kinds: Arc::new(Scripted(script)), client: client.clone(), cache, device: Device::default() };
+        let bench = Bench {
+            kinds: Arc::new(Scripted(script)),
+            client: client.clone(),
+            cache,
+            device: Device::default(),
+            limits,
+        };
         let stage = {
             let shared = shared.clone();
             thread::spawn(move || stage_thread::run(&shared, &bench))
@@ -159,6 +170,37 @@ fn assignment(member: &Member, attempt: u64, fence: u64) -> Assignment {
         resume: None,
         drain: false,
     }
+}
+
+/// A stage that takes memory until it is stopped: the failure says how much, and the stage stops because its grant has ended for it.
+#[test]
+fn a_stage_beyond_its_memory_fails_for_good_and_stops() {
+    let more = 64 << 20;
+    let limits = StageLimits {
+        memory: process::memory().map(|bytes| bytes + more),
+        grace: Duration::from_secs(60),
+        ..StageLimits::default()
+    };
+    let script: Script = Box::new(move |context| {
+        let mut taken = Vec::new();
+        while !context.interrupted() {
+            if taken.len() < 64 {
+                taken.push(vec![1_u8; 16 << 20]);
+            }
+            thread::sleep(Duration::from_millis(5));
+        }
+        Ok(Outcome::Yielded { at: taken.len() as u64 })
+    });
+    let worker = Worker::start_within(script, limits);
+    worker.grant(1);
+    worker.wait("the failure is reported", |coordinator| !coordinator.outcomes.is_empty());
+    worker.fake.desired(|coordinator| coordinator.assignments.clear());
+    let told = worker.leave();
+    let [report] = told.outcomes.as_slice() else { panic!("{:?}", told.outcomes) };
+    let TaskOutcome::Failed { class: FailureClass::OutOfMemory, message } = &report.outcome else {
+        panic!("{report:?}")
+    };
+    assert!(message.contains("expected at most") && message.contains("--stage-memory"), "{message}");
 }
 
 fn finished(context: &mut dyn GangContext) -> Result<Outcome, StageError> {
@@ -389,6 +431,21 @@ fn an_outcome_that_is_refused_is_a_failure_and_not_silence() {
     };
     assert_eq!(*class, FailureClass::Infrastructure);
     assert!(message.contains("not-found"), "{message}");
+}
+
+/// A state that the store does not take: each try would train to its first save and fail there.
+#[test]
+fn what_is_refused_for_good_is_not_tried_again() {
+    let worker = Worker::start(Box::new(finished));
+    lock(&worker.fake.coordinator).unfit = true;
+    worker.grant(1);
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    let coordinator = worker.leave();
+    let TaskOutcome::Failed { class, message } = &coordinator.outcomes[0].outcome else {
+        panic!("{:?}", coordinator.outcomes)
+    };
+    assert_eq!(*class, FailureClass::Refused);
+    assert!(message.contains("too-large"), "{message}");
 }
 
 #[test]

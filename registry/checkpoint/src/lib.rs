@@ -34,7 +34,7 @@ pub enum BlobError {
     /// The grant has ended.
     #[error("write refused: {0}")]
     Refused(String),
-    /// The store does not take such bytes, whoever brings them and when.
+    /// The store takes no such bytes from any caller at any time.
     #[error("{0}")]
     Unfit(String),
     /// Full or not writable.

@@ -26,7 +26,7 @@ use async_trait::async_trait;
 use protocol::stage::Keep;
 use protocol::{Alias, Digest, ModelName, RunId, StageName, TaskId};
 
-pub use rows::{CheckpointRow, EndedRow, LineageNode, LogRow, Needs, Recovery, Root, RunRow, StageResultRow};
+pub use rows::{CheckpointRow, EndedRow, LineageNode, LogRow, Needs, Recovery, Root, RunRow, StageResultRow, Usage};
 
 use crate::curve::Curve;
 use crate::forget::Forgotten;
@@ -48,8 +48,8 @@ pub trait Records: Debug + Send + Sync {
     /// What is kept of a run that ended; `None` while it has never ended.
     async fn ended(&self, run: &RunId) -> Result<Option<EndedRow>>;
 
-    /// The views of runs that ended, as JSON, with their runs; oldest first. Of more than `limit` the newest.
-    async fn ended_views(&self, limit: u32) -> Result<Vec<(RunId, String)>>;
+    /// Returns the views of ended runs as JSON, oldest first: the newest `limit`, or the newest `limit` submitted before a run.
+    async fn ended_views(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<(RunId, String)>>;
 
     /// Runs that ended before a time, in milliseconds since 1970; oldest first.
     async fn ended_before(&self, before_ms: i64) -> Result<Vec<RunId>>;
@@ -90,6 +90,9 @@ pub trait Records: Debug + Send + Sync {
 
     /// Log lines of a run, or of one stage of it, that were stored after line `after`; at most `limit`.
     async fn logs(&self, run: &RunId, stage: Option<&StageName>, after: i64, limit: u32) -> Result<Vec<LogRow>>;
+
+    /// Returns how much a run has stored of everything that has a limit.
+    async fn usage(&self, run: &RunId) -> Result<Usage>;
 
     /// The current values of a stage by key; of all keys, or of `keys`; at most about `points` of each, 0 for all.
     async fn metrics(

@@ -82,6 +82,15 @@ pub struct CheckpointRow {
     pub at_ms: i64,
 }
 
+/// The amounts that a run has ever stored, including those that were deleted since.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Usage {
+    /// Bytes of log lines.
+    pub log_bytes: u64,
+    /// Values by step.
+    pub values: u64,
+}
+
 /// A log line.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LogRow {

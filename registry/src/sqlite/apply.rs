@@ -12,8 +12,8 @@ use sqlx::query_builder::Separated;
 use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 
 use super::error::write_error;
-use super::moves;
-use super::statement::{int, json, one, run};
+use super::statement::{int, json, one, run, run_and_stage};
+use super::{logs, moves, usage};
 use crate::catalog::{PromoteOrder, Which};
 use crate::vouched::{Vouched, complete};
 use crate::write::two_states;
@@ -53,7 +53,7 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
                 set_archive(conn, *key, of.as_str(), stage.as_str(), execution.as_deref()).await?;
             }
             Write::Metrics { grant, rows } => add_metrics(conn, grant, rows).await?,
-            Write::Logs { grant, first, lines } => add_logs(conn, grant, *first, lines).await?,
+            Write::Logs { grant, first, lines } => logs::add(conn, grant, *first, lines).await?,
             Write::Checkpoint { grant, step, manifest, metrics } => {
                 complete(blobs, *manifest)?;
                 one_checkpoint_a_step(conn, &grant.task, *step, *manifest).await?;
@@ -289,12 +289,6 @@ async fn set_run(
     run(conn, set.bind(run_id).bind(pipeline).bind(source).bind(state).bind(key).bind(now).bind(now)).await.map(|_| ())
 }
 
-/// A task's run and stage, out of its name.
-pub(super) fn run_and_stage(task: &TaskId) -> (&str, &str) {
-    let mut parts = task.as_str().split('/');
-    (parts.next().unwrap_or_default(), parts.next().unwrap_or_default())
-}
-
 async fn add_metrics(conn: &mut SqliteConnection, grant: &Grant, rows: &[MetricRow]) -> Result<()> {
     let (of_run, stage) = run_and_stage(&grant.task);
     let mut series: BTreeMap<&str, i64> = BTreeMap::new();
@@ -324,20 +318,8 @@ async fn add_metrics(conn: &mut SqliteConnection, grant: &Grant, rows: &[MetricR
     let values = |row: &mut Separated<'_, Sqlite, &'static str>, (id, step, value): &(i64, i64, Option<f64>)| {
         row.push_bind(*id).push_bind(*step).push_bind(*value);
     };
-    insert(conn, "INSERT INTO metrics (series, step, value) ", &all, values, " ON CONFLICT DO NOTHING").await
-}
-
-async fn add_logs(conn: &mut SqliteConnection, grant: &Grant, first: u64, lines: &[String]) -> Result<()> {
-    let (of_run, stage) = run_and_stage(&grant.task);
-    let now = clock::now_ms();
-    let rows: Vec<(u64, &String)> = (first..).zip(lines).collect();
-    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (number, line): &(u64, &String)| {
-        row.push_bind(of_run.to_owned()).push_bind(stage.to_owned()).push_bind(grant.task.as_str().to_owned());
-        row.push_bind(int(grant.attempt.0)).push_bind(grant.worker.as_str().to_owned());
-        row.push_bind(int(*number)).push_bind(now).push_bind((*line).clone());
-    };
-    let begin = "INSERT INTO logs (run, stage, task, attempt, worker, line, at_ms, text) ";
-    insert(conn, begin, &rows, values, " ON CONFLICT DO NOTHING").await
+    insert(conn, "INSERT INTO metrics (series, step, value) ", &all, values, " ON CONFLICT DO NOTHING").await?;
+    usage::add(conn, of_run, 0, rows.len() as u64).await
 }
 
 /// Adds a shard to those that an order stores.

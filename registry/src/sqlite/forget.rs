@@ -68,7 +68,7 @@ async fn stages(conn: &mut SqliteConnection, sql: &'static str, run: &str) -> Re
 
 /// All stages that have a row in the run's name.
 const STAGES: &str = "SELECT stage FROM stage_results WHERE run = ?1 UNION SELECT stage FROM executions WHERE run = ?1 \
-    UNION SELECT stage FROM series WHERE run = ?1 UNION SELECT stage FROM logs WHERE run = ?1 \
+    UNION SELECT stage FROM series WHERE run = ?1 UNION SELECT stage FROM log_streams WHERE run = ?1 \
     UNION SELECT substr(task, length(?1) + 2) FROM checkpoints WHERE task >= ?1 || '/' AND task < ?1 || '0' \
     UNION SELECT substr(task, length(?1) + 2) FROM fences WHERE task >= ?1 || '/' AND task < ?1 || '0'";
 
@@ -117,6 +117,7 @@ async fn forget_stages(conn: &mut SqliteConnection, run: &str, gone: &mut Forgot
     }
     if !kept_any {
         execute(conn, sqlx::query("DELETE FROM shards WHERE run = ?").bind(run)).await?;
+        execute(conn, sqlx::query("DELETE FROM usage WHERE run = ?").bind(run)).await?;
         execute(conn, sqlx::query("DELETE FROM forgotten WHERE run = ?").bind(run)).await?;
     }
     Ok(())
@@ -132,7 +133,14 @@ async fn forget_stage(
     gone.values +=
         delete("DELETE FROM metrics WHERE series IN (SELECT id FROM series WHERE run = ?1 AND stage = ?2)").await?;
     delete("DELETE FROM series WHERE run = ?1 AND stage = ?2").await?;
-    gone.lines += delete("DELETE FROM logs WHERE run = ?1 AND stage = ?2").await?;
+    let streams = "SELECT coalesce(sum(count), 0) FROM log_batches WHERE stream IN \
+                   (SELECT id FROM log_streams WHERE run = ?1 AND stage = ?2)";
+    let lines = sqlx::query(streams).bind(run).bind(stage.as_str()).fetch_one(&mut *conn).await.map_err(write_error)?;
+    gone.lines += lines.get::<i64, _>(0).unsigned_abs();
+    let mut delete = async |sql: &'static str| execute(conn, sqlx::query(sql).bind(run).bind(stage.as_str())).await;
+    delete("DELETE FROM log_batches WHERE stream IN (SELECT id FROM log_streams WHERE run = ?1 AND stage = ?2)")
+        .await?;
+    delete("DELETE FROM log_streams WHERE run = ?1 AND stage = ?2").await?;
     delete("DELETE FROM executions WHERE run = ?1 AND stage = ?2").await?;
     // A task's name is `run/stage` or `run/stage/shard`; `0` comes right after `/`.
     gone.checkpoints += delete(

@@ -4,8 +4,10 @@
 //! committed. `database is locked` cannot happen: nobody else writes, and readers of a WAL database wait for nobody.
 
 mod apply;
+mod curves;
 mod error;
 mod forget;
+mod logs;
 mod models;
 mod moves;
 mod open;
@@ -13,6 +15,7 @@ mod query;
 mod retention;
 mod rows;
 mod statement;
+mod usage;
 mod writer;
 
 use std::sync::Arc;

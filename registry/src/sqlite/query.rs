@@ -5,7 +5,7 @@ use std::path::Path;
 
 use async_trait::async_trait;
 use futures::TryStreamExt as _;
-use protocol::{Alias, Attempt, Digest, ModelName, RunId, StageName, TaskId, WorkerId};
+use protocol::{Alias, Digest, ModelName, RunId, StageName, TaskId};
 use sqlx::pool::PoolConnection;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Connection, Row, Sqlite, SqliteConnection, SqlitePool};
@@ -13,10 +13,12 @@ use sqlx::{Connection, Row, Sqlite, SqliteConnection, SqlitePool};
 use super::open::{open_copy, stored};
 use super::rows::{checkpoints, digest, run_row, stage_result};
 use super::statement::json;
-use super::{models, retention};
+use super::{curves, logs, models, retention, usage};
 use crate::QueryError;
-use crate::catalog::{CheckpointRow, EndedRow, LineageNode, LogRow, Needs, Records, Recovery, RunRow, StageResultRow};
-use crate::curve::{Curve, Curves};
+use crate::catalog::{
+    CheckpointRow, EndedRow, LineageNode, LogRow, Needs, Records, Recovery, RunRow, StageResultRow, Usage,
+};
+use crate::curve::Curve;
 use crate::store_id::Stored;
 use crate::versions::{Model, Promotion, Version};
 
@@ -52,7 +54,7 @@ impl Records for SqliteRecords {
         if let Some(row) = sqlx::query(newest).fetch_optional(&mut *moment).await? {
             let seq: i64 = row.try_get(0)?;
             recovery.snapshot = Some((seq.unsigned_abs(), row.try_get(1)?));
-            // Of the columns of a group, SQLite gives those of the row with the maximum.
+            // The other columns of a group are those of its row with the maximum: SQLite promises it.
             let parts = "SELECT part, state, max(seq) FROM snapshot_parts WHERE seq <= ? GROUP BY part";
             let mut rows = sqlx::query(parts).bind(seq).fetch(&mut *moment);
             while let Some(row) = rows.try_next().await? {
@@ -77,11 +79,12 @@ impl Records for SqliteRecords {
         row.map(ended).transpose()
     }
 
-    async fn ended_views(&self, limit: u32) -> Result<Vec<(RunId, String)>> {
+    async fn ended_views(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<(RunId, String)>> {
         let mut conn = self.connection().await?;
         let find = "SELECT run, view FROM (SELECT rowid AS number, run, view FROM runs WHERE view IS NOT NULL \
-                    ORDER BY rowid DESC LIMIT ?) ORDER BY number";
-        let rows = sqlx::query(find).bind(limit).fetch_all(&mut *conn).await?;
+                    AND (?1 IS NULL OR rowid < (SELECT rowid FROM runs WHERE run = ?1)) \
+                    ORDER BY rowid DESC LIMIT ?2) ORDER BY number";
+        let rows = sqlx::query(find).bind(before.map(RunId::as_str)).bind(limit).fetch_all(&mut *conn).await?;
         rows.iter().map(|row| Ok((RunId::new(row.try_get::<String, _>(0)?), row.try_get(1)?))).collect()
     }
 
@@ -144,23 +147,11 @@ impl Records for SqliteRecords {
     }
 
     async fn logs(&self, run: &RunId, stage: Option<&StageName>, after: i64, limit: u32) -> Result<Vec<LogRow>> {
-        let mut conn = self.connection().await?;
-        let find = sqlx::query(
-            "SELECT * FROM logs WHERE run = ?1 AND (?2 IS NULL OR stage = ?2) AND id > ?3 ORDER BY id LIMIT ?4",
-        );
-        let find = find.bind(run.as_str()).bind(stage.map(StageName::as_str)).bind(after).bind(limit);
-        let line = |row: &SqliteRow| -> Result<LogRow> {
-            Ok(LogRow {
-                id: row.try_get("id")?,
-                task: TaskId::new(row.try_get::<String, _>("task")?),
-                attempt: Attempt(row.try_get::<i64, _>("attempt")?.unsigned_abs()),
-                worker: WorkerId::new(row.try_get::<String, _>("worker")?),
-                line: row.try_get::<i64, _>("line")?.unsigned_abs(),
-                at_ms: row.try_get("at_ms")?,
-                text: row.try_get("text")?,
-            })
-        };
-        find.fetch_all(&mut *conn).await?.iter().map(line).collect()
+        logs::read(&mut *self.connection().await?, run, stage, after, limit).await
+    }
+
+    async fn usage(&self, run: &RunId) -> Result<Usage> {
+        usage::read(&mut *self.connection().await?, run).await
     }
 
     async fn models(&self) -> Result<Vec<Model>> {
@@ -203,20 +194,7 @@ impl Records for SqliteRecords {
         keys: Option<&[String]>,
         points: usize,
     ) -> Result<BTreeMap<String, Curve>> {
-        let mut conn = self.connection().await?;
-        let find = sqlx::query(
-            "SELECT s.key, s.task, s.attempt, m.step, m.value FROM series s JOIN metrics m ON m.series = s.id \
-             WHERE s.run = ?1 AND s.stage = ?2 AND (?3 IS NULL OR s.key IN (SELECT value FROM json_each(?3))) \
-             ORDER BY s.key, s.task, s.attempt DESC, m.step",
-        );
-        let keys = keys.map(|keys| json(&keys));
-        let rows = find.bind(run.as_str()).bind(stage.as_str()).bind(keys).fetch_all(&mut *conn).await?;
-        let mut curves = Curves::default();
-        for row in &rows {
-            let step = row.try_get::<i64, _>(3)?.unsigned_abs();
-            curves.push(row.try_get(0)?, row.try_get(1)?, row.try_get(2)?, step, row.try_get(4)?);
-        }
-        Ok(curves.finish(points))
+        curves::read(&mut *self.connection().await?, run, stage, keys, points).await
     }
 
     async fn needs(&self) -> Result<Needs> {

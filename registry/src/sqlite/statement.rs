@@ -1,5 +1,6 @@
 //! Running one statement, and the values that are bound to it.
 
+use protocol::TaskId;
 use sqlx::SqliteConnection;
 use sqlx::sqlite::SqliteRow;
 
@@ -27,4 +28,10 @@ pub(super) fn int(number: u64) -> i64 {
 pub(super) fn json<T: serde::Serialize>(value: &T) -> String {
     // Maps of names to numbers or digests always serialise.
     serde_json::to_string(value).unwrap_or_else(|e| panic!("a row that is no JSON: {e}"))
+}
+
+/// A task's run and stage, out of its name.
+pub(super) fn run_and_stage(task: &TaskId) -> (&str, &str) {
+    let mut parts = task.as_str().split('/');
+    (parts.next().unwrap_or_default(), parts.next().unwrap_or_default())
 }

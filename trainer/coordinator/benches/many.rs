@@ -14,9 +14,12 @@ use std::time::{Duration, Instant};
 
 use coordinator::{Config, Control, Coordinator, Handle};
 use protocol::limits;
-use protocol::message::{DesiredAssignments, Join, Joined, PROTOCOL_VERSION, Poll, Submit};
+use protocol::message::{
+    DesiredAssignments, Grant, Join, Joined, LogBatch, MetricBatch, MetricRow, PROTOCOL_VERSION, Poll, Submit,
+};
 use protocol::pipeline::Pipeline;
 use protocol::stage::Backend;
+use registry::cli::Command;
 use registry::{Holder, Store};
 
 type Result<T = ()> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>>;
@@ -246,10 +249,113 @@ fn heartbeats(handle: &Handle) -> Result {
         (200, _) => Result::Ok(()),
         (status, answer) => Err(format!("{path}: {status} {}", String::from_utf8_lossy(&answer)).into()),
     };
-    beside(handle, "lists of all 10,000 runs, 4 clients", 4, |caller| ask(caller, "/v1/runs?limit=1000000"))?;
     let blob = format!("/v1/blobs/{}", std::env::var("MANY_EXPORT")?);
     beside(handle, "exports of 256 MiB, 4 clients", 4, |caller| ask(caller, &blob))?;
+    let command = |caller: &mut Caller, command: serde_json::Value| {
+        caller.post::<serde_json::Value>("/v1/registry", &command).map(drop)
+    };
+    let (grant, poll) = recorded(handle)?;
+    writeln!(out, "| (recorded {CURVES} curves of {STEPS} values; resident {} MB) |", resident_mb()?)?;
+    let run = grant.task.as_str().split('/').next().unwrap_or_default();
+    let curves = format!("/v1/runs/{run}/metrics?points=500");
+    beside(handle, "four curves of a million values, 4 clients", 4, |caller| ask(caller, &curves))?;
+    let line = std::sync::atomic::AtomicU64::new(0);
+    let log = |caller: &mut Caller| {
+        // Its lease must not run out meanwhile.
+        caller.post::<DesiredAssignments>("/v1/workers/recorder/poll", &poll)?;
+        let first = line.fetch_add(10_000, Ordering::Relaxed);
+        let batch = LogBatch { grant: grant.clone(), first, lines: vec!["x".to_owned(); 10_000] };
+        caller.post::<()>("/v1/logs", &batch)
+    };
+    beside(handle, "log lines of one byte, 2 clients", 2, log)?;
+    let lines = format!("/v1/runs/{run}/logs?limit=10000");
+    beside(handle, "10,000 log lines read, 4 clients", 4, |caller| ask(caller, &lines))?;
+    beside(handle, "gc, 1 client", 1, |caller| {
+        command(caller, serde_json::to_value(Command::Gc { dry_run: false, grace_minutes: None })?)
+    })?;
+    queue(handle)?;
+    writeln!(out, "| (10,000 runs wait; resident {} MB) |", resident_mb()?)?;
+    beside(handle, "10,000 queued runs", 0, |_| Ok(()))?;
+    beside(handle, "10,000 queued runs and submissions, 8 clients", 8, |caller| submit(caller, &small))?;
+    // A client that reads all of them, page by page.
+    let list = |caller: &mut Caller| {
+        let mut before = String::new();
+        loop {
+            let (status, answer) = caller.call("GET", &format!("/v1/runs?limit=500{before}"), b"")?;
+            let views: Vec<serde_json::Value> = serde_json::from_slice(&answer)?;
+            match views.first().and_then(|view| view["run"].as_str()) {
+                Some(first) if status == 200 => before = format!("&before={first}"),
+                _ => return Result::Ok(()),
+            }
+        }
+    };
+    beside(handle, "lists of all 20,000 runs, 4 clients", 4, list)?;
+    beside(handle, "four curves again, beside 10,000 queued runs, 4 clients", 4, |caller| ask(caller, &curves))?;
     Ok(())
+}
+
+/// Curves, and values of each.
+const CURVES: usize = 4;
+const STEPS: u64 = 1_000_000;
+
+/// A worker that has a task and records the curves; what it may write by, and its heartbeat.
+fn recorded(handle: &Handle) -> Result<(Grant, Poll)> {
+    let mut caller = Caller::connect(handle)?;
+    let submit = Submit {
+        pipeline: serde_json::to_value(pipeline(99)?)?,
+        source: String::new(),
+        idempotency_key: None,
+        until: None,
+    };
+    caller.post::<serde_json::Value>("/v1/runs", &submit)?;
+    let join = Join {
+        protocol: PROTOCOL_VERSION,
+        worker: "recorder".into(),
+        pid: 7,
+        backend: Backend::Flex,
+        instruction_set: "avx2".into(),
+        peer_address: "127.0.0.1:1".into(),
+    };
+    let joined: Joined = caller.post("/v1/workers", &join)?;
+    let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0 };
+    let grant = loop {
+        let desired: DesiredAssignments = caller.post("/v1/workers/recorder/poll", &poll)?;
+        if let Some(assignment) = desired.assignments.into_iter().next() {
+            break assignment.grant;
+        }
+    };
+    for first in (0..STEPS).step_by(10_000 / CURVES) {
+        let rows = (first..first + (10_000 / CURVES) as u64).flat_map(|step| {
+            (0..CURVES).map(move |curve| MetricRow { step, key: format!("curve-{curve}"), value: (step as f64).sin() })
+        });
+        let batch = MetricBatch { grant: grant.clone(), rows: rows.collect() };
+        caller.post::<()>("/v1/metrics", &batch)?;
+        caller.post::<DesiredAssignments>("/v1/workers/recorder/poll", &poll)?;
+    }
+    Ok((grant, poll))
+}
+
+/// 10,000 runs that wait for a worker of their backend.
+fn queue(handle: &Handle) -> Result {
+    std::thread::scope(|scope| {
+        let clients: Vec<_> = (0..16)
+            .map(|client| {
+                scope.spawn(move || {
+                    let mut caller = Caller::connect(handle)?;
+                    for seed in (0..RUNS).filter(|seed| seed % 16 == client) {
+                        let pipeline = serde_json::to_value(pipeline(5_000_000 + seed)?)?;
+                        let submit = Submit { pipeline, source: String::new(), idempotency_key: None, until: None };
+                        caller.post::<serde_json::Value>("/v1/runs", &submit)?;
+                    }
+                    Result::Ok(())
+                })
+            })
+            .collect();
+        for client in clients {
+            client.join().map_err(|_| "a client panicked")??;
+        }
+        Ok(())
+    })
 }
 
 /// The second life: a restart, timed; submissions, in turns with an empty store; heartbeats.

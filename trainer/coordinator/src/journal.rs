@@ -233,7 +233,7 @@ fn restore(policy: Policy, text: &str, parts: &BTreeMap<String, String>) -> Resu
     Ok(state)
 }
 
-/// What is stored.
+/// The states that a store holds.
 #[derive(Debug)]
 pub struct Recovered {
     /// The state of the newest snapshot.

@@ -38,7 +38,8 @@ pub use outcome::refused_for_good;
 pub use policy::{GrantOrder, Policy};
 pub use rejected::Rejected;
 pub use shell::{
-    Config, Connections, Coordinator, Door, Handle, Records, RecordsError, StartError, Trouble, resolve_versions,
+    Allowances, Config, Connections, Coordinator, Door, Handle, Records, RecordsError, StartError, Trouble,
+    resolve_versions,
 };
 pub use state::State;
 pub use state::run::Control;

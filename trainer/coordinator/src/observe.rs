@@ -78,9 +78,9 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
 fn tick(state: &mut State, at: Millis, overslept: u64) -> Vec<Event> {
     let now = at.max(state.now);
     // Who sleeps through his own alarm was not listening either: that is not the workers' fault. Who was heard meanwhile all the same
-    // gets no more than a lease from now.
+    // gets no more than a lease from now, or from when it was heard: a look that waited long comes after polls that came later.
     if overslept > state.policy.lease_ms / 3 {
-        let later = |(name, heard): (&WorkerId, &Millis)| (name.clone(), heard.after(overslept).min(at));
+        let later = |(name, heard): (&WorkerId, &Millis)| (name.clone(), heard.after(overslept).min(at).max(*heard));
         state.heard.workers = state.heard.workers.iter().map(later).collect();
     }
     let mut events = Vec::new();

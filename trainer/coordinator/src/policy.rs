@@ -30,6 +30,8 @@ pub struct Policy {
     pub forget_ms: u64,
     /// After how many decisions the state is stored as a whole and the facts before it go.
     pub snapshot_every: u64,
+    /// Runs that have not ended; one more is refused.
+    pub live_runs: usize,
     /// Who is served first.
     pub grants: GrantOrder,
     /// Faults of ours that a task survives.
@@ -50,6 +52,7 @@ impl Default for Policy {
             backoff_max_ms: 30_000,
             forget_ms: 3_600_000,
             snapshot_every: 4_000,
+            live_runs: 20_000,
             grants: GrantOrder::ByName,
             fault_budget: 5,
             infrastructure_budget: 100,

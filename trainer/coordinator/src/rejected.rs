@@ -20,6 +20,9 @@ pub enum Rejected {
     /// It contradicts what is.
     #[error("{0}")]
     Conflict(String),
+    /// There is as much of it as there may be; the same may be accepted later.
+    #[error("{0}")]
+    Full(String),
     /// It cannot be.
     #[error("{0}")]
     Invalid(String),

@@ -1,7 +1,7 @@
 //! Who gets what. Deterministic in state and moment; what was given stays given, whatever this file says in a later build.
 //!
 //! Executions are served in the order of [`State::wanted`](crate::state::State::wanted), as [`Queue`](crate::state::queue::Queue) has
-//! them: what nobody who is idle can take is not looked at. Gangs that have become
+//! them: work that no idle worker can take is not looked at. Gangs that have become
 //! too large give up members. Then plain tasks, shards and merges
 //! that are ready, one worker each: they are short, and much waits for them. Then gangs that are under way take in those who
 //! is left, up to their `max`; then gangs that wait start with everybody who is left. A gang takes only workers that have said that they

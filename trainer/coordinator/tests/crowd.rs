@@ -157,7 +157,7 @@ fn crowd(size: usize, stop: &Arc<AtomicBool>, work: impl Fn() + Send + Sync + 's
 async fn a_crowd_of_strangers_delays_no_heartbeat() {
     let dir = tempfile::tempdir().unwrap();
     // As with a limit of two hundred descriptors or so.
-    let few = Connections { most: 100, strangers: 50, idle: Duration::from_secs(20) };
+    let few = Connections { most: 100, strangers: 50, ..Connections::default() };
     let handle = Arc::new(start(dir.path(), few).await);
     let address = handle.address();
     let before = resident_mib();
@@ -217,7 +217,7 @@ async fn a_crowd_of_strangers_delays_no_heartbeat() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn silent_connections_end_and_known_ones_are_not_evicted() {
     let dir = tempfile::tempdir().unwrap();
-    let limits = Connections { most: 20, strangers: 4, idle: Duration::from_secs(4) };
+    let limits = Connections { most: 20, strangers: 4, idle: Duration::from_secs(4), ..Connections::default() };
     let handle = start(dir.path(), limits).await;
     let (mut known, joined) = join(&handle);
     let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: u64::MAX };

@@ -1,4 +1,4 @@
-//! What runs that wait cost those who work, counted: executions, runs and workers that a decision looks at.
+//! The cost of queued runs, counted in executions, runs and workers that a decision looks at.
 
 #[allow(dead_code, reason = "not every test file uses all of it")]
 mod common;
@@ -27,7 +27,7 @@ fn claim(coordinator: &mut PureCoordinator, worker: &str) {
     coordinator.report(&held, TaskOutcome::Finished { output, metrics: Default::default() });
 }
 
-/// Of each of some claims: what decisions looked at, and the parts of the state that have changed.
+/// Returns for each of some claims the number of visits, and of parts of the state that changed.
 fn costs(coordinator: &mut PureCoordinator) -> Vec<(u64, usize)> {
     let cost = |_| {
         let (before, visits) = (coordinator.state.clone(), coordinator.state.visits);

@@ -4,6 +4,7 @@
 //! in seconds and a message can be read without running anything.
 
 pub mod artifact;
+mod bounded;
 pub mod canonical;
 pub mod digest;
 pub mod id;

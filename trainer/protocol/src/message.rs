@@ -193,6 +193,7 @@ pub struct Member {
 pub struct MetricBatch {
     /// Grant of the write.
     pub grant: Grant,
+    #[serde(deserialize_with = "crate::bounded::batch")]
     pub rows: Vec<MetricRow>,
 }
 
@@ -213,6 +214,7 @@ pub struct LogBatch {
     pub grant: Grant,
     /// Number of the first line within the attempt and worker; a batch sent twice is stored once.
     pub first: u64,
+    #[serde(deserialize_with = "crate::bounded::batch")]
     pub lines: Vec<String>,
 }
 
@@ -271,7 +273,7 @@ pub enum FailureClass {
     Diverged,
     /// The memory was exhausted: final.
     OutOfMemory,
-    /// The coordinator or the other members refuse something, and would do so each time: too large, of another build. Final.
+    /// The coordinator or another member refuses what is too large or of another build: final.
     Refused,
     /// The store is full or not writable: final; after freeing space, `resume` continues.
     Storage,

@@ -1,5 +1,6 @@
 //! Arguments, one type and one function per verb.
 
+mod allowance_args;
 mod args;
 mod config;
 mod control;

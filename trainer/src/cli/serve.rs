@@ -9,6 +9,7 @@ use coordinator::{Config, Coordinator};
 use registry::{Holder, Store};
 use tokio::signal::unix::{SignalKind, signal};
 
+use super::allowance_args::AllowanceArgs;
 use super::door::DoorArgs;
 use crate::problem::{Problem, Result};
 use crate::{client, print};
@@ -37,6 +38,8 @@ pub(crate) struct ServeArgs {
     store: PathBuf,
     #[command(flatten)]
     blobs: super::args::BlobArgs,
+    #[command(flatten)]
+    allowances: AllowanceArgs,
 }
 
 impl ServeArgs {
@@ -48,7 +51,9 @@ impl ServeArgs {
         if let Some(token) = &self.token.token {
             tokens.add("admin", Scopes::all(), token);
         }
-        self.door.config(self.bind, tokens, self.insecure)
+        let mut config = self.door.config(self.bind, tokens, self.insecure)?;
+        self.allowances.set(&mut config);
+        Ok(config)
     }
 }
 

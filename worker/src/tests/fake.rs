@@ -56,6 +56,8 @@ pub(super) struct FakeState {
     pub(super) fetched: Vec<Digest>,
     /// Ends with an artifact are refused.
     pub(super) refuses: bool,
+    /// Blobs are too large, whichever comes.
+    pub(super) unfit: bool,
 }
 
 /// For how long a coordinator that has too much to do wants to be left alone: longer than any pause of ours between two tries.
@@ -245,6 +247,9 @@ async fn put_blob(
     let number =
         |name: &str| headers[name].to_str().ok().and_then(|text| text.parse::<usize>().ok()).expect("a number");
     let (offset, bytes) = (number("x-stride-offset"), number("x-stride-bytes"));
+    if lock(&fake.coordinator).unfit {
+        return refuse(StatusCode::PAYLOAD_TOO_LARGE, "too-large");
+    }
     fake.received.fetch_add(body.len() as u64, Ordering::SeqCst);
     let cut = fake.cut.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok();
     let mut answer = serde_json::Value::Null;

@@ -30,6 +30,7 @@ impl Deciding<'_> {
             return Ok(false);
         }
         check_pipeline(&pipeline, until.as_ref())?;
+        self.check_room()?;
         let run = Run::new(self.state.submitted + 1, Arc::new(pipeline), key, until);
         let parked: Vec<u64> = self.state.parked.iter().copied().collect();
         for old in parked.iter().filter_map(|number| self.state.runs.get(number).cloned()).collect::<Vec<_>>() {
@@ -48,6 +49,15 @@ impl Deciding<'_> {
         self.effects.push(Effect::Submitted(run.id.clone()));
         self.record(Fact::Run { run: Box::new(run) });
         Ok(true)
+    }
+
+    /// Refuses one run more than there may be.
+    fn check_room(&self) -> Result<(), Rejected> {
+        let (live, most) = (self.state.runs.size(), self.state.policy.live_runs);
+        if live < most {
+            return Ok(());
+        }
+        Err(Rejected::Full(format!("{live} runs have not ended; expected at most {most}")))
     }
 
     pub(crate) fn control(
@@ -70,6 +80,7 @@ impl Deciding<'_> {
             return Ok(false);
         }
         if !known {
+            self.check_room()?;
             self.record(Fact::Run { run: Box::new(Run::clone(&run)) });
         }
         match action {

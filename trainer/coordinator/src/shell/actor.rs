@@ -12,6 +12,7 @@ use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
 use super::actor_handle::{ActorHandle, Reply};
+use super::allowances::Allowances;
 use super::blocking::blocking;
 use super::effects;
 use crate::batch::{Ask, Batches, Done, Turn};
@@ -45,11 +46,11 @@ impl Entropy {
 }
 
 /// Starts the actor on a recovered state.
-pub(crate) fn start(store: Store, recovered: Recovered) -> (Arc<ActorHandle>, JoinHandle<()>) {
+pub(crate) fn start(store: Store, recovered: Recovered, allowances: Allowances) -> (Arc<ActorHandle>, JoinHandle<()>) {
     let Recovered { snapshot, state } = recovered;
     let (now, snapshot_at) = (state.now, state.seq);
     let batches = Batches::new(state);
-    let (actor_handle, queue) = ActorHandle::new(store, now, Arc::clone(batches.front()), snapshot);
+    let (actor_handle, queue) = ActorHandle::new(store, now, Arc::clone(batches.front()), snapshot, allowances);
     let actor_handle = Arc::new(actor_handle);
     let moments = Moments { actor_handle: Arc::clone(&actor_handle), entropy: Entropy::new() };
     let actor = Actor { actor_handle: Arc::clone(&actor_handle), batches, moments, snapshot_at, snapshot: None };

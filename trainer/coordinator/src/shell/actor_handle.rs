@@ -12,6 +12,7 @@ use registry::{QueryError, ReadStore, Store, WriteError};
 use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 
+use super::allowances::Allowances;
 use super::blocking::blocking;
 use super::clock::Clock;
 use super::records::{Records, read};
@@ -36,6 +37,11 @@ pub(crate) struct ActorHandle {
     /// Places for calls of clients, and for batches that go past the actor to the disk.
     pub(crate) clients: Semaphore,
     pub(crate) batches: Semaphore,
+    /// Turns of questions that read much, and places to wait for one.
+    pub(crate) reads: Semaphore,
+    pub(crate) readers: Semaphore,
+    /// Limits of runs and tokens.
+    pub(crate) allowances: Allowances,
     front: Arc<Front>,
     /// The state of the newest snapshot that is stored.
     pub(super) snapshot: tokio::sync::Mutex<Arc<State>>,
@@ -54,12 +60,16 @@ impl ActorHandle {
         now: Millis,
         front: Arc<Front>,
         snapshot: State,
+        allowances: Allowances,
     ) -> (Self, mpsc::Receiver<(Ask, Reply)>) {
         let (asks, queue) = mpsc::channel(QUEUE);
         let handle = Self {
             asks,
             clients: Semaphore::new(limits::CLIENTS_WAITING),
             batches: Semaphore::new(limits::BATCHES_WAITING),
+            reads: Semaphore::new(limits::READS_AT_ONCE),
+            readers: Semaphore::new(limits::READS_WAITING),
+            allowances,
             front,
             snapshot: tokio::sync::Mutex::new(Arc::new(snapshot)),
             changed: watch::Sender::new(0),

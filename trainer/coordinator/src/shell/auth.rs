@@ -5,7 +5,7 @@
 
 use std::net::IpAddr;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use access::{Caller, Scope, Tokens};
 use axum::body::Body;
@@ -19,6 +19,7 @@ use tokio::sync::Semaphore;
 use super::failure::Failure;
 use super::listener::Peer;
 use super::paced::Paced;
+use super::rate::Rates;
 use super::route::Route;
 
 /// What the door knows.
@@ -29,10 +30,11 @@ pub(crate) struct Gate {
     hosts: Vec<String>,
     /// Kibibytes of calls that may be in memory.
     pub(crate) bodies: Arc<Semaphore>,
+    rates: Rates,
 }
 
 impl Gate {
-    pub(crate) fn new(tokens: Tokens, hosts: &[String]) -> Self {
+    pub(crate) fn new(tokens: Tokens, hosts: &[String], calls: u32) -> Self {
         let mut names = vec!["localhost".to_owned()];
         if let Ok(own) = nix::unistd::gethostname()
             && let Ok(own) = own.into_string()
@@ -41,12 +43,27 @@ impl Gate {
             names.push(own);
         }
         names.extend(hosts.iter().cloned());
-        Self { tokens, hosts: names, bodies: Arc::new(Semaphore::new(limits::CALLS_BYTES >> 10)) }
+        Self {
+            tokens,
+            hosts: names,
+            bodies: Arc::new(Semaphore::new(limits::CALLS_BYTES >> 10)),
+            rates: Rates::new(calls),
+        }
     }
 
     fn caller(&self, headers: &HeaderMap) -> Option<&Arc<Caller>> {
         let (scheme, token) = headers.get(header::AUTHORIZATION)?.to_str().ok()?.split_once(' ')?;
         scheme.eq_ignore_ascii_case("bearer").then(|| self.tokens.find(token))?
+    }
+
+    /// Refuses more calls a second than a token may make that is no worker's. Workers are bounded by what they wait for.
+    fn is_too_fast(&self, caller: &Caller) -> Option<Failure> {
+        if caller.scopes.allow(Scope::Worker) {
+            return None;
+        }
+        self.rates.take(&caller.name, Instant::now()).err()?;
+        let message = format!("the token of `{}` makes more calls a second than it may", caller.name);
+        Some(Failure::busy(message).hint("call less often; a server takes more with `--max-calls-per-second`"))
     }
 
     /// Why a call is none that a client of ours would send.
@@ -95,8 +112,13 @@ pub(crate) async fn admit(
         let failure = Failure::new(StatusCode::UNAUTHORIZED, "unauthorized", "this server wants a token".to_owned());
         return closing(failure.hint("give it with --token-file, --token, STRIDE_TOKEN_FILE or STRIDE_TOKEN"));
     };
-    if let Some(peer) = request.extensions().get::<Arc<Peer>>() {
-        peer.is_known();
+    if let Some(peer) = request.extensions().get::<Arc<Peer>>()
+        && let Err(failure) = peer.is_known(&caller)
+    {
+        return closing(failure);
+    }
+    if let Some(failure) = gate.is_too_fast(&caller) {
+        return failure.into_response();
     }
     if !route.scopes.iter().any(|scope| caller.scopes.allow(*scope)) {
         return closing(forbidden(&caller, route.scopes));
@@ -144,7 +166,7 @@ mod tests {
 
     #[test]
     fn names_must_be_ours_and_addresses_may_be_any() {
-        let gate = Gate::new(Tokens::default(), &["stride.lab".to_owned()]);
+        let gate = Gate::new(Tokens::default(), &["stride.lab".to_owned()], 1);
         for ours in ["127.0.0.1:7700", "localhost", "LOCALHOST:1", "[::1]:7700", "10.0.0.7", "stride.lab:7700"] {
             assert!(gate.is_ours(ours), "{ours}");
         }

@@ -52,7 +52,7 @@ impl Door {
         let failed = |cause| StartError::Listen { address: config.listen, cause };
         let listener = Listener::bind(config.listen, config.tls.clone()).await.map_err(failed)?;
         let address = listener.address().map_err(failed)?;
-        let gate = Arc::new(Gate::new(config.tokens.clone(), &config.hosts));
+        let gate = Arc::new(Gate::new(config.tokens.clone(), &config.hosts, config.allowances.calls));
         Ok(Self { listener, address, tls: config.tls.is_some(), connections: config.connections.clone(), gate })
     }
 

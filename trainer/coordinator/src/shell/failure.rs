@@ -72,6 +72,10 @@ impl From<Rejected> for Failure {
             Rejected::NotFound(_) => (StatusCode::NOT_FOUND, "not-found"),
             Rejected::Conflict(_) => (StatusCode::CONFLICT, "conflict"),
             Rejected::Invalid(_) => (StatusCode::BAD_REQUEST, "invalid"),
+            Rejected::Full(_) => {
+                let hint = "wait until others have ended, or cancel some; a server takes more with `--max-runs`";
+                return Self::busy(rejected.to_string()).hint(hint);
+            }
         };
         Self::new(status, code, rejected.to_string())
     }

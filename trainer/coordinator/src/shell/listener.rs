@@ -3,14 +3,17 @@
 //! A connection is a stranger's until a call on it has shown a good token. Strangers share a small part of all connections,
 //! and where it is full the oldest of them goes: a worker that connects needs milliseconds to show its token, while those
 //! who only sit there are the oldest soon. So a crowd of strangers costs a worker nothing, and cannot use up descriptors.
+//!
+//! Callers that are no workers share a part of the connections too, and each token has a part of that: readers cannot keep workers out.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::convert::Infallible;
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
+use access::{Caller, Scope};
 use axum::body::Body;
 use axum::extract::Request;
 use axum::http::StatusCode;
@@ -45,6 +48,10 @@ pub struct Connections {
     pub most: usize,
     /// Those that have not shown a token yet.
     pub strangers: usize,
+    /// Those of callers whose token is no worker's.
+    pub clients: usize,
+    /// Those of one such token.
+    pub of_token: usize,
     /// How long the head of a request may take, and how long a connection may idle between two.
     pub idle: Duration,
 }
@@ -54,7 +61,8 @@ impl Default for Connections {
     fn default() -> Self {
         let (descriptors, _) = getrlimit(Resource::RLIMIT_NOFILE).unwrap_or((1024, 1024));
         let most = usize::try_from(descriptors / 2).unwrap_or(usize::MAX).clamp(16, 8192);
-        Self { most, strangers: (most / 4).clamp(8, 512), idle: Duration::from_secs(20) }
+        let strangers = (most / 4).clamp(8, 512);
+        Self { most, strangers, clients: most / 2, of_token: (most / 8).clamp(8, 256), idle: Duration::from_secs(20) }
     }
 }
 
@@ -76,6 +84,14 @@ struct Crowd {
     next: AtomicU64,
     /// By arrival.
     strangers: Mutex<BTreeMap<u64, Stranger>>,
+    clients: Mutex<Clients>,
+}
+
+/// Connections of callers that are no workers.
+#[derive(Debug, Default)]
+struct Clients {
+    all: usize,
+    of_token: HashMap<String, usize>,
 }
 
 #[derive(Debug)]
@@ -90,6 +106,8 @@ pub(crate) struct Peer {
     id: u64,
     crowd: Arc<Crowd>,
     leave: Arc<Notify>,
+    /// The caller whose connections it counts against. Workers have no such limit.
+    client: OnceLock<String>,
 }
 
 impl Crowd {
@@ -107,7 +125,7 @@ impl Crowd {
         self.open.fetch_add(1, Ordering::Relaxed);
         let (id, leave) = (self.next.fetch_add(1, Ordering::Relaxed), Arc::new(Notify::new()));
         strangers.insert(id, Stranger { since: Instant::now(), leave: Arc::clone(&leave) });
-        Some(Arc::new(Peer { id, crowd: Arc::clone(self), leave }))
+        Some(Arc::new(Peer { id, crowd: Arc::clone(self), leave, client: OnceLock::new() }))
     }
 
     /// Sends the oldest stranger away.
@@ -128,15 +146,52 @@ impl Crowd {
 
 impl Peer {
     /// A good token was shown: this is no stranger any more.
-    pub(crate) fn is_known(&self) {
+    ///
+    /// # Errors
+    /// If callers that are no workers, or those with this token, have as many connections as they may.
+    pub(crate) fn is_known(&self, caller: &Caller) -> Result<(), Failure> {
+        self.is_no_stranger();
+        if caller.scopes.allow(Scope::Worker) || self.client.get().is_some() {
+            return Ok(());
+        }
+        let limits = &self.crowd.limits;
+        let mut clients = self.crowd.clients.lock().unwrap_or_else(PoisonError::into_inner);
+        let own = clients.of_token.get(&caller.name).copied().unwrap_or_default();
+        if own >= limits.of_token {
+            let message = format!("the token of `{}` has {own} connections, which is all that it may", caller.name);
+            return Err(Failure::busy(message)
+                .hint("close some; a server takes more of one token with `--max-connections-per-token`"));
+        }
+        if clients.all >= limits.clients {
+            let message =
+                format!("callers that are no workers have {} connections, which is all there are", clients.all);
+            return Err(Failure::busy(message).hint("try again; a server takes more with a higher limit of open files"));
+        }
+        if self.client.set(caller.name.clone()).is_ok() {
+            clients.all += 1;
+            clients.of_token.insert(caller.name.clone(), own + 1);
+        }
+        Ok(())
+    }
+
+    fn is_no_stranger(&self) {
         self.crowd.strangers.lock().unwrap_or_else(PoisonError::into_inner).remove(&self.id);
     }
 }
 
 impl Drop for Peer {
     fn drop(&mut self) {
-        self.is_known();
+        self.is_no_stranger();
         self.crowd.open.fetch_sub(1, Ordering::Relaxed);
+        let Some(token) = self.client.take() else { return };
+        let mut clients = self.crowd.clients.lock().unwrap_or_else(PoisonError::into_inner);
+        clients.all -= 1;
+        if let Some(own) = clients.of_token.get_mut(&token) {
+            *own -= 1;
+            if *own == 0 {
+                clients.of_token.remove(&token);
+            }
+        }
     }
 }
 
@@ -163,8 +218,13 @@ pub(crate) async fn serve(
     limits: Connections,
     mut stopped: watch::Receiver<bool>,
 ) {
-    let crowd =
-        Arc::new(Crowd { limits, open: AtomicUsize::new(0), next: AtomicU64::new(0), strangers: Mutex::default() });
+    let crowd = Arc::new(Crowd {
+        limits,
+        open: AtomicUsize::new(0),
+        next: AtomicU64::new(0),
+        strangers: Mutex::default(),
+        clients: Mutex::default(),
+    });
     let mut accepting = JoinSet::new();
     for listener in listeners {
         accepting.spawn(accept(listener, router.clone(), Arc::clone(&crowd)));

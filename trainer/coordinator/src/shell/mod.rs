@@ -5,6 +5,7 @@
 
 mod actor;
 mod actor_handle;
+mod allowances;
 mod api;
 mod auth;
 mod blocking;
@@ -18,6 +19,7 @@ mod listener;
 mod paced;
 mod polls;
 mod queries;
+mod rate;
 mod records;
 mod route;
 mod start_error;
@@ -43,6 +45,7 @@ use crate::state::run::Control;
 use crate::view::WorkerView;
 
 use self::actor_handle::ActorHandle;
+pub use self::allowances::Allowances;
 pub use self::api::routes;
 use self::auth::Gate;
 pub use self::door::Door;
@@ -69,6 +72,8 @@ pub struct Config {
     pub insecure: bool,
     /// How many connections there may be.
     pub connections: Connections,
+    /// Limits of runs and tokens.
+    pub allowances: Allowances,
     /// Times and budgets.
     pub policy: Policy,
     /// No worker of an earlier coordinator can reach this one (`trainer run` starts its own): theirs are gone for certain.
@@ -92,6 +97,7 @@ impl Config {
             tls: None,
             insecure: false,
             connections: Connections::default(),
+            allowances: Allowances::default(),
             policy: Policy::default(),
             alone: false,
             park: false,
@@ -131,7 +137,8 @@ impl Coordinator {
     /// Recovers from the snapshot and the facts in `store`, then listens.
     pub async fn start(store: Store, config: Config) -> Result<Handle, StartError> {
         config.check()?;
-        let recovered = journal::recover_both(config.policy.clone(), &store.recovery().await?)?;
+        let policy = Policy { live_runs: config.allowances.runs, ..config.policy.clone() };
+        let recovered = journal::recover_both(policy, &store.recovery().await?)?;
         let listen = |address| move |cause| StartError::Listen { address, cause };
         let main = Listener::bind(config.listen, config.tls.clone()).await.map_err(listen(config.listen))?;
         let address = main.address().map_err(listen(config.listen))?;
@@ -146,13 +153,13 @@ impl Coordinator {
         let (token, mut tokens) = (Token::random(), config.tokens.clone());
         tokens.add(user(), Scopes::all(), &token);
 
-        let (actor_handle, actor) = actor::start(store, recovered);
+        let (actor_handle, actor) = actor::start(store, recovered, config.allowances.clone());
         actor_handle.decide(Event::Started { alone: config.alone, park: config.park }).await?;
         effects::let_go(&actor_handle);
         let (stop, stopped) = watch::channel(false);
         let tick = effects::tick(actor_handle.clone(), config.policy.tick_ms, stopped.clone());
         let clock = actor_handle.spawn("the clock", tick);
-        let gate = Arc::new(Gate::new(tokens, &config.hosts));
+        let gate = Arc::new(Gate::new(tokens, &config.hosts, config.allowances.calls));
         let router = api::router(actor_handle.clone(), &gate);
         let serve = listener::serve(listeners, router, config.connections.clone(), stopped);
         let server = actor_handle.spawn("the server", serve);

@@ -55,9 +55,10 @@ fn default_lines() -> u32 {
     1000
 }
 
-/// `?limit=`.
+/// `?before=&limit=`.
 #[derive(Debug, Deserialize)]
 pub(crate) struct RunsQuery {
+    before: Option<RunId>,
     #[serde(default = "default_lines")]
     limit: u32,
 }
@@ -89,6 +90,16 @@ fn place(actor_handle: &ActorHandle) -> Result<SemaphorePermit<'_>, Failure> {
     actor_handle.clients.try_acquire().map_err(full)
 }
 
+/// A turn among the questions that read much: few at a time, or they would fill memory and take the threads from heartbeats.
+async fn turn(actor_handle: &ActorHandle) -> Result<(SemaphorePermit<'_>, SemaphorePermit<'_>), Failure> {
+    let most = limits::READS_WAITING;
+    let full = |_| Failure::busy(format!("{most} lists and curves wait to be read already"));
+    let waiting = actor_handle.readers.try_acquire().map_err(full)?;
+    // The semaphore is never closed.
+    let closed = |_| Failure::busy("nothing is read any more".to_owned());
+    Ok((waiting, actor_handle.reads.acquire().await.map_err(closed)?))
+}
+
 pub(crate) async fn submit(
     State(actor_handle): State<Arc<ActorHandle>>,
     Message(submit, _): Message<Submit>,
@@ -97,13 +108,15 @@ pub(crate) async fn submit(
     Ok(Json(Submitted { run: actor_handle.submit(submit).await? }))
 }
 
-/// Runs by submission: those in memory, and of those that ended the newest `limit`.
+/// Runs by submission: the newest, or those before a run. Who wants more asks again with `before`.
 pub(crate) async fn runs(
     State(actor_handle): State<Arc<ActorHandle>>,
     Query(query): Query<RunsQuery>,
 ) -> Result<impl IntoResponse, Failure> {
-    let views = actor_handle.records().run_views(query.limit).await?;
-    // Beside the threads that answer heartbeats: there may be thousands.
+    let _turn = turn(&actor_handle).await?;
+    let records = actor_handle.records();
+    let views = records.run_views(query.before.as_ref(), query.limit).await?;
+    // Beside the threads that answer heartbeats: there may be many.
     let list = blocking(move || format!("[{}]", views.join(","))).await;
     Ok(([(header::CONTENT_TYPE, "application/json")], list))
 }
@@ -139,6 +152,7 @@ pub(crate) async fn logs(
     Path(run): Path<RunId>,
     Query(query): Query<LogQuery>,
 ) -> Result<Json<Vec<LogRow>>, Failure> {
+    let _turn = turn(&actor_handle).await?;
     Ok(Json(actor_handle.records().logs(&run, query.stage.as_ref(), query.after, query.limit).await?))
 }
 
@@ -147,6 +161,7 @@ pub(crate) async fn metrics(
     Path(run): Path<RunId>,
     Query(query): Query<MetricQuery>,
 ) -> Result<Json<StageMetrics>, Failure> {
+    let _turn = turn(&actor_handle).await?;
     Ok(Json(actor_handle.records().metrics(&run, query.stage.as_ref(), query.points).await?))
 }
 

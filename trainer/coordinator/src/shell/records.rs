@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use protocol::message::RunView;
-use protocol::{Digest, RunId, StageName};
+use protocol::{Digest, RunId, StageName, limits};
 use registry::{Curve, LogRow, OpenError, ReadStore, Write, WriteError};
 
 use super::clock::wall_clock;
@@ -83,20 +83,26 @@ impl Records {
         &self.store
     }
 
-    /// Runs by submission, each as JSON: those that go on, and of those that ended the newest `limit`.
+    /// Runs by submission, each as JSON: the newest `limit`, or those before a run, if one is given.
     ///
     /// # Errors
     /// If the tables do not read.
-    pub async fn run_views(&self, limit: u32) -> Result<Vec<String>, Refused> {
-        let ended = self.store.ended_views(limit).await.map_err(WriteError::from)?;
+    pub async fn run_views(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<String>, Refused> {
+        let limit = limit.min(limits::RUNS_LISTED);
+        let ended = self.store.ended_views(before, limit).await.map_err(WriteError::from)?;
         let place = |run: RunId| (state::run::number_of(&run), run);
         let mut views: BTreeMap<_, String> = ended.into_iter().map(|(run, view)| (place(run), view)).collect();
+        let first_after = before.map_or(u64::MAX, |run| state::run::number_of(run).unwrap_or_default());
         // A run that ended since the state was read, or goes on after an end, is in both.
-        views.extend(self.ending.iter().map(|(run, view)| (place(run.clone()), view.clone())));
-        for run in self.state.runs.values() {
+        let ending = self.ending.iter().map(|(run, view)| (place(run.clone()), view.clone()));
+        views.extend(ending.filter(|((number, _), _)| number.is_some_and(|number| number < first_after)));
+        for (_, run) in self.state.runs.range(..first_after).rev().take(limit as usize) {
             let view = serde_json::to_string(&self.state.view(run, self.now));
             let view = view.map_err(|e| Rejected::Invalid(format!("run `{}`: {e}", run.id)))?;
             views.insert(place(run.id.clone()), view);
+        }
+        while views.len() > limit as usize {
+            views.pop_first();
         }
         Ok(views.into_values().collect())
     }
@@ -135,7 +141,7 @@ impl Records {
         after: i64,
         limit: u32,
     ) -> Result<Vec<LogRow>, Refused> {
-        let mut rows = Vec::new();
+        let (mut rows, limit) = (Vec::new(), limit.min(limits::LINES_READ));
         for (_, (run, stage)) in self.sources(run, stage).await? {
             rows.extend(self.store.logs(&run, Some(&stage), after, limit).await.map_err(WriteError::from)?);
         }
@@ -154,6 +160,7 @@ impl Records {
         stage: Option<&StageName>,
         points: usize,
     ) -> Result<StageMetrics, Refused> {
+        let points = if points == 0 { limits::CURVE_POINTS } else { points.min(limits::CURVE_POINTS) };
         let mut stages = StageMetrics::new();
         for (name, (run, stage)) in self.sources(run, stage).await? {
             stages.insert(name, self.store.metrics(&run, &stage, None, points).await.map_err(WriteError::from)?);

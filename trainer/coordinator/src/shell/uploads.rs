@@ -12,7 +12,7 @@ use axum::response::Response;
 use checkpoint::BlobError;
 use futures::{StreamExt as _, stream};
 use protocol::message::{CommitCheckpoint, Grant, LogBatch, MetricBatch, ReportOutcome};
-use protocol::{Digest, limits};
+use protocol::{Digest, RunId, limits};
 use registry::blob::{Arriving, PART_BYTES, ResumeError};
 use registry::{Write, WriteError};
 
@@ -46,11 +46,29 @@ async fn write(actor_handle: &ActorHandle, write: Write) -> Result<Json<()>, Fai
     Ok(Json(()))
 }
 
+/// The run whose task it is.
+fn run_of(grant: &Grant) -> RunId {
+    RunId::new(grant.task.as_str().split('/').next().unwrap_or_default())
+}
+
+/// A run has had all that it may have of something; what comes later is left out.
+fn used_up(message: String, option: &str) -> Failure {
+    let failure = Failure::new(StatusCode::PAYLOAD_TOO_LARGE, "used-up", message);
+    failure.hint(&format!("write less, or start the server with a larger `{option}`"))
+}
+
 pub(crate) async fn metrics(
     State(actor_handle): State<Arc<ActorHandle>>,
     Message(batch, _): Message<MetricBatch>,
 ) -> Result<Json<()>, Failure> {
     actor_handle.state().check_telemetry(&batch.grant)?;
+    let (run, most) = (run_of(&batch.grant), actor_handle.allowances.values);
+    if actor_handle.store.usage(&run).await?.values + batch.rows.len() as u64 > most {
+        return Err(used_up(
+            format!("run `{run}` has recorded {most} values, which is all that it may"),
+            "--max-values",
+        ));
+    }
     write(&actor_handle, Write::Metrics { grant: batch.grant, rows: batch.rows }).await
 }
 
@@ -59,6 +77,12 @@ pub(crate) async fn logs(
     Message(batch, _): Message<LogBatch>,
 ) -> Result<Json<()>, Failure> {
     actor_handle.state().check_telemetry(&batch.grant)?;
+    let (run, most) = (run_of(&batch.grant), actor_handle.allowances.log_bytes);
+    let bytes: usize = batch.lines.iter().map(String::len).sum();
+    if actor_handle.store.usage(&run).await?.log_bytes + bytes as u64 > most {
+        let message = format!("run `{run}` has written {most} bytes of log lines, which is all that it may");
+        return Err(used_up(message, "--max-log-mib"));
+    }
     write(&actor_handle, Write::Logs { grant: batch.grant, first: batch.first, lines: batch.lines }).await
 }
 

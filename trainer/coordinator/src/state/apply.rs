@@ -64,6 +64,9 @@ impl State {
             | Fact::Draining { .. } => {}
         }
         if !self.mends.is_empty() {
+            // The place of an input that is made again depends on its readers and on their other inputs.
+            let waiting: Vec<Digest> = keys.iter().flat_map(|key| self.waiting_for(*key)).collect();
+            keys.extend(waiting);
             let mended: Vec<Digest> = keys.iter().flat_map(|key| self.mended_for(*key)).collect();
             keys.extend(mended);
         }

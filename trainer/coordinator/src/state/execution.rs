@@ -151,7 +151,7 @@ impl StageExecution {
         }
     }
 
-    /// Whether a gang does it.
+    /// Returns true if a gang does it.
     pub fn is_gang(&self) -> bool {
         self.tasks.first().is_some_and(|task| task.part == Part::Gang)
     }

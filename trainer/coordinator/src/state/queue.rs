@@ -3,7 +3,10 @@
 //! All of it follows from the facts: [`State::apply`](super::State::apply) brings the entry of each execution up to date that a fact
 //! concerns. A decision finds here what workers can be given and looks at no execution that waits. Invariant C14.
 
+use std::collections::BTreeSet;
+
 use protocol::Digest;
+use protocol::message::RunState;
 use protocol::stage::Backend;
 
 use super::State;
@@ -14,7 +17,6 @@ use super::shared::{Map, Set};
 use super::task::{Lease, Part, Task};
 use super::worker::Worker;
 use crate::time::Millis;
-use protocol::message::RunState;
 
 /// A place in the order of service.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -23,30 +25,30 @@ pub struct Rank {
     pub run: u64,
     /// Stages as in the pipeline.
     pub stage: usize,
-    /// What is made again for a stage comes before it: the place in [`State::mended_for`], or `usize::MAX` for the stage itself.
+    /// The place in [`State::mended_for`] of an input that is made again, which comes before its reader; `usize::MAX` for the stage itself.
     pub mended: usize,
 }
 
-/// What an execution needs.
+/// The workers that an execution needs.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Need {
     /// Members of a gang rather than one worker for a task that is ready.
     pub gang: bool,
-    /// Where it is computed.
+    /// The backend that computes it.
     pub backend: Backend,
     /// The instruction set that it is bound to.
     pub instruction_set: Option<String>,
 }
 
 impl Need {
-    /// Whether a worker fits.
+    /// Returns true if a worker fits.
     pub fn takes(&self, worker: &Worker) -> bool {
         let set = self.instruction_set.as_ref();
         worker.backend == self.backend && set.is_none_or(|set| worker.instruction_set == *set)
     }
 }
 
-/// What is known of one execution.
+/// The indexed properties of one execution.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Entry {
     /// `None`: no running run waits for it.
@@ -54,7 +56,7 @@ struct Entry {
     need: Option<Need>,
     /// The backend, if shards are held.
     sharding: Option<Backend>,
-    /// When the wait of a task ends.
+    /// The time at which the first wait of a task ends.
     due: Option<Millis>,
 }
 
@@ -63,7 +65,7 @@ struct Entry {
 pub struct Queue {
     entries: Map<Digest, Entry>,
     by_need: Map<Need, Set<(Rank, Digest)>>,
-    /// How many wanted executions have shards under way.
+    /// The number of wanted executions with held shards.
     sharding: Map<Backend, usize>,
     due: Set<(Millis, Digest)>,
 }
@@ -90,7 +92,7 @@ impl Queue {
         entry.need.as_ref().filter(|need| need.gang).and(entry.rank)
     }
 
-    /// Whether shards of some execution are under way.
+    /// Returns true if shards of some execution are held.
     pub fn is_sharding(&self, backend: Backend) -> bool {
         self.sharding.contains_key(&backend)
     }
@@ -171,18 +173,8 @@ impl State {
     /// The first of the places at which running runs wait for an execution, or for what it is made again for.
     fn rank_now(&self, execution: &StageExecution) -> Option<Rank> {
         let mut first = self.first_active(execution);
-        if self.mends.is_empty() {
-            return first;
-        }
-        let mut waiting: Vec<Digest> = self.mending(execution.key);
-        let mut seen = Vec::new();
-        while let Some(key) = waiting.pop() {
-            if seen.contains(&key) {
-                continue;
-            }
-            seen.push(key);
-            waiting.extend(self.mending(key));
-            let rank = self.executions.get(&key).and_then(|execution| self.first_active(execution));
+        for key in self.waiting_for(execution.key) {
+            let rank = self.executions.get(&key).and_then(|waiting| self.first_active(waiting));
             let place = self.mended_for(key).iter().position(|input| *input == execution.key);
             if let (Some(rank), Some(mended)) = (rank, place) {
                 let rank = Rank { mended, ..rank };
@@ -192,9 +184,18 @@ impl State {
         first
     }
 
-    /// Executions that wait for one to be made again.
-    fn mending(&self, input: Digest) -> Vec<Digest> {
-        self.mends.get(&input).into_iter().flat_map(|waiting| waiting.iter().copied()).collect()
+    /// Executions that wait for one to be made again, and those that wait for them.
+    pub(super) fn waiting_for(&self, input: Digest) -> BTreeSet<Digest> {
+        let mut all = BTreeSet::new();
+        let mut found = vec![input];
+        while let Some(key) = found.pop() {
+            for waiting in self.mends.get(&key).into_iter().flatten() {
+                if all.insert(*waiting) {
+                    found.push(*waiting);
+                }
+            }
+        }
+        all
     }
 
     fn first_active(&self, execution: &StageExecution) -> Option<Rank> {

@@ -23,9 +23,9 @@ pub struct Tasks {
 struct Index {
     held: Set<usize>,
     waiting: Set<usize>,
-    /// Of the waiting ones, those without a back-off.
+    /// The waiting tasks without a back-off.
     free: Set<usize>,
-    /// When a back-off ends, or the grace of a task that is asked to drain.
+    /// The ends of back-offs, and of the grace of tasks asked to drain.
     deadlines: Set<(Millis, usize)>,
     /// Of the held ones, how many are asked to drain.
     draining: usize,
@@ -91,12 +91,12 @@ impl Tasks {
         Self { all: all.into_iter().collect(), index }
     }
 
-    /// How many there are.
+    /// The number of tasks.
     pub fn len(&self) -> usize {
         self.all.len()
     }
 
-    /// Whether there is none.
+    /// Returns true if there is none.
     pub fn is_empty(&self) -> bool {
         self.all.is_empty()
     }
@@ -128,7 +128,7 @@ impl Tasks {
         (self.all[first].part != Part::Merge || self.open() == 1).then_some(first)
     }
 
-    /// When the first back-off or grace ends.
+    /// The end of the first back-off or grace.
     pub fn first_deadline(&self) -> Option<Millis> {
         self.index.deadlines.first().map(|(time, _)| *time)
     }
@@ -138,7 +138,7 @@ impl Tasks {
         self.index.deadlines.iter().take_while(move |(time, _)| *time <= now).map(|(_, i)| *i)
     }
 
-    /// Whether somebody has a shard.
+    /// Returns true if a worker holds a shard.
     pub fn is_any_shard_held(&self) -> bool {
         self.held().next().is_some_and(|i| matches!(self.all[i].part, Part::Shard { .. }))
     }

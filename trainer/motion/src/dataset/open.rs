@@ -10,7 +10,7 @@
 //!   frames `trunc(from * fps) .. trunc(to * fps)`, under the same length rule. The loaders name such entries with
 //!   random letters; ours are named by their frames, so that the same folder always gives the same dataset.
 //! * A time range that is inverted, empty, negative or not finite cuts no frames upstream, and its caption is dropped.
-//! Fields after the times are ignored. Both are reported with file and line.
+//!   Fields after the times are ignored. Both are reported with file and line.
 //! * KIT times are read at KIT's 12.5 fps. (Some loaders use 20 for both. Published KIT texts have no times, so no
 //!   published number depends on it, and seconds should be seconds.)
 //! * `007975` and `M007975` of HumanML3D are known to hold NaN in some builds. They are then skipped by name; NaN in
@@ -264,7 +264,25 @@ enum Loaded {
 
 impl Dataset {
     /// Opens a folder. Reads `train.txt`, `val.txt`, `test.txt`, `new_joint_vecs/`, `texts/`, `Mean.npy`, `Std.npy`.
+    ///
+    /// # Errors
+    /// [`OpenError`] with every problem found.
+    ///
+    /// # Panics
+    /// Never.
     pub fn open(path: &Path, format: DataFormat) -> Result<(Self, OpenReport), OpenError> {
+        Self::open_while(path, format, &|_| true).map(|opened| opened.expect("reading is never stopped"))
+    }
+
+    /// Opens a folder while `go_on`, which is asked every few clips with how many are read, returns true; else `None`.
+    ///
+    /// # Errors
+    /// As [`open`](Self::open).
+    pub fn open_while(
+        path: &Path,
+        format: DataFormat,
+        go_on: &dyn Fn(usize) -> bool,
+    ) -> Result<Option<(Self, OpenReport)>, OpenError> {
         let fail = |problems| OpenError { folder: path.into(), problems };
         if !path.is_dir() {
             let what = if path.exists() { "is not a folder" } else { "no such folder" };
@@ -315,7 +333,13 @@ impl Dataset {
                 ids.push(id);
             }
         }
-        let loaded: HashMap<&str, Loaded> = ids.iter().copied().zip(load_all(path, &ids, skeleton)).collect();
+        let mut loaded: HashMap<&str, Loaded> = HashMap::new();
+        for (part, ids) in ids.chunks(AT_ONCE).enumerate() {
+            if !go_on(part * AT_ONCE) {
+                return Ok(None);
+            }
+            loaded.extend(ids.iter().copied().zip(load_all(path, ids, skeleton)));
+        }
         for id in &ids {
             if let Loaded::Bad(found) = &loaded[id] {
                 problems.extend(found.iter().cloned());
@@ -330,7 +354,7 @@ impl Dataset {
             let what = format!("{}: no usable training clip\n{report}", path.join("train.txt").display());
             return Err(fail(vec![Problem::new(ProblemKind::Empty, what)]));
         }
-        Ok((dataset, report))
+        Ok(Some((dataset, report)))
     }
 
     /// Converts loaded clips to entries by the load rules, and records those left out.
@@ -501,6 +525,9 @@ fn read_statistic(file: &Path, skeleton: &Skeleton, positive: bool) -> Result<Ve
     }
     Ok(array.data)
 }
+
+/// Clips that are read between two looks at whether to go on.
+const AT_ONCE: usize = 256;
 
 /// Loads all clips, a contiguous part of the list on each core. The result has the order of `ids`.
 fn load_all(root: &Path, ids: &[&str], skeleton: &Skeleton) -> Vec<Loaded> {

@@ -467,3 +467,17 @@ impl Recent {
         sums.into_iter().map(|(key, sum)| (key, sum / count)).collect()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_state_larger_than_a_file_may_be_is_refused_in_words() {
+        let refused = check_size(9 << 30, 8 << 30).map_err(|error| (error.class(), error.to_string()));
+        let Err((class, message)) = refused else { panic!("9 GiB are taken") };
+        assert_eq!(class, protocol::message::FailureClass::Input);
+        assert!(message.contains("9.0 GiB") && message.contains("at most 8.0 GiB"), "{message}");
+        assert!(check_size(7 << 30, 8 << 30).is_ok());
+    }
+}
