@@ -9,12 +9,12 @@
 //! ```
 //!
 //! Any process that reads the store's folder makes it, whether or not another one holds the store and goes on working; only
-//! collection waits. A blob is linked where both
-//! folders are on one file system, else copied, and hashed either way; blobs in a bucket are fetched, so a backup holds them too. A second backup into the same folder adds what is new;
-//! until its `backup.json` is in place the one before is whole. One that was cut short is made again by the same command.
+//! collection waits. A blob is copied and hashed; blobs in a bucket are fetched, so a backup holds them too. A second backup into the same
+//! folder adds what is new; until its `backup.json` is in place the one before is whole. One that was cut short is made again by the same
+//! command.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::{self, DirBuilder, File};
+use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write as _};
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
@@ -25,12 +25,13 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
 use crate::blob::Backend;
-use crate::blob::disk::write_whole;
+use crate::blob::disk::{regular, write_whole};
 use crate::blob::fs::Folder;
 use crate::blob::place::Place;
 use crate::identity::Marker;
+use crate::lease::{self, LeaseTerms};
 use crate::lock::CollectionLock;
-use crate::retention::{self, Rows};
+use crate::retention::{self, Asked, Rows};
 use crate::{BlobStore, QueryError, ReadStore, StoreId, clock, folder, sqlite};
 
 const MANIFEST: &str = "backup.json";
@@ -182,8 +183,8 @@ impl ReadStore {
         sync(&copy)?;
         let (blobs, from, store) = (self.blobs().clone(), self.dir().to_owned(), self.id().clone());
         let ended = |e: tokio::task::JoinError| BackupError::Damaged(format!("the copying ended early: {e}"));
+        let needed = retention::needed(&Asked::of(self), &rows).await?;
         let work = move || {
-            let needed = retention::needed(&blobs, &rows)?;
             let blobs = copy_blobs(&blobs, &from, &to, needed)?;
             let (database_digest, database_bytes) = hashed(&copy).map_err(disk("cannot read", &copy))?;
             let manifest = Manifest { format: FORMAT, store, at_ms, database, database_bytes, database_digest, blobs };
@@ -219,7 +220,7 @@ fn claim(place: &dyn Backend, old: Option<Marker>, store: &StoreId) -> Result<()
     if old.is_some() {
         return Ok(());
     }
-    let written = Marker { store: store.clone(), epoch: 0 }.write(None, place);
+    let written = Marker { store: store.clone(), epoch: 0, held: None }.write(None, place);
     if written.map_err(|e| BackupError::Damaged(e.to_string()))? {
         return Ok(());
     }
@@ -253,11 +254,14 @@ fn copy_blobs(
     Ok(copied)
 }
 
-/// Links or copies a blob; it has its name only once it is whole.
+/// Copies a blob; it has its name only once it is whole. Where the file system can, both share their bytes until one of them changes, but
+/// never a file: what happens to the store's happens to no backup.
 fn copy_blob(blobs: &BlobStore, source: &Path, target: &Path, digest: Digest) -> Result<u64, BackupError> {
     let part = target.with_extension("part");
     let _ = fs::remove_file(&part);
-    if fs::hard_link(source, &part).is_err() {
+    let copied = regular(OpenOptions::new().read(true), source)
+        .and_then(|mut file| io::copy(&mut file, &mut File::create(&part)?));
+    if copied.is_err() {
         let damaged = |e: BlobError| BackupError::Damaged(e.to_string());
         let mut reader = blobs.read(digest).map_err(damaged)?;
         let mut file = File::create(&part).map_err(disk("cannot write", &part))?;
@@ -370,6 +374,12 @@ fn copy_back(backup: &Path, fresh: &Path, manifest: &Manifest, place: Option<Pla
         let why = format!("there are blobs of another store: see `{}`", seen.marker_place());
         return Err(BackupError::Folder(why));
     }
+    let own = lease::lock_of(fresh).map_err(disk("cannot read", fresh))?;
+    let free = lease::wait_until_free(&*seen, &own, LeaseTerms::default());
+    free.map_err(|e| BackupError::Folder(e.to_string()))?.map_err(|by| {
+        BackupError::Folder(format!("{by} holds the blobs of the place, by `{}`; stop that first", seen.marker_place()))
+    })?;
+    let marker = Marker::read(&*seen).map_err(|e| BackupError::Folder(e.to_string()))?;
     let epoch = marker.as_ref().map_or(0, |marker| marker.epoch);
     claim(&*seen, marker, &manifest.store)?;
     let blobs = looked.open().map_err(disk("cannot open the blobs of", fresh))?;

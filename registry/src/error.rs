@@ -26,10 +26,10 @@ pub enum QueryError {
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {
     /// Somebody else holds the task now.
-    #[error("stale fence: task `{task}` is at fence {current}, the write carries {carried}")]
+    #[error("stale fence: the grant of task `{task}` with fence {carried} has been superseded")]
     StaleFence {
         task: TaskId,
-        /// The fence in the store.
+        /// The fence in the store. Not part of the message, which the caller sees.
         current: Fence,
         /// The fence of the write.
         carried: Fence,
@@ -54,6 +54,13 @@ pub enum WriteError {
     /// Full or not writable.
     #[error("{0}")]
     Storage(String),
+    /// Nobody has shown that what it names is whole, or a collection has come between. Nothing is wrong with it yet: see
+    /// [`Store::prove`](crate::Store::prove).
+    #[error("artifact {artifact} is not proven whole; upload what is missing of it and name it again")]
+    Unproven { artifact: protocol::Digest },
+    /// The place where the blobs lie does not answer; the same write may succeed later.
+    #[error("{0}")]
+    Unreachable(String),
     /// A fault of ours or of the database.
     #[error("{0}")]
     Internal(String),

@@ -10,7 +10,7 @@
 //! Blobs in a bucket can be reached by two copies of a database, each of which would collect what only the other needs. So
 //! the marker also holds the database's epoch, the number of its openings; opening the store raises both, the marker by
 //! a compare-and-set. A database that was opened less often than the marker says is a copy, and a holder whose epoch the marker
-//! has left behind collects nothing.
+//! has left behind collects nothing. Of two copies that were opened equally often the lease decides ([`crate::lease`]).
 //!
 //! | database | marker | witness | the store is |
 //! |---|---|---|---|
@@ -147,6 +147,29 @@ pub(crate) struct Marker {
     pub(crate) store: StoreId,
     /// How often the store's database had been opened when it last took the blobs for its own.
     pub(crate) epoch: u64,
+    /// Which process holds them, where a lock in the store's folder cannot say so ([`crate::lease`]).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) held: Option<Held>,
+}
+
+/// Which process holds blobs.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Held {
+    /// Who, for people.
+    pub(crate) by: String,
+    /// The lock that it has; nobody else has that at the same time.
+    pub(crate) lock: String,
+    /// Another text each time that a store is opened.
+    pub(crate) opening: String,
+    /// How often it has said so since.
+    pub(crate) renewals: u64,
+}
+
+impl Held {
+    /// Once more.
+    pub(crate) fn renewed(&self) -> Self {
+        Self { renewals: self.renewals + 1, ..self.clone() }
+    }
 }
 
 impl Marker {
@@ -165,7 +188,7 @@ impl Marker {
     }
 
     fn text(&self) -> String {
-        serde_json::json!({"store": self.store, "epoch": self.epoch}).to_string()
+        serde_json::json!(self).to_string()
     }
 }
 
@@ -437,7 +460,7 @@ mod tests {
     fn parts_are_opened_only_if_they_belong_together() {
         let found = |beside: Option<char>, any_blob, witness: Option<(char, u64)>| Found {
             dir: "/s".into(),
-            marker: beside.map(|store| Marker { store: id(store), epoch: 2 }),
+            marker: beside.map(|store| Marker { store: id(store), epoch: 2, held: None }),
             marker_place: "/s/blobs/IDENTITY".into(),
             any_blob,
             witness: witness.map(|(store, commits)| Testimony { store: id(store), commits }),

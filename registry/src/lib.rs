@@ -6,9 +6,11 @@
 //!
 //! Not its job: who works on what (the coordinator), what tensors mean (the stages).
 
+pub mod audit;
 pub mod backup;
 pub mod blob;
 pub mod bundle;
+mod calls;
 pub mod catalog;
 pub mod cli;
 mod clock;
@@ -20,16 +22,20 @@ pub mod forget;
 pub mod fsck;
 mod identity;
 pub mod leaderboard;
+mod lease;
 mod lock;
 mod open_error;
+mod proofs;
+mod prove;
 mod reserve;
 pub mod retention;
+mod scoped;
+mod server_key;
 mod sqlite;
 mod store;
 mod store_id;
 pub mod testing;
 pub mod versions;
-mod vouched;
 mod write;
 
 pub use blob::BlobStore;
@@ -38,8 +44,11 @@ pub use catalog::{CheckpointRow, EndedRow, LineageNode, LogRow, Recovery, RunRow
 pub use curve::{Curve, Point};
 pub use error::{QueryError, WriteError};
 pub use identity::Mismatch;
+pub use lease::LeaseTerms;
 pub use lock::Holder;
 pub use open_error::OpenError;
+pub use proofs::Proof;
+pub use server_key::ServerKey;
 pub use store::{ReadStore, Store};
 pub use store_id::{StoreId, Stored};
 pub use versions::{Expect, Gate, Model, ModelRef, Pick, Promotion, Version};

@@ -10,7 +10,7 @@ use registry::cli::{OutputArg, Verb, execute};
 
 /// Models, their versions, and the aliases that point at them
 #[derive(Debug, Parser)]
-#[command(name = "registry", version)]
+#[command(name = "registry", version = env!("STRIDE_VERSION"), after_help = registry::cli::EXIT_CODES)]
 struct Cli {
     /// The store's folder
     #[arg(long, env = "STRIDE_STORE", default_value = ".stride", global = true)]

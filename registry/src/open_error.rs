@@ -19,6 +19,16 @@ pub enum OpenError {
         /// Who.
         holder: Holder,
     },
+    /// Another process holds its blobs, which this folder is not the only one to reach.
+    #[error("the blobs of store `{}` are in use by {by}: `{marker}` is renewed all the time", dir.display())]
+    Held {
+        /// The store.
+        dir: PathBuf,
+        /// Who.
+        by: String,
+        /// The marker beside the blobs.
+        marker: String,
+    },
     /// Its database, its blobs and its folder do not belong together, or one of them is missing or has gone back.
     #[error("store `{}` is not whole: {mismatch}", dir.display())]
     Mismatch {
@@ -128,6 +138,9 @@ impl OpenError {
             Self::Busy { holder, .. } => {
                 format!("wait for process {} to end, or choose another folder with `--store`", holder.pid)
             }
+            Self::Held { .. } => "nothing was changed: stop that process first, and go on with the store that has the newer work; a \
+                                  copy of a store needs a place for blobs of its own, which `registry backup` and `restore` give it"
+                .into(),
             Self::Mismatch { mismatch, .. } => mismatch.hint().into(),
             Self::Elsewhere { asked, .. } => format!(
                 "leave `--blobs` out, or choose another folder with `--store`; if the blobs were moved, `registry adopt --blobs \

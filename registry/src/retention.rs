@@ -9,7 +9,7 @@
 //! short a one was asked for.
 //!
 //! The writer goes on meanwhile. Marking reads one moment of the database; from just before that moment on the writer notes
-//! what new rows name (`Named`), and a blob is removed only while nobody can be noting it. A root whose manifest does not
+//! what new rows name ([`Proofs`]). Some blobs at a time are condemned, in the writer, and then removed, beside it. A root whose manifest does not
 //! read stops the collection, for nobody can say what it needs; so does a database or a folder of blobs that is not the
 //! store's own any more.
 
@@ -17,13 +17,16 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use checkpoint::BlobError;
+use futures::{StreamExt as _, TryStreamExt as _, stream};
+use protocol::artifact::mentioned;
 use protocol::{Digest, TaskId};
 use serde::{Deserialize, Serialize};
 
-use crate::blob::{BlobStore, ManifestError};
+use crate::blob::{BlobStore, Entry, ManifestError};
+use crate::calls::Calls;
 use crate::catalog::{Needs, Root};
 use crate::lock::CollectionLock;
-use crate::vouched::{Named, mentioned};
+use crate::proofs::Proofs;
 use crate::{QueryError, ReadStore, Store, WriteError, clock};
 
 /// How long a fresh blob is safe from collection: longer than any upload waits for its row.
@@ -47,9 +50,11 @@ pub struct Plan {
 impl ReadStore {
     /// What [`Store::gc`] would remove.
     pub async fn gc_plan(&self, grace_ms: i64) -> Result<Plan, QueryError> {
-        let (rows, blobs) = (Rows::from(self.needs().await?), self.blobs().clone());
+        let rows = Rows::from(self.needs().await?);
         let ages = Ages { now_ms: clock::now_ms(), grace_ms, opened_ms: self.opened_ms(), live: rows.live };
-        blocking(move || plan(&blobs, &rows, &ages)).await
+        let (plan, candidates) = plan(&Asked::of(self), &rows, &ages).await?;
+        let bytes = candidates.iter().map(|entry| entry.bytes).sum();
+        Ok(Plan { remove: candidates.iter().map(|entry| entry.digest).collect(), bytes, ..plan })
     }
 }
 
@@ -61,33 +66,87 @@ impl Store {
         let _alone = lock.map_err(|e| WriteError::Storage(format!("nothing was collected: no lock: {e}")))?;
         self.check_identity().await.map_err(|why| WriteError::Storage(format!("nothing was collected: {why}")))?;
         crate::reserve::release_if_full(self.dir());
-        let _noting = Noting(Arc::clone(self.named()));
+        let _noting = Noting(Arc::clone(self.proofs()));
         let forgotten = self.begin_collection().await?;
-        let (rows, blobs, named) = (Rows::from(self.needs().await?), self.blobs().clone(), Arc::clone(self.named()));
+        let rows = Rows::from(self.needs().await?);
         let ages = Ages { now_ms: clock::now_ms(), grace_ms, opened_ms: self.opened_ms(), live: rows.live };
-        let plan = blocking(move || {
-            let plan = plan(&blobs, &rows, &ages)?;
-            sweep(&blobs, &rows, &ages, &named, plan)
-        });
-        let plan = plan.await;
+        let place = Asked::of(self);
+        let plan = match plan(&place, &rows, &ages).await {
+            Ok((plan, candidates)) => self.sweep(&place, &rows, &ages, plan, candidates).await,
+            Err(e) => Err(e.into()),
+        };
         crate::reserve::keep(self.dir());
         Ok(Plan { forget_shards: forgotten, ..plan? })
     }
-}
 
-async fn blocking<T: Send + 'static>(
-    work: impl FnOnce() -> Result<T, QueryError> + Send + 'static,
-) -> Result<T, QueryError> {
-    let ended = |e: tokio::task::JoinError| QueryError::Blob(format!("the collection ended early: {e}"));
-    tokio::task::spawn_blocking(work).await.map_err(ended)?
+    /// Removes what was planned, but what was put again or named since.
+    async fn sweep(
+        &self,
+        place: &Asked,
+        rows: &Rows,
+        ages: &Ages,
+        mut plan: Plan,
+        candidates: Vec<Entry>,
+    ) -> Result<Plan, WriteError> {
+        let mut kept = BTreeSet::new();
+        for batch in candidates.chunks(BATCH) {
+            // What new rows name has needs of its own.
+            mark(place, rows, |_| true, self.proofs().to_follow(), &mut kept).await?;
+            let batch = batch.iter().map(|entry| entry.digest).filter(|digest| !kept.contains(digest));
+            let condemned = Condemned(Arc::clone(self.proofs()), self.condemn(batch.collect()).await?);
+            let removing = stream::iter(condemned.1.clone()).map(|digest| {
+                let ages = *ages;
+                let is_young = move |put_ms| put_ms >= ages.before_ms(put_ms);
+                place.ask(move |blobs| blobs.remove_unless(digest, is_young))
+            });
+            let removed = removing.buffer_unordered(AT_ONCE).try_collect::<Vec<Option<Entry>>>().await;
+            drop(condemned);
+            for entry in removed.map_err(|e| WriteError::Storage(e.to_string()))?.into_iter().flatten() {
+                plan.remove.push(entry.digest);
+                plan.bytes += entry.bytes;
+            }
+        }
+        plan.remove.sort();
+        Ok(plan)
+    }
 }
 
 /// Ends the noting, however the collection ends.
-struct Noting(Arc<Named>);
+struct Noting(Arc<Proofs>);
 
 impl Drop for Noting {
     fn drop(&mut self) {
-        self.0.end();
+        self.0.end_collection();
+    }
+}
+
+/// Blobs that are being removed, however that ends.
+struct Condemned(Arc<Proofs>, Vec<Digest>);
+
+impl Drop for Condemned {
+    fn drop(&mut self) {
+        self.0.removed(&self.1);
+    }
+}
+
+/// Where the blobs lie, and how it is asked.
+pub(crate) struct Asked {
+    blobs: BlobStore,
+    calls: Calls,
+}
+
+impl Asked {
+    pub(crate) fn of(store: &ReadStore) -> Self {
+        Self { blobs: store.blobs().clone(), calls: store.calls().clone() }
+    }
+
+    async fn ask<T: Send + 'static>(&self, call: impl FnOnce(&BlobStore) -> T + Send + 'static) -> T {
+        let blobs = self.blobs.clone();
+        self.calls.run(move || call(&blobs)).await
+    }
+
+    async fn list(&self) -> Result<BTreeMap<Digest, Entry>, QueryError> {
+        self.ask(BlobStore::list).await.map_err(|e| QueryError::Blob(e.to_string()))
     }
 }
 
@@ -112,6 +171,7 @@ impl From<Needs> for Rows {
 }
 
 /// How old a blob must be to go.
+#[derive(Debug, Clone, Copy)]
 struct Ages {
     now_ms: i64,
     grace_ms: i64,
@@ -130,97 +190,87 @@ impl Ages {
     }
 }
 
+/// Manifests that are read, and blobs that are removed, at once.
+const AT_ONCE: usize = 16;
+/// Blobs that are removed before new rows are looked at again.
+const BATCH: usize = 64;
+
 /// Adds all that `queue` needs to `marked`. `is_there` says which digests are blobs.
-fn mark(
-    blobs: &BlobStore,
+async fn mark(
+    place: &Asked,
     rows: &Rows,
     is_there: impl Fn(Digest) -> bool,
     mut queue: Vec<Digest>,
     marked: &mut BTreeSet<Digest>,
 ) -> Result<(), QueryError> {
-    while let Some(digest) = queue.pop() {
-        let root = rows.roots.get(&digest);
-        if !marked.insert(digest) || !(root.is_some() || is_there(digest)) {
-            continue;
-        }
-        queue.extend(rows.parents.get(&digest).into_iter().flatten());
-        match (blobs.manifest(digest), root) {
-            (Ok(manifest), _) => {
-                marked.extend(manifest.files.values().map(|file| file.digest));
-                mentioned(&manifest.meta, &mut queue);
+    while !queue.is_empty() {
+        queue.retain(|digest| marked.insert(*digest) && (rows.roots.contains_key(digest) || is_there(*digest)));
+        let parents = queue.iter().filter_map(|digest| rows.parents.get(digest)).flatten().copied();
+        let mut next: Vec<Digest> = parents.collect();
+        let read = |digest: Digest| place.ask(move |blobs| (digest, blobs.manifest(digest)));
+        let mut reading = stream::iter(queue).map(read).buffer_unordered(AT_ONCE);
+        while let Some((digest, read)) = reading.next().await {
+            match (read, rows.roots.get(&digest)) {
+                (Ok(manifest), _) => {
+                    marked.extend(manifest.files.values().map(|file| file.digest));
+                    mentioned(&manifest.meta, &mut next);
+                }
+                // Mentioned, but as a blob by itself; or gone since the listing.
+                (Err(ManifestError::NotAManifest { .. } | ManifestError::Blob(BlobError::NotFound(_))), None) => {}
+                (Err(e), why) => {
+                    let why = why.map_or_else(|| format!("artifact {digest}"), Clone::clone);
+                    return Err(QueryError::Blob(format!(
+                        "nothing was collected, for what {why} needs cannot be read: {e}"
+                    )));
+                }
             }
-            // Mentioned, but as a blob by itself; or gone since the listing.
-            (Err(ManifestError::NotAManifest { .. } | ManifestError::Blob(BlobError::NotFound(_))), None) => {}
-            (Err(e), why) => {
-                let why = why.map_or_else(|| format!("artifact {digest}"), Clone::clone);
-                return Err(QueryError::Blob(format!(
-                    "nothing was collected, for what {why} needs cannot be read: {e}"
-                )));
-            }
         }
+        drop(reading);
+        queue = next;
     }
     Ok(())
 }
 
 /// The blobs that the rows need, all of them there.
-pub(crate) fn needed(blobs: &BlobStore, rows: &Rows) -> Result<BTreeSet<Digest>, QueryError> {
-    for (root, why) in &rows.roots {
-        blobs.complete_manifest(*root).map_err(|e| QueryError::Blob(format!("{why}: {e}")))?;
-    }
-    let all = blobs.list().map_err(|e| QueryError::Blob(e.to_string()))?;
+pub(crate) async fn needed(place: &Asked, rows: &Rows) -> Result<BTreeSet<Digest>, QueryError> {
+    let check = |(root, why): (&Digest, &String)| {
+        let (root, why) = (*root, why.clone());
+        let asked = place.ask(move |blobs| blobs.complete_manifest(root));
+        async move { asked.await.map(|_| ()).map_err(|e| QueryError::Blob(format!("{why}: {e}"))) }
+    };
+    stream::iter(&rows.roots).map(check).buffered(AT_ONCE).try_collect::<()>().await?;
+    let all = place.list().await?;
     let mut marked = BTreeSet::new();
-    mark(blobs, rows, |digest| all.contains_key(&digest), rows.roots.keys().copied().collect(), &mut marked)?;
+    mark(place, rows, |digest| all.contains_key(&digest), rows.roots.keys().copied().collect(), &mut marked).await?;
     // What is mentioned need not be there; what roots list is, by now.
     marked.retain(|digest| all.contains_key(digest));
     Ok(marked)
 }
 
-fn plan(blobs: &BlobStore, rows: &Rows, ages: &Ages) -> Result<Plan, QueryError> {
-    let all = blobs.list().map_err(|e| QueryError::Blob(e.to_string()))?;
+/// What stays, and the blobs that may go.
+async fn plan(place: &Asked, rows: &Rows, ages: &Ages) -> Result<(Plan, Vec<Entry>), QueryError> {
+    let all = place.list().await?;
     let mut marked = BTreeSet::new();
     let is_there = |digest| all.contains_key(&digest);
-    mark(blobs, rows, is_there, rows.roots.keys().copied().collect(), &mut marked)?;
+    mark(place, rows, is_there, rows.roots.keys().copied().collect(), &mut marked).await?;
     // Nobody relies yet on what no row names: if it is damaged, that stops nothing.
-    let (damaged, held): (Vec<_>, Vec<_>) = blobs
-        .held()
-        .into_iter()
-        .partition(|digest| matches!(blobs.manifest(*digest), Err(ManifestError::Blob(BlobError::Corrupt { .. }))));
-    mark(blobs, rows, is_there, held, &mut marked)?;
+    let is_damaged = |blobs: &BlobStore, digest: &Digest| {
+        matches!(blobs.manifest(*digest), Err(ManifestError::Blob(BlobError::Corrupt { .. })))
+    };
+    let held = move |blobs: &BlobStore| blobs.held().into_iter().partition(|digest| is_damaged(blobs, digest));
+    let (damaged, held): (Vec<Digest>, Vec<Digest>) = place.ask(held).await;
+    mark(place, rows, is_there, held, &mut marked).await?;
     marked.extend(damaged);
     let mut plan = Plan { forget_shards: rows.forget_shards.clone(), ..Plan::default() };
-    for (digest, entry) in all {
-        if marked.contains(&digest) {
+    let mut candidates = Vec::new();
+    for entry in all.into_values() {
+        if marked.contains(&entry.digest) {
             plan.kept += 1;
         } else if entry.put_ms >= ages.before_ms(entry.put_ms) {
             plan.fresh += 1;
         } else {
-            plan.remove.push(digest);
-            plan.bytes += entry.bytes;
+            candidates.push(entry);
         }
     }
-    Ok(plan)
-}
-
-/// Blobs that are removed before new rows are looked at again.
-const BATCH: usize = 64;
-
-/// Removes what was planned, but what was put again or named since.
-fn sweep(blobs: &BlobStore, rows: &Rows, ages: &Ages, named: &Named, plan: Plan) -> Result<Plan, QueryError> {
-    let storage = |e: BlobError| QueryError::Storage(e.to_string());
-    let mut plan = Plan { bytes: 0, ..plan };
-    let mut kept = BTreeSet::new();
-    let candidates = std::mem::take(&mut plan.remove);
-    for batch in candidates.chunks(BATCH) {
-        // What new rows name has needs of its own.
-        mark(blobs, rows, |_| true, named.noted().into_iter().collect(), &mut kept)?;
-        for digest in batch.iter().filter(|digest| !kept.contains(digest)) {
-            let Some(entry) = blobs.entry(*digest).map_err(storage)? else { continue };
-            let remove = || blobs.remove_older(*digest, ages.before_ms(entry.put_ms));
-            if named.unless_named(*digest, remove).transpose().map_err(storage)? == Some(true) {
-                plan.remove.push(*digest);
-                plan.bytes += entry.bytes;
-            }
-        }
-    }
-    Ok(plan)
+    Ok((plan, candidates))
 }

@@ -19,25 +19,30 @@ use std::io;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Instant;
 
 use checkpoint::BlobError;
 use protocol::stage::Keep;
-use protocol::{Alias, Digest, ModelName, RunId, TaskId};
+use protocol::{Alias, Digest, Group, ModelName, RunId, TaskId};
 
 use crate::blob::disk::free_bytes;
 use crate::blob::place::{Looked, Place};
 use crate::blob::{Backend, BlobStore};
+use crate::calls::Calls;
 use crate::catalog::{Catalog, Done, Order, PromoteOrder, Records, RollbackOrder, Which};
 use crate::forget::Forgotten;
-use crate::identity::{self, Found, Marker, MarkerError, Verdict, Witness};
+use crate::identity::{self, Found, Held, Marker, MarkerError, Verdict, Witness};
+use crate::lease::{self, Lease, LeaseTerms};
 use crate::lock::{self, Holder, SharedLock, StoreLock, Taken, network_filesystem};
 use crate::open_error::OpenError;
+use crate::proofs::Proofs;
 use crate::reserve::{self, OPEN_NEEDS_BYTES};
+use crate::scoped::ScopedRecords;
+use crate::server_key::{self, ServerKey};
 use crate::sqlite::{Opened, Session, SqliteCatalog, SqliteRecords, Writer};
 use crate::store_id::{StoreId, Stored};
 use crate::versions::{Expect, Pick, Promotion};
-use crate::vouched::{Named, Vouched};
-use crate::{Write, WriteError, clock, folder, sqlite};
+use crate::{WriteError, clock, folder, sqlite};
 
 /// What a store can be asked, from what is committed. A [`Store`] is one; a process that only reads opens one by itself, whether
 /// or not somebody holds the store. It starts nothing and writes nothing. Clones share it.
@@ -50,9 +55,10 @@ struct Reading {
     id: StoreId,
     opened_ms: i64,
     blobs: BlobStore,
+    calls: Calls,
     records: Arc<dyn Records>,
     /// Keeps writers out of a database that is read without its log.
-    _closed: Option<SharedLock>,
+    _closed: Option<Arc<SharedLock>>,
 }
 
 /// A store, held by this process. Clones share it; the last one to go lets it go.
@@ -62,10 +68,11 @@ pub struct Store(Arc<Inner>);
 #[derive(Debug)]
 struct Inner {
     read: ReadStore,
-    /// Before `lock`: the writer ends first.
+    /// Before `lock`: the writer ends first, and then nobody holds the blobs.
     catalog: Box<dyn Catalog>,
+    _lease: Option<Lease>,
     lock: Arc<StoreLock>,
-    named: Arc<Named>,
+    proofs: Arc<Proofs>,
 }
 
 impl std::ops::Deref for Store {
@@ -98,12 +105,35 @@ impl ReadStore {
         let shared = SharedLock::try_take(&dir.join("lock")).map_err(|e| io(&dir.join("lock"), e))?;
         let closed = shared.filter(|_| folder::log_bytes(&dir) == 0);
         // Before the database: the witness and the marker never know of more than what is committed.
-        let seen = Seen::of(&dir, None, false).await?;
+        let seen = Seen::of(&dir, &Asked::Remembered, false).await?;
         let id = sqlite::check_to_read(&dir, &seen.found, closed.is_some()).await?;
         let blobs = BlobStore::beside(seen.blobs, &seen.looked.verified());
         let records = Arc::new(SqliteRecords::new(sqlite::open_readers(&dir, closed.is_some())));
         let opened_ms = clock::now_ms();
-        Ok(Self(Arc::new(Reading { dir, id, opened_ms, blobs, records, _closed: closed })))
+        Ok(Self(Arc::new(Reading {
+            dir,
+            id,
+            opened_ms,
+            blobs,
+            calls: Calls::default(),
+            records,
+            _closed: closed.map(Arc::new),
+        })))
+    }
+
+    /// The store as `group` sees it: its own runs and models, and no name of any other.
+    #[must_use]
+    pub fn seen_by(&self, group: &Group) -> Self {
+        let Reading { dir, id, opened_ms, blobs, calls, records, _closed } = &*self.0;
+        Self(Arc::new(Reading {
+            dir: dir.clone(),
+            id: id.clone(),
+            opened_ms: *opened_ms,
+            blobs: blobs.clone(),
+            calls: calls.clone(),
+            records: Arc::new(ScopedRecords::new(Arc::clone(records), group.clone())),
+            _closed: _closed.clone(),
+        }))
     }
 
     /// Who holds the store in `dir` now, if somebody does. There need be no store.
@@ -132,6 +162,15 @@ impl ReadStore {
         &self.0.blobs
     }
 
+    /// Makes a call that asks the place where the blobs lie, beside the threads that answer others.
+    pub async fn ask_blobs<T: Send + 'static>(&self, call: impl FnOnce() -> T + Send + 'static) -> T {
+        self.0.calls.run(call).await
+    }
+
+    pub(crate) fn calls(&self) -> &Calls {
+        &self.0.calls
+    }
+
     /// When this process opened it, in milliseconds since 1970.
     pub(crate) fn opened_ms(&self) -> i64 {
         self.0.opened_ms
@@ -153,33 +192,55 @@ impl Store {
     /// The same; `blobs` is where the blobs of a new store are to lie, and where those of one that is there must be.
     pub async fn open_with(dir: &Path, blobs: Option<&Place>, holder: Holder) -> Result<Self, OpenError> {
         let io = |path: &Path, e: io::Error| OpenError::io(path, &e);
-        if !folder::has_database(dir) && Seen::of(dir, None, false).await?.found.evidence().is_none() {
+        if !folder::has_database(dir) && Seen::of(dir, &Asked::Remembered, false).await?.found.evidence().is_none() {
             refuse_other_files(dir)?;
         }
         DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(|e| io(dir, e))?;
-        Self::take(dir, blobs, holder, Purpose::Work).await
+        Self::take(dir, Asked::named(blobs), holder, Purpose::Work).await
+    }
+
+    /// Opens the store in `dir`, making it if there is none, with its blobs at a place that no name leads to: for tests.
+    pub async fn open_over(
+        dir: &Path,
+        blobs: Arc<dyn Backend>,
+        holder: Holder,
+        terms: LeaseTerms,
+    ) -> Result<Self, OpenError> {
+        let io = |path: &Path, e: io::Error| OpenError::io(path, &e);
+        DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(|e| io(dir, e))?;
+        Self::take_by(dir, Asked::Given(blobs), holder, Purpose::Work, terms).await
     }
 
     /// Opens a store that is there.
     pub async fn open_existing(dir: &Path, holder: Holder) -> Result<Self, OpenError> {
         there(dir).await?;
-        Self::take(dir, None, holder, Purpose::Work).await
+        Self::take(dir, Asked::Remembered, holder, Purpose::Work).await
     }
 
     /// Opens a store whose blobs are missing or were moved to `blobs`, or whose database has gone back, and makes what is left one
     /// store again. What was lost stays lost: blobs that only lost rows named go with the next collection.
     pub async fn adopt(dir: &Path, blobs: Option<&Place>, holder: Holder) -> Result<Self, OpenError> {
         there(dir).await?;
-        Self::take(dir, blobs, holder, Purpose::Adopt).await
+        Self::take(dir, Asked::named(blobs), holder, Purpose::Adopt).await
     }
 
     /// Opens a store that is there to collect what nothing needs: on a full disk as well, which is when it has to be done.
     pub async fn open_to_collect(dir: &Path, holder: Holder) -> Result<Self, OpenError> {
         there(dir).await?;
-        Self::take(dir, None, holder, Purpose::Collect).await
+        Self::take(dir, Asked::Remembered, holder, Purpose::Collect).await
     }
 
-    async fn take(dir: &Path, place: Option<&Place>, holder: Holder, purpose: Purpose) -> Result<Self, OpenError> {
+    async fn take(dir: &Path, place: Asked, holder: Holder, purpose: Purpose) -> Result<Self, OpenError> {
+        Self::take_by(dir, place, holder, purpose, LeaseTerms::default()).await
+    }
+
+    async fn take_by(
+        dir: &Path,
+        place: Asked,
+        holder: Holder,
+        purpose: Purpose,
+        terms: LeaseTerms,
+    ) -> Result<Self, OpenError> {
         let io = |path: &Path, e: io::Error| OpenError::io(path, &e);
         let dir = dir.canonicalize().map_err(|e| io(dir, e))?;
         close_to_others(&dir).map_err(|e| io(&dir, e))?;
@@ -200,7 +261,12 @@ impl Store {
         }
         // Under the lock: nobody is making the store at the same time.
         let adopt = purpose == Purpose::Adopt;
-        let seen = Seen::of(&dir, place, adopt).await?;
+        let mut seen = Seen::of(&dir, &place, adopt).await?;
+        let is_shared = seen.looked.is_shared(&dir);
+        if is_shared && seen.found.marker().is_some_and(|marker| marker.held.is_some()) {
+            wait_until_free(&dir, &seen, terms).await?;
+            seen = Seen::of(&dir, &place, adopt).await?;
+        }
         if seen.to_remember && !folder::has_database(&dir) && seen.found.evidence().is_none() {
             // Before the database is there: one that is there knows where its blobs are.
             seen.place.remember(&dir).map_err(|e| io(&dir, e))?;
@@ -214,26 +280,39 @@ impl Store {
         let blobs = opened.map_err(|e| io(&opening, io::Error::other(e)))?.map_err(|e| io(&opening, e))?;
         let mut marker = seen.found.marker().cloned();
         if let Verdict::New | Verdict::Unfinished(_) = verdict {
-            marker = Some(mark(&dir, &blobs, marker, &Stored { id: id.clone(), epoch: 0, commits: 0 }).await?);
+            marker = Some(mark(&dir, &blobs, marker, &Stored { id: id.clone(), epoch: 0, commits: 0 }, None).await?);
         }
         let stored = sqlite::raise_epoch(&dir, &mut conn).await?;
-        mark(&dir, &blobs, marker, &stored).await?;
+        let held = is_shared.then(|| lease::held(&dir, &lock.holder())).transpose().map_err(|e| io(&dir, e))?;
+        let begun = Instant::now();
+        let marker = mark(&dir, &blobs, marker, &stored, held).await?;
+        let lease = is_shared.then(|| Lease::begin(blobs.place(), marker, begun, terms));
+        let lease = lease.transpose().map_err(|e| io(&dir, e))?;
+        if let Some(lease) = &lease {
+            let check = lease.checked();
+            blobs.permit_removals_by(move || check.may_remove());
+        }
         let witness = Witness::begin(&dir, &stored).map_err(|e| io(&dir, e))?;
         reserve::keep(&dir);
         let session = Session { conn, epoch: stored.epoch, witness };
-        let named = Arc::new(Named::default());
-        let vouched = Vouched { blobs: blobs.clone(), named: Arc::clone(&named) };
-        let writer = Writer::start(session, vouched, Arc::clone(&lock)).map_err(|e| io(&dir, e))?;
+        let proofs = Arc::new(Proofs::new(lease.as_ref().map(Lease::checked)));
+        let writer = Writer::start(session, Arc::clone(&proofs), Arc::clone(&lock)).map_err(|e| io(&dir, e))?;
         let records = Arc::new(SqliteRecords::new(sqlite::open_readers(&dir, false)));
         let catalog = Box::new(SqliteCatalog { writer, records: Arc::clone(&records) });
         let opened_ms = clock::now_ms();
-        let read = ReadStore(Arc::new(Reading { dir, id, opened_ms, blobs, records, _closed: None }));
-        Ok(Self(Arc::new(Inner { read, catalog, lock, named })))
+        let read =
+            ReadStore(Arc::new(Reading { dir, id, opened_ms, blobs, calls: Calls::default(), records, _closed: None }));
+        Ok(Self(Arc::new(Inner { read, catalog, _lease: lease, lock, proofs })))
     }
 
     /// What is kept besides the blobs.
     pub fn catalog(&self) -> &dyn Catalog {
         &*self.0.catalog
+    }
+
+    /// The key of this store's server, made when it is first asked for. Read from the disk each time.
+    pub fn server_key(&self) -> io::Result<ServerKey> {
+        server_key::read_or_make(self.dir())
     }
 
     /// Tells other processes where this one answers requests.
@@ -244,11 +323,6 @@ impl Store {
     /// What others are told about this process.
     pub fn holder(&self) -> Holder {
         self.0.lock.holder()
-    }
-
-    /// One transaction: returns once all of `writes` would survive a loss of power, or none is stored.
-    pub async fn write(&self, writes: Vec<Write>) -> Result<(), WriteError> {
-        self.order(Order::Write(writes)).await.map(|_| ())
     }
 
     /// Moves an alias to a version: compares it with `expect` if given, judges the gates, moves, logs.
@@ -300,7 +374,7 @@ impl Store {
 
     /// Keeps an artifact whatever else points at it.
     pub async fn pin(&self, digest: Digest, reason: &str) -> Result<(), WriteError> {
-        self.order(Order::Pin { digest, reason: Some(reason.to_owned()) }).await.map(|_| ())
+        self.order_proven(&[digest], || Order::Pin { digest, reason: Some(reason.to_owned()) }).await.map(|_| ())
     }
 
     /// Ends a pin.
@@ -325,9 +399,9 @@ impl Store {
         }
     }
 
-    /// What rows come to name while a collection is under way.
-    pub(crate) fn named(&self) -> &Arc<Named> {
-        &self.0.named
+    /// What is proven, and what rows come to name while a collection is under way.
+    pub(crate) fn proofs(&self) -> &Arc<Proofs> {
+        &self.0.proofs
     }
 
     /// Forgets the rows that a collection takes with it; returns the tasks whose shards went.
@@ -338,7 +412,15 @@ impl Store {
         }
     }
 
-    async fn order(&self, order: Order) -> Result<Done, WriteError> {
+    /// Takes away what is known of blobs that no row has come to name; returns those.
+    pub(crate) async fn condemn(&self, blobs: Vec<Digest>) -> Result<Vec<Digest>, WriteError> {
+        match self.order(Order::Condemn(blobs)).await? {
+            Done::Condemned(taken) => Ok(taken),
+            done => Err(unexpected(&done)),
+        }
+    }
+
+    pub(crate) async fn order(&self, order: Order) -> Result<Done, WriteError> {
         self.0.catalog.commit(order).await
     }
 }
@@ -362,6 +444,23 @@ enum Purpose {
     Adopt,
 }
 
+/// Where the blobs are said to lie.
+#[derive(Debug, Clone)]
+enum Asked {
+    /// Where the folder says.
+    Remembered,
+    /// Where the caller says.
+    Named(Place),
+    /// Here.
+    Given(Arc<dyn Backend>),
+}
+
+impl Asked {
+    fn named(place: Option<&Place>) -> Self {
+        place.map_or(Self::Remembered, |place| Self::Named(place.clone()))
+    }
+}
+
 /// A store as it can be seen without its database.
 struct Seen {
     place: Place,
@@ -375,27 +474,34 @@ struct Seen {
 impl Seen {
     /// Looks, changing nothing. `asked` is where the blobs are said to be; elsewhere is an error unless they `moved` there or
     /// the store is still to be made.
-    async fn of(dir: &Path, asked: Option<&Place>, moved: bool) -> Result<Self, OpenError> {
-        let (dir, asked) = (dir.to_owned(), asked.cloned());
+    async fn of(dir: &Path, asked: &Asked, moved: bool) -> Result<Self, OpenError> {
+        let (dir, asked) = (dir.to_owned(), asked.clone());
         let path = dir.clone();
         let looking = tokio::task::spawn_blocking(move || Self::look(&dir, asked, moved));
         looking.await.map_err(|e| OpenError::io(&path, &io::Error::other(e)))?
     }
 
-    fn look(dir: &Path, asked: Option<Place>, moved: bool) -> Result<Self, OpenError> {
+    fn look(dir: &Path, asked: Asked, moved: bool) -> Result<Self, OpenError> {
         let io = |e: io::Error| OpenError::io(&dir.join("blobs/PLACE"), &e);
         let here = Place::Folder(std::path::absolute(dir).map_err(io)?);
         let remembered = Place::remembered(dir).map_err(io)?;
         let is_new = remembered.is_none() && !folder::has_database(dir);
         let current = remembered.unwrap_or(here);
-        let asked = asked.unwrap_or_else(|| current.clone());
+        let (asked, given) = match asked {
+            Asked::Remembered => (current.clone(), None),
+            Asked::Named(place) => (place, None),
+            Asked::Given(blobs) => (current.clone(), Some(blobs)),
+        };
         let to_remember = asked != current;
         if to_remember && !moved && !is_new {
             return Err(OpenError::Elsewhere { dir: dir.to_owned(), place: current, asked });
         }
         let place = asked;
         let blobs_error = |e: BlobError| OpenError::Blobs { dir: dir.to_owned(), message: e.to_string() };
-        let looked = place.look(dir).map_err(blobs_error)?;
+        let looked = match given {
+            Some(blobs) => Looked::Given(blobs, dir.to_owned()),
+            None => place.look(dir).map_err(blobs_error)?,
+        };
         let blobs = looked.to_read().map_err(io)?;
         let found = Found::look(dir, &*blobs).map_err(|e| match e {
             MarkerError::Blob(e) => blobs_error(e),
@@ -416,15 +522,31 @@ async fn there(dir: &Path) -> Result<(), OpenError> {
     if folder::has_database(dir) {
         return Ok(());
     }
-    match Seen::of(dir, None, false).await?.found.evidence() {
+    match Seen::of(dir, &Asked::Remembered, false).await?.found.evidence() {
         Some(_) => Ok(()),
         None => Err(OpenError::NotAStore(dir.to_owned())),
     }
 }
 
+/// Waits until no other process holds the blobs of a store that is about to be opened.
+async fn wait_until_free(dir: &Path, seen: &Seen, terms: LeaseTerms) -> Result<(), OpenError> {
+    let own = lease::lock_of(dir).map_err(|e| OpenError::io(dir, &e))?;
+    let (place, marker) = (Arc::clone(&seen.blobs), seen.blobs.marker_place());
+    let waiting = tokio::task::spawn_blocking(move || lease::wait_until_free(&*place, &own, terms));
+    let failed = |message: String| OpenError::Blobs { dir: dir.to_owned(), message };
+    let waited = waiting.await.map_err(|e| failed(e.to_string()))?.map_err(|e| failed(e.to_string()))?;
+    waited.map_err(|by| OpenError::Held { dir: dir.to_owned(), by, marker })
+}
+
 /// Puts the marker of a store that was opened beside its blobs, in the place of the `old` one.
-async fn mark(dir: &Path, blobs: &BlobStore, old: Option<Marker>, stored: &Stored) -> Result<Marker, OpenError> {
-    let marker = Marker { store: stored.id.clone(), epoch: stored.epoch };
+async fn mark(
+    dir: &Path,
+    blobs: &BlobStore,
+    old: Option<Marker>,
+    stored: &Stored,
+    held: Option<Held>,
+) -> Result<Marker, OpenError> {
+    let marker = Marker { store: stored.id.clone(), epoch: stored.epoch, held };
     let (place, written) = (blobs.place(), marker.clone());
     let writing = tokio::task::spawn_blocking(move || written.write(old.as_ref(), &*place));
     let failed = |message: String| OpenError::Blobs { dir: dir.to_owned(), message };
@@ -438,7 +560,7 @@ async fn mark(dir: &Path, blobs: &BlobStore, old: Option<Marker>, stored: &Store
 }
 
 /// Names that a store's folder may have before its database is there.
-const OF_A_STORE: [&str; 6] = ["lock", "blobs", "staging", "witness", "witness.new", "reserve"];
+const OF_A_STORE: [&str; 7] = ["lock", "blobs", "staging", "witness", "witness.new", "reserve", server_key::FILE];
 
 /// A store is not made in a folder that holds something else.
 fn refuse_other_files(dir: &Path) -> Result<(), OpenError> {

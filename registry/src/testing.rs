@@ -3,6 +3,8 @@
 //! Every file of a bundle is held against a digest, which hardly a changed file has. So changed bytes also come as the archive before its compression,
 //! and as a manifest whose digest the rest of the bundle is told: then it is what reads them that has to refuse them.
 
+pub mod slow;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::PathBuf;

@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 
 use protocol::message::{Grant, MetricRow};
-use protocol::{Alias, Digest, Fence, ModelName, RunId, StageName, TaskId};
+use protocol::{Alias, Digest, Fence, Group, ModelName, Owner, RunId, StageName, TaskId};
 use serde_json::Value;
 
 /// One row or change.
@@ -53,6 +53,19 @@ pub enum Write {
         state: String,
         /// Unique when given.
         idempotency_key: Option<String>,
+    },
+    /// The group that a run belongs to.
+    RunOwner {
+        /// Which.
+        run: RunId,
+        /// Whose.
+        owner: Group,
+    },
+    /// Makes a new model its owner's. One that is there must be the owner's to control, or the whole transaction is refused.
+    ModelOwner {
+        model: ModelName,
+        /// Who registers.
+        owner: Owner,
     },
     /// A run that goes on in another state.
     RunState {
@@ -162,6 +175,29 @@ pub enum Write {
 }
 
 impl Write {
+    /// The artifacts that it names, which must be proven whole.
+    pub(crate) fn artifacts(&self) -> Vec<Digest> {
+        match self {
+            Self::Checkpoint { manifest, .. } => vec![*manifest],
+            Self::Shard { output, .. } => vec![*output],
+            Self::StageResult { outputs, .. } => outputs.values().copied().collect(),
+            Self::Version { artifact, .. } => vec![*artifact],
+            Self::Facts { .. }
+            | Self::SnapshotParts { .. }
+            | Self::Snapshot { .. }
+            | Self::Fence { .. }
+            | Self::Run { .. }
+            | Self::RunOwner { .. }
+            | Self::ModelOwner { .. }
+            | Self::RunState { .. }
+            | Self::RunEnded { .. }
+            | Self::Archive { .. }
+            | Self::Metrics { .. }
+            | Self::Logs { .. }
+            | Self::Promote { .. } => Vec::new(),
+        }
+    }
+
     /// The grant that vouches for it; the store checks its fence. Who adds a write decides here whether it needs one.
     pub(crate) fn grant(&self) -> Option<&Grant> {
         match self {
@@ -175,6 +211,8 @@ impl Write {
             | Self::Snapshot { .. }
             | Self::Fence { .. }
             | Self::Run { .. }
+            | Self::RunOwner { .. }
+            | Self::ModelOwner { .. }
             | Self::RunState { .. }
             | Self::RunEnded { .. }
             | Self::Archive { .. }

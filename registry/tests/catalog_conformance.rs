@@ -10,8 +10,9 @@ use std::sync::Arc;
 use common::{artifact, fence, grant, metrics, result, rows, version};
 use futures::future::join_all;
 use protocol::stage::Keep;
-use protocol::{Alias, ArtifactKind, Digest, ModelName, RunId, StageName, TaskId};
+use protocol::{Alias, ArtifactKind, Digest, FileEntry, Manifest, ModelName, RunId, StageName, TaskId};
 use registry::catalog::{Catalog, Done, Order, PromoteOrder, Records, RollbackOrder, Which};
+use registry::testing::slow::SlowBucket;
 use registry::versions::Action;
 use registry::{BlobStore, Expect, Pick, QueryError, Store, Write, WriteError};
 use serde_json::json;
@@ -25,6 +26,7 @@ trait Place {
 
 struct Opened {
     store: Store,
+    bucket: SlowBucket,
 }
 
 impl Opened {
@@ -41,27 +43,30 @@ impl Opened {
     }
 
     async fn write(&self, writes: Vec<Write>) -> Result<(), WriteError> {
-        self.catalog().commit(Order::Write(writes)).await.map(|_| ())
+        self.store.write(writes).await
     }
 }
 
-/// SQLite in a store's folder.
-struct Sqlite(TempDir);
+/// SQLite in a store's folder, with blobs in a bucket.
+struct Sqlite(TempDir, SlowBucket);
 
 impl Place for Sqlite {
     async fn open(&self) -> Opened {
         // Another file under the lock's name keeps the operating system's lock out of the way: the epoch alone has to do.
         let _ = fs::remove_file(self.0.path().join("lock"));
-        Opened { store: common::open(self.0.path()).await }
+        let blobs = self.1.place("p", self.0.path());
+        Opened { store: common::open_over(self.0.path(), blobs).await, bucket: self.1.clone() }
     }
 }
 
 macro_rules! conformance {
     ($($name:ident),+ $(,)?) => {
         mod sqlite {
+            use super::SlowBucket;
+
             $(#[tokio::test]
             async fn $name() {
-                super::$name(&super::Sqlite(tempfile::tempdir().unwrap())).await;
+                super::$name(&super::Sqlite(tempfile::tempdir().unwrap(), SlowBucket::default())).await;
             })+
         }
     };
@@ -78,6 +83,9 @@ conformance![
     values_and_lines_that_come_twice_count_once,
     the_newest_attempt_takes_over_from_its_first_step,
     a_row_names_only_what_is_whole,
+    a_commit_waits_for_no_place_of_blobs,
+    what_a_collection_condemns_is_proven_anew,
+    what_a_row_has_named_is_known_to_be_present,
     a_step_has_one_state_and_a_policy_says_which_stay,
     the_first_value_of_a_key_stands,
     a_key_of_a_submission_is_one_runs,
@@ -318,6 +326,109 @@ async fn a_row_names_only_what_is_whole(place: &impl Place) {
     assert!(opened.records().models().await.unwrap().is_empty());
 }
 
+/// A commit that asked would wait as long as the bucket does.
+async fn a_commit_waits_for_no_place_of_blobs(place: &impl Place) {
+    let opened = place.open().await;
+    opened.write(vec![fence("r/s", 1)]).await.unwrap();
+    let made = artifact(opened.blobs(), ArtifactKind::Model, "made");
+    let names = || {
+        let grant = || grant("r/s", 1);
+        [
+            Order::Write(vec![Write::Checkpoint { grant: grant(), step: 1, manifest: made, metrics: BTreeMap::new() }]),
+            Order::Write(vec![Write::Shard { grant: grant(), output: made }]),
+            Order::Write(vec![result("key", made)]),
+            Order::Write(vec![version("m", made, 0.5)]),
+            Order::Pin { digest: made, reason: Some("a test".into()) },
+        ]
+    };
+    for order in names() {
+        let refused = opened.catalog().commit(order).await;
+        assert!(matches!(refused, Err(WriteError::Unproven { artifact }) if artifact == made), "{refused:?}");
+    }
+    assert!(opened.records().needs().await.unwrap().roots.is_empty());
+
+    let proof = opened.store.prove(made).await.unwrap();
+    opened.bucket.silence(true);
+    let before = opened.bucket.requests();
+    let others = [
+        promote(Pick::Number(1), None, &[]),
+        Order::Promote(PromoteOrder {
+            model: "m".into(),
+            alias: Alias::new("staging"),
+            to: Which::Artifact(made),
+            expect: None,
+            require: Vec::new(),
+            reason: "a test".into(),
+            actor: "tester".into(),
+        }),
+        Order::BeginCollection,
+        Order::Condemn(vec![made, Digest::of(b"other")]),
+        Order::PruneCheckpoints { task: "r/s".into(), keep: Keep::default() },
+        Order::Pin { digest: made, reason: None },
+    ];
+    for order in names().into_iter().chain(others) {
+        let what = format!("{order:?}");
+        let committing = tokio::time::timeout(std::time::Duration::from_secs(20), opened.catalog().commit(order));
+        committing.await.unwrap_or_else(|_| panic!("waits for the bucket: {what}")).unwrap();
+    }
+    assert!(opened.bucket.requests() <= before + 4, "the lease alone asks");
+    drop(proof);
+    opened.bucket.silence(false);
+}
+
+async fn what_a_collection_condemns_is_proven_anew(place: &impl Place) {
+    let opened = place.open().await;
+    let commit = async |order| opened.catalog().commit(order).await;
+    let made = artifact(opened.blobs(), ArtifactKind::Vae, "made");
+    let file = Digest::of(b"made");
+    let proof = opened.store.prove(made).await.unwrap();
+    commit(Order::BeginCollection).await.unwrap();
+    match commit(Order::Condemn(vec![file])).await.unwrap() {
+        Done::Condemned(taken) => assert_eq!(taken, [file]),
+        done => panic!("{done:?}"),
+    }
+    let named = || Order::Write(vec![result("key", made)]);
+    assert!(matches!(commit(named()).await, Err(WriteError::Unproven { .. })), "its file is about to go");
+    assert!(opened.records().needs().await.unwrap().roots.is_empty());
+    drop(proof);
+
+    // A row that is there first keeps the blobs, what the manifest mentions and what it was made of.
+    let other = artifact(opened.blobs(), ArtifactKind::Vae, "other");
+    let _proof = opened.store.prove(other).await.unwrap();
+    commit(Order::Write(vec![result("other", other)])).await.unwrap();
+    let needed = vec![other, Digest::of(b"other"), Digest::of(b"data")];
+    match commit(Order::Condemn(needed)).await.unwrap() {
+        Done::Condemned(taken) => assert!(taken.is_empty(), "{taken:?}"),
+        done => panic!("{done:?}"),
+    }
+}
+
+async fn what_a_row_has_named_is_known_to_be_present(place: &impl Place) {
+    const FILES: usize = 40;
+    let opened = place.open().await;
+    let mut manifest = Manifest::new(ArtifactKind::Vae, json!({}));
+    for i in 0..FILES {
+        let digest = opened.blobs().put(format!("file {i}").as_bytes()).unwrap();
+        manifest.files.insert(i.to_string(), FileEntry { digest, bytes: format!("file {i}").len() as u64 });
+    }
+    let made = opened.blobs().put(&manifest.to_bytes()).unwrap();
+    let listed: Vec<Digest> = manifest.files.values().map(|file| file.digest).collect();
+    let all = [&[made, Digest::of(b"never put")], &listed[..]].concat();
+    assert!(opened.records().present(&all).await.unwrap().is_empty());
+    opened.write(vec![result("key", made)]).await.unwrap();
+    drop(opened);
+    let opened = place.open().await;
+    let known = opened.records().present(&all).await.unwrap();
+    assert_eq!((known.len(), known.get(&Digest::of(b"file 0"))), (FILES + 1, Some(&6)));
+    // The manifest is read again, and nothing that it lists is asked for.
+    let before = opened.bucket.requests();
+    drop(opened.store.prove(made).await.unwrap());
+    let asked = opened.bucket.requests() - before;
+    assert!(asked < FILES as u64 / 2, "{asked}");
+    opened.catalog().commit(Order::Condemn(all.clone())).await.unwrap();
+    assert!(opened.records().present(&all).await.unwrap().is_empty(), "nobody relies on it any more");
+}
+
 async fn a_step_has_one_state_and_a_policy_says_which_stay(place: &impl Place) {
     let opened = place.open().await;
     opened.write(vec![fence("r/s", 1)]).await.unwrap();
@@ -515,7 +626,7 @@ async fn needs_name_every_row_that_names_a_blob(place: &impl Place) {
         ])
         .await
         .unwrap();
-    opened.catalog().commit(Order::Pin { digest: pinned, reason: Some("kept".into()) }).await.unwrap();
+    opened.store.pin(pinned, "kept").await.unwrap();
     let needs = opened.records().needs().await.unwrap();
     let found: BTreeSet<_> = needs.roots.iter().map(|root| root.digest).collect();
     assert_eq!(found, [checkpoint, shard, value, model, pinned].into());

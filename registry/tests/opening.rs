@@ -91,7 +91,7 @@ async fn a_read_only_place_is_refused_as_such() {
     std::fs::create_dir(&closed).unwrap();
     std::fs::set_permissions(&closed, std::fs::Permissions::from_mode(0o555)).unwrap();
     if std::fs::write(closed.join("probe"), b"").is_ok() {
-        eprintln!("SKIPPED in part: this user may write everywhere, so folder permissions say nothing");
+        fixtures::skip("this user may write everywhere, so folder permissions say nothing");
         return;
     }
     let error = Store::open(&closed.join("store"), Holder::this_process("t")).await.unwrap_err();

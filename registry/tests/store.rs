@@ -179,6 +179,9 @@ async fn a_row_may_not_name_what_is_not_there() {
     let whole = artifact(store.blobs(), ArtifactKind::Checkpoint, "content");
     let content = Digest::of(b"content").hex();
     std::fs::remove_file(dir.path().join("blobs/sha256").join(&content[..2]).join(&content[2..])).unwrap();
+    // By another process, which has not stored it itself a moment ago.
+    drop(store);
+    let store = open(dir.path()).await;
     let incomplete = store.write(vec![checkpoint(whole)]).await.unwrap_err();
     assert!(incomplete.to_string().contains("lists `content`"), "{incomplete}");
 

@@ -99,11 +99,47 @@ fn another_user_gets_nothing_from_a_run() {
             assert_eq!(as_other("cat", &[&format!("/proc/{pid}/environ")]), None);
         }
     } else {
-        eprintln!("SKIPPED: only root can try the files as another user; their modes were checked");
+        fixtures::skip("only root can try the files as another user; their modes were checked");
     }
     println!("{} routes and {} files tried", routes.len(), all.len());
 
     run.signal(Signal::SIGINT);
     run.wait();
     assert!(!bench.store().join("token").exists(), "the token goes with its run");
+}
+
+/// `kill -HUP` has the token file read again; a broken one changes nothing.
+#[test]
+fn a_token_is_revoked_without_a_restart() {
+    let bench = Bench::new(TRAINER);
+    let (tokens, log) = (bench.path().join("tokens"), bench.path().join("serve.log"));
+    let write = |text: &str| {
+        fs::write(&tokens, text).expect("written");
+        fs::set_permissions(&tokens, fs::Permissions::from_mode(0o600)).expect("ours");
+    };
+    let lines = ["alice read 0123456789abcdef-alice", "bob read 0123456789abcdef-bob"];
+    write(&lines.join("\n"));
+    let serve = ["serve", "--bind", "127.0.0.1:0", "--token-file", "tokens"];
+    let mut server = Running::logged(bench.command(&serve).env_remove("STRIDE_TOKEN"), &log);
+    let said = || fs::read_to_string(&log).unwrap_or_default();
+    let address = wait_for("the server to listen", || {
+        assert!(server.alive(), "{}", said());
+        Some(said().split_once("listening on http://")?.1.split_once(' ')?.0.to_owned())
+    });
+    let may = |name: &str| {
+        ask(&address, "GET", "/v1/runs", &format!("authorization: Bearer 0123456789abcdef-{name}\r\n")) == Some(200)
+    };
+    assert!(may("alice") && may("bob"));
+    write(&format!("{}\nbob nonsense 0123456789abcdef-bob\n", lines[0]));
+    server.signal(Signal::SIGHUP);
+    wait_for("the server to name the mistake", || said().contains("`nonsense` is no scope").then_some(()));
+    assert!(may("alice") && may("bob"), "the table stays as it was");
+    write(lines[0]);
+    server.signal(Signal::SIGHUP);
+    wait_for("the line to be gone", || (!may("bob")).then_some(()));
+    assert!(may("alice"));
+    server.signal(Signal::SIGTERM);
+    assert_eq!(server.wait().code, Some(0));
+    let audit = bench.run(&["registry", "audit"]).expect_code(0).stdout;
+    assert!(audit.contains("alice") && audit.contains("401"), "{audit}");
 }

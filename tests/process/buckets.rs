@@ -47,7 +47,7 @@ fn a_run_on_a_bucket_that_is_killed_and_goes_on_gives_the_digests_of_a_folder() 
 #[test]
 fn the_quickstart_on_a_bucket_gives_the_digests_of_a_folder() {
     if std::env::var_os("STRIDE_LONG_TESTS").is_none() {
-        eprintln!("SKIPPED: the quickstart on a bucket (set STRIDE_LONG_TESTS=1)");
+        fixtures::skip("the quickstart on a bucket (set STRIDE_LONG_TESTS=1)");
         return;
     }
     let trainer = std::env::var("TRAINER").unwrap_or_else(|_| TRAINER.to_owned());

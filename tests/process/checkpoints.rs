@@ -131,7 +131,7 @@ fn a_checkpoint_is_in_memory_once() {
     if std::env::var_os("STRIDE_LONG_TESTS").is_some() {
         a_checkpoint_of("1024, layers: 5, feed_forward: 2048");
     } else {
-        eprintln!("SKIPPED: the memory of a checkpoint of 1.6 GB (set STRIDE_LONG_TESTS=1)");
+        fixtures::skip("the memory of a checkpoint of 1.6 GB (set STRIDE_LONG_TESTS=1)");
     }
 }
 

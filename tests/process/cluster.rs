@@ -5,10 +5,11 @@ use std::path::PathBuf;
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use cluster_tests::cluster::{Cluster, TOKEN, stage_of};
+use cluster_tests::cluster::{Cluster, TOKEN, WORKER_TOKEN, stage_of};
 use cluster_tests::network::{Network, SlowLine};
 use cluster_tests::{Bench, Running, digests, wait_for};
 use nix::sys::signal::Signal;
+use protocol::proof::{GRANT_HEADER, SECRET_HEADER};
 use serde_json::{Value, json};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
@@ -115,7 +116,7 @@ fn p4_the_coordinator_is_killed_and_away_for_a_while() {
     if std::env::var_os("STRIDE_LONG_TESTS").is_some() {
         coordinator_away(Duration::from_secs(60));
     } else {
-        eprintln!("SKIPPED: 60 s without a coordinator (set STRIDE_LONG_TESTS=1)");
+        fixtures::skip("60 s without a coordinator (set STRIDE_LONG_TESTS=1)");
     }
 }
 
@@ -204,7 +205,7 @@ fn network_cut(how_long: Duration, sets: &[&str], expected: &(Value, Curves), ou
 fn p4_a_worker_that_is_cut_off_is_gone_without_and_comes_back_by_itself() {
     network_cut(Duration::from_secs(19), &VAE, reference(), false);
     if std::env::var_os("STRIDE_LONG_TESTS").is_none() {
-        eprintln!("SKIPPED: a network cut of 30 s (set STRIDE_LONG_TESTS=1)");
+        fixtures::skip("a network cut of 30 s (set STRIDE_LONG_TESTS=1)");
         return;
     }
     // Long enough for a gang of three, whatever this machine does in a second.
@@ -220,20 +221,22 @@ fn p4_a_worker_that_is_cut_off_is_gone_without_and_comes_back_by_itself() {
 #[test]
 fn p2_a_worker_that_slept_past_its_lease_writes_nothing() {
     let mut cluster = Cluster::start(TRAINER);
-    cluster.join("a");
+    let secret = "the-secret-of-worker-a-known-to-this-test";
+    cluster.join_by("a", &["env".to_owned(), format!("STRIDE_WORKER_SECRET={secret}")], &[]);
     let sets = [&VAE[..], &["--set", "stages.vae.workers={min: 1, max: 1}"]].concat();
     let run = cluster.submit(&config(), &sets);
     cluster.wait_step(&run, "vae", 20);
     // What the worker holds, as it would be told itself.
     let workers = cluster.get("/v1/workers").expect("the coordinator is there");
-    let orders = cluster
-        .post(
-            "/v1/workers/a/poll",
-            &json!({"incarnation": workers[0]["incarnation"], "doing": [], "ready": [], "version": 0}),
-        )
-        .expect("answered");
+    let post = |cluster: &Cluster, secret: &str, path: &str, body: &Value| {
+        let headers = [("content-type", "application/json"), (SECRET_HEADER, secret)];
+        cluster.call_as(WORKER_TOKEN, "POST", path, &headers, body.to_string().as_bytes()).expect("answered")
+    };
+    let poll = json!({"incarnation": workers[0]["incarnation"], "doing": [], "ready": [], "version": 0});
+    let orders = post(&cluster, secret, "/v1/workers/a/poll", &poll);
     let grant = orders.body["assignments"][0]["grant"].clone();
     assert_eq!(grant["worker"], "a", "{:?}", orders.body);
+    let secret = orders.body["assignments"][0]["secret"].as_str().expect("the grant's secret").to_owned();
     cluster.signal("a", Signal::SIGSTOP);
     let stopped = Instant::now();
     cluster.join("b");
@@ -266,15 +269,18 @@ fn p2_a_worker_that_slept_past_its_lease_writes_nothing() {
         ),
     ];
     for (path, body) in &writes {
-        let reply = cluster.post(path, body).expect("answered");
+        let reply = post(&cluster, &secret, path, body);
         assert_eq!((reply.status, reply.body["code"].as_str()), (409, Some("stale-fence")), "{path}: {:?}", reply.body);
+        let forged = post(&cluster, "", path, body);
+        assert_eq!((forged.status, forged.body["code"].as_str()), (403, Some("unproven")), "{path}: {:?}", forged.body);
     }
     let forged = format!("forged by {}", std::process::id());
     let reply = cluster
-        .call(
+        .call_as(
+            WORKER_TOKEN,
             "PUT",
             &format!("/v1/blobs/sha256:{}", "0".repeat(64)),
-            &[("x-stride-grant", &grant.to_string())],
+            &[(GRANT_HEADER, &grant.to_string()), (SECRET_HEADER, &secret)],
             forged.as_bytes(),
         )
         .expect("answered");
@@ -581,6 +587,61 @@ fn p4_a_slow_joiner_holds_nobody_up() {
         assert!(cluster.stage(&run, "vae")["state"] == "running", "the stage was over too early to tell");
         cluster.said("w2").contains("adopts=true").then_some(())
     });
+    let view = cluster.wait_end(&run);
+    assert_eq!(stage_of(&view, "vae")["attempt"], 1);
+    cluster.fsck();
+}
+
+/// Sampled: a worker to whose peer port nobody can connect trains alone, with nothing saved; another one joins the cluster. The first keeps
+/// its steps and its rate.
+#[test]
+fn p20_a_worker_that_refuses_its_peers_keeps_its_steps_and_its_rate() {
+    let sets = [
+        "--set",
+        "stages.vae.steps=1500",
+        "--set",
+        "stages.vae.windows.until=1",
+        "--set",
+        "stages.vae.checkpoint.every=0",
+        "--until",
+        "vae",
+    ];
+    let mut cluster = Cluster::start(TRAINER);
+    // It listens on the other kind of address alone.
+    let port = Cluster::free_address().port();
+    cluster.join_by("w1", &[], &["--peer-address", &format!("[::1]:{port}")]);
+    let run = cluster.submit(&config(), &sets);
+    let at = |cluster: &Cluster| {
+        let stage = cluster.stage(&run, "vae");
+        (stage["progress"]["done"].as_u64().unwrap_or_default(), stage["attempt"].clone(), stage["workers"].clone())
+    };
+    // Steps in so many seconds, none of which goes back.
+    let rate = |cluster: &Cluster, seconds: u64| {
+        let (begun, first) = (Instant::now(), at(cluster).0);
+        let mut last = first;
+        while begun.elapsed() < Duration::from_secs(seconds) {
+            let (done, attempt, _) = at(cluster);
+            assert!(
+                done >= last && attempt == 1,
+                "step {last} became {done} in attempt {attempt}\n{}",
+                cluster.everything()
+            );
+            last = done;
+            std::thread::sleep(Duration::from_millis(100));
+        }
+        (last - first) as f64 / begun.elapsed().as_secs_f64()
+    };
+    cluster.wait_step(&run, "vae", 50);
+    let alone = rate(&cluster, 8);
+    cluster.join("w2");
+    wait_for("the second worker to be there", || {
+        let workers = cluster.get("/v1/workers")?;
+        workers.as_array()?.iter().any(|worker| worker["worker"] == "w2").then_some(())
+    });
+    let beside = rate(&cluster, 15);
+    eprintln!("{alone:.1} steps a second alone, {beside:.1} beside a worker that cannot reach it");
+    assert!(beside >= 0.8 * alone, "{beside:.1} steps a second, {alone:.1} alone\n{}", cluster.everything());
+    assert_eq!(at(&cluster).2, json!(["w1"]));
     let view = cluster.wait_end(&run);
     assert_eq!(stage_of(&view, "vae")["attempt"], 1);
     cluster.fsck();

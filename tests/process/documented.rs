@@ -7,7 +7,7 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use cluster_tests::documented::{shell_lines, words};
+use cluster_tests::documented::{self, shell_lines, words};
 use cluster_tests::{Bench, PATIENCE, Running, wait_for};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
@@ -60,7 +60,7 @@ fn bash(dir: &Path, preamble: &str, line: &str) -> Command {
 fn has_openssl() -> bool {
     let found = Command::new("openssl").arg("version").output().is_ok_and(|output| output.status.success());
     if !found {
-        eprintln!("SKIPPED: the documented commands make a certificate with openssl, which is not here");
+        fixtures::skip("the documented commands make a certificate with openssl, which is not here");
     }
     found
 }
@@ -119,7 +119,7 @@ fn the_units_of_systemd() {
     let bench = Bench::new(TRAINER);
     let dir = bench.path();
     let root = dir.join("root");
-    for folder in ["etc/stride", "var/lib/stride", "usr/local"] {
+    for folder in ["etc/stride", "var/lib/stride/data", "usr/local"] {
         fs::create_dir_all(root.join(folder)).expect("a folder");
     }
     let bin = programs(dir);
@@ -165,7 +165,7 @@ fn the_units_of_systemd() {
         .map(|(name, value)| (name.to_owned(), here(value)))
         .filter(|(name, _)| name.starts_with("STRIDE_"))
         .collect();
-    assert_eq!(environment.len(), 3, "{environment:?}");
+    assert_eq!(environment.len(), 4, "{environment:?}");
     let mut join = start(&worker["ExecStart"], &environment, "worker.log");
 
     let url = format!("https://localhost:{port}");
@@ -238,4 +238,83 @@ fn the_container_file_builds_what_there_is() {
     let serve: Vec<&str> = serve.iter().map(String::as_str).collect();
     let said = bench.run(&serve).expect_code(2);
     assert!(said.stderr.contains("/etc/stride/tokens"), "it wants the file that the comment mounts: {}", said.stderr);
+}
+
+/// Plans every pipeline that a document shows, and every one that is shipped.
+#[test]
+fn every_pipeline_of_the_documents_and_of_configs_can_be_planned() {
+    let root = Bench::repository();
+    let bench = Bench::new(TRAINER);
+    let mut planned = 0;
+    let mut plan = |place: &str, path: &Path| {
+        let path = path.display().to_string();
+        let said = bench.run(&["plan", "--no-time", &path]);
+        assert!(said.code == Some(0), "{place}: {}", said.stderr);
+        planned += 1;
+    };
+    for document in documented::all(&root) {
+        for (line, text) in documented::pipelines(&document) {
+            let path = bench.path().join("shown.yaml");
+            fs::write(&path, text).expect("written");
+            plan(&format!("{}:{line}", document.display()), &path);
+        }
+    }
+    for folder in ["configs", "docs/results"] {
+        for entry in fs::read_dir(root.join(folder)).expect("a folder") {
+            let path = entry.expect("an entry").path();
+            if path.extension().is_some_and(|extension| extension == "yaml") {
+                plan(&path.display().to_string(), &path);
+            }
+        }
+    }
+    assert!(planned >= 30, "only {planned} pipelines were found");
+}
+
+#[test]
+fn a_version_says_what_was_built_and_under_which_licence() {
+    let bench = Bench::new(TRAINER);
+    let said = bench.run(&["--version"]).expect_code(0).stdout;
+    let line = said.lines().next().expect("a line");
+    assert!(line.starts_with(&format!("trainer {} (", env!("CARGO_PKG_VERSION"))), "{line}");
+    assert!(line.contains("debug build;") || line.contains("commit "), "{line}");
+    assert!(line.contains("features: ") && line.contains("flex"), "{line}");
+    assert!(line.contains("licence: MIT OR Apache-2.0"), "{line}");
+    let root = Bench::repository();
+    let readme = fs::read_to_string(root.join("README.md")).expect("a README");
+    for (name, words) in [("LICENSE-MIT", "Permission is hereby granted"), ("LICENSE-APACHE", "Apache License")] {
+        let text = fs::read_to_string(root.join(name)).expect("a licence");
+        assert!(text.contains(words) && readme.contains(&format!("]({name})")), "{name}");
+    }
+}
+
+/// What needs no model, of the examples that `--help` shows, and what they write.
+#[test]
+fn a_shell_and_a_manual_get_what_they_read() {
+    let bench = Bench::new(TRAINER);
+    for (shell, part) in [("bash", "complete -F"), ("zsh", "#compdef trainer"), ("fish", "complete -c trainer")] {
+        let script = bench.run(&["completions", shell]).expect_code(0).stdout;
+        assert!(script.contains(part) && script.contains("generate"), "{shell}: {} bytes", script.len());
+    }
+    bench.run(&["man", "pages"]).expect_code(0);
+    for page in ["trainer.1", "trainer-run.1", "trainer-worker-join.1"] {
+        let text = fs::read_to_string(bench.path().join("pages").join(page)).expect("a page");
+        assert!(text.contains(".TH"), "{page}");
+    }
+}
+
+#[test]
+fn a_doctor_says_what_is_missing_and_what_to_do() {
+    let bench = Bench::new(TRAINER);
+    let said = bench.run(&["doctor"]).expect_code(0).stdout;
+    assert!(said.contains("warn  store    there is none in `.stride`; `trainer run PIPELINE` makes one"), "{said}");
+    assert!(said.contains("ok    device   `flex`") && said.contains("  disk  "), "{said}");
+    bench.run(&["run", &Bench::config("smoke.yaml"), "--until", "dataset", "--workers", "1"]).expect_code(0);
+    let said = bench.run(&["doctor", "-o", "json"]).expect_code(0).json();
+    let findings = said["findings"].as_array().expect("findings");
+    let store = findings.iter().find(|finding| finding["what"] == "store").expect("the store");
+    assert_eq!((&store["state"], &store["hint"]), (&"ok".into(), &serde_json::Value::Null));
+    let said = bench.run(&["doctor", "--server", "http://127.0.0.1:1"]).expect_code(1).stdout;
+    let line = said.lines().find(|line| line.contains("server")).expect("the server");
+    assert!(line.starts_with("FAIL") && line.contains("trainer serve"), "{line}");
+    assert!(bench.path().read_dir().expect("a folder").count() == 1, "it writes nothing but what the run wrote");
 }

@@ -40,7 +40,7 @@ fn check(bench: &Bench, said: Said, reason: &str) {
 #[test]
 fn p15_a_worker_whose_allocation_is_refused_is_final() {
     if Command::new("prlimit").arg("--version").output().is_err() {
-        eprintln!("SKIPPED: `prlimit` bounds a worker's memory here and is not there");
+        fixtures::skip("`prlimit` bounds a worker's memory here and is not there");
         return;
     }
     let bench = Bench::new(TRAINER);
@@ -73,7 +73,7 @@ impl Group {
                 return Some(group);
             }
         }
-        eprintln!("SKIPPED: a worker that the kernel kills for want of memory needs root and control groups");
+        fixtures::skip("a worker that the kernel kills for want of memory needs root and control groups");
         None
     }
 }
@@ -122,7 +122,7 @@ fn p15_workers_of_a_machine_share_a_dataset() {
     let is_long = std::env::var_os("STRIDE_LONG_TESTS").is_some();
     let (clips, workers, own_mb) = if is_long { (42_000, 16, 400) } else { (550, 3, 40) };
     if !is_long {
-        eprintln!("SKIPPED: sixteen workers on a dataset of 4 GB (set STRIDE_LONG_TESTS=1)");
+        fixtures::skip("sixteen workers on a dataset of 4 GB (set STRIDE_LONG_TESTS=1)");
     }
     let bench = Bench::new(TRAINER);
     let pipeline = format!(

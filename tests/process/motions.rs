@@ -42,6 +42,20 @@ pub(crate) fn are_written(bench: &Bench) {
     let empty = bench.run(&[&["generate", "", "-o", "e.npy"][..], &model].concat()).expect_code(0);
     assert!(empty.stderr.contains("the sentence is empty"), "{}", empty.stderr);
 
+    // Words that training never had.
+    let unknown =
+        bench.run(&["generate", "quantum flapdoodle", "--model", "smoke@staging", "-o", "u.npy", "-o", "json"]);
+    let row = unknown.json();
+    assert_eq!((&row["known"], &row["unknown_words"]), (&false.into(), &serde_json::json!(["quantum", "flapdoodle"])));
+    for part in ["never saw `quantum`, `flapdoodle`", "nearest known: \""] {
+        assert!(unknown.stderr.contains(part), "{}", unknown.stderr);
+    }
+    let partly = bench.run(&["generate", "a flapdoodle", "--stage", "mld", "-o", "u.npy", "-o", "json"]).json();
+    assert_eq!((&partly["known"], &partly["unknown_words"]), (&true.into(), &serde_json::json!(["flapdoodle"])));
+    let far =
+        bench.run(&["generate", "a", "--model", "smoke@staging", "--guidance", "40", "-o", "u.npy"]).expect_code(0);
+    assert!(far.stderr.contains("was trained for guidance 0.5 to 5; at 40"), "{}", far.stderr);
+
     // Another form, and back.
     let said = bench.run(&["export", "p-01.npy", "-o", "x.bvh", "-o", "x.glb", "-o", "json"]).expect_code(0);
     let off = lines(&said)[0]["skeleton_error_m"].as_f64().expect("how far off");
@@ -75,7 +89,10 @@ pub(crate) fn are_written(bench: &Bench) {
     for (line, words) in [
         (&["generate", "x", "--model", "smoke@staging", "-o", "x.fbx"][..], "ends in .bvh, .glb"),
         (&["generate", "x", "--model", "smoke@staging", "-o", "none/x.glb"], "there is no folder `none`"),
-        (&["generate", "x", "y", "--frames", "40,44,48", "--model", "smoke@staging", "-o", "x.npy"], "3 lengths for 2"),
+        (
+            &["generate", "x x", "y y", "--frames", "40,44,48", "--model", "smoke@staging", "-o", "x.npy"],
+            "3 lengths for 2",
+        ),
         (&["generate", "--captions", "none.txt", "--model", "smoke@staging", "-o", "x.npy"], "none.txt"),
         (&["export", "m.html", "-o", "x.npy"], "an array, .npy, or a recording, .bvh"),
         (&["export", "lines.jsonl", "-o", "x.npy"], "an array, .npy"),

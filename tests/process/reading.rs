@@ -41,7 +41,7 @@ fn read_everything(bench: &Bench, finished: &str, interrupted: &str) {
         (&*format!("status {interrupted} -o json"), 0),
         ("logs", 0),
         (&*format!("logs {interrupted} --stage vae --follow"), 0),
-        ("sweep status", 3),
+        ("sweep status", 7),
         ("worker list", 0),
         (&*format!("plan {config}"), 0),
         ("registry list", 0),
@@ -52,9 +52,9 @@ fn read_everything(bench: &Bench, finished: &str, interrupted: &str) {
         ("registry fsck", 0),
         (&*format!("time smoke@best --stage mld --run {finished} --sentences 1"), 0),
         (&*format!("submit {config}"), 2),
-        ("resume nobody", 3),
-        ("pause nobody", 3),
-        ("cancel nobody", 3),
+        ("resume nobody", 7),
+        ("pause nobody", 7),
+        ("cancel nobody", 7),
     ] {
         bench.run(&line.split(' ').collect::<Vec<_>>()).expect_code(code);
         assert_eq!(state(), before, "`trainer {line}` changed a file");
@@ -98,7 +98,7 @@ fn reading_a_store_that_nobody_holds_changes_nothing() {
     assert_eq!(killed.wait().code, None);
 
     assert!(fs::metadata(bench.store().join("stride.db-wal")).expect("a log").len() > 0);
-    assert_eq!(state(&bench, "@last"), [&*interrupted, "paused", "ready"], "nobody works on it");
+    assert_eq!(state(&bench, "@last"), [&*interrupted, "interrupted", "ready"], "nobody works on it");
     assert_eq!(state(&bench, &finished), [&*finished, "finished", "ran"]);
     let logs = bench.run(&["logs"]).expect_code(0).stdout;
     assert!(logs.starts_with("dataset w1 "), "{logs}");
@@ -108,7 +108,7 @@ fn reading_a_store_that_nobody_holds_changes_nothing() {
     assert_eq!(again, interrupted);
     resumed.signal(Signal::SIGINT);
     resumed.wait().expect_code(130);
-    assert_eq!(state(&bench, "@last"), [&*interrupted, "paused", "ready"]);
+    assert_eq!(state(&bench, "@last"), [&*interrupted, "interrupted", "ready"]);
     read_everything(&bench, &finished, &interrupted);
 }
 

@@ -27,13 +27,7 @@ stages:
 
 /// The fixture, whose sizes are those of the recipe but for widths.
 fn checkpoint() -> Option<PathBuf> {
-    let root = std::env::var_os("STRIDE_SHARED").map_or_else(|| Bench::repository().join("../shared"), PathBuf::from);
-    let file = root.join("data/parity/02_control_v2_lcm/weights.ckpt");
-    if !file.exists() {
-        eprintln!("SKIPPED: no fixture {} (set STRIDE_SHARED)", file.display());
-        return None;
-    }
-    Some(file)
+    fixtures::data("parity/02_control_v2_lcm/weights.ckpt")
 }
 
 /// A folder with a mean and a deviation of HumanML3D's features.

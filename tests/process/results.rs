@@ -51,7 +51,7 @@ fn regenerate(dir: &Path, store: &Path, tables: &Path) -> String {
 fn tables_are_made_from_a_run_and_again_from_what_it_stored() {
     let tables = Path::new(TRAINER).with_file_name("tables");
     if !tables.exists() {
-        eprintln!("SKIPPED: no {}; build it with `cargo build --bin tables`", tables.display());
+        fixtures::skip(&format!("no {}; build it with `cargo build --bin tables`", tables.display()));
         return;
     }
     let bench = Bench::new(TRAINER);

@@ -87,7 +87,7 @@ fn p19_a_sweep_decides_the_same_with_other_workers_and_when_it_is_killed() {
     );
     let best_said = bench.run(&["sweep", "best", "-o", "json"]).expect_code(0).json();
     assert_eq!(best_said["best"][0]["values"], best["values"]);
-    bench.run(&["sweep", "best", "--stage", "lcm"]).expect_code(3);
+    bench.run(&["sweep", "best", "--stage", "lcm"]).expect_code(7);
 }
 
 #[test]

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::io::{self, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
@@ -15,6 +16,8 @@ use crate::{Bench, PATIENCE, Running, signal, wait_for, wait_within};
 
 /// What the coordinator wants to be shown.
 pub const TOKEN: &str = "a-token-of-tests-only";
+/// The token of all workers, which allows nothing else.
+pub const WORKER_TOKEN: &str = "a-token-of-workers-of-tests-only";
 /// The least time of a training step, in milliseconds: 400 steps take ten seconds on the fastest machine, and a test finds a middle.
 const PACE: &str = "25";
 
@@ -97,9 +100,13 @@ impl Cluster {
                 let mut command = Command::new(first);
                 command.args(rest).arg(trainer.get_program()).args(trainer.get_args());
                 command.current_dir(self.bench.path()).stdin(Stdio::null()).env("NO_COLOR", "1");
-                command.env("STRIDE_TOKEN", TOKEN);
                 command
             }
+        };
+        match arguments.first() {
+            Some(&"worker") => command.env("STRIDE_TOKEN", WORKER_TOKEN),
+            // The server has a file of both.
+            _ => command.env_remove("STRIDE_TOKEN"),
         };
         command.env("STRIDE_WORKER_PACE", PACE);
         Running::logged(&mut command, &self.log(who))
@@ -108,7 +115,11 @@ impl Cluster {
     /// Starts the coordinator, again if it was there before, and waits until it answers.
     pub fn serve(&mut self) {
         let address = self.address.to_string();
-        let mut arguments = vec!["serve", "--bind", &address];
+        let tokens = self.bench.path().join("tokens");
+        fs::write(&tokens, format!("admin admin {TOKEN}\nworkers worker {WORKER_TOKEN}\n")).expect("a token file");
+        fs::set_permissions(&tokens, fs::Permissions::from_mode(0o600)).expect("ours");
+        let tokens = tokens.display().to_string();
+        let mut arguments = vec!["serve", "--bind", &address, "--token-file", &tokens];
         if !self.address.ip().is_loopback() {
             arguments.push("--insecure");
         }
@@ -155,6 +166,10 @@ impl Cluster {
         if !self.address.ip().is_loopback() {
             arguments.push("--insecure");
         }
+        let folder = self.bench.path().display().to_string();
+        if !more.contains(&"--data-root") {
+            arguments.extend(["--data-root", &folder]);
+        }
         let worker = self.spawn(name, wrap, &arguments);
         if let Some(mut old) = self.workers.insert(name.to_owned(), worker) {
             assert!(!old.alive(), "worker {name} was replaced while it ran");
@@ -191,10 +206,22 @@ impl Cluster {
 
     /// One call; an error if nobody answers.
     pub fn call(&self, method: &str, path: &str, headers: &[(&str, &str)], body: &[u8]) -> io::Result<Reply> {
+        self.call_as(TOKEN, method, path, headers, body)
+    }
+
+    /// The same with another token.
+    pub fn call_as(
+        &self,
+        token: &str,
+        method: &str,
+        path: &str,
+        headers: &[(&str, &str)],
+        body: &[u8],
+    ) -> io::Result<Reply> {
         let mut stream = TcpStream::connect_timeout(&self.address, Duration::from_secs(5))?;
         stream.set_read_timeout(Some(Duration::from_secs(30)))?;
         let mut head = format!("{method} {path} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n");
-        head += &format!("authorization: Bearer {TOKEN}\r\n");
+        head += &format!("authorization: Bearer {token}\r\n");
         for (name, value) in headers {
             head += &format!("{name}: {value}\r\n");
         }

@@ -32,7 +32,9 @@ impl Disk {
         match disk.mount() {
             Ok(()) => Some(disk),
             Err(error) => {
-                eprintln!("SKIPPED: a disk that fills up or pauses needs root, `mkfs.ext4` and a loop device: {error}");
+                fixtures::skip(&format!(
+                    "a disk that fills up or pauses needs root, `mkfs.ext4` and a loop device: {error}"
+                ));
                 None
             }
         }

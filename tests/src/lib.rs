@@ -10,6 +10,7 @@ pub mod documented;
 pub mod imports;
 pub mod mounted;
 pub mod network;
+pub mod supply;
 pub mod tables;
 
 use std::collections::BTreeMap;

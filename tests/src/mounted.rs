@@ -16,7 +16,7 @@ impl Mounted {
         if done.is_ok_and(|output| output.status.success()) {
             Some(Self(path.to_owned()))
         } else {
-            eprintln!("SKIPPED: this test mounts a small file system and needs root");
+            fixtures::skip("this test mounts a small file system and needs root");
             None
         }
     }

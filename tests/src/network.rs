@@ -37,7 +37,7 @@ impl Network {
         match made.and_then(|network| network.build().map(|()| network)) {
             Ok(network) => Some(network),
             Err(error) => {
-                eprintln!("SKIPPED: network cuts need root and `ip netns`: {error}");
+                fixtures::skip(&format!("network cuts need root and `ip netns`: {error}"));
                 None
             }
         }
@@ -81,7 +81,16 @@ impl Network {
     /// What comes to host `i` comes at so many kilobits a second from now on. False, loudly, where `tc` cannot do that.
     pub fn slow_down(&self, i: usize, kilobits: u32) -> bool {
         let shape = format!("qdisc add dev sv{}-{i} root tbf rate {kilobits}kbit burst 32kb latency 400ms", self.id);
-        tool("tc", &shape).map_err(|error| eprintln!("SKIPPED: a slow link: {error}")).is_ok()
+        tool("tc", &shape).map_err(|error| fixtures::skip(&format!("a slow link: {error}"))).is_ok()
+    }
+
+    /// Nothing that host `i` sends reaches the other hosts, while it hears them and the coordinator hears it; or so no more.
+    pub fn mute(&self, i: usize, is_mute: bool) {
+        let (verb, space) = (if is_mute { "add" } else { "del" }, self.space(i));
+        for other in (0..self.hosts).filter(|other| *other != i) {
+            ip(&format!("-n {space} route {verb} blackhole 10.77.{}.{}/32", self.id, other + 2))
+                .unwrap_or_else(|e| panic!("{e}"));
+        }
     }
 
     /// The host is back, and so are its connections.

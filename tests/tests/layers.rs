@@ -2,7 +2,7 @@
 //! need each other.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use cluster_tests::{Bench, imports};
@@ -82,6 +82,49 @@ fn dependencies_point_one_way() {
     never("models", &["tokio", "sqlx", "axum", "reqwest", "registry", "checkpoint", "stages"]);
     never("stages", &["sqlx", "axum", "reqwest", "registry", "coordinator", "worker"]);
     never("worker", &["sqlx", "coordinator", "registry"]);
+}
+
+/// The code of a crate's files without their tests.
+fn sources(folder: &Path) -> Vec<(PathBuf, String)> {
+    let entries = std::fs::read_dir(folder).expect("a folder").map(|entry| entry.expect("an entry").path());
+    let found = entries.flat_map(|path| match path.is_dir() {
+        true => sources(&path),
+        false => {
+            let text = std::fs::read_to_string(&path).expect("a source file");
+            let code = text.split("#[cfg(test)]").next().unwrap_or_default().to_owned();
+            vec![(path, code)]
+        }
+    });
+    found.collect()
+}
+
+/// A stage reads a file of its settings through `stages::external` alone, which holds it to the worker's data roots and to its digest, and
+/// parsers open files through `motion::DataPath`.
+#[test]
+fn stages_and_parsers_open_no_path_of_their_own() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let opens =
+        ["File::open(", "OpenOptions", "fs::read", "fs::metadata", "read_dir(", "symlink_metadata", ".is_dir()"];
+    let makes = ["DataPath::local", "Path::new(", "PathBuf::from"];
+    let at = |folder: &str| sources(&root.join(folder));
+    let expect_none = |folder: &str, words: &[&str], but: &[&str]| {
+        let files = at(folder);
+        assert!(files.len() > 3, "{folder}");
+        for (path, code) in files.iter().filter(|(path, _)| !but.iter().any(|but| path.ends_with(but))) {
+            let found = words.iter().find(|word| code.contains(*word));
+            assert!(found.is_none(), "{}: `{}`", path.display(), found.unwrap_or(&""));
+        }
+    };
+    let testing = ["attempt.rs", "gang.rs", "hostile.rs", "hostile_models.rs"];
+    expect_none("trainer/stages/src", &[&opens[..], &makes].concat(), &testing);
+    expect_none("trainer/text/src", &[&opens[..], &makes[..1]].concat(), &[]);
+    // Those that a user's own commands write and read by.
+    expect_none("trainer/mocap/src", &opens, &["sample.rs"]);
+    expect_none("trainer/motion/src", &opens, &["files.rs", "synthetic.rs"]);
+    for parser in ["listing.rs", "captions.rs", "corpus.rs", "arrays.rs", "bvh.rs", "parse.rs", "take.rs"] {
+        let file = at("trainer/mocap/src").into_iter().find(|(path, _)| path.ends_with(parser)).expect(parser);
+        assert!(!file.1.contains("DataPath::local"), "{parser}");
+    }
 }
 
 #[test]

@@ -5,10 +5,8 @@ use std::path::Path;
 
 use access::{Server, ServerOptions, explain, local};
 use coordinator::{Config, Coordinator, Handle, WorkerView};
-use protocol::message::{
-    ApiError, DesiredAssignments, FailureClass, Poll, ReportOutcome, RunView, Submit, TaskOutcome,
-};
-use protocol::{Digest, Incarnation, RunId, WorkerId};
+use protocol::message::{ApiError, RunView, Submit};
+use protocol::{Digest, RunId};
 use registry::cli::{Answer, Command};
 use registry::{Holder, LogRow, ReadStore, Store};
 use reqwest::{Method, RequestBuilder, Response, StatusCode};
@@ -64,7 +62,7 @@ impl Client {
     }
 
     /// A client of a coordinator in this process.
-    pub(crate) fn of(handle: &Handle) -> Result<Self> {
+    fn of(handle: &Handle) -> Result<Self> {
         let server = Server::new(&handle.local_url(), Some(handle.token().clone()), None)?;
         Ok(Self { server, own: None })
     }
@@ -160,23 +158,6 @@ impl Client {
 
     pub(crate) async fn workers(&self) -> Result<Vec<WorkerView>> {
         self.get("/v1/workers").await
-    }
-
-    /// Reports what a worker that has died can no longer report: how its work ended.
-    pub(crate) async fn fail_for(
-        &self,
-        worker: &WorkerId,
-        incarnation: Incarnation,
-        class: FailureClass,
-        message: &str,
-    ) -> Result<()> {
-        let poll = Poll { incarnation, doing: Vec::new(), ready: Vec::new(), version: 0 };
-        let desired: DesiredAssignments = self.post(&format!("/v1/workers/{worker}/poll"), &poll).await?;
-        for assignment in desired.assignments {
-            let outcome = TaskOutcome::Failed { class, message: message.to_owned() };
-            self.post::<()>("/v1/outcomes", &ReportOutcome { grant: assignment.grant, outcome }).await?;
-        }
-        Ok(())
     }
 
     pub(crate) async fn registry(&self, command: &Command) -> Result<Answer> {

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
+use motion::DataPath;
 use protocol::StageName;
 use protocol::pipeline::Pipeline;
 use protocol::stage::{DataFeatures, DataFormat, DataOpen, DataSynthetic};
@@ -57,7 +58,7 @@ fn synthetic(data: &DataSynthetic) -> Entries {
 
 /// As many clips as the folder has files; a hundred if it is not there.
 fn recorded(data: &DataFeatures) -> Entries {
-    let files = mocap::listing::list(Path::new(&data.path), None).map_or(100, |listing| listing.clips.len());
+    let files = mocap::listing::list(&DataPath::local(&data.path), None).map_or(100, |listing| listing.clips.len());
     divided(files, data.mirror, data.val, data.test)
 }
 

@@ -71,7 +71,7 @@ impl Fleet {
             next_start: now,
         };
         let members = (0..count).map(member).collect();
-        let (url, token) = (coordinator.local_url(), coordinator.token().clone());
+        let (url, token) = (coordinator.local_url(), coordinator.worker_token().clone());
         let mut fleet = Self { members, url, token, backend, store: store.to_owned(), logs, memory: Watch::new() };
         for i in 0..count {
             fleet.spawn(i)?;
@@ -88,7 +88,7 @@ impl Fleet {
         let member = &mut self.members[i];
         member.log_from = std::fs::metadata(&log).map_or(0, |log| log.len());
         let child = Command::new(program)
-            .args(["worker", "join", &self.url, "--name", member.name.as_str(), "--die-with-parent"])
+            .args(["worker", "join", &self.url, "--name", member.name.as_str(), "--die-with-parent", "--any-file"])
             .args(["--backend", self.backend.name(), "--device", &member.device.to_string(), "--store"])
             .arg(&self.store)
             // Not an argument, which every user of the machine can read.
@@ -96,6 +96,7 @@ impl Fleet {
             // Ours are of another server.
             .env_remove("STRIDE_TOKEN_FILE")
             .env_remove("STRIDE_CA")
+            .env_remove("STRIDE_DATA_ROOT")
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .stderr(stderr)

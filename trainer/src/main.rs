@@ -2,6 +2,7 @@
 //!
 //! No logic of its own: it reads arguments and files, starts a coordinator and worker processes, and shows what they say.
 
+mod advice;
 mod cli;
 mod client;
 mod cost;

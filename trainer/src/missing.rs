@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use motion::{Skeleton, npy};
+use motion::{DataPath, Skeleton, npy};
 use protocol::StageName;
 use protocol::pipeline::Pipeline;
 use protocol::stage::{Backend, DataFormat, ExternalFolder};
@@ -71,7 +71,7 @@ fn lacks(folder: &ExternalFolder) -> Option<String> {
 /// Refuses a folder whose features have the width of another format, which its statistics tell.
 pub(crate) fn check_format(path: &Path, format: DataFormat) -> Result<()> {
     // What else is wrong with the file is said by who opens the folder.
-    let Ok(mean) = npy::read_any_float(&path.join("Mean.npy")) else { return Ok(()) };
+    let Ok(mean) = npy::read_any_float(&DataPath::local(path.join("Mean.npy"))) else { return Ok(()) };
     let width = |format| Skeleton::of(format).features;
     let found = mean.data.len();
     if found == width(format) {

@@ -1,13 +1,14 @@
 //! A pipeline file on disk: read, checked, and its dataset folders looked at, all before a store is opened.
 
 use std::io::Read as _;
-use std::path::Path;
+use std::os::unix::fs::FileTypeExt as _;
+use std::path::{Path, PathBuf};
 
-use motion::Dataset;
 use motion::folder_digest::{files_digest, folder_digest};
+use motion::{DataPath, Dataset};
 use protocol::pipeline::{self, Pipeline, PipelineStage};
 use protocol::stage::{DataFormat, ExternalFolder};
-use protocol::{Digest, StageName, limits};
+use protocol::{Digest, StageName, limits, spelling};
 use registry::ReadStore;
 
 use crate::hub_names;
@@ -26,13 +27,48 @@ pub(crate) fn read(path: &Path, sets: &[String]) -> Result<PipelineFile> {
     let name = path.display().to_string();
     let source = read_text(path).map_err(|error| {
         let problem = Problem::usage(format!("cannot read the pipeline `{name}`: {error}"));
-        if error.kind() == std::io::ErrorKind::NotFound {
-            problem.hint("shipped pipelines are in `configs/`; `trainer run configs/quickstart.yaml` needs no data")
-        } else {
-            problem
+        match error.kind() {
+            std::io::ErrorKind::NotFound => problem.hint(instead_of(path)),
+            std::io::ErrorKind::IsADirectory => problem.hint(inside(path)),
+            _ => problem,
         }
     })?;
     of_text(&name, source, sets)
+}
+
+/// The pipelines in a folder, by name.
+fn pipelines_in(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let is_yaml = |path: &PathBuf| path.extension().is_some_and(|ending| ending == "yaml" || ending == "yml");
+    let mut found: Vec<PathBuf> = entries.map(|entry| entry.path()).filter(is_yaml).collect();
+    found.sort();
+    found
+}
+
+/// A pipeline that was probably meant by a path that does not exist.
+fn instead_of(path: &Path) -> String {
+    let beside = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let known: Vec<PathBuf> = [beside, Path::new("configs")].into_iter().flat_map(pipelines_in).collect();
+    let stem = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let stems: Vec<String> = known.iter().map(|path| stem(path)).collect();
+    let near = spelling::nearest(&stem(path), stems.iter().map(String::as_str));
+    let near = near.and_then(|near| known.iter().find(|path| stem(path) == near));
+    near.map_or_else(
+        || "shipped pipelines are in `configs/`; `trainer run configs/quickstart.yaml` needs no data".to_owned(),
+        |near| format!("did you mean `{}`?", near.strip_prefix(".").unwrap_or(near).display()),
+    )
+}
+
+/// What a folder has that could have been meant.
+fn inside(folder: &Path) -> String {
+    match pipelines_in(folder).as_slice() {
+        [] => "name a pipeline's file, such as `configs/quickstart.yaml`; it has none".to_owned(),
+        found => {
+            let names: Vec<String> = found.iter().take(8).map(|path| path.display().to_string()).collect();
+            let more = if found.len() > names.len() { ", ..." } else { "" };
+            format!("name one of its pipelines: {}{more}", names.join(", "))
+        }
+    }
 }
 
 /// Validates the text of a file called `name`.
@@ -45,9 +81,18 @@ pub(crate) fn of_text(name: &str, source: String, sets: &[String]) -> Result<Pip
     Ok(PipelineFile { pipeline, source })
 }
 
-/// A pipeline may come through a pipe (`<(...)`), so that only its end says how long it is.
+/// A pipeline may come through a pipe of the shell's (`<(...)`), so that only its end says how long it is. A named pipe in a folder has
+/// no writer that could be waited for.
 fn read_text(path: &Path) -> std::io::Result<String> {
     let mut bytes = Vec::new();
+    let of_the_shell = path.starts_with("/dev") || path.starts_with("/proc");
+    let found = std::fs::metadata(path)?.file_type();
+    if found.is_dir() {
+        return Err(std::io::Error::new(std::io::ErrorKind::IsADirectory, "it is a folder; expected a file"));
+    }
+    if found.is_fifo() && !of_the_shell {
+        return Err(std::io::Error::other("it is a named pipe; expected a file"));
+    }
     std::fs::File::open(path)?.take(limits::PIPELINE_BYTES + 1).read_to_end(&mut bytes)?;
     let refuse = |what: String| std::io::Error::new(std::io::ErrorKind::InvalidData, what);
     if bytes.len() as u64 > limits::PIPELINE_BYTES {
@@ -97,9 +142,9 @@ fn digest_folders(pipeline: &mut Pipeline) -> Result<()> {
             let content = match format {
                 Some(format) => {
                     check_format(Path::new(&path), format)?;
-                    folder_digest(Path::new(&path), format).map_err(bad_folder)?
+                    folder_digest(&DataPath::local(&path), format).map_err(bad_folder)?
                 }
-                None => files_digest(Path::new(&path))
+                None => files_digest(&DataPath::local(&path))
                     .map_err(|e| Problem::usage(format!("stage `{}`: {path}: {e}", stage.name)))?,
             };
             stage.external.insert(field, content);
@@ -143,7 +188,7 @@ pub(crate) fn check_data(pipeline: &Pipeline, store: &Path) -> Result<()> {
     for (stage, folder, format) in dataset_folders(pipeline) {
         let seen = |digest: &Digest| store.join("seen").join(digest.hex()).exists();
         if !stage.external.get(&folder.field).is_some_and(seen) {
-            Dataset::open(Path::new(&folder.path), format).map_err(bad_folder)?;
+            Dataset::open(&DataPath::local(&folder.path), format).map_err(bad_folder)?;
         }
     }
     Ok(())

@@ -3,10 +3,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use coordinator::search::{Score, Search, Ticket};
+use protocol::message::RunState;
 use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::stage::{TextEmbed, TextEncoder};
 use protocol::sweep::{STATE_OUTPUT, rung_name};
-use protocol::{ArtifactKind, Digest, StageName, Steps, TaskId};
+use protocol::{ArtifactKind, Digest, RunId, StageName, Steps, TaskId};
 use registry::{ReadStore, RunRow, StageResultRow};
 use serde::Serialize;
 use serde_json::Value;
@@ -231,15 +232,12 @@ async fn best_of_sweep(
 /// Says what a run of `pipeline` on `store` would do; `None` is a store that does not exist yet.
 pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&ReadStore>) -> Result<Plan> {
     let now = known(pipeline, store).await?;
-    let mut earlier: Vec<(RunRow, Pipeline)> = Vec::new();
+    let mut resumable = BTreeMap::new();
+    let mut earlier = Vec::new();
     if let Some(store) = store {
-        let mut rows = store.runs().await?;
-        rows.sort_by_key(|row| std::cmp::Reverse(row.created_ms));
-        // A run of another build may not read; it has nothing to say then.
-        earlier.extend(rows.into_iter().filter_map(|row| {
-            let pipeline = serde_json::from_value(row.pipeline.clone()).ok()?;
-            Some((row, pipeline))
-        }));
+        let runs = store.runs().await?;
+        resumable = checkpoints(pipeline, &now, store, &runs).await?;
+        earlier = earlier_runs(&pipeline.name, runs);
     }
     let mut running: BTreeSet<&StageName> = BTreeSet::new();
     let mut stages = Vec::new();
@@ -250,11 +248,7 @@ pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&ReadStore>) -> Resu
         } else {
             let upstream = stage.inputs.iter().find(|input| running.contains(&input.stage));
             let absent = stage.settings.folders().into_iter().find(|f| !stage.external.contains_key(&f.field));
-            let resume = match (key, store) {
-                (Some(key), Some(store)) => checkpoint(stage, key, store, &earlier).await?,
-                _ => None,
-            };
-            match (resume, upstream) {
+            match (resumable.get(&stage.name).cloned(), upstream) {
                 (None, _) if absent.is_some() => {
                     ("run", format!("`{}` is missing", absent.map(|folder| folder.path).unwrap_or_default()))
                 }
@@ -295,37 +289,64 @@ pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&ReadStore>) -> Resu
     })
 }
 
-/// The newest checkpoint of a stage with this key.
-async fn checkpoint(
-    stage: &PipelineStage,
-    key: Digest,
+/// Where each unfinished training stage would resume, for people. Stages of runs that ended are found by key; only runs that have not
+/// ended are read, each once.
+async fn checkpoints(
+    pipeline: &Pipeline,
+    now: &Known,
     store: &ReadStore,
-    earlier: &[(RunRow, Pipeline)],
-) -> Result<Option<String>> {
-    for (row, pipeline) in earlier {
-        let Some(steps) = stage.settings.steps() else { return Ok(None) };
-        if known(pipeline, Some(store)).await?.keys.get(&stage.name) != Some(&key) {
-            continue;
-        }
-        if let Some(found) = store.latest_checkpoint(&TaskId::of(&row.run, &stage.name, None)).await? {
-            return Ok(Some(format!(
-                "run {} stopped at step {} of {} (checkpoint {})",
-                row.run,
-                found.step,
-                steps,
-                found.manifest.short()
-            )));
+    runs: &[RunRow],
+) -> Result<BTreeMap<StageName, String>> {
+    let mut unfinished: BTreeMap<Digest, &PipelineStage> = BTreeMap::new();
+    for stage in &pipeline.stages {
+        if let Some(key) = now.keys.get(&stage.name)
+            && !now.made_by.contains_key(&stage.name)
+            && stage.settings.steps().is_some()
+        {
+            unfinished.insert(*key, stage);
         }
     }
-    Ok(None)
+    if unfinished.is_empty() {
+        return Ok(BTreeMap::new());
+    }
+    let keys: Vec<Digest> = unfinished.keys().copied().collect();
+    let mut begun: Vec<(Digest, (RunId, StageName))> = store.sources(&keys).await?.into_iter().collect();
+    for row in runs.iter().filter(|row| !has_ended(row)) {
+        // A run of another build may not read.
+        let Ok(other) = serde_json::from_value::<Pipeline>(row.pipeline.clone()) else { continue };
+        for (stage, key) in known(&other, Some(store)).await?.keys {
+            begun.push((key, (row.run.clone(), stage)));
+        }
+    }
+    let mut found: BTreeMap<StageName, (u64, String)> = BTreeMap::new();
+    for (key, (run, task_stage)) in begun {
+        let Some(stage) = unfinished.get(&key) else { continue };
+        let Some(newest) = store.latest_checkpoint(&TaskId::of(&run, &task_stage, None)).await? else { continue };
+        if found.get(&stage.name).is_some_and(|(step, _)| *step >= newest.step) {
+            continue;
+        }
+        let steps = stage.settings.steps().map(|steps| steps.to_string()).unwrap_or_default();
+        let why =
+            format!("run {run} stopped at step {} of {steps} (checkpoint {})", newest.step, newest.manifest.short());
+        found.insert(stage.name.clone(), (newest.step, why));
+    }
+    Ok(found.into_iter().map(|(stage, (_, why))| (stage, why)).collect())
+}
+
+fn has_ended(row: &RunRow) -> bool {
+    serde_json::from_value(Value::String(row.state.clone())).is_ok_and(RunState::is_final)
+}
+
+/// The pipelines of earlier runs of this name, newest first. A run of another build that does not read is left out.
+fn earlier_runs(name: &str, mut rows: Vec<RunRow>) -> Vec<Pipeline> {
+    rows.retain(|row| row.pipeline.get("name").and_then(Value::as_str) == Some(name));
+    rows.sort_by_key(|row| std::cmp::Reverse(row.created_ms));
+    rows.into_iter().filter_map(|row| serde_json::from_value(row.pipeline).ok()).collect()
 }
 
 /// What tells a stage from the same one of the newest run of that name.
-fn difference(pipeline: &Pipeline, stage: &PipelineStage, earlier: &[(RunRow, Pipeline)]) -> String {
-    let before = earlier
-        .iter()
-        .filter(|(_, other)| other.name == pipeline.name)
-        .find_map(|(_, other)| Some((other, other.stage(&stage.name)?)));
+fn difference(pipeline: &Pipeline, stage: &PipelineStage, earlier: &[Pipeline]) -> String {
+    let before = earlier.iter().find_map(|other| Some((other, other.stage(&stage.name)?)));
     let Some((other, before)) = before else { return "never run".into() };
     if before.settings.kind() != stage.settings.kind() {
         return format!("kind changed: {} -> {}", before.settings.kind(), stage.settings.kind());
@@ -394,16 +415,15 @@ mod tests {
     #[test]
     fn a_changed_setting_is_named() {
         let before = pipeline(&["vae.lr=2e-4"]);
-        let earlier = [(row(&before), before)];
+        let rows = || vec![row(&before)];
         let why = |sets: &[&str]| {
             let now = pipeline(sets);
-            difference(&now, now.stage(&"vae".into()).unwrap(), &earlier)
+            difference(&now, now.stage(&"vae".into()).unwrap(), &earlier_runs(&now.name, rows()))
         };
         assert_eq!(why(&["vae.lr=1e-4"]), "changed: lr 0.0002 -> 0.0001");
         assert_eq!(why(&["vae.network.width=64", "seed=3"]), "changed: seed 0 -> 3, network.width 256 -> 64");
         assert_eq!(why(&[]), "not finished before");
-        let other = pipeline(&["name=q"]);
-        assert_eq!(difference(&other, other.stage(&"vae".into()).unwrap(), &earlier), "never run");
+        assert_eq!(why(&["name=q"]), "never run");
     }
 
     #[tokio::test]

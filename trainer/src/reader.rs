@@ -17,7 +17,7 @@ const LINES: u32 = 1000;
 #[derive(Debug)]
 pub(crate) enum Reader {
     /// A coordinator that runs.
-    Server(Client),
+    Server(Box<Client>),
     /// A store that nobody holds.
     Store(Box<Records>),
 }
@@ -26,7 +26,7 @@ impl Reader {
     /// Finds what answers for `target`.
     pub(crate) async fn open(target: &Target) -> Result<Self> {
         match Client::running(target).await? {
-            Some(client) => Ok(Self::Server(client)),
+            Some(client) => Ok(Self::Server(Box::new(client))),
             None => Ok(Self::Store(Box::new(Records::open(&target.store).await?))),
         }
     }

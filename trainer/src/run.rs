@@ -4,13 +4,14 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use coordinator::shell::raise_descriptor_limit;
-use coordinator::{Config, Control, Coordinator, Handle, Trouble, WorkerView};
+use coordinator::{Config, Control, Coordinator, Handle, Trouble};
 use protocol::message::{FailureClass, RunState, RunView, StageState, Submit};
 use protocol::pipeline::Pipeline;
 use protocol::{RunId, StageName};
 use registry::{Holder, Place, Store};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
+use crate::advice::advice;
 use crate::fleet::{self, Death, Fleet};
 use crate::missing::check_backend;
 use crate::pipeline_file::PipelineFile;
@@ -82,6 +83,7 @@ pub(crate) async fn run(request: Request, options: Options) -> Result<u8> {
         pipeline_file::check_stage(&file.pipeline, until.as_ref())?;
         check_backend(file.pipeline.backend)?;
         pipeline_file::check_data(&file.pipeline, &options.store)?;
+        advice(&file.pipeline).iter().for_each(|note| print::note(&format!("note: {note}")));
     }
     let holder = Holder::this_process(&*options.command);
     let store = match &request {
@@ -96,7 +98,8 @@ pub(crate) async fn run(request: Request, options: Options) -> Result<u8> {
     let (run, pipeline) = begin(&handle, &store, request).await?;
     pipeline_file::remember_data(&pipeline, &dir);
     let bars = options.output == Output::Table && print::on_terminal();
-    let mut progress = Progress::new(bars);
+    let mut progress =
+        Progress::new(bars, &pipeline, "all of this run are busy or starting, and `--workers N` has N of them");
     progress.note(&format!("run {run} in {}", client::shown(&options.store)));
 
     let mut fleet = None;
@@ -110,11 +113,13 @@ pub(crate) async fn run(request: Request, options: Options) -> Result<u8> {
     let end = watched?;
     let view = view.map_err(|error| Problem::new(exit::FAULT, error))?;
     let exit = report(&view, &pipeline, &end, &options);
-    if view.state == RunState::Finished && options.output == Output::Table {
+    if view.state == RunState::Finished {
         match pictures::save(&store, &view).await {
-            Ok(copies) => copies.iter().for_each(|(stage, path)| {
+            Ok(copies) if options.output == Output::Table => copies.iter().for_each(|(stage, path)| {
                 print::out(&format!("{stage} drew {}", client::shown(path)));
             }),
+            // A program finds them by their name.
+            Ok(_) => {}
             Err(why) => print::note(&format!("pictures of the run were not copied: {why}")),
         }
     }
@@ -188,28 +193,19 @@ async fn watch(
 /// Tells the coordinator that a worker has died, and what of.
 async fn report_death(handle: &Handle, death: &Death) {
     if let Some(why) = &death.out_of_memory {
-        // Said in the worker's own name, as it would have said it: with a grant that still holds, and never again with one that does not.
-        let held = handle.workers().into_iter().find(|view| view.worker == death.worker && view.task.is_some());
-        if let Some(view) = held
-            && let Err(problem) = fail_for(handle, &view, why).await
-        {
-            tracing::warn!(worker = %death.worker, "its work is tried again: {}", problem.error);
+        // As it would have said it itself: with a grant that still holds, and never again with one that does not.
+        let message = format!("worker `{}` {why}", death.worker);
+        if let Err(error) = handle.fail_for(&death.worker, FailureClass::OutOfMemory, message).await {
+            tracing::warn!(worker = %death.worker, "its work is tried again: {error}");
         }
     }
     // A worker that never joined is not known; then there is nothing to take from it.
     let _ = handle.worker_gone(&death.worker).await;
 }
 
-async fn fail_for(handle: &Handle, dead: &WorkerView, why: &str) -> Result<()> {
-    let client = client::Client::of(handle)?;
-    let message = format!("worker `{}` {why}", dead.worker);
-    client.fail_for(&dead.worker, dead.incarnation, FailureClass::OutOfMemory, &message).await
-}
-
 /// Whether a stage waits for somebody to do it. A run whose stages are all known needs no workers.
 fn wants_workers(view: &RunView) -> bool {
-    let waits = |stage: &protocol::message::StageView| stage.state == StageState::Ready && stage.message.is_some();
-    view.state == RunState::Running && view.stages.iter().any(waits)
+    view.state == RunState::Running && view.stages.iter().any(|stage| stage.wants_workers.is_some())
 }
 
 async fn drain(

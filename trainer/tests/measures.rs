@@ -33,7 +33,7 @@ fn measures_are_taken_and_misused_with_the_reason() {
     let table = bench.run(&time).expect_code(0).stdout;
     println!("{table}");
     assert!(table.contains("AITS") && table.contains("3 sentences") && table.contains("threads"), "{table}");
-    let unknown = bench.run(&["time", "--stage", "vae"]).expect_code(3).stderr;
+    let unknown = bench.run(&["time", "--stage", "vae"]).expect_code(7).stderr;
     assert!(unknown.contains("no model") && unknown.contains("mld"), "{unknown}");
     bench.run(&["time"]).expect_code(2);
     models_are_drawn_as_they_were_measured(&bench);

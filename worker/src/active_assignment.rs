@@ -14,6 +14,7 @@ use protocol::message::{Assignment, Doing, Grant, Progress, Role};
 use protocol::{Digest, Generation};
 use tokio::sync::Notify;
 
+use crate::client::Credential;
 use crate::event_count::{EventCount, lock};
 use crate::gang::endpoint::Endpoint;
 use crate::gang::member::{Busy, MeshConfig};
@@ -21,6 +22,8 @@ use crate::gang::mesh::{Halt, Mesh};
 
 /// After a refused write, how long to wait for orders that explain it.
 const STALE_PATIENCE: Duration = Duration::from_secs(30);
+/// After a checkpoint that could not be stored, how long to train before the next try.
+const SAVE_PAUSE: Duration = Duration::from_secs(5);
 
 #[derive(Debug)]
 struct State {
@@ -29,6 +32,8 @@ struct State {
     /// The stage has returned; nothing runs under this grant any more.
     done: bool,
     progress: Progress,
+    /// Steps of the training state in memory.
+    holds: Option<u64>,
     committed: Option<Digest>,
     /// The newest generation's connections, until the stage takes them.
     offered: Option<Arc<Mesh>>,
@@ -44,6 +49,16 @@ pub(crate) struct ActiveAssignment {
     endpoint: Arc<Endpoint>,
     flags: Arc<Flags>,
     busy: Busy,
+    /// What is stored now is a checkpoint that may be made later.
+    postponable: AtomicBool,
+    put_off: Mutex<PutOff>,
+}
+
+/// Checkpoints that could not be stored: how many in a row, and when the next one is tried.
+#[derive(Debug, Default)]
+struct PutOff {
+    times: u32,
+    until: Option<Instant>,
 }
 
 /// What holds for all that a worker holds.
@@ -78,12 +93,14 @@ impl ActiveAssignment {
             ended: None,
             done: false,
             progress: Progress::default(),
+            holds: None,
             committed: None,
             offered: None,
             newest: None,
         };
         let (state, busy) = (Mutex::new(state), Busy::default());
-        let held = Self { state, event_count: Arc::default(), wake, endpoint, flags, busy };
+        let (postponable, put_off) = (AtomicBool::new(false), Mutex::default());
+        let held = Self { state, event_count: Arc::default(), wake, endpoint, flags, busy, postponable, put_off };
         held.connect(&mut lock(&held.state));
         Arc::new(held)
     }
@@ -91,6 +108,12 @@ impl ActiveAssignment {
     /// The right to write, as of the newest orders.
     pub(crate) fn grant(&self) -> Grant {
         lock(&self.state).assignment.grant.clone()
+    }
+
+    /// The same, with its secret.
+    pub(crate) fn credential(&self) -> Credential {
+        let state = lock(&self.state);
+        Credential { grant: state.assignment.grant.clone(), secret: state.assignment.secret.clone() }
     }
 
     pub(crate) fn assignment(&self) -> Assignment {
@@ -211,6 +234,31 @@ impl ActiveAssignment {
         self.flags.away.load(Ordering::SeqCst)
     }
 
+    /// Says whether what is stored from here on may be stored later.
+    pub(crate) fn set_postponable(&self, may: bool) {
+        self.postponable.store(may, Ordering::SeqCst);
+    }
+
+    pub(crate) fn may_put_off(&self) -> bool {
+        self.postponable.load(Ordering::SeqCst)
+    }
+
+    /// Takes note of whether a part of a checkpoint could not be stored: the next one is tried after a pause that doubles.
+    pub(crate) fn was_put_off(&self, was: bool) {
+        let mut put_off = lock(&self.put_off);
+        if was {
+            let pause = SAVE_PAUSE.saturating_mul(1 << put_off.times.min(4));
+            *put_off = PutOff { times: put_off.times + 1, until: Some(Instant::now() + pause) };
+        } else {
+            *put_off = PutOff::default();
+        }
+    }
+
+    /// Whether a checkpoint could not be stored a moment ago.
+    pub(crate) fn is_put_off(&self) -> bool {
+        lock(&self.put_off).until.is_some_and(|until| Instant::now() < until)
+    }
+
     /// Why to give up waiting for peers of `generation`, if there is a reason.
     pub(crate) fn halt(&self, generation: Generation) -> Option<Halt> {
         let state = lock(&self.state);
@@ -231,7 +279,7 @@ impl ActiveAssignment {
             Role::Member { members, .. } => members
                 .first()
                 .is_some_and(|first| (&first.worker, first.incarnation) == (&grant.worker, grant.incarnation)),
-            Role::Alone | Role::Shard { .. } | Role::Merge { .. } => true,
+            Role::Alone | Role::Resolve | Role::Shard { .. } | Role::Merge { .. } => true,
         }
     }
 
@@ -252,8 +300,14 @@ impl ActiveAssignment {
     /// For the poll.
     pub(crate) fn doing(&self) -> Doing {
         let state = lock(&self.state);
-        let lost = state.newest.as_ref().map(|mesh| mesh.lost().into_iter().collect()).unwrap_or_default();
-        Doing { grant: state.assignment.grant.clone(), progress: state.progress.clone(), lost }
+        let (lost, waits_for) = state.newest.as_ref().map(|mesh| (mesh.lost(), mesh.waits_for())).unwrap_or_default();
+        let holds = state.holds;
+        Doing { holds, waits_for, lost, ..Doing::new(state.assignment.grant.clone(), state.progress.clone()) }
+    }
+
+    /// Notes how many steps the state in memory has seen; `None` if it is worth nothing to others.
+    pub(crate) fn set_holds(&self, steps: Option<u64>) {
+        lock(&self.state).holds = steps;
     }
 
     /// Sleeps until something changes, at most so long; returns why the grant has ended, if it has.
@@ -272,16 +326,16 @@ impl ActiveAssignment {
         }
     }
 
-    /// A write under `refused` met a newer fence. Waits for the orders that say what became of us: a newer grant to write
+    /// A call under `refused` met a newer fence, or was not recognised. Waits for the orders that say what became of us: a newer grant to write
     /// under, or the end.
-    pub(crate) fn after_stale(&self, refused: &Grant) -> Result<(), String> {
+    pub(crate) fn after_stale(&self, refused: &Credential) -> Result<(), String> {
         let until = Instant::now() + STALE_PATIENCE;
         loop {
             let ticket = self.event_count.ticket();
             if let Some(reason) = self.ended() {
                 return Err(reason);
             }
-            if self.grant() != *refused {
+            if self.credential() != *refused {
                 return Ok(());
             }
             let left = until.saturating_duration_since(Instant::now());

@@ -10,7 +10,7 @@ use std::time::Duration;
 use protocol::Incarnation;
 use protocol::message::{Assignment, DesiredAssignments, Join, Joined, Poll};
 use tokio::sync::Notify;
-use tokio::time::sleep;
+use tokio::time::{Instant, sleep};
 
 use crate::active_assignment::{ActiveAssignment, Flags, Reading};
 use crate::client::{CallError, Client};
@@ -22,6 +22,10 @@ use crate::prepare::Preparation;
 const LONGEST: Duration = Duration::from_secs(1);
 /// Shortest time between two polls.
 const SHORTEST: Duration = Duration::from_millis(20);
+/// How long a name is waited for that another process has: a process that was killed has it until its lease ends.
+const NAME_PATIENCE: Duration = Duration::from_secs(60);
+/// Time after which a worker says again that it waits for its coordinator.
+const REMIND: Duration = Duration::from_secs(60);
 /// Refusals in a row before they are believed.
 const REFUSALS: u32 = 5;
 
@@ -148,16 +152,28 @@ pub(crate) enum End {
 /// Offers this process until the coordinator takes it, or gives how the worker ends instead.
 async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Joined, End> {
     let mut pause = Duration::from_millis(50);
-    let mut said = false;
+    let begun = Instant::now();
+    let mut said: Option<Instant> = None;
     loop {
         match client.join(join).await {
             Ok(joined) => {
                 tracing::info!(worker = %join.worker, incarnation = %joined.incarnation, peer_address = join.peer_address, "joined");
                 return Ok(joined);
             }
+            Err(CallError::NameHeld(message)) if begun.elapsed() < NAME_PATIENCE => {
+                if said.is_none_or(|said| said.elapsed() > REMIND) {
+                    said = Some(Instant::now());
+                    tracing::warn!("{message}; waiting");
+                }
+            }
             Err(error) if error.may_pass() => {
-                if !std::mem::replace(&mut said, true) {
-                    tracing::warn!("the coordinator cannot take this worker yet: {error}; trying again");
+                if said.is_none_or(|said| said.elapsed() > REMIND) {
+                    said = Some(Instant::now());
+                    let help = match error {
+                        CallError::Away(_) => "; `trainer serve` starts one there, Ctrl-C ends this worker",
+                        _ => "",
+                    };
+                    tracing::warn!("waiting for the coordinator at {}: {error}{help}", client.url());
                 }
             }
             Err(error) => {

@@ -9,12 +9,12 @@ use bytes::{Bytes, BytesMut};
 use checkpoint::{Blob, BlobError, Blobs};
 use protocol::Digest;
 use protocol::digest::Hasher;
-use protocol::message::Grant;
 
 use crate::active_assignment::ActiveAssignment;
 use crate::cache::{Arriving, Cache, Cached};
-use crate::client::{CallError, Client};
+use crate::client::{CallError, Client, Credential};
 use crate::failpoints;
+use crate::receipts::Receipts;
 use crate::retry::{self, GaveUp};
 
 /// [`Blobs`] of an attempt. Writes carry its grant; reads are verified and cached.
@@ -23,6 +23,8 @@ pub(crate) struct HttpBlobs {
     pub(crate) held: Arc<ActiveAssignment>,
     pub(crate) client: Client,
     pub(crate) cache: Arc<Cache>,
+    /// What was uploaded.
+    pub(crate) receipts: Receipts,
     /// Whether the fail points of checkpoints are passed: in gangs.
     pub(crate) gang: bool,
 }
@@ -75,11 +77,13 @@ impl HttpBlobs {
     }
 
     /// Sends what is missing.
-    fn send(&self, grant: &Grant, digest: Digest, bytes: u64, pieces: &[&[u8]]) -> Result<(), CallError> {
+    fn send(&self, credential: &Credential, digest: Digest, bytes: u64, pieces: &[&[u8]]) -> Result<(), CallError> {
         let mut offset = 0;
         if bytes > SMALL_BYTES {
-            let there = self.client.wait(self.client.staged(grant, digest))?;
+            let receipt = self.receipts.of(digest);
+            let there = self.client.wait(self.client.staged(credential, digest, receipt))?;
             if there.stored {
+                self.receipts.keep(digest, there.receipt);
                 return Ok(());
             }
             offset = there.staged;
@@ -90,8 +94,9 @@ impl HttpBlobs {
         loop {
             let part = cut(pieces, offset);
             let end = offset + part.len() as u64;
-            let there = self.client.wait(self.client.put_part(grant, digest, bytes, offset, part))?;
+            let there = self.client.wait(self.client.put_part(credential, digest, bytes, offset, part))?;
             if there.stored {
+                self.receipts.keep(digest, there.receipt);
                 return Ok(());
             }
             if there.staged != end || end == bytes {
@@ -138,8 +143,8 @@ impl Blobs for HttpBlobs {
         pieces.iter().for_each(|piece| hasher.update(piece));
         let digest = hasher.finish();
         let bytes = pieces.iter().map(|piece| piece.len() as u64).sum();
-        retry::until_ended(&self.held, &format!("uploading blob {digest}"), |grant| {
-            self.send(grant, digest, bytes, pieces)
+        retry::until_put_off(&self.held, &format!("uploading blob {digest}"), |credential| {
+            self.send(credential, digest, bytes, pieces)
         })
         .map_err(|gave_up| error(gave_up, None))?;
         if self.gang {

@@ -7,7 +7,7 @@ use access::ConnectionOptions;
 use protocol::WorkerId;
 use protocol::stage::Backend;
 
-use crate::{JoinError, Options, StageLimits};
+use crate::{Files, JoinError, Options, StageLimits};
 
 /// Offer this machine to a coordinator.
 #[derive(Debug, Clone, clap::Args)]
@@ -32,6 +32,12 @@ pub struct JoinArgs {
     /// The folder of the coordinator's store, if it is on this machine: blobs are read there, and shared by all workers
     #[arg(long, value_name = "DIR")]
     pub store: Option<PathBuf>,
+    /// Read files that pipelines name below this folder, and none elsewhere; may be given several times. Without it no file is read
+    #[arg(long = "data-root", value_name = "DIR", env = "STRIDE_DATA_ROOT", value_delimiter = ':')]
+    pub data_roots: Vec<PathBuf>,
+    /// Read files wherever pipelines name them. For a worker whose pipelines are its own user's, as those of `trainer run`
+    #[arg(long, hide = true)]
+    pub any_file: bool,
     /// Where other workers reach this one [default: the address from which the coordinator is reached, any port]
     #[arg(long, value_name = "HOST:PORT")]
     pub peer_address: Option<String>,
@@ -67,6 +73,13 @@ impl TryFrom<JoinArgs> for Options {
             device: args.device,
             cache: args.cache,
             store: args.store,
+            files: match args.any_file {
+                true => Files::Anywhere,
+                // An empty variable names none.
+                false => {
+                    Files::Beneath(args.data_roots.into_iter().filter(|root| !root.as_os_str().is_empty()).collect())
+                }
+            },
             peer_address: args.peer_address,
             die_with_parent: args.die_with_parent,
             limits,

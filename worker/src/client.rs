@@ -2,16 +2,21 @@
 //!
 //! One runtime with one thread drives all connections; stages and uploads are synchronous and wait on it.
 
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use access::{Server, explain};
+use access::{Server, Token, explain};
 use bytes::Bytes;
-use protocol::Digest;
-use protocol::message::{ApiError, DesiredAssignments, Grant, Join, Joined, Poll};
+use protocol::message::{ApiError, DesiredAssignments, Gone, Grant, Join, Joined, Poll};
+use protocol::proof::{BlobStored, GRANT_HEADER, PROCESS_HEADER, Process, RECEIPT_HEADER, SECRET_HEADER};
+use protocol::{Digest, WorkerId};
 use reqwest::{RequestBuilder, Response, StatusCode};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tokio::runtime::Handle;
+
+use crate::event_count::lock;
+use crate::failpoints;
 
 /// Why a call did not do what it should.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -25,9 +30,12 @@ pub(crate) enum CallError {
     /// It answered that it failed, by a fault of its own.
     #[error("{0}")]
     Fault(String),
-    /// The grant is not the task's newest.
+    /// The grant is not the task's newest, or the coordinator does not recognise its secret.
     #[error("{0}")]
     Stale(String),
+    /// Another process has the worker's name, for at most its lease.
+    #[error("{0}")]
+    NameHeld(String),
     /// The coordinator's store is full or not writable: the same call may succeed once there is room.
     #[error("{0}")]
     Full(String),
@@ -60,6 +68,23 @@ impl CallError {
 pub(crate) struct Client {
     server: Server,
     runtime: Handle,
+    /// Shown when the process speaks for itself. Drawn at its start, and held in memory only.
+    secret: Token,
+    /// What the coordinator calls this process.
+    process: Arc<Mutex<Option<Process>>>,
+}
+
+/// A grant and the secret that came with it.
+#[derive(Clone, PartialEq, Eq)]
+pub(crate) struct Credential {
+    pub(crate) grant: Grant,
+    pub(crate) secret: String,
+}
+
+impl std::fmt::Debug for Credential {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Credential").field("grant", &self.grant).finish_non_exhaustive()
+    }
 }
 
 /// For calls with small bodies.
@@ -70,7 +95,13 @@ const LONG: Duration = Duration::from_secs(600);
 impl Client {
     /// A client of `server`.
     pub(crate) fn new(server: Server, runtime: Handle) -> Self {
-        Self { server, runtime }
+        let secret = failpoints::secret().unwrap_or_else(Token::random);
+        Self { server, runtime, secret, process: Arc::default() }
+    }
+
+    /// The coordinator's address.
+    pub(crate) fn url(&self) -> &str {
+        self.server.url()
     }
 
     fn request(&self, method: reqwest::Method, path: &str, timeout: Duration) -> RequestBuilder {
@@ -82,8 +113,12 @@ impl Client {
         self.runtime.block_on(call)
     }
 
+    /// Offers this process. A join that is sent again, because its answer was lost, shows the same secret.
     pub(crate) async fn join(&self, join: &Join) -> Result<Joined, CallError> {
-        answer(self.post("/v1/workers", join, SHORT).await?).await
+        let joined: Joined = answer(self.post("/v1/workers", self.secret.secret(), join, SHORT).await?).await?;
+        let process = Process { worker: join.worker.clone(), incarnation: joined.incarnation };
+        *lock(&self.process) = Some(process);
+        Ok(joined)
     }
 
     pub(crate) async fn poll(
@@ -92,31 +127,52 @@ impl Client {
         poll: &Poll,
         patience: Duration,
     ) -> Result<DesiredAssignments, CallError> {
-        answer(self.post(path, poll, patience).await?).await
+        answer(self.post(path, self.secret.secret(), poll, patience).await?).await
     }
 
-    /// A call whose answer says no more than that it was done.
-    pub(crate) async fn tell<T: Serialize + Sync>(&self, path: &str, what: &T) -> Result<(), CallError> {
-        self.post(path, what, SHORT).await.map(drop)
+    /// Says that this process ends, so that its name and its work are free before its lease ends.
+    pub(crate) async fn leave(&self, worker: &WorkerId) -> Result<(), CallError> {
+        let Some(Process { incarnation, .. }) = lock(&self.process).clone() else { return Ok(()) };
+        let path = format!("/v1/workers/{worker}/gone");
+        self.post(&path, self.secret.secret(), &Gone { incarnation }, SHORT).await.map(drop)
     }
 
-    /// How much of a blob the coordinator has.
-    pub(crate) async fn staged(&self, grant: &Grant, digest: Digest) -> Result<Stored, CallError> {
+    /// A write in the name of a grant, whose answer says no more than that it was done.
+    pub(crate) async fn tell<T: Serialize + Sync>(
+        &self,
+        path: &str,
+        credential: &Credential,
+        what: &T,
+    ) -> Result<(), CallError> {
+        self.post(path, &credential.secret, what, SHORT).await.map(drop)
+    }
+
+    /// How much of a blob the coordinator has. Shows the receipt of an earlier upload, if there was one.
+    pub(crate) async fn staged(
+        &self,
+        credential: &Credential,
+        digest: Digest,
+        receipt: Option<String>,
+    ) -> Result<BlobStored, CallError> {
         let request = self.request(reqwest::Method::GET, &format!("/v1/blobs/{digest}/staged"), LONG);
-        answer(check(in_the_name_of(request, grant)?.send().await).await?).await
+        let mut request = in_the_name_of(request, credential)?;
+        if let Some(receipt) = receipt {
+            request = request.header(RECEIPT_HEADER, receipt);
+        }
+        answer(check(request.send().await).await?).await
     }
 
     /// Sends what begins at `offset` of a blob of `bytes` bytes.
     pub(crate) async fn put_part(
         &self,
-        grant: &Grant,
+        credential: &Credential,
         digest: Digest,
         bytes: u64,
         offset: u64,
         part: Bytes,
-    ) -> Result<Stored, CallError> {
+    ) -> Result<BlobStored, CallError> {
         let request = self.request(reqwest::Method::PUT, &format!("/v1/blobs/{digest}"), LONG);
-        let request = in_the_name_of(request, grant)?.header("content-type", "application/octet-stream");
+        let request = in_the_name_of(request, credential)?.header("content-type", "application/octet-stream");
         let request = request.header("x-stride-bytes", bytes).header("x-stride-offset", offset);
         answer(check(request.body(part).send().await).await?).await
     }
@@ -127,6 +183,9 @@ impl Client {
         if offset > 0 {
             request = request.header("range", format!("bytes={offset}-"));
         }
+        if let Some(process) = &*lock(&self.process) {
+            request = request.header(PROCESS_HEADER, header(process)?).header(SECRET_HEADER, self.secret.secret());
+        }
         let response = check(request.send().await).await?;
         match (offset, response.status()) {
             (0, _) | (_, StatusCode::PARTIAL_CONTENT) => Ok(Download(response)),
@@ -134,17 +193,16 @@ impl Client {
         }
     }
 
-    async fn post<T: Serialize + Sync>(&self, path: &str, what: &T, timeout: Duration) -> Result<Response, CallError> {
-        check(self.request(reqwest::Method::POST, path, timeout).json(what).send().await).await
+    async fn post<T: Serialize + Sync>(
+        &self,
+        path: &str,
+        secret: &str,
+        what: &T,
+        timeout: Duration,
+    ) -> Result<Response, CallError> {
+        let request = self.request(reqwest::Method::POST, path, timeout).header(SECRET_HEADER, secret);
+        check(request.json(what).send().await).await
     }
-}
-
-/// What the coordinator says of a blob that is sent to it.
-#[derive(Debug, Clone, Copy, serde::Serialize, serde::Deserialize)]
-pub(crate) struct Stored {
-    pub(crate) stored: bool,
-    /// Bytes that have arrived, if not all have.
-    pub(crate) staged: u64,
 }
 
 /// A blob on its way here.
@@ -163,9 +221,13 @@ impl Download {
     }
 }
 
-fn in_the_name_of(request: RequestBuilder, grant: &Grant) -> Result<RequestBuilder, CallError> {
-    let grant = serde_json::to_string(grant).map_err(|e| CallError::Refused(e.to_string()))?;
-    Ok(request.header("x-stride-grant", grant))
+fn in_the_name_of(request: RequestBuilder, credential: &Credential) -> Result<RequestBuilder, CallError> {
+    Ok(request.header(GRANT_HEADER, header(&credential.grant)?).header(SECRET_HEADER, &credential.secret))
+}
+
+/// A value of a header, as JSON.
+fn header(value: &impl Serialize) -> Result<String, CallError> {
+    serde_json::to_string(value).map_err(|e| CallError::Refused(e.to_string()))
 }
 
 async fn answer<T: DeserializeOwned>(response: Response) -> Result<T, CallError> {
@@ -193,7 +255,8 @@ async fn check(sent: Result<Response, reqwest::Error>) -> Result<Response, CallE
         None => error.message,
     };
     Err(match (status, error.code.as_str()) {
-        (_, "stale-fence") => CallError::Stale(message),
+        (_, "stale-fence" | "unproven") => CallError::Stale(message),
+        (_, "name-held") => CallError::NameHeld(message),
         (_, "storage") | (StatusCode::INSUFFICIENT_STORAGE, _) => CallError::Full(message),
         (_, "not-found") | (StatusCode::NOT_FOUND, _) => CallError::NotFound(message),
         (_, "damaged") => CallError::Damaged(message),

@@ -8,8 +8,10 @@ use std::time::{Duration, Instant};
 use burn::tensor::Device;
 use checkpoint::{BlobError, Blobs};
 use protocol::message::{CommitCheckpoint, Progress, StageTask};
+use protocol::proof::Vouched;
 use protocol::{ArtifactKind, Digest, Manifest};
 use stages::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
+use stages::external::DataAccess;
 
 use crate::active_assignment::ActiveAssignment;
 use crate::blobs::HttpBlobs;
@@ -21,6 +23,7 @@ use crate::gang::member::Phase;
 use crate::gang::mesh::{Halt, Mesh};
 use crate::gang::tree;
 use crate::process;
+use crate::receipts::Receipts;
 use crate::retry::{self, GaveUp};
 use crate::telemetry_buffer::{Sender, TelemetryBuffer};
 
@@ -29,12 +32,15 @@ use crate::telemetry_buffer::{Sender, TelemetryBuffer};
 pub(crate) struct HttpContext {
     task: StageTask,
     device: Device,
+    data: Arc<DataAccess>,
     held: Arc<ActiveAssignment>,
     client: Client,
     blobs: Arc<HttpBlobs>,
     telemetry: Arc<TelemetryBuffer>,
     mesh: Option<Arc<Mesh>>,
     behind: Option<Behind>,
+    /// When the last exchange or rendezvous ended.
+    computes_since: Instant,
     gang: bool,
     _sender: Sender,
 }
@@ -44,23 +50,43 @@ pub(crate) struct HttpContext {
 struct Behind {
     mesh: Arc<Mesh>,
     source: usize,
+    /// Steps of that state.
+    step: u64,
     applied: Option<u64>,
     begun: Instant,
 }
 
 impl HttpContext {
-    pub(crate) fn new(held: Arc<ActiveAssignment>, client: Client, cache: Arc<Cache>, device: Device) -> Self {
+    pub(crate) fn new(
+        held: Arc<ActiveAssignment>,
+        client: Client,
+        cache: Arc<Cache>,
+        data: Arc<DataAccess>,
+        device: Device,
+    ) -> Self {
         let assignment = held.assignment();
         let gang = matches!(assignment.role, protocol::message::Role::Member { .. });
-        let blobs = Arc::new(HttpBlobs { held: held.clone(), client: client.clone(), cache, gang });
+        let blobs = Arc::new(HttpBlobs {
+            held: held.clone(),
+            client: client.clone(),
+            cache,
+            receipts: Receipts::default(),
+            gang,
+        });
         let (telemetry, sender) = TelemetryBuffer::open(held.clone(), client.clone());
         let task = assignment.stage;
-        Self { task, device, held, client, blobs, telemetry, mesh: None, behind: None, gang, _sender: sender }
+        let (mesh, behind, computes_since) = (None, None, Instant::now());
+        Self { task, device, data, held, client, blobs, telemetry, mesh, behind, computes_since, gang, _sender: sender }
     }
 
     /// Waits until everything recorded and logged is stored.
     pub(crate) fn flush(&self) -> Result<(), ContextError> {
         self.telemetry.flush().map_err(given_up)
+    }
+
+    /// What vouches for a manifest that this attempt has uploaded.
+    pub(crate) fn receipts(&self, manifest: Digest) -> BTreeMap<Digest, String> {
+        self.blobs.receipts.for_manifest(manifest)
     }
 
     /// Lets the peers go, saying goodbye: to the next generation, or for good.
@@ -115,13 +141,14 @@ impl HttpContext {
                 self.part();
                 Err(ContextError::GrantEnded(reason))
             }
-            Halt::Disagree(message) => Err(ContextError::Refused(message)),
-            Halt::Regroup | Halt::Peer => self.await_regroup(mesh),
+            Halt::Fault(message) => Err(ContextError::Fault(message)),
+            Halt::Regroup | Halt::Peer | Halt::Disagree(_) => self.await_regroup(mesh),
         }
     }
 
     /// Says that the members are at one state, of which `adopted` bytes came here in so many seconds.
-    fn met(&self, mesh: &Mesh, adopted: Option<(usize, f64)>) {
+    fn met(&mut self, mesh: &Mesh, adopted: Option<(usize, f64)>) {
+        self.computes_since = Instant::now();
         tracing::info!(
             task = %mesh.config.task,
             generation = %mesh.config.generation,
@@ -162,6 +189,10 @@ impl AttemptContext for HttpContext {
         self.device.clone()
     }
 
+    fn data(&self) -> Arc<DataAccess> {
+        self.data.clone()
+    }
+
     fn blobs(&self) -> Arc<dyn Blobs> {
         self.saves();
         self.blobs.clone()
@@ -181,7 +212,9 @@ impl AttemptContext for HttpContext {
     }
 
     fn put_manifest(&mut self, manifest: &Manifest) -> Result<Digest, ContextError> {
-        self.blobs.put(manifest.to_bytes()).map_err(blob_error)
+        let digest = self.blobs.put(manifest.to_bytes()).map_err(blob_error)?;
+        self.blobs.receipts.note(digest, manifest);
+        Ok(digest)
     }
 
     fn progress(&mut self, done: u64, total: u64, unit: &str, metrics: &[(&str, f64)]) {
@@ -216,6 +249,7 @@ impl GangContext for HttpContext {
 
     fn rendezvous(&mut self, applied: Option<u64>, state: &[&[u8]]) -> Result<Rendezvous, ContextError> {
         self.held.busy().set(Phase::Working);
+        self.held.set_holds(applied);
         loop {
             self.check()?;
             if let Some(newer) = self.held.take_mesh() {
@@ -232,8 +266,8 @@ impl GangContext for HttpContext {
             let length = (kept.len() as u64).to_le_bytes();
             let offered: Vec<&[u8]> = state.iter().copied().chain([&kept[..], &length[..]]).collect();
             match exchange::rendezvous(&mesh, applied, &offered, &|| held.halt(generation)) {
-                Ok(Met::Behind(source)) => {
-                    self.behind = Some(Behind { mesh, source, applied, begun: Instant::now() });
+                Ok(Met::Behind(source, step)) => {
+                    self.behind = Some(Behind { mesh, source, step, applied, begun: Instant::now() });
                     return Ok(Rendezvous::Behind);
                 }
                 Ok(Met::Keep) => {
@@ -246,14 +280,17 @@ impl GangContext for HttpContext {
     }
 
     fn adopt(&mut self, state: &mut [&mut [u8]]) -> Result<Adopted, ContextError> {
-        let Some(Behind { mesh, source, applied, begun }) = self.behind.take() else { return Ok(Adopted::Cut) };
+        let Some(Behind { mesh, source, step, applied, begun }) = self.behind.take() else { return Ok(Adopted::Cut) };
         let held = self.held.clone();
         let generation = mesh.config.generation;
         let directly = applied.is_none();
         match exchange::adopt(&mesh, source, state, directly, &|| held.halt(generation)) {
             Ok(rest) => {
-                let rows = rows(&rest).ok_or_else(|| malformed("is cut short"))?;
-                self.telemetry.take_over(rows, applied).map_err(|e| malformed(&e.to_string()))?;
+                let rows = rows(&rest).ok_or_else(|| "is cut short".to_owned());
+                let taken = rows.and_then(|rows| self.telemetry.take_over(rows, applied).map_err(|e| e.to_string()));
+                // It may lie over a state of this member's own already, so this try is over.
+                taken.map_err(|why| ContextError::Fault(format!("a peer's list of recorded values {why}")))?;
+                self.held.set_holds(Some(step));
                 let bytes = state.iter().map(|piece| piece.len()).sum::<usize>() + rest.len();
                 self.met(&mesh, Some((bytes, begun.elapsed().as_secs_f64())));
                 Ok(Adopted::Whole)
@@ -271,8 +308,10 @@ impl GangContext for HttpContext {
 
     fn exchange(&mut self, step: u64, slices: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError> {
         self.check()?;
+        let saved = self.held.busy().phase() == Phase::Saving;
         self.held.busy().set(Phase::Working);
         failpoints::pace();
+        let computed = self.computes_since.elapsed();
         let Some(mesh) = self.mesh.clone() else { return Ok(Exchange::Regroup) };
         let generation = mesh.config.generation;
         if self.held.halt(generation).is_some() {
@@ -285,17 +324,20 @@ impl GangContext for HttpContext {
             let part = parts.iter().find(|(at, _)| *at == slice).map(|(_, part)| part.as_slice());
             let part = part.filter(|part| own.first().is_none_or(|(_, first): &(_, &[f32])| first.len() == part.len()));
             let Some(part) = part else {
-                return Err(ContextError::Refused(format!(
+                return Err(ContextError::Fault(format!(
                     "step {step}: slice {slice} of this member's {share:?} is missing or of another length; a fault of the stage"
                 )));
             };
             own.push((slice..slice + 1, part));
         }
-        let contribution =
-            Contribution { step, slices, parts: own, drain: self.held.drain(), durable: self.telemetry.durable() };
+        let (drain, durable) = (self.held.drain(), self.telemetry.durable());
+        let contribution = Contribution { step, slices, parts: own, drain, saved, computed, durable };
         let held = self.held.clone();
-        match exchange::exchange(&mesh, &contribution, &|| held.halt(generation)) {
+        let exchanged = exchange::exchange(&mesh, &contribution, &|| held.halt(generation));
+        self.computes_since = Instant::now();
+        match exchanged {
             Ok(total) => {
+                self.held.set_holds(Some(step + 1));
                 self.telemetry.forget(total.durable);
                 Ok(Exchange::Sum { sum: total.sum, drain: total.drain })
             }
@@ -324,7 +366,11 @@ impl GangContext for HttpContext {
     }
 
     fn can_save(&self) -> bool {
-        !self.held.is_away()
+        !self.held.is_away() && !self.held.is_put_off()
+    }
+
+    fn may_postpone(&mut self, may: bool) {
+        self.held.set_postponable(may);
     }
 
     fn commit_checkpoint(
@@ -338,10 +384,13 @@ impl GangContext for HttpContext {
         let digest = self.put_manifest(manifest)?;
         let metrics: BTreeMap<String, f64> =
             metrics.iter().filter(|(_, v)| v.is_finite()).map(|(k, v)| (k.clone(), *v)).collect();
+        let receipts = self.receipts(digest);
         failpoints::hit("checkpoint::before_commit");
-        retry::until_ended(&self.held, &format!("committing the checkpoint of step {step}"), |grant| {
-            let commit = CommitCheckpoint { grant: grant.clone(), step, manifest: digest, metrics: metrics.clone() };
-            self.client.wait(self.client.tell("/v1/checkpoints", &commit))
+        retry::until_put_off(&self.held, &format!("committing the checkpoint of step {step}"), |credential| {
+            let (grant, metrics) = (credential.grant.clone(), metrics.clone());
+            let commit = CommitCheckpoint { grant, step, manifest: digest, metrics };
+            let vouched = Vouched { what: commit, receipts: receipts.clone() };
+            self.client.wait(self.client.tell("/v1/checkpoints", credential, &vouched))
         })
         .map_err(given_up)?;
         failpoints::hit("checkpoint::after_commit");
@@ -354,10 +403,6 @@ impl GangContext for HttpContext {
 fn rows(behind: &[u8]) -> Option<&[u8]> {
     let (rows, length) = behind.split_at_checked(behind.len().checked_sub(8)?)?;
     (u64::from_le_bytes(length.try_into().ok()?) == rows.len() as u64).then_some(rows)
-}
-
-fn malformed(why: &str) -> ContextError {
-    ContextError::Refused(format!("a peer's list of recorded values {why}; is it the same build?"))
 }
 
 fn given_up(gave_up: GaveUp) -> ContextError {
@@ -374,7 +419,7 @@ fn blob_error(error: BlobError) -> ContextError {
         BlobError::Refused(reason) => ContextError::GrantEnded(reason),
         BlobError::Unfit(message) => ContextError::Refused(message),
         BlobError::Storage(message) => ContextError::Storage(message),
-        BlobError::Unavailable(message) => ContextError::Unavailable(message),
+        BlobError::Unreachable(message) | BlobError::Unavailable(message) => ContextError::Unavailable(message),
         error @ (BlobError::NotFound(_) | BlobError::Corrupt { .. } | BlobError::Damaged(_)) => {
             ContextError::Damaged(error.to_string())
         }

@@ -3,6 +3,8 @@
 //! Built only with the feature `failpoints`. `STRIDE_WORKER_FAILPOINT=name`, or `name@3` for the third time it gets there,
 //! has the process end as by `kill -9` at one of them. The registry has points and a variable of its own.
 //!
+//! `STRIDE_WORKER_SECRET=text` is the secret of the process, so that a test can speak in its name.
+//!
 //! `STRIDE_WORKER_PACE=25` has every training step take 25 ms at the least, so that a test which stops something in the middle
 //! of a stage finds a middle on a fast machine too.
 
@@ -51,6 +53,22 @@ pub fn arm_from_env() {
         };
         fail::cfg_callback(name, kill).expect("a fail point takes a callback");
     }
+}
+
+/// The secret that a test gave this process.
+///
+/// # Panics
+/// If it is no secret.
+#[cfg(feature = "failpoints")]
+pub(crate) fn secret() -> Option<access::Token> {
+    let text = std::env::var("STRIDE_WORKER_SECRET").ok()?;
+    Some(text.parse().expect("STRIDE_WORKER_SECRET: a secret of plain ASCII"))
+}
+
+/// `None`: a process draws its own.
+#[cfg(not(feature = "failpoints"))]
+pub(crate) fn secret() -> Option<access::Token> {
+    None
 }
 
 /// Gets to a point.

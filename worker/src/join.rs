@@ -11,6 +11,7 @@ use burn::tensor::Device;
 use protocol::WorkerId;
 use protocol::message::{Join, PROTOCOL_VERSION};
 use protocol::stage::Backend;
+use stages::external::{DataAccess, open_roots};
 use tokio::runtime;
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -25,6 +26,27 @@ use crate::{failpoints, kinds, process};
 
 /// How long the coordinator may take to hear that we leave.
 const FAREWELL: Duration = Duration::from_secs(2);
+
+/// Which files outside the store pipelines may name.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Files {
+    /// All that the process may read.
+    Anywhere,
+    /// Those below these folders.
+    Beneath(Vec<PathBuf>),
+}
+
+impl Files {
+    fn open(&self) -> Result<DataAccess, JoinError> {
+        match self {
+            Self::Anywhere => Ok(DataAccess::anywhere(process::host_name())),
+            Self::Beneath(folders) => {
+                let roots = open_roots(folders).map_err(JoinError::Usage)?;
+                Ok(DataAccess::beneath(roots, process::host_name()))
+            }
+        }
+    }
+}
 
 /// How a worker takes part.
 #[derive(Debug, Clone)]
@@ -41,6 +63,8 @@ pub struct Options {
     pub cache: Option<PathBuf>,
     /// The folder of the coordinator's store, if it is on this machine.
     pub store: Option<PathBuf>,
+    /// Which files outside the store its stages may read.
+    pub files: Files,
     /// Where peers reach this worker, `host:port`; the address from which the coordinator is reached if `None`.
     pub peer_address: Option<String>,
     /// Be killed when the parent dies, and leave Ctrl-C to it.
@@ -125,6 +149,7 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
             options.server.url()
         );
     }
+    let data = Arc::new(options.files.open()?);
     let runtime = runtime::Builder::new_multi_thread().worker_threads(1).thread_name("http").enable_all().build();
     let runtime = runtime.map_err(system("the HTTP thread"))?;
     let client = Client::new(options.server.clone(), runtime.handle().clone());
@@ -142,7 +167,7 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
         let run = move || shared.preparation.run(&client, &cache);
         thread::Builder::new().name("prepare".to_owned()).spawn(run).map_err(system("the thread that fetches ahead"))?
     };
-    let bench = Bench { kinds, client: client.clone(), cache, device, limits: options.limits.clone() };
+    let bench = Bench { kinds, client: client.clone(), cache, data, device, limits: options.limits.clone() };
     let stage = {
         let shared = shared.clone();
         let run = move || {
@@ -171,8 +196,7 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
     match end {
         End::Left => {
             // Spares the coordinator the wait for our lease to run out; if it does not hear it, that is what happens.
-            let path = format!("/v1/workers/{}/gone", offer.worker);
-            let told = runtime.block_on(async { tokio::time::timeout(FAREWELL, client.tell(&path, &())).await });
+            let told = runtime.block_on(async { tokio::time::timeout(FAREWELL, client.leave(&offer.worker)).await });
             if !matches!(told, Ok(Ok(()))) {
                 tracing::debug!("the coordinator did not hear that this worker leaves");
             }

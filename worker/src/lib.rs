@@ -22,6 +22,7 @@ mod kinds;
 mod mapped;
 mod prepare;
 pub mod process;
+mod receipts;
 mod retry;
 mod stage_limits;
 mod stage_thread;
@@ -30,5 +31,5 @@ mod telemetry_buffer;
 mod tests;
 
 pub use cli::JoinArgs;
-pub use join::{JoinError, Options, init_logging, join};
+pub use join::{Files, JoinError, Options, init_logging, join};
 pub use stage_limits::StageLimits;

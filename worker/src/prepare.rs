@@ -2,18 +2,22 @@
 //!
 //! The coordinator says for which tasks ([`Prepare`]); a thread of its own fetches and verifies their inputs into the cache, and the
 //! next poll says which of them are there. A task that is not named any more is forgotten at once, in the middle of a download too.
+//!
+//! A task is ready only once each member of its gang answers here, so that a gang does not stop for a joiner that cannot reach it.
 
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use checkpoint::BlobError;
-use protocol::message::Prepare;
-use protocol::{Digest, Manifest, TaskId};
+use protocol::message::{Member, Prepare};
+use protocol::{Digest, Manifest, TaskId, WorkerId};
 use tokio::sync::{Notify, watch};
 
 use crate::cache::{Arriving, Cache, Cached};
 use crate::client::{CallError, Client};
 use crate::event_count::lock;
+use crate::gang::handshake::{self, HandshakeError};
 
 /// Between two tries to fetch something.
 const PAUSE: Duration = Duration::from_secs(1);
@@ -46,6 +50,8 @@ enum Stopped {
     Damaged(Digest),
     #[error("{0} is not a manifest: {1}")]
     Manifest(Digest, serde_json::Error),
+    #[error("its member `{0}` does not answer at {1}: {2}")]
+    Peer(WorkerId, String, HandshakeError),
 }
 
 type News = watch::Receiver<Option<Vec<Prepare>>>;
@@ -81,51 +87,80 @@ impl Preparation {
     /// Fetches what is wanted, until [`end`](Self::end). The body of a thread.
     pub(crate) fn run(&self, client: &Client, cache: &Cache) {
         let mut news = self.wanted.subscribe();
-        let mut missed = 0;
+        let mut missed: BTreeMap<TaskId, u32> = BTreeMap::new();
         loop {
             let Some(wanted) = news.borrow_and_update().clone() else { return };
-            let missing = wanted.into_iter().find(|task| !lock(&self.ready).iter().any(|(ready, _)| ready == task));
-            let Some(task) = missing else {
+            missed.retain(|task, _| wanted.iter().any(|wanted| wanted.task == *task));
+            let missing = wanted.into_iter().filter(|task| !lock(&self.ready).iter().any(|(ready, _)| ready == task));
+            let missing: Vec<Prepare> = missing.collect();
+            if missing.is_empty() {
                 // The sender is ours, so it is there.
                 let _ = client.wait(news.changed());
                 continue;
-            };
-            // Trials of a sweep read the same things.
-            let has_all = |ready: &Prepare| (&ready.inputs, ready.resume) == (&task.inputs, task.resume);
-            let known = lock(&self.ready).iter().find(|(ready, _)| has_all(ready)).map(|(_, all)| all.clone());
-            let prepared = match known.map_or_else(|| prepare(&task, client, cache, &mut news), Ok) {
-                // The attempt that reads it reports the damage; fetching ahead has nobody to report to.
-                Err(Stopped::Call(CallError::Damaged(why))) => {
-                    tracing::warn!(task = %task.task, "not all of its inputs can be fetched ahead: {why}");
-                    Ok(Vec::new())
-                }
-                Err(Stopped::Call(CallError::NotFound(why))) if missed >= MISSED => {
-                    tracing::warn!(task = %task.task, "not all of its inputs can be fetched ahead: {why}");
-                    Ok(Vec::new())
-                }
-                prepared => prepared,
-            };
-            missed = if matches!(prepared, Err(Stopped::Call(CallError::NotFound(_)))) { missed + 1 } else { 0 };
-            match prepared {
-                Ok(all) => {
-                    tracing::info!(task = %task.task, "its inputs are here");
-                    // Not if it is not wanted any more: then its blobs are just cached.
-                    if news.borrow().as_ref().is_some_and(|wanted| wanted.contains(&task)) {
-                        let mut ready = lock(&self.ready);
-                        ready.push((task, all));
-                        // What was kept for a task before these has been read.
-                        let wanted: Vec<Digest> = ready.iter().flat_map(|(_, all)| all).copied().collect();
-                        cache.forget_ahead(&wanted);
-                        drop(ready);
-                        self.wake.notify_one();
+            }
+            // One that cannot be prepared yet does not keep others from it.
+            let mut is_later = false;
+            for task in missing {
+                let misses = missed.entry(task.task.clone()).or_default();
+                match self.prepare(&task, misses, client, cache, &mut news) {
+                    Ok(all) => self.is_ready(task, all, cache, &news),
+                    Err(Stopped::News) => break,
+                    Err(error) => {
+                        tracing::debug!(task = %task.task, "it cannot be prepared yet: {error}");
+                        is_later = true;
                     }
                 }
-                Err(Stopped::News) => {}
-                Err(error) => {
-                    tracing::debug!(task = %task.task, "its inputs cannot be fetched ahead yet: {error}");
-                    let _ = client.wait(async { tokio::time::timeout(PAUSE, news.changed()).await });
-                }
             }
+            if is_later {
+                let _ = client.wait(async { tokio::time::timeout(PAUSE, news.changed()).await });
+            }
+        }
+    }
+
+    /// Fetches what a task needs and looks whether its members answer; gives the digests of what is there.
+    fn prepare(
+        &self,
+        task: &Prepare,
+        missed: &mut u32,
+        client: &Client,
+        cache: &Cache,
+        news: &mut News,
+    ) -> Result<Vec<Digest>, Stopped> {
+        // Trials of a sweep read the same things.
+        let has_all = |ready: &Prepare| (&ready.inputs, ready.resume) == (&task.inputs, task.resume);
+        let known = lock(&self.ready).iter().find(|(ready, _)| has_all(ready)).map(|(_, all)| all.clone());
+        let prepared = match known.map_or_else(|| prepare(task, client, cache, news), Ok) {
+            // The attempt that reads it reports the damage; fetching ahead has nobody to report to.
+            Err(Stopped::Call(CallError::Damaged(why))) => {
+                tracing::warn!(task = %task.task, "not all of its inputs can be fetched ahead: {why}");
+                Ok(Vec::new())
+            }
+            Err(Stopped::Call(CallError::NotFound(why))) if *missed >= MISSED => {
+                tracing::warn!(task = %task.task, "not all of its inputs can be fetched ahead: {why}");
+                Ok(Vec::new())
+            }
+            prepared => prepared,
+        };
+        *missed = if matches!(prepared, Err(Stopped::Call(CallError::NotFound(_)))) { *missed + 1 } else { 0 };
+        let all = prepared?;
+        for Member { worker, peer_address, .. } in &task.peers {
+            let answers = handshake::probe(peer_address);
+            answers.map_err(|error| Stopped::Peer(worker.clone(), peer_address.clone(), error))?;
+        }
+        Ok(all)
+    }
+
+    fn is_ready(&self, task: Prepare, all: Vec<Digest>, cache: &Cache, news: &News) {
+        tracing::info!(task = %task.task, "its inputs are here");
+        // Not if it is not wanted any more: then its blobs are just cached.
+        if news.borrow().as_ref().is_some_and(|wanted| wanted.contains(&task)) {
+            let mut ready = lock(&self.ready);
+            ready.push((task, all));
+            // What was kept for a task before these has been read.
+            let wanted: Vec<Digest> = ready.iter().flat_map(|(_, all)| all).copied().collect();
+            cache.forget_ahead(&wanted);
+            drop(ready);
+            self.wake.notify_one();
         }
     }
 }

@@ -78,10 +78,14 @@ pub(crate) fn peak_memory() -> Option<u64> {
     Some(peak.trim().strip_suffix(" kB")?.parse::<u64>().ok()? << 10)
 }
 
+/// The name of this machine; empty if the system does not say.
+pub(crate) fn host_name() -> String {
+    std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default().trim().to_owned()
+}
+
 /// A name for a worker that was given none: host and process.
 pub(crate) fn default_name() -> String {
-    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
-    let host: String = host.trim().chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').take(40).collect();
+    let host: String = host_name().chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').take(40).collect();
     let host = if host.starts_with(|c: char| c.is_ascii_alphanumeric()) { host } else { "worker".to_owned() };
     format!("{host}-{}", std::process::id())
 }

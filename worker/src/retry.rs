@@ -2,10 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use protocol::message::Grant;
-
 use crate::active_assignment::ActiveAssignment;
-use crate::client::CallError;
+use crate::client::{CallError, Credential};
 
 /// Why a call in the name of a grant was given up.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -22,11 +20,34 @@ const FAULTS: u32 = 8;
 /// Longest pause between two tries.
 const LONGEST: Duration = Duration::from_secs(1);
 
+/// How long a call that may be made again later is tried now.
+const PATIENCE: Duration = Duration::from_secs(2);
+
 /// Calls until it succeeds, is refused for good, or the grant has ended. `call` is given the newest grant each time.
 pub(crate) fn until_ended<T>(
     held: &ActiveAssignment,
     what: &str,
-    mut call: impl FnMut(&Grant) -> Result<T, CallError>,
+    call: impl FnMut(&Credential) -> Result<T, CallError>,
+) -> Result<T, GaveUp> {
+    until(held, what, |_| false, call)
+}
+
+/// The same for a part of a checkpoint. If that may be made later, what cannot be stored now is put off.
+pub(crate) fn until_put_off<T>(
+    held: &ActiveAssignment,
+    what: &str,
+    call: impl FnMut(&Credential) -> Result<T, CallError>,
+) -> Result<T, GaveUp> {
+    let done = until(held, what, |tried| tried >= PATIENCE && held.may_put_off(), call);
+    held.was_put_off(matches!(&done, Err(GaveUp::Answer(error)) if error.may_pass()));
+    done
+}
+
+fn until<T>(
+    held: &ActiveAssignment,
+    what: &str,
+    is_put_off: impl Fn(Duration) -> bool,
+    mut call: impl FnMut(&Credential) -> Result<T, CallError>,
 ) -> Result<T, GaveUp> {
     let begun = Instant::now();
     let mut warned = begun;
@@ -36,8 +57,8 @@ pub(crate) fn until_ended<T>(
         if let Some(reason) = held.ended() {
             return Err(GaveUp::Ended(reason));
         }
-        let grant = held.grant();
-        match call(&grant) {
+        let credential = held.credential();
+        match call(&credential) {
             Ok(done) => {
                 if warned != begun {
                     tracing::info!("{what}: done after {:.0} s", begun.elapsed().as_secs_f64());
@@ -45,12 +66,13 @@ pub(crate) fn until_ended<T>(
                 return Ok(done);
             }
             Err(CallError::Stale(message)) => {
-                tracing::debug!(task = %grant.task, "{what}: {message}");
-                held.after_stale(&grant).map_err(GaveUp::Ended)?;
+                tracing::debug!(task = %credential.grant.task, "{what}: {message}");
+                held.after_stale(&credential).map_err(GaveUp::Ended)?;
             }
             Err(CallError::Fault(message)) if faults == FAULTS => {
                 return Err(GaveUp::Answer(CallError::Fault(message)));
             }
+            Err(error) if error.may_pass() && is_put_off(begun.elapsed()) => return Err(GaveUp::Answer(error)),
             Err(error) if error.may_pass() => {
                 faults += u32::from(matches!(error, CallError::Fault(_)));
                 if warned == begun || warned.elapsed() > Duration::from_secs(10) {

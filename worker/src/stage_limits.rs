@@ -3,11 +3,13 @@
 //! A thread looks at both while a stage computes. What goes beyond is reported as a failure that is final. The coordinator ends the grant for it,
 //! and the stage stops where it next looks; if it does not, the process ends, which frees what it has.
 
+use std::collections::BTreeMap;
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use protocol::message::{FailureClass, ReportOutcome, Role, TaskOutcome};
+use protocol::proof::Vouched;
 
 use crate::active_assignment::ActiveAssignment;
 use crate::client::Client;
@@ -90,8 +92,10 @@ fn watch(limits: &StageLimits, held: &ActiveAssignment, client: &Client, ended: 
     tracing::error!(task = %held.grant().task, "{message}");
     for _ in 0..TRIES {
         let outcome = TaskOutcome::Failed { class, message: message.clone() };
-        let report = ReportOutcome { grant: held.grant(), outcome };
-        let told: Result<(), _> = client.wait(client.tell("/v1/outcomes", &report));
+        let credential = held.credential();
+        let what = ReportOutcome { grant: credential.grant.clone(), outcome };
+        let report = Vouched { what, receipts: BTreeMap::new() };
+        let told = client.wait(client.tell("/v1/outcomes", &credential, &report));
         match told {
             Err(error) if error.may_pass() && held.ended().is_none() => {
                 if !is_running(PERIOD) {

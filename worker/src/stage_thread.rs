@@ -3,13 +3,18 @@
 use std::any::Any;
 use std::backtrace::{Backtrace, BacktraceStatus};
 use std::cell::RefCell;
+use std::collections::BTreeMap;
 use std::panic::{self, AssertUnwindSafe};
 use std::sync::Arc;
 use std::time::Duration;
 
 use burn::tensor::Device;
+use protocol::Digest;
 use protocol::message::{FailureClass, ReportOutcome, Role, TaskOutcome};
+use protocol::proof::Vouched;
 use stages::context::{AttemptContext, ContextError, GangContext, Outcome, Part, StageError};
+use stages::external;
+use stages::external::DataAccess;
 
 use crate::active_assignment::ActiveAssignment;
 use crate::assignments::Shared;
@@ -33,6 +38,7 @@ pub(crate) struct Bench {
     pub(crate) kinds: Arc<dyn Kinds>,
     pub(crate) client: Client,
     pub(crate) cache: Arc<Cache>,
+    pub(crate) data: Arc<DataAccess>,
     pub(crate) device: Device,
     pub(crate) limits: StageLimits,
 }
@@ -58,21 +64,31 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
     let assignment = held.assignment();
     let grant = &assignment.grant;
     tracing::info!(task = %grant.task, attempt = %grant.attempt, fence = %grant.fence, kind = assignment.stage.settings.kind(), "begin");
-    let mut context = HttpContext::new(held.clone(), bench.client.clone(), bench.cache.clone(), bench.device.clone());
+    let mut context = HttpContext::new(
+        held.clone(),
+        bench.client.clone(),
+        bench.cache.clone(),
+        bench.data.clone(),
+        bench.device.clone(),
+    );
+    let part = |part, context: &mut HttpContext| bench.kinds.part(context, part).map(Done::Stage);
     let stage = AssertUnwindSafe(|| match assignment.role {
-        Role::Alone => bench.kinds.alone(&mut context),
-        Role::Shard { index, of } => {
-            bench.kinds.part(&mut context, Part::Shard { index: index as usize, of: of as usize })
-        }
-        Role::Merge { shards } => bench.kinds.part(&mut context, Part::Merge { shards }),
-        Role::Member { .. } => bench.kinds.gang(&mut context),
+        Role::Alone => bench.kinds.alone(&mut context).map(Done::Stage),
+        Role::Shard { index, of } => part(Part::Shard { index: index as usize, of: of as usize }, &mut context),
+        Role::Merge { shards } => part(Part::Merge { shards }, &mut context),
+        Role::Member { .. } => bench.kinds.gang(&mut context).map(Done::Stage),
+        Role::Resolve => external::digests(&context).map(Done::Resolved),
     });
     let caught = stage_limits::within(&bench.limits, held, &bench.client, || panic::catch_unwind(stage));
     let result = caught.unwrap_or_else(|payload| Err(StageError::Fault(panic_message(&*payload))));
     let Some(outcome) = outcome(result, held, &context) else { return };
 
     failpoints::hit("outcome::before_report");
-    let reported = report(held, bench, &outcome);
+    let receipts = match &outcome {
+        TaskOutcome::Finished { output, .. } => context.receipts(*output),
+        TaskOutcome::Resolved { .. } | TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => BTreeMap::new(),
+    };
+    let reported = report(held, bench, &outcome, &receipts);
     failpoints::hit("outcome::after_report");
     match reported {
         Ok(()) => tracing::info!(task = %grant.task, attempt = %grant.attempt, "end: {}", summary(&outcome)),
@@ -86,22 +102,38 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
                 _ => FailureClass::Infrastructure,
             };
             let message = format!("what it made was refused: {error}");
-            if let Err(GaveUp::Answer(error)) = report(held, bench, &TaskOutcome::Failed { class, message }) {
+            if let Err(GaveUp::Answer(error)) =
+                report(held, bench, &TaskOutcome::Failed { class, message }, &BTreeMap::new())
+            {
                 tracing::error!(task = %grant.task, "so was the failure: {error}");
             }
         }
     }
 }
 
-fn report(held: &ActiveAssignment, bench: &Bench, outcome: &TaskOutcome) -> Result<(), GaveUp> {
-    retry::until_ended(held, "reporting the outcome", |grant| {
-        let report = ReportOutcome { grant: grant.clone(), outcome: outcome.clone() };
-        bench.client.wait(bench.client.tell("/v1/outcomes", &report))
+fn report(
+    held: &ActiveAssignment,
+    bench: &Bench,
+    outcome: &TaskOutcome,
+    receipts: &BTreeMap<Digest, String>,
+) -> Result<(), GaveUp> {
+    retry::until_ended(held, "reporting the outcome", |credential| {
+        let report = ReportOutcome { grant: credential.grant.clone(), outcome: outcome.clone() };
+        let vouched = Vouched { what: report, receipts: receipts.clone() };
+        bench.client.wait(bench.client.tell("/v1/outcomes", credential, &vouched))
     })
 }
 
+/// The result of an assignment.
+enum Done {
+    /// The outcome of a stage.
+    Stage(Outcome),
+    /// Digests of what a stage's settings name outside the store.
+    Resolved(BTreeMap<String, Digest>),
+}
+
 /// What to report; nothing if the grant has ended, or if it is for rank 0 to say.
-fn outcome(result: Result<Outcome, StageError>, held: &ActiveAssignment, context: &HttpContext) -> Option<TaskOutcome> {
+fn outcome(result: Result<Done, StageError>, held: &ActiveAssignment, context: &HttpContext) -> Option<TaskOutcome> {
     let task = held.grant().task;
     let result = match result {
         // What was recorded belongs to the outcome; without it the outcome is not reported.
@@ -117,11 +149,12 @@ fn outcome(result: Result<Outcome, StageError>, held: &ActiveAssignment, context
             tracing::info!(%task, "end; rank 0 reports");
             None
         }
-        Ok(Outcome::Finished { output, metrics }) => {
+        Ok(Done::Resolved(digests)) => Some(TaskOutcome::Resolved { digests }),
+        Ok(Done::Stage(Outcome::Finished { output, metrics })) => {
             let metrics = metrics.into_iter().filter(|(_, value)| value.is_finite()).collect();
             Some(TaskOutcome::Finished { output, metrics })
         }
-        Ok(Outcome::Yielded { at }) => Some(TaskOutcome::Yielded { at }),
+        Ok(Done::Stage(Outcome::Yielded { at })) => Some(TaskOutcome::Yielded { at }),
         Err(StageError::Context(ContextError::GrantEnded(reason))) => {
             tracing::info!(%task, "dropped: {reason}");
             None
@@ -151,6 +184,7 @@ fn is_out_of_memory(message: &str) -> bool {
 fn summary(outcome: &TaskOutcome) -> String {
     match outcome {
         TaskOutcome::Finished { output, .. } => format!("finished, {}", output.short()),
+        TaskOutcome::Resolved { digests } => format!("{} digests", digests.len()),
         TaskOutcome::Yielded { at } => format!("yielded at {at}"),
         TaskOutcome::Failed { class, .. } => format!("failed, {class:?}"),
     }

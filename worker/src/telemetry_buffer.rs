@@ -236,9 +236,9 @@ impl TelemetryBuffer {
             (rows, lines)
         };
         if !rows.is_empty() {
-            let sent = retry::until_ended(&self.held, "sending metrics", |grant| {
-                let batch = MetricBatch { grant: grant.clone(), rows: rows.clone() };
-                self.client.wait(self.client.tell("/v1/metrics", &batch))
+            let sent = retry::until_ended(&self.held, "sending metrics", |credential| {
+                let batch = MetricBatch { grant: credential.grant.clone(), rows: rows.clone() };
+                self.client.wait(self.client.tell("/v1/metrics", credential, &batch))
             });
             stored_or_left_out(sent)?;
             let mut state = lock(&self.state);
@@ -250,10 +250,10 @@ impl TelemetryBuffer {
             }
         }
         if let Some((first, _)) = lines.first() {
-            let sent = retry::until_ended(&self.held, "sending logs", |grant| {
+            let sent = retry::until_ended(&self.held, "sending logs", |credential| {
                 let lines = lines.iter().map(|(_, line)| line.clone()).collect();
-                let batch = LogBatch { grant: grant.clone(), first: *first, lines };
-                self.client.wait(self.client.tell("/v1/logs", &batch))
+                let batch = LogBatch { grant: credential.grant.clone(), first: *first, lines };
+                self.client.wait(self.client.tell("/v1/logs", credential, &batch))
             });
             stored_or_left_out(sent)?;
             let last = first + lines.len() as u64;

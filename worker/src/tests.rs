@@ -92,6 +92,7 @@ impl Worker {
             kinds: Arc::new(Scripted(script)),
             client: client.clone(),
             cache,
+            data: Arc::default(),
             device: Device::default(),
             limits,
         };
@@ -154,6 +155,7 @@ fn assignment(member: &Member, attempt: u64, fence: u64) -> Assignment {
             worker: WorkerId::from("w0"),
             incarnation: Incarnation(1),
         },
+        secret: format!("the-secret-of-fence-{fence}"),
         stage: StageTask {
             run: RunId::from("run"),
             name: StageName::from("stage"),
@@ -256,6 +258,17 @@ fn p9_everything_arrives_once_though_answers_are_lost() {
     );
     assert!(matches!(coordinator.outcomes[..], [ReportOutcome { outcome: TaskOutcome::Finished { .. }, .. }]));
     assert_eq!(coordinator.joins, 1);
+}
+
+#[test]
+fn a_name_that_another_process_has_is_waited_for() {
+    let worker = Worker::start(Box::new(finished));
+    worker.wait("the first join", |coordinator| coordinator.joins == 1);
+    worker.fake.name_held.store(3, Ordering::SeqCst);
+    lock(&worker.fake.coordinator).forget = true;
+    worker.wait("the second join", |coordinator| coordinator.joins == 2);
+    assert_eq!(worker.fake.name_held.load(Ordering::SeqCst), 0);
+    worker.leave();
 }
 
 #[test]

@@ -40,6 +40,9 @@ pub enum BlobError {
     /// Full or not writable.
     #[error("{0}")]
     Storage(String),
+    /// The place where blobs lie does not answer; the same call may succeed later.
+    #[error("{0}")]
+    Unreachable(String),
     /// Anything else, after retries.
     #[error("{0}")]
     Unavailable(String),

@@ -29,6 +29,15 @@ pub struct Stat {
     pub stamp: String,
 }
 
+/// Why a place gives no answers.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Problem {
+    /// Since when, in milliseconds since 1970.
+    pub since_ms: i64,
+    /// What happens instead, in words.
+    pub what: String,
+}
+
 /// Where bytes lie. Calls block, and may come from many threads; one digest may be put by two of them at once.
 pub trait Backend: Send + Sync + fmt::Debug {
     /// A place for a blob of `bytes` bytes to arrive at.
@@ -58,6 +67,11 @@ pub trait Backend: Send + Sync + fmt::Debug {
     /// Puts a marker in the place of `old`, `None` for none; `false`, and nothing is changed, if there is not `old`. Of two that
     /// try this at once one is told `false`.
     fn set_marker(&self, old: Option<&str>, marker: &str) -> Result<bool, BlobError>;
+
+    /// Why it gives no answers now, as far as the last calls have shown.
+    fn problem(&self) -> Option<Problem> {
+        None
+    }
 
     /// As [`stage`](Self::stage), in place of what is staged under a name of 64 hexadecimal digits. A backend that can keeps what has
     /// arrived when it is dropped, and when the process ends.

@@ -10,6 +10,7 @@ use protocol::{Digest, Incarnation, TaskId, WorkerId};
 
 use super::backend::Staged;
 use super::holds::Holds;
+use super::seen::SMALL_BYTES;
 
 /// Bytes that arrive in parts and are hashed on the way. They are gone if it is dropped.
 #[derive(Debug)]
@@ -19,9 +20,16 @@ pub struct Upload {
     pub(super) written: u64,
     /// How many bytes there may be.
     pub(super) bytes: u64,
+    /// What has come, while it is short and all of it came to this process.
+    pub(super) content: Option<Vec<u8>>,
 }
 
 impl Upload {
+    /// Nothing has come yet of the `bytes` bytes that may.
+    pub(super) fn new(staged: Box<dyn Staged>, bytes: u64) -> Self {
+        Self { staged, hasher: Hasher::default(), written: 0, bytes, content: Some(Vec::new()) }
+    }
+
     /// Appends bytes, on disk or where blobs lie.
     pub fn write(&mut self, bytes: &[u8]) -> Result<(), BlobError> {
         let written = self.written + bytes.len() as u64;
@@ -31,6 +39,10 @@ impl Upload {
         self.staged.write(bytes)?;
         self.hasher.update(bytes);
         self.written = written;
+        self.content = self.content.take().filter(|_| written <= SMALL_BYTES).map(|mut content| {
+            content.extend_from_slice(bytes);
+            content
+        });
         Ok(())
     }
 

@@ -19,11 +19,12 @@ pub mod memory;
 pub mod objects;
 pub mod place;
 mod reader;
+mod seen;
 mod staging;
 mod store;
 mod uploads;
 
-pub use self::backend::{Backend, Entry, Staged, Stat};
+pub use self::backend::{Backend, Entry, Problem, Staged, Stat};
 pub use self::begun::Upload;
 pub use self::manifest::{MANIFEST_BYTES, ManifestError};
 pub use self::reader::{PART_BYTES, Reader};

@@ -89,6 +89,8 @@ impl Place {
 pub(crate) enum Looked {
     Folder(PathBuf),
     Objects(Arc<Remote>, PathBuf),
+    /// One that no name leads to.
+    Given(Arc<dyn Backend>, PathBuf),
 }
 
 impl Looked {
@@ -97,13 +99,22 @@ impl Looked {
         Ok(match self {
             Self::Folder(root) => Arc::new(Folder::to_read(root)),
             Self::Objects(remote, dir) => Arc::new(Objects::to_read(Arc::clone(remote), dir)?),
+            Self::Given(blobs, _) => Arc::clone(blobs),
         })
+    }
+
+    /// Whether other folders than the store's may lead to it, so that the lock in that one says nothing.
+    pub(crate) fn is_shared(&self, dir: &Path) -> bool {
+        match self {
+            Self::Folder(root) => root != dir,
+            Self::Objects(..) | Self::Given(..) => true,
+        }
     }
 
     /// The file that remembers which blobs were found whole.
     pub(crate) fn verified(&self) -> PathBuf {
         match self {
-            Self::Folder(dir) | Self::Objects(_, dir) => dir.join("blobs/verified"),
+            Self::Folder(dir) | Self::Objects(_, dir) | Self::Given(_, dir) => dir.join("blobs/verified"),
         }
     }
 
@@ -115,6 +126,7 @@ impl Looked {
                 let objects = Objects::open(Arc::clone(remote), dir)?;
                 Ok(BlobStore::remembering(Arc::new(objects), &self.verified()))
             }
+            Self::Given(blobs, _) => Ok(BlobStore::remembering(Arc::clone(blobs), &self.verified())),
         }
     }
 }

@@ -1,7 +1,7 @@
 //! A blob read part by part, verified by the time its last part is handed out.
 
 use std::fmt;
-use std::io::Read;
+use std::io::{self, Read};
 use std::sync::Arc;
 
 use checkpoint::BlobError;
@@ -99,9 +99,14 @@ impl Reader {
 /// Up to [`PART_BYTES`]; fewer only at the end.
 fn read_part(source: &mut (dyn Read + Send), digest: Digest) -> Result<Vec<u8>, BlobError> {
     let mut part = Vec::with_capacity(PART_BYTES);
-    source
-        .take(PART_BYTES as u64)
-        .read_to_end(&mut part)
-        .map_err(|e| BlobError::Unavailable(format!("failed to read blob {digest}: {e}")))?;
+    source.take(PART_BYTES as u64).read_to_end(&mut part).map_err(|e| read_error(digest, &e))?;
     Ok(part)
+}
+
+pub(super) fn read_error(digest: Digest, e: &io::Error) -> BlobError {
+    let message = format!("failed to read blob {digest}: {e}");
+    match e.kind() {
+        io::ErrorKind::HostUnreachable => BlobError::Unreachable(message),
+        _ => BlobError::Unavailable(message),
+    }
 }

@@ -1,20 +1,22 @@
 //! The store of blobs: verifies what is read and what is used again, stores equal bytes once, and mends what was damaged.
 
 use std::collections::BTreeMap;
+use std::fmt;
 use std::path::Path;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, RwLock};
 
 use checkpoint::{Blob, BlobError, Blobs};
 use protocol::Digest;
 use protocol::digest::Hasher;
 
-use super::backend::{Backend, Entry, Stat};
+use super::backend::{Backend, Entry, Problem, Stat};
 use super::begun::{Upload, Uploads};
 use super::fs::Folder;
 use super::holds::Holds;
 use super::known::{Finding, Findings, Known};
 use super::memory::Memory;
-use super::reader::Reader;
+use super::reader::{Reader, read_error};
+use super::seen::Seen;
 
 /// The file that remembers what held tasks have stored.
 const HELD: &str = "held";
@@ -27,12 +29,23 @@ pub struct BlobStore(Arc<Shared>);
 struct Shared {
     backend: Arc<dyn Backend>,
     /// Held shared while a blob is touched, exclusively while one is removed: so that nobody is told that a blob is stored
-    /// which is going away.
-    removal: RwLock<()>,
+    /// which is going away. One for all blobs whose digests begin alike.
+    removals: [RwLock<()>; 256],
     /// Held while a damaged blob is looked at once more and put aside.
     mending: Mutex<()>,
     known: Arc<Findings>,
+    seen: Seen,
     uploads: Uploads,
+    permit: OnceLock<Permit>,
+}
+
+/// Whether a blob may be removed now.
+struct Permit(Box<dyn Fn() -> Result<(), BlobError> + Send + Sync>);
+
+impl fmt::Debug for Permit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Permit")
+    }
 }
 
 impl BlobStore {
@@ -60,9 +73,11 @@ impl BlobStore {
     fn with(backend: Arc<dyn Backend>, known: Known, held: Holds) -> Self {
         Self(Arc::new(Shared {
             backend,
-            removal: RwLock::default(),
+            removals: std::array::from_fn(|_| RwLock::default()),
             mending: Mutex::default(),
             known: Arc::new(Findings::new(known)),
+            seen: Seen::default(),
+            permit: OnceLock::new(),
             uploads: Uploads::new(held),
         }))
     }
@@ -96,19 +111,50 @@ impl BlobStore {
         &self.0.uploads
     }
 
+    /// From here on a blob is removed or put aside only if `permit` has just said that it may be.
+    pub(crate) fn permit_removals_by(&self, permit: impl Fn() -> Result<(), BlobError> + Send + Sync + 'static) {
+        // Set once, when the store is opened.
+        let _ = self.0.permit.set(Permit(Box::new(permit)));
+    }
+
+    fn may_remove(&self) -> Result<(), BlobError> {
+        self.0.permit.get().map_or(Ok(()), |permit| (permit.0)())
+    }
+
+    pub(super) fn seen(&self) -> &Seen {
+        &self.0.seen
+    }
+
     fn known(&self) -> MutexGuard<'_, Known> {
         self.0.known.lock()
     }
 
+    fn removal(&self, digest: Digest) -> &RwLock<()> {
+        let byte = u8::from_str_radix(&digest.hex()[..2], 16).unwrap_or_default();
+        &self.0.removals[usize::from(byte)]
+    }
+
+    /// Why the place where the blobs lie gives no answers now, as far as the last calls have shown.
+    pub fn problem(&self) -> Option<Problem> {
+        self.backend().problem()
+    }
+
     pub(super) fn must_stat(&self, digest: Digest) -> Result<Stat, BlobError> {
-        self.backend().stat(digest)?.ok_or(BlobError::NotFound(digest))
+        let stat = self.backend().stat(digest)?;
+        if stat.is_none() {
+            self.seen().forget(digest);
+        }
+        stat.ok_or(BlobError::NotFound(digest))
     }
 
     /// Refuses a blob that was found damaged and was not written to since.
     fn not_damaged(&self, digest: Digest) -> Result<Stat, BlobError> {
         let stat = self.must_stat(digest)?;
         match self.known().finding(digest, &stat.stamp) {
-            Some(Finding::Damaged(found)) => Err(BlobError::Corrupt { expected: digest, found }),
+            Some(Finding::Damaged(found)) => {
+                self.seen().forget(digest);
+                Err(BlobError::Corrupt { expected: digest, found })
+            }
             Some(Finding::Whole) | None => Ok(stat),
         }
     }
@@ -184,7 +230,7 @@ impl BlobStore {
 
     /// Begins to store a blob of `bytes` bytes.
     pub fn begin(&self, bytes: u64) -> Result<Upload, BlobError> {
-        Ok(Upload { staged: self.backend().stage(bytes)?, hasher: Hasher::default(), written: 0, bytes })
+        Ok(Upload::new(self.backend().stage(bytes)?, bytes))
     }
 
     /// Gives an upload the name `digest`, and refuses it if that is not what its bytes hash to. Returns once it would survive a
@@ -194,13 +240,18 @@ impl BlobStore {
         if found != digest {
             return Err(BlobError::Corrupt { expected: digest, found });
         }
+        let (bytes, content) = (upload.written, upload.content);
         if self.reuse(digest)? {
+            self.seen().complete(digest, content);
             return Ok(());
         }
         // A collection that runs now removes only what was old when it began.
         if upload.staged.commit(digest)? {
+            let _no_removal = self.removal(digest).read().unwrap_or_else(PoisonError::into_inner);
             let stat = self.must_stat(digest)?;
             self.known().set(digest, stat.stamp, Finding::Whole);
+            self.seen().note(digest, bytes);
+            self.seen().complete(digest, content);
             return Ok(());
         }
         // Another thread was faster with the same bytes.
@@ -220,18 +271,21 @@ impl BlobStore {
                     let _mending = self.0.mending.lock().unwrap_or_else(PoisonError::into_inner);
                     // Somebody else may have mended it.
                     if let Err(BlobError::Corrupt { .. }) = self.verify(digest) {
+                        self.may_remove()?;
                         self.backend().put_aside(digest)?;
                         self.known().forget(digest);
+                        self.seen().forget(digest);
                     }
                     continue;
                 }
                 Err(e) => return Err(e),
             };
             // Not held while gigabytes are hashed: a collection would wait, and everybody who waits for it.
-            let _no_removal = self.0.removal.read().unwrap_or_else(PoisonError::into_inner);
+            let _no_removal = self.removal(digest).read().unwrap_or_else(PoisonError::into_inner);
             if self.backend().stat(digest)?.is_some_and(|now| now.stamp == stat.stamp) {
                 let touched = self.backend().touch(digest)?;
                 self.known().set(digest, touched.stamp, Finding::Whole);
+                self.seen().note(digest, touched.bytes);
                 return Ok(true);
             }
         }
@@ -247,10 +301,9 @@ impl BlobStore {
         Ok(self.size(digest)?.is_some())
     }
 
-    /// A blob as a listing shows it, if it is there.
-    pub(crate) fn entry(&self, digest: Digest) -> Result<Option<Entry>, BlobError> {
-        let stat = self.backend().stat(digest)?;
-        Ok(stat.map(|stat| Entry { digest, bytes: stat.bytes, put_ms: stat.put_ms }))
+    /// The length of a blob that this process has just stored or used again. Asks no place.
+    pub(crate) fn just_stored(&self, digest: Digest) -> Option<u64> {
+        self.seen().bytes(digest)
     }
 
     /// All blobs by name.
@@ -268,15 +321,21 @@ impl BlobStore {
         self.backend().aside()
     }
 
-    /// Removes a blob unless it was put after `before_ms` or a held task has put it; says whether it did. One that is known
-    /// to be damaged is put aside instead.
-    pub(crate) fn remove_older(&self, digest: Digest, before_ms: i64) -> Result<bool, BlobError> {
-        let _alone = self.0.removal.write().unwrap_or_else(PoisonError::into_inner);
+    /// Removes a blob unless it `is_young`, by when it was last put, or a held task has put it; gives what was removed. One that is
+    /// known to be damaged is put aside instead.
+    pub(crate) fn remove_unless(
+        &self,
+        digest: Digest,
+        is_young: impl FnOnce(i64) -> bool,
+    ) -> Result<Option<Entry>, BlobError> {
+        let _alone = self.removal(digest).write().unwrap_or_else(PoisonError::into_inner);
         if self.held().contains(&digest) {
-            return Ok(false);
+            return Ok(None);
         }
+        self.seen().forget(digest);
         match self.backend().stat(digest)? {
-            Some(stat) if stat.put_ms < before_ms => {
+            Some(stat) if !is_young(stat.put_ms) => {
+                self.may_remove()?;
                 let damaged = self.known().is_damaged(digest);
                 if damaged {
                     self.backend().put_aside(digest)?
@@ -284,9 +343,9 @@ impl BlobStore {
                     self.backend().remove(digest)?
                 }
                 self.known().forget(digest);
-                Ok(true)
+                Ok(Some(Entry { digest, bytes: stat.bytes, put_ms: stat.put_ms }))
             }
-            _ => Ok(false),
+            _ => Ok(None),
         }
     }
 }
@@ -327,7 +386,6 @@ impl Blob for Opened {
         if offset.checked_add(out.len() as u64).is_none_or(|end| end > self.bytes) {
             return Err(checkpoint::past_the_end(offset, out.len(), self.bytes));
         }
-        let failed = |e| BlobError::Unavailable(format!("failed to read blob {}: {e}", self.digest));
-        self.store.backend().read(self.digest, offset)?.read_exact(out).map_err(failed)
+        self.store.backend().read(self.digest, offset)?.read_exact(out).map_err(|e| read_error(self.digest, &e))
     }
 }

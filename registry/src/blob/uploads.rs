@@ -108,7 +108,7 @@ impl BlobStore {
         match self.backend().stage_as(&name(&place), bytes) {
             Ok(staged) => {
                 all.insert(place, Begun { upload: None, waits: false, bytes: Some(bytes), touched: Instant::now() });
-                Ok(arriving(Upload { staged, hasher: Hasher::default(), written: 0, bytes }))
+                Ok(arriving(Upload::new(staged, bytes)))
             }
             Err(error) => {
                 self.discard(&mut all, &place);
@@ -134,7 +134,7 @@ impl BlobStore {
         if all.get(place).is_none_or(|begun| begun.waits) {
             all.remove(place);
             if let Some(staged) = staged {
-                let upload = Some(Upload { staged, hasher, written, bytes: written });
+                let upload = Some(Upload { staged, hasher, written, bytes: written, content: None });
                 all.insert(place.clone(), Begun { upload, waits: false, bytes: None, touched: Instant::now() });
             }
         }
@@ -244,7 +244,9 @@ impl Arriving {
         // Before it is there: a collection in between must not take it.
         self.store.hold(&self.holder.0, self.digest);
         let stored = self.store.commit(upload, self.digest);
-        self.waits = matches!(stored, Err(BlobError::Unavailable(_) | BlobError::Storage(_)));
+        let may_be_later =
+            |e: &BlobError| matches!(e, BlobError::Unreachable(_) | BlobError::Unavailable(_) | BlobError::Storage(_));
+        self.waits = stored.as_ref().is_err_and(may_be_later);
         stored.map(|()| true)
     }
 }

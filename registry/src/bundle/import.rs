@@ -10,7 +10,7 @@ use std::io::BufReader;
 use std::path::Path;
 
 use checkpoint::BlobError;
-use protocol::{Digest, ModelName};
+use protocol::{Digest, ModelName, Owner};
 use serde_json::{Value, json};
 
 use super::{Bundle, BundleError, Sink, read};
@@ -68,10 +68,20 @@ impl Store {
     /// Registers the version in a bundle's file, as `model` or as what it was called where it was exported. Of a model that the store has it
     /// becomes the next version; an artifact that it has as this model already gets no new one.
     pub async fn import_bundle(&self, file: &Path, model: Option<ModelName>) -> Result<Version, ImportError> {
+        // The store's own user; a model without an owner is the store's.
+        let owner = Owner { admin: true, ..Owner::default() };
+        self.import_bundle_of(file, model, owner).await
+    }
+
+    /// The same, for the owner of a token.
+    pub async fn import_bundle_of(
+        &self,
+        file: &Path,
+        model: Option<ModelName>,
+        owner: Owner,
+    ) -> Result<Version, ImportError> {
         let (blobs, file) = (self.blobs().clone(), file.to_owned());
-        let stored = tokio::task::spawn_blocking(move || store(&blobs, &file)).await;
-        let ended = |e: tokio::task::JoinError| WriteError::Internal(format!("the import ended early: {e}"));
-        let (Bundle { head, .. }, _protected) = stored.map_err(ended)??;
+        let (Bundle { head, .. }, _protected) = self.ask_blobs(move || store(&blobs, &file)).await?;
         let name = model.unwrap_or_else(|| head.model.clone());
         let mut source = json!({
             "imported": {"model": head.model, "version": head.version, "source": head.source},
@@ -86,8 +96,9 @@ impl Store {
         }
         let metrics: BTreeMap<String, f64> =
             head.metrics.into_iter().map(|(metric, value)| (metric, value.unwrap_or(f64::NAN))).collect();
+        let own = Write::ModelOwner { model: name.clone(), owner };
         let write = Write::Version { model: name.clone(), artifact: head.artifact, metrics, source };
-        self.write(vec![write]).await?;
+        self.write(vec![own, write]).await?;
         let version = self.version_of(&name, head.artifact).await?;
         Ok(version.ok_or_else(|| QueryError::NotFound(format!("no version of `{name}` is {}", head.artifact)))?)
     }

@@ -9,7 +9,8 @@
 //! - **One epoch writes.** Opening for writing raises the epoch; a commit under an older one is refused with
 //!   [`WriteError::Superseded`], whichever process or machine it comes from. So exclusivity needs no lock that both can see.
 //! - **Committed transactions are counted** ([`Stored::commits`]), so that a catalog that has gone back is told from the newest.
-//! - **A row names only what is whole**: manifests are checked, and noted for a collection under way, before the row is stored.
+//! - **A row names only what is proven whole**: an artifact without a [`Proof`](crate::Proof) is refused with [`WriteError::Unproven`]. A
+//!   commit asks no place for blobs; the blobs of what is named are noted for a collection under way, and as [present](Records::present).
 //! - **An answer is of one moment**, and of every commit that was acknowledged before the question.
 //!
 //! Rules that no database has a say in are functions beside the types ([`crate::versions`], and `curve`): which version is
@@ -24,7 +25,7 @@ use std::sync::Arc;
 
 use async_trait::async_trait;
 use protocol::stage::Keep;
-use protocol::{Alias, Digest, ModelName, RunId, StageName, TaskId};
+use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 
 pub use rows::{CheckpointRow, EndedRow, LineageNode, LogRow, Needs, Recovery, Root, RunRow, StageResultRow, Usage};
 
@@ -50,6 +51,15 @@ pub trait Records: Debug + Send + Sync {
 
     /// Returns the views of ended runs as JSON, oldest first: the newest `limit`, or the newest `limit` submitted before a run.
     async fn ended_views(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<(RunId, String)>>;
+
+    /// The same, of the runs of one group.
+    async fn ended_views_of(&self, group: &Group, before: Option<&RunId>, limit: u32) -> Result<Vec<(RunId, String)>>;
+
+    /// The groups that runs belong to; a run of the store's own user, or of none, is missing.
+    async fn run_owners(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Group>>;
+
+    /// The groups that models belong to, or that of one model; a model that was imported by hand is missing.
+    async fn model_owners(&self, model: Option<&ModelName>) -> Result<BTreeMap<ModelName, Group>>;
 
     /// Runs that ended before a time, in milliseconds since 1970; oldest first.
     async fn ended_before(&self, before_ms: i64) -> Result<Vec<RunId>>;
@@ -132,6 +142,9 @@ pub trait Records: Debug + Send + Sync {
     /// An artifact and all that it was made of, nearest first.
     async fn lineage(&self, digest: Digest) -> Result<Vec<LineageNode>>;
 
+    /// Those of `blobs` that are known to be in their place, with their lengths.
+    async fn present(&self, blobs: &[Digest]) -> Result<BTreeMap<Digest, u64>>;
+
     /// What the rows need of the blobs.
     async fn needs(&self) -> Result<Needs>;
 
@@ -190,6 +203,9 @@ pub enum Order {
     },
     /// Forgets the rows that a collection takes. From here on what rows come to name is noted.
     BeginCollection,
+    /// Takes away what is known of blobs, but for those that rows have come to name since the collection began: nobody may rely on
+    /// the others any more.
+    Condemn(Vec<Digest>),
 }
 
 /// A promotion to be made.
@@ -246,6 +262,8 @@ pub enum Done {
     Pruned(Vec<Digest>),
     /// Of a collection's beginning: the tasks whose shards were forgotten.
     Begun(Vec<TaskId>),
+    /// Of condemning: the blobs that no row has come to name.
+    Condemned(Vec<Digest>),
     /// Of forgetting: what went.
     Forgotten(Forgotten),
 }

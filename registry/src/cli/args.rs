@@ -164,6 +164,12 @@ pub enum Verb {
         /// A model version or a digest
         artifact: String,
     },
+    /// Shows who called what of the server, from where, and what came of it; of a server for tokens with the scope `admin`
+    Audit {
+        /// The newest lines
+        #[arg(long, value_name = "LINES", default_value_t = 100)]
+        limit: usize,
+    },
     /// Hashes every blob again and follows every reference
     Fsck,
     /// Removes blobs that nothing needs
@@ -298,6 +304,7 @@ impl Verb {
                 Command::Leaderboard { of, published: !no_published, style }
             }
             Self::Lineage { artifact } => Command::Lineage { reference: artifact },
+            Self::Audit { limit } => Command::Audit { limit },
             Self::Fsck => Command::Fsck,
             Self::Gc { dry_run, grace } => Command::Gc { dry_run, grace_minutes: Some(grace) },
             Self::Forget { run: Some(run), .. } => Command::Forget { run },

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use checkpoint::model::Model;
 use protocol::artifact::Role;
 use protocol::message::ApiError;
-use protocol::{Manifest, ModelName};
+use protocol::{Manifest, ModelName, Owner};
 
 use super::export::{Source, whole};
 use super::{Answer, Data, error};
@@ -95,14 +95,14 @@ async fn read(source: &impl Source, digest: protocol::Digest) -> Result<Manifest
     serde_json::from_slice(&bytes).map_err(|e| error("damaged", e, Some("`registry fsck` checks the store")))
 }
 
-/// Registers what a bundle's file holds in a store that this process holds, as `model` or as it was called there. Messages call the file
-/// `shown`.
-pub async fn import(store: &Store, file: &Path, shown: &str, model: Option<&str>) -> Answer {
+/// Registers what a bundle's file holds in a store that this process holds, as `model` or as it was called there, for `owner`. Messages
+/// call the file `shown`.
+pub async fn import(store: &Store, file: &Path, shown: &str, model: Option<&str>, owner: Owner) -> Answer {
     let model = match model.map(str::parse::<ModelName>).transpose() {
         Ok(model) => model,
         Err(e) => return Answer::refused(error("invalid", e, Some("`--model NAME` gives it another name"))),
     };
-    match store.import_bundle(file, model).await {
+    match store.import_bundle_of(file, model, owner).await {
         Ok(version) => Answer::done(Data::Imported { version, file: shown.to_owned() }),
         Err(ImportError::Write(e)) => Answer::from(e),
         Err(ImportError::Query(e)) => Answer::from(e),

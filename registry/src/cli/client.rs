@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use access::{ConnectError, Server, ServerOptions, explain};
 use checkpoint::published::Layout;
 use protocol::message::ApiError;
-use protocol::{Digest, ModelName};
+use protocol::{Digest, ModelName, Owner};
 use reqwest::header::CONTENT_LENGTH;
 use reqwest::{Body, Method, Response};
 use tokio::io::AsyncReadExt as _;
@@ -275,7 +275,10 @@ async fn export_to(place: &Place, model: &str, to: Destination<'_>) -> Result<An
 async fn import(place: &Place, file: &Path, model: Option<&str>) -> Result<Answer, Missed> {
     let shown = file.display().to_string();
     match place {
-        Place::Here(store) => Ok(bundles::import(store, file, &shown, model).await),
+        Place::Here(store) => {
+            let owner = Owner { admin: true, ..Owner::default() };
+            Ok(bundles::import(store, file, &shown, model, owner).await)
+        }
         Place::Reading(_) => Ok(Answer::refused(error("internal", "the store was opened for reading", None))),
         Place::At(server) => {
             let opened = async {

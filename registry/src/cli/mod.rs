@@ -3,8 +3,7 @@
 //!
 //! [`Command`] is what may be asked and [`Answer`] what comes back, both plain data, so that a client can send the one and
 //! show the other. A command never names a place on the machine that runs it: what `export` writes, the client fetches and
-//! writes itself. Exit codes: 0 done, 1 other errors, 2 wrong usage or an unusable store, 3 not found, 4 conflict, 5 the token
-//! is refused, 6 the holder of the store does not answer, 9 damage found, 10 a gate does not hold.
+//! writes itself. [`EXIT_CODES`] lists what the process exits with.
 
 mod args;
 mod bundles;
@@ -26,12 +25,26 @@ pub use bundles::import;
 pub use client::{ask, execute};
 pub use print::{render, show_error};
 
+use crate::audit::{self, AuditEntry};
 use crate::backup::{BackupError, Summary};
 use crate::forget::Forgotten;
 use crate::leaderboard::{self, Comparison, Leaderboard, Style};
 use crate::retention::{GRACE_MS, Plan};
 use crate::versions::{BEST, Expect, Gate, LATEST, Model, ModelRef, Promotion, Version};
 use crate::{LineageNode, OpenError, QueryError, ReadStore, Store, StoreId, WriteError, fsck};
+
+/// The table of exit codes for `--help`. They mean the same in `trainer`.
+pub const EXIT_CODES: &str = "\
+Exit codes:
+    0  done
+    1  what was asked for failed
+    2  wrong usage, or a store that cannot be used; nothing was changed
+    4  a conflict with what is stored
+    5  the token is missing or not enough
+    6  the process that holds the store does not answer
+    7  there is no such model, version, run or artifact
+    9  stored data is damaged
+   10  a gate does not hold; nothing was changed";
 
 /// What may be asked of a registry.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -121,6 +134,11 @@ pub enum Command {
         /// In milliseconds since 1970.
         before_ms: i64,
     },
+    /// The newest lines of the audit log.
+    Audit {
+        /// How many.
+        limit: usize,
+    },
 }
 
 impl Command {
@@ -135,11 +153,41 @@ impl Command {
             | Self::Lineage { .. } => Scope::Read,
             Self::Promote { .. } | Self::Rollback { .. } => Scope::Promote,
             // Reads every byte of the store.
-            Self::Fsck
+            Self::Audit { .. }
+            | Self::Fsck
             | Self::Gc { .. }
             | Self::Forget { .. }
             | Self::ForgetEnded { .. }
             | Self::ForgetLeftovers { .. } => Scope::Admin,
+        }
+    }
+
+    /// The model and the alias that it moves.
+    pub fn moves(&self) -> Option<(&str, &str)> {
+        match self {
+            Self::Promote { reference, to, .. } => Some((reference, to)),
+            Self::Rollback { model, alias, .. } => Some((model, alias)),
+            _ => None,
+        }
+    }
+
+    /// The command and what it names, for a log.
+    pub fn in_short(&self) -> String {
+        match self {
+            Self::List => "list".into(),
+            Self::Show { reference } => format!("show {reference}"),
+            Self::History { model, .. } => format!("history {model}"),
+            Self::Promote { reference, to, .. } => format!("promote {reference} to {to}"),
+            Self::Rollback { model, alias, .. } => format!("rollback {model}@{alias}"),
+            Self::Compare { left, right, .. } => format!("compare {left} {right}"),
+            Self::Leaderboard { of, .. } => format!("leaderboard {of}"),
+            Self::Lineage { reference } => format!("lineage {reference}"),
+            Self::Fsck => "fsck".into(),
+            Self::Gc { dry_run, .. } => if *dry_run { "gc --dry-run" } else { "gc" }.into(),
+            Self::Forget { run } => format!("forget {run}"),
+            Self::ForgetEnded { before_ms } => format!("forget --ended-before {before_ms}"),
+            Self::ForgetLeftovers { before_ms } => format!("forget --leftovers-before {before_ms}"),
+            Self::Audit { limit } => format!("audit {limit}"),
         }
     }
 
@@ -152,6 +200,7 @@ impl Command {
             | Self::Compare { .. }
             | Self::Leaderboard { .. }
             | Self::Lineage { .. }
+            | Self::Audit { .. }
             | Self::Fsck => true,
             Self::Gc { dry_run, .. } => *dry_run,
             Self::Promote { .. }
@@ -199,6 +248,8 @@ pub enum Data {
     Gc { dry_run: bool, plan: Plan },
     /// Of `adopt`.
     Adopted { store: StoreId },
+    /// Of `audit`.
+    Audit { entries: Vec<AuditEntry> },
     /// Of `forget`.
     Forgotten { runs: Vec<(RunId, Forgotten)> },
     /// Of `backup`.
@@ -238,7 +289,7 @@ impl Answer {
     pub fn refused(error: ApiError) -> Self {
         let exit = match error.code.as_str() {
             "invalid" | "store" => 2,
-            "not-found" => 3,
+            "not-found" => 7,
             "conflict" | "stale-fence" => 4,
             "unauthorized" | "forbidden" => 5,
             "unreachable" => 6,
@@ -281,7 +332,10 @@ impl From<WriteError> for Answer {
             ),
             WriteError::NotFound(_) => error("not-found", e, Some("`registry list` shows what there is")),
             WriteError::Storage(_) | WriteError::Superseded { .. } => error("storage", e, None),
-            WriteError::Internal(_) => error("internal", e, Some("`registry fsck` checks the store")),
+            WriteError::Unreachable(_) => error("unreachable", e, None),
+            WriteError::Unproven { .. } | WriteError::Internal(_) => {
+                error("internal", e, Some("`registry fsck` checks the store"))
+            }
         })
     }
 }
@@ -385,10 +439,16 @@ async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &st
                 Err(_) => store.resolve(&reference).await?.artifact,
             };
             let nodes = store.lineage(digest).await?;
-            if nodes.iter().all(|node| node.kind.is_none() && node.inputs.is_empty()) && !exists(store, digest)? {
+            if nodes.iter().all(|node| node.kind.is_none() && node.inputs.is_empty()) && !exists(store, digest).await? {
                 return Err(Refused::from(QueryError::NotFound(format!("no artifact {digest}"))));
             }
             Data::Lineage { nodes }
+        }
+        Command::Audit { limit } => {
+            let dir = store.dir().to_owned();
+            let read = tokio::task::spawn_blocking(move || audit::read(&dir, limit.min(MOST_LINES))).await;
+            let failed = |e: &dyn std::fmt::Display| QueryError::Storage(format!("the audit log cannot be read: {e}"));
+            Data::Audit { entries: read.map_err(|e| failed(&e))?.map_err(|e| failed(&e))? }
         }
         Command::Fsck => {
             let report = store.fsck().await?;
@@ -446,8 +506,8 @@ async fn one(store: &ReadStore, text: &str) -> Result<Version, Refused> {
 }
 
 /// The data format of a version's motions, which is how the papers name their datasets.
-fn format_of(store: &ReadStore, version: &Version) -> Option<String> {
-    let manifest = store.blobs().manifest(version.artifact).ok()?;
+async fn format_of(store: &ReadStore, version: &Version) -> Option<String> {
+    let manifest = manifest(store, version.artifact).await.ok()?;
     ModelMeta::read(&manifest).ok().map(|model| model.format.name().to_owned())
 }
 
@@ -455,14 +515,20 @@ async fn leaderboard(store: &ReadStore, of: &str, published: bool) -> Result<Lea
     if leaderboard::FORMATS.contains(&of) {
         let mut all = Vec::new();
         for model in store.models().await? {
-            all.extend(store.versions(&model.model).await?);
+            for version in store.versions(&model.model).await? {
+                if format_of(store, &version).await.as_deref() == Some(of) {
+                    all.push(version);
+                }
+            }
         }
-        all.retain(|version| format_of(store, version).as_deref() == Some(of));
         return Ok(leaderboard::leaderboard(of.to_owned(), &all, None, published.then_some(of)));
     }
     let model = known(store, of).await?;
     let versions = store.versions(&model.model).await?;
-    let format = versions.first().and_then(|version| format_of(store, version)).filter(|_| published);
+    let format = match versions.first().filter(|_| published) {
+        Some(version) => format_of(store, version).await,
+        None => None,
+    };
     Ok(leaderboard::leaderboard(of.to_owned(), &versions, model.metric.as_deref(), format.as_deref()))
 }
 
@@ -478,12 +544,20 @@ async fn known(store: &ReadStore, name: &str) -> Result<Model, Refused> {
     }
 }
 
-fn exists(store: &ReadStore, digest: Digest) -> Result<bool, Refused> {
-    store.blobs().exists(digest).map_err(|e| Refused::from(QueryError::Blob(e.to_string())))
+async fn exists(store: &ReadStore, digest: Digest) -> Result<bool, Refused> {
+    let blobs = store.blobs().clone();
+    store.ask_blobs(move || blobs.exists(digest)).await.map_err(|e| Refused::from(QueryError::Blob(e.to_string())))
+}
+
+async fn manifest(store: &ReadStore, digest: Digest) -> Result<Manifest, QueryError> {
+    let blobs = store.blobs().clone();
+    store.ask_blobs(move || blobs.manifest(digest)).await.map_err(|e| QueryError::Blob(e.to_string()))
 }
 
 /// Versions that are looked at for bases of a control part.
 pub const MOST_BASES: usize = 1_000;
+/// Lines of the audit log that are shown at most.
+const MOST_LINES: usize = 10_000;
 
 async fn show(store: &ReadStore, text: &str) -> Result<Data, Refused> {
     let reference: ModelRef = text.parse().map_err(invalid)?;
@@ -493,8 +567,8 @@ async fn show(store: &ReadStore, text: &str) -> Result<Data, Refused> {
         return Ok(Data::Model { model, versions });
     }
     let version = store.resolve(text).await?;
-    let manifest = store.blobs().manifest(version.artifact).map_err(|e| QueryError::Blob(e.to_string()))?;
-    let fits = fits(store, &manifest)?;
+    let manifest = manifest(store, version.artifact).await?;
+    let fits = fits(store, &manifest).await?;
     let bases = match fits.get(&Role::CONTROL) {
         Some(wanted) => bases(store, &version, wanted).await?,
         None => Vec::new(),
@@ -512,7 +586,7 @@ async fn bases(store: &ReadStore, own: &Version, wanted: &Parts) -> Result<Vec<S
     let mut bases = Vec::new();
     for version in all.iter().take(MOST_BASES).filter(|version| version.artifact != own.artifact) {
         // What is no model, or is damaged, is no base; `fsck` says so.
-        let Ok(manifest) = store.blobs().manifest(version.artifact) else { continue };
+        let Ok(manifest) = manifest(store, version.artifact).await else { continue };
         let Ok(model) = ModelMeta::read(&manifest) else { continue };
         if wanted.iter().all(|(role, digest)| model.parts.get(role) == Some(digest)) {
             bases.push(format!("{}:{}", version.model, version.version));
@@ -522,11 +596,11 @@ async fn bases(store: &ReadStore, own: &Version, wanted: &Parts) -> Result<Vec<S
 }
 
 /// For each part of a model those that it was made for; nothing for what is no model.
-fn fits(store: &ReadStore, manifest: &Manifest) -> Result<BTreeMap<Role, Parts>, Refused> {
-    let Ok(model) = ModelMeta::read(manifest) else { return Ok(BTreeMap::new()) };
+async fn fits(store: &ReadStore, of: &Manifest) -> Result<BTreeMap<Role, Parts>, Refused> {
+    let Ok(model) = ModelMeta::read(of) else { return Ok(BTreeMap::new()) };
     let mut all = BTreeMap::new();
     for (role, digest) in model.parts {
-        let part = store.blobs().manifest(digest).map_err(|e| QueryError::Blob(e.to_string()))?;
+        let part = manifest(store, digest).await?;
         let fits = model::fits(&role, &part).map_err(|e| QueryError::Blob(e.to_string()))?;
         if !fits.is_empty() {
             all.insert(role, fits);

@@ -125,6 +125,22 @@ pub fn render(data: &Data) -> String {
             }
             format!("{}\n", table.trim_fmt())
         }
+        Data::Audit { entries } if entries.is_empty() => "the audit log is empty\n".into(),
+        Data::Audit { entries } => {
+            let mut table = table(&["WHEN", "WHO", "FROM", "CALL", "OBJECT", "STATUS", "CALLS"]);
+            for entry in entries {
+                table.add_row([
+                    format_ms(entry.at_ms),
+                    entry.who.clone(),
+                    entry.from.clone(),
+                    entry.call.clone(),
+                    entry.object.clone(),
+                    entry.status.to_string(),
+                    entry.count.to_string(),
+                ]);
+            }
+            format!("{}\n", table.trim_fmt())
+        }
         Data::Promotion { promotion } => {
             let Promotion { model, alias, from, to, .. } = promotion;
             let from = from.map_or_else(|| "nothing".into(), |from| format!("version {from}"));

@@ -5,6 +5,7 @@
 //! stored table by table: a statement for many rows, because with hundreds of workers the statements are what costs.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 use protocol::message::{Grant, MetricRow};
 use protocol::{Digest, Fence, TaskId};
@@ -13,9 +14,9 @@ use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 
 use super::error::write_error;
 use super::statement::{int, json, one, run, run_and_stage};
-use super::{logs, moves, usage};
+use super::{logs, moves, owners, usage};
 use crate::catalog::{PromoteOrder, Which};
-use crate::vouched::{Vouched, complete};
+use crate::proofs::{Artifact, Proofs};
 use crate::write::two_states;
 use crate::{Write, WriteError, clock};
 
@@ -25,7 +26,7 @@ type Result<T> = std::result::Result<T, WriteError>;
 const ROWS: usize = 250;
 
 /// Does all of `writes`, or says why one of them is refused; then the caller rolls back.
-pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: &[Write]) -> Result<()> {
+pub(super) async fn apply(conn: &mut SqliteConnection, proofs: &Proofs, writes: &[Write]) -> Result<()> {
     let mut fences = Fences::read(conn, writes).await?;
     let (mut decisions, mut shards) = (Vec::new(), BTreeMap::new());
     for write in writes {
@@ -40,6 +41,8 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
             Write::Run { run, pipeline, source, state, idempotency_key } => {
                 set_run(conn, run.as_str(), &pipeline.to_string(), source, state, idempotency_key.as_deref()).await?;
             }
+            Write::RunOwner { run, owner } => owners::own_run(conn, run, owner).await?,
+            Write::ModelOwner { model, owner } => owners::claim(conn, model, owner).await?,
             Write::RunState { run: of, state } => {
                 let set = sqlx::query("UPDATE runs SET state = ?, updated_ms = ? WHERE run = ?");
                 run(conn, set.bind(state).bind(clock::now_ms()).bind(of.as_str())).await?;
@@ -55,7 +58,7 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
             Write::Metrics { grant, rows } => add_metrics(conn, grant, rows).await?,
             Write::Logs { grant, first, lines } => logs::add(conn, grant, *first, lines).await?,
             Write::Checkpoint { grant, step, manifest, metrics } => {
-                complete(blobs, *manifest)?;
+                proven(conn, proofs, *manifest).await?;
                 one_checkpoint_a_step(conn, &grant.task, *step, *manifest).await?;
                 let insert = sqlx::query(
                     "INSERT INTO checkpoints (task, attempt, step, manifest, metrics, at_ms) VALUES (?, ?, ?, ?, ?, ?) \
@@ -65,7 +68,7 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
                 run(conn, insert.bind(manifest.to_string()).bind(json(metrics)).bind(clock::now_ms())).await?;
             }
             Write::Shard { grant, output } => {
-                complete(blobs, *output)?;
+                proven(conn, proofs, *output).await?;
                 add_shard(&mut shards, &grant.task, *output)?;
             }
             Write::StageResult { grant: _, key, run, stage, kind, outputs, metrics, inputs, wall_s } => {
@@ -79,11 +82,11 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
                     inputs,
                     wall_s: *wall_s,
                 };
-                set_result(conn, blobs, &made).await?;
+                set_result(conn, proofs, &made).await?;
             }
             Write::Version { model, artifact, metrics, source } => {
-                let manifest = complete(blobs, *artifact)?;
-                moves::register(conn, model, *artifact, manifest.kind, metrics, source).await?;
+                let kind = proven(conn, proofs, *artifact).await?.kind;
+                moves::register(conn, model, *artifact, kind, metrics, source).await?;
             }
             Write::Promote { model, alias, artifact, require, reason, actor } => {
                 let order = PromoteOrder {
@@ -102,6 +105,18 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
     add_facts(conn, &decisions).await?;
     add_shards(conn, &shards).await?;
     fences.write(conn).await
+}
+
+/// An artifact that a row is about to name: its blobs are known to be in their place from here on.
+pub(super) async fn proven(conn: &mut SqliteConnection, proofs: &Proofs, digest: Digest) -> Result<Arc<Artifact>> {
+    let artifact = proofs.name(digest)?;
+    let now = clock::now_ms();
+    let rows: Vec<(&Digest, &u64)> = artifact.blobs.iter().collect();
+    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (digest, bytes): &(&Digest, &u64)| {
+        row.push_bind(digest.to_string()).push_bind(int(**bytes)).push_bind(now);
+    };
+    insert(conn, "INSERT INTO blobs (digest, bytes, verified_ms) ", &rows, values, " ON CONFLICT DO NOTHING").await?;
+    Ok(artifact)
 }
 
 /// Runs `begin` with a tuple of values for each row, and `end`, as few statements as there may be.
@@ -166,11 +181,9 @@ impl Fences {
             Some(current) if *current > grant.fence => {
                 Err(WriteError::StaleFence { task: grant.task.clone(), current: *current, carried: grant.fence })
             }
-            current => Err(WriteError::Conflict(format!(
-                "the write for task `{}` carries fence {}, which was never granted: the newest is {}",
-                grant.task,
-                grant.fence,
-                current.map_or_else(|| "none".into(), |fence| fence.to_string())
+            _ => Err(WriteError::Conflict(format!(
+                "the write for task `{}` carries fence {}, which was never granted",
+                grant.task, grant.fence
             ))),
         }
     }
@@ -363,7 +376,7 @@ struct Made<'a> {
     wall_s: f64,
 }
 
-async fn set_result(conn: &mut SqliteConnection, blobs: &Vouched, made: &Made<'_>) -> Result<()> {
+async fn set_result(conn: &mut SqliteConnection, proofs: &Proofs, made: &Made<'_>) -> Result<()> {
     let (key, outputs) = (made.key.to_string(), json(made.outputs));
     let stored = one(conn, sqlx::query("SELECT outputs FROM stage_results WHERE key = ?").bind(&key)).await?;
     match stored.map(|row| row.get::<String, _>(0)) {
@@ -376,7 +389,7 @@ async fn set_result(conn: &mut SqliteConnection, blobs: &Vouched, made: &Made<'_
         }
         None => {}
     }
-    blobs.named.note(made.inputs.values().copied());
+    proofs.note(made.inputs.values().copied());
     let now = clock::now_ms();
     let add = sqlx::query(
         "INSERT INTO stage_results (key, run, stage, kind, outputs, metrics, inputs, wall_s, at_ms) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -384,14 +397,13 @@ async fn set_result(conn: &mut SqliteConnection, blobs: &Vouched, made: &Made<'_
     let add = add.bind(&key).bind(made.run).bind(made.stage).bind(made.kind).bind(outputs).bind(json(made.metrics));
     run(conn, add.bind(json(made.inputs)).bind(made.wall_s).bind(now)).await?;
     for output in made.outputs.values() {
-        let manifest = complete(blobs, *output)?;
+        let artifact = proven(conn, proofs, *output).await?;
         let kind =
-            serde_json::to_value(manifest.kind).ok().and_then(|k| k.as_str().map(str::to_owned)).unwrap_or_default();
-        let bytes: u64 = manifest.files.values().map(|file| file.bytes).sum();
+            serde_json::to_value(artifact.kind).ok().and_then(|k| k.as_str().map(str::to_owned)).unwrap_or_default();
         let add = sqlx::query(
             "INSERT INTO artifacts (digest, kind, bytes, run, stage, key, at_ms) VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING",
         );
-        let add = add.bind(output.to_string()).bind(kind).bind(int(bytes)).bind(made.run).bind(made.stage);
+        let add = add.bind(output.to_string()).bind(kind).bind(int(artifact.bytes)).bind(made.run).bind(made.stage);
         run(conn, add.bind(&key).bind(now)).await?;
         for (role, input) in made.inputs {
             let add = sqlx::query("INSERT INTO edges (parent, child, role) VALUES (?, ?, ?) ON CONFLICT DO NOTHING");

@@ -6,6 +6,7 @@ use protocol::{RunId, StageName};
 use sqlx::{Row, SqliteConnection};
 
 use super::error::write_error;
+use super::owners;
 use super::statement::{one, run as execute};
 use crate::forget::Forgotten;
 use crate::{WriteError, clock};
@@ -23,6 +24,7 @@ pub(super) async fn forget(conn: &mut SqliteConnection, run: &RunId) -> Result<F
         )));
     }
     execute(conn, sqlx::query("DELETE FROM runs WHERE run = ?").bind(run.as_str())).await?;
+    owners::disown_run(conn, run).await?;
     let note = sqlx::query("INSERT INTO forgotten (run, at_ms) VALUES (?, ?) ON CONFLICT DO NOTHING");
     execute(conn, note.bind(run.as_str()).bind(clock::now_ms())).await?;
     let mut gone = Forgotten::default();

@@ -11,6 +11,7 @@ mod logs;
 mod models;
 mod moves;
 mod open;
+mod owners;
 mod query;
 mod retention;
 mod rows;

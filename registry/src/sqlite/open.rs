@@ -67,7 +67,13 @@ pub(crate) async fn open_writer(dir: &Path, found: &Found, adopt: bool) -> Resul
         e => OpenError::Damaged { path: path.clone(), message: e.to_string() },
     })?;
     let store = match &verdict {
-        Verdict::Whole(store) | Verdict::Unfinished(store) => store.clone(),
+        Verdict::Whole(store) => store.clone(),
+        Verdict::Unfinished(store) => {
+            // What was known of blobs says nothing of those that are there now.
+            let forget = sqlx::query("DELETE FROM blobs").execute(&mut conn).await;
+            forget.map_err(|e| open_error(&path, &e))?;
+            store.clone()
+        }
         Verdict::New => name(&path, &mut conn).await?,
     };
     Ok(Opened { conn, store, verdict })
@@ -143,6 +149,8 @@ pub(crate) async fn reach_epoch(dir: &Path, epoch: u64) -> Result<(), sqlx::Erro
     let mut conn = SqliteConnection::connect_with(&options).await?;
     let reach = sqlx::query("UPDATE store SET epoch = max(epoch, ?)").bind(int(epoch));
     reach.execute(&mut conn).await?;
+    // Only what the copy needs has come with it.
+    sqlx::query("DELETE FROM blobs").execute(&mut conn).await?;
     conn.close().await
 }
 

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use async_trait::async_trait;
 use futures::TryStreamExt as _;
-use protocol::{Alias, Digest, ModelName, RunId, StageName, TaskId};
+use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 use sqlx::pool::PoolConnection;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Connection, Row, Sqlite, SqliteConnection, SqlitePool};
@@ -13,7 +13,7 @@ use sqlx::{Connection, Row, Sqlite, SqliteConnection, SqlitePool};
 use super::open::{open_copy, stored};
 use super::rows::{checkpoints, digest, run_row, stage_result};
 use super::statement::json;
-use super::{curves, logs, models, retention, usage};
+use super::{curves, logs, models, owners, retention, usage};
 use crate::QueryError;
 use crate::catalog::{
     CheckpointRow, EndedRow, LineageNode, LogRow, Needs, Records, Recovery, RunRow, StageResultRow, Usage,
@@ -86,6 +86,24 @@ impl Records for SqliteRecords {
                     ORDER BY rowid DESC LIMIT ?2) ORDER BY number";
         let rows = sqlx::query(find).bind(before.map(RunId::as_str)).bind(limit).fetch_all(&mut *conn).await?;
         rows.iter().map(|row| Ok((RunId::new(row.try_get::<String, _>(0)?), row.try_get(1)?))).collect()
+    }
+
+    async fn ended_views_of(&self, group: &Group, before: Option<&RunId>, limit: u32) -> Result<Vec<(RunId, String)>> {
+        let mut conn = self.connection().await?;
+        let find = "SELECT run, view FROM (SELECT runs.rowid AS number, run, view FROM run_owners JOIN runs USING (run) \
+                    WHERE owner = ?1 AND view IS NOT NULL AND (?2 IS NULL OR runs.rowid < (SELECT rowid FROM runs WHERE run = ?2)) \
+                    ORDER BY runs.rowid DESC LIMIT ?3) ORDER BY number";
+        let before = before.map(RunId::as_str);
+        let rows = sqlx::query(find).bind(group.as_str()).bind(before).bind(limit).fetch_all(&mut *conn).await?;
+        rows.iter().map(|row| Ok((RunId::new(row.try_get::<String, _>(0)?), row.try_get(1)?))).collect()
+    }
+
+    async fn run_owners(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Group>> {
+        Ok(owners::of_runs(&mut *self.connection().await?, runs).await?)
+    }
+
+    async fn model_owners(&self, model: Option<&ModelName>) -> Result<BTreeMap<ModelName, Group>> {
+        Ok(owners::of_models(&mut *self.connection().await?, model).await?)
     }
 
     async fn sources(&self, keys: &[Digest]) -> Result<BTreeMap<Digest, (RunId, StageName)>> {
@@ -195,6 +213,13 @@ impl Records for SqliteRecords {
         points: usize,
     ) -> Result<BTreeMap<String, Curve>> {
         curves::read(&mut *self.connection().await?, run, stage, keys, points).await
+    }
+
+    async fn present(&self, blobs: &[Digest]) -> Result<BTreeMap<Digest, u64>> {
+        let mut conn = self.connection().await?;
+        let find = "SELECT digest, bytes FROM blobs WHERE digest IN (SELECT value FROM json_each(?))";
+        let rows = sqlx::query(find).bind(json(&blobs)).fetch_all(&mut *conn).await?;
+        rows.iter().map(|row| Ok((digest(row, "digest")?, row.try_get::<i64, _>("bytes")?.unsigned_abs()))).collect()
     }
 
     async fn needs(&self) -> Result<Needs> {

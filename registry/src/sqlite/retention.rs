@@ -6,11 +6,12 @@ use protocol::stage::Keep;
 use protocol::{Digest, TaskId};
 use sqlx::{Row, SqliteConnection};
 
+use super::apply::proven;
 use super::error::write_error;
 use super::rows::{checkpoints, digest, digests};
-use super::statement::{int, run};
+use super::statement::{int, json, run};
 use crate::catalog::{Needs, Root};
-use crate::vouched::{Vouched, complete};
+use crate::proofs::Proofs;
 use crate::{QueryError, WriteError, clock};
 
 /// Forgets a task's checkpoints but those that `keep` names. A metric that none of them has is refused, and all of them stay.
@@ -35,7 +36,7 @@ pub(super) async fn prune(conn: &mut SqliteConnection, task: &TaskId, keep: &Kee
 /// Sets a pin, or ends it.
 pub(super) async fn pin(
     conn: &mut SqliteConnection,
-    blobs: &Vouched,
+    proofs: &Proofs,
     digest: Digest,
     reason: Option<&str>,
 ) -> Result<(), WriteError> {
@@ -43,10 +44,22 @@ pub(super) async fn pin(
     let Some(reason) = reason else {
         return run(conn, sqlx::query("DELETE FROM pins WHERE digest = ?").bind(name)).await.map(|_| ());
     };
-    complete(blobs, digest)?;
+    proven(conn, proofs, digest).await?;
     let set =
         "INSERT INTO pins (digest, reason, at_ms) VALUES (?, ?, ?) ON CONFLICT DO UPDATE SET reason = excluded.reason";
     run(conn, sqlx::query(set).bind(name).bind(reason).bind(clock::now_ms())).await.map(|_| ())
+}
+
+/// Takes away what is known of blobs that no row has come to name; returns those.
+pub(super) async fn condemn(
+    conn: &mut SqliteConnection,
+    proofs: &Proofs,
+    blobs: &[Digest],
+) -> Result<Vec<Digest>, WriteError> {
+    let taken = proofs.condemn(blobs);
+    let forget = "DELETE FROM blobs WHERE digest IN (SELECT value FROM json_each(?))";
+    run(conn, sqlx::query(forget).bind(json(&taken))).await?;
+    Ok(taken)
 }
 
 /// Forgets the shards of finished runs, for which the stage's artifact stands; returns their tasks.

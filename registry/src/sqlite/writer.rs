@@ -19,7 +19,7 @@ use crate::WriteError;
 use crate::catalog::{Done, Order};
 use crate::identity::Witness;
 use crate::lock::StoreLock;
-use crate::vouched::Vouched;
+use crate::proofs::Proofs;
 
 /// Orders of one transaction at most. Beyond it the latency of the first grows and the share of the sync is small.
 const GROUP: usize = 256;
@@ -45,11 +45,11 @@ pub(crate) struct Writer {
 
 impl Writer {
     /// Starts the thread on an open database. It keeps the lock until its last commit.
-    pub(crate) fn start(session: Session, blobs: Vouched, lock: Arc<StoreLock>) -> io::Result<Self> {
+    pub(crate) fn start(session: Session, proofs: Arc<Proofs>, lock: Arc<StoreLock>) -> io::Result<Self> {
         let (queue, orders) = mpsc::channel(QUEUE);
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let thread = std::thread::Builder::new().name("registry-writer".into()).spawn(move || {
-            runtime.block_on(serve(session, orders, &blobs));
+            runtime.block_on(serve(session, orders, &proofs));
             drop(lock);
         })?;
         Ok(Self { queue: Some(queue), thread: Some(thread) })
@@ -75,7 +75,7 @@ impl Drop for Writer {
     }
 }
 
-async fn serve(mut session: Session, mut orders: mpsc::Receiver<(Order, Answer)>, blobs: &Vouched) {
+async fn serve(mut session: Session, mut orders: mpsc::Receiver<(Order, Answer)>, proofs: &Proofs) {
     let mut group = Vec::with_capacity(GROUP);
     loop {
         let received = if session.witness.is_behind() {
@@ -92,7 +92,7 @@ async fn serve(mut session: Session, mut orders: mpsc::Receiver<(Order, Answer)>
         if received == 0 {
             break;
         }
-        commit(&mut session, blobs, &mut group).await;
+        commit(&mut session, proofs, &mut group).await;
     }
     session.witness.catch_up();
     if let Err(e) = session.conn.close().await {
@@ -100,10 +100,10 @@ async fn serve(mut session: Session, mut orders: mpsc::Receiver<(Order, Answer)>
     }
 }
 
-async fn commit(session: &mut Session, blobs: &Vouched, group: &mut Vec<(Order, Answer)>) {
+async fn commit(session: &mut Session, proofs: &Proofs, group: &mut Vec<(Order, Answer)>) {
     let mut results = Vec::with_capacity(group.len());
     let conn = &mut session.conn;
-    let mut outcome = run_all(conn, session.epoch, blobs, group, &mut results).await;
+    let mut outcome = run_all(conn, session.epoch, proofs, group, &mut results).await;
     if outcome.is_ok() {
         fail_point!("db::before_commit");
         outcome = match (exec(conn, "COMMIT").await, outcome) {
@@ -142,7 +142,7 @@ async fn count(conn: &mut SqliteConnection, epoch: u64) -> Result<u64, WriteErro
 async fn run_all(
     conn: &mut SqliteConnection,
     epoch: u64,
-    blobs: &Vouched,
+    proofs: &Proofs,
     group: &[(Order, Answer)],
     results: &mut Vec<Result<Done, WriteError>>,
 ) -> Result<u64, WriteError> {
@@ -150,7 +150,7 @@ async fn run_all(
     let commits = count(conn, epoch).await?;
     for (order, _) in group {
         exec(conn, "SAVEPOINT o").await?;
-        let result = run(conn, blobs, order).await;
+        let result = run(conn, proofs, order).await;
         if let Err(e) = &result
             && exec(conn, "ROLLBACK TO o").await.is_err()
         {
@@ -163,14 +163,14 @@ async fn run_all(
     Ok(commits)
 }
 
-async fn run(conn: &mut SqliteConnection, blobs: &Vouched, order: &Order) -> Result<Done, WriteError> {
+async fn run(conn: &mut SqliteConnection, proofs: &Proofs, order: &Order) -> Result<Done, WriteError> {
     match order {
-        Order::Write(writes) => apply::apply(conn, blobs, writes).await.map(|()| Done::Nothing),
+        Order::Write(writes) => apply::apply(conn, proofs, writes).await.map(|()| Done::Nothing),
         Order::Promote(order) => moves::promote(conn, order).await.map(|p| Done::Promoted(Box::new(p))),
         Order::Rollback(order) => moves::rollback(conn, order).await.map(|p| Done::Promoted(Box::new(p))),
         Order::PruneCheckpoints { task, keep } => retention::prune(conn, task, keep).await.map(Done::Pruned),
         Order::Pin { digest, reason } => {
-            retention::pin(conn, blobs, *digest, reason.as_deref()).await.map(|()| Done::Nothing)
+            retention::pin(conn, proofs, *digest, reason.as_deref()).await.map(|()| Done::Nothing)
         }
         Order::Forget(run) => forget::forget(conn, run).await.map(Done::Forgotten),
         Order::ForgetLeftovers { run, before_ms } => {
@@ -178,9 +178,10 @@ async fn run(conn: &mut SqliteConnection, blobs: &Vouched, order: &Order) -> Res
         }
         Order::BeginCollection => {
             // Rows of this transaction before here are committed when the answer comes, which is when marking begins.
-            blobs.named.begin();
+            proofs.begin_collection();
             retention::forget_shards(conn).await.map(Done::Begun)
         }
+        Order::Condemn(blobs) => retention::condemn(conn, proofs, blobs).await.map(Done::Condemned),
     }
 }
 

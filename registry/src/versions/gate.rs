@@ -12,6 +12,7 @@ use std::fmt;
 use std::str::FromStr;
 
 use protocol::Alias;
+use protocol::spelling::question;
 use serde::{Deserialize, Serialize};
 
 /// A comparison.
@@ -184,7 +185,10 @@ fn find(metrics: &BTreeMap<String, f64>, name: &str) -> Result<f64, String> {
     match ends[..] {
         [(_, value)] => Ok(*value),
         [] if metrics.is_empty() => Err(format!("no metric `{name}`: it has none at all")),
-        [] => Err(format!("no metric `{name}`: it has {}", list(metrics.keys()))),
+        [] => {
+            let meant = question(name, metrics.keys().map(String::as_str));
+            Err(format!("no metric `{name}`{meant}: it has {}", list(metrics.keys())))
+        }
         _ => Err(format!("several metrics `{name}`: name one of {}", list(ends.into_iter().map(|(key, _)| key)))),
     }
 }

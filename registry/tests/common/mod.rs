@@ -8,7 +8,8 @@ use std::collections::BTreeMap;
 
 use protocol::message::{Grant, MetricRow};
 use protocol::{ArtifactKind, Attempt, Digest, Fence, FileEntry, Incarnation, Manifest, TaskId};
-use registry::{BlobStore, Holder, OpenError, Store, Write};
+use registry::blob::Backend;
+use registry::{BlobStore, Holder, LeaseTerms, OpenError, Store, Write};
 use serde_json::json;
 
 /// Opens a store. A process that another test is starting right now may have a copy of a lock that was let go.
@@ -18,6 +19,18 @@ pub async fn try_open(dir: &std::path::Path) -> Result<Store, OpenError> {
         match Store::open(dir, Holder::this_process("test")).await {
             Err(OpenError::Busy { .. }) if std::time::Instant::now() < until => tokio::task::yield_now().await,
             opened => return opened,
+        }
+    }
+}
+
+/// Opens a store whose blobs lie at a place of the test's.
+pub async fn open_over(dir: &std::path::Path, blobs: std::sync::Arc<dyn Backend>) -> Store {
+    let until = std::time::Instant::now() + std::time::Duration::from_secs(10);
+    loop {
+        let blobs = std::sync::Arc::clone(&blobs);
+        match Store::open_over(dir, blobs, Holder::this_process("test"), LeaseTerms::default()).await {
+            Err(OpenError::Busy { .. }) if std::time::Instant::now() < until => tokio::task::yield_now().await,
+            opened => return opened.unwrap(),
         }
     }
 }

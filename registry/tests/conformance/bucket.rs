@@ -81,7 +81,7 @@ fn a_cut_put_is_done_once_or_not_at_all() {
         let bytes = bytes(60_000 + u32::try_from(i).unwrap());
         bucket.cut_after(after);
         if let Err(error) = store.put(&bytes) {
-            assert!(matches!(error, BlobError::Unavailable(_)), "{error}");
+            assert!(matches!(error, BlobError::Unreachable(_)), "{error}");
             store.put(&bytes).unwrap();
         }
         assert_eq!(bucket.cuts(), i as u64 + 1, "cut after {after} bytes");
@@ -130,7 +130,7 @@ fn an_upload_in_parts_that_is_given_up_leaves_nothing_and_goes_on_from_here() {
         }
         bucket.close();
         let error = sending.join().unwrap().unwrap_err();
-        let BlobError::Unavailable(said) = &error else { panic!("{error}") };
+        let BlobError::Unreachable(said) = &error else { panic!("{error}") };
         assert!(said.contains("AWS_ENDPOINT_URL") && said.contains("s3://stride-tests/p/sha256"), "{said}");
     });
     bucket.open();

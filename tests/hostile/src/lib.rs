@@ -6,6 +6,7 @@
 //!
 //! Not its job: that what is read is right; each parser's own tests say so.
 
+pub mod canary;
 pub mod fuzz;
 pub mod mutate;
 pub mod named;

@@ -10,11 +10,11 @@ use mocap::rotations::Rig;
 use mocap::take::{Reading, Take, resample};
 use mocap::{Body, arrays, captions, glb, requests};
 use motion::text::Caption;
-use motion::{Skeleton, npy, text, waypoints};
+use motion::{DataPath, Skeleton, npy, text, waypoints};
 use protocol::stage::DataFormat;
 use text_models::{EncoderFolder, Kind, ReadAt, Request, Rules, TokenIds, Tokenizer, WeightsFile};
 
-use crate::{Target, named, scratch, seeds};
+use crate::{Target, canary, named, scratch, seeds};
 
 /// A pickle reader copies what a pickle names again, up to a million values: its own bound, far above [`crate::MEMORY`].
 pub const PICKLE_MEMORY: usize = 512 << 20;
@@ -80,7 +80,9 @@ fn read<T, E: ToString>(result: Result<T, E>) -> Option<T> {
     match result {
         Ok(value) => Some(value),
         Err(error) => {
-            let length = error.to_string().len();
+            let error = error.to_string();
+            canary::expect_absent(&error);
+            let length = error.len();
             assert!(length <= ERROR, "an error of {length} bytes");
             None
         }
@@ -91,7 +93,7 @@ fn bvh(bytes: &[u8]) -> bool {
     let Some(bvh) = read(Bvh::parse(Path::new("x.bvh"), bytes)) else { return false };
     assert_eq!(bvh.values.len(), bvh.frames * bvh.channels());
     assert!(bvh.rate > 0.0 && bvh.values.iter().all(|value| value.is_finite()));
-    if let Ok(take) = Take::of_bvh(&bvh, &Reading::default()) {
+    if let Some(take) = read(Take::of_bvh(&bvh, &Reading::default())) {
         let skeleton = Skeleton::of(DataFormat::Humanml3d);
         assert_eq!(take.joints.len(), 66 * bvh.frames);
         assert!(!resample(&take.joints, 66, take.rate, skeleton.fps).is_empty());
@@ -104,7 +106,7 @@ fn joint_map(bytes: &[u8]) -> bool {
     assert_eq!(JointMap::parse(Path::new("x.yaml"), &map.to_yaml()).ok().as_ref(), Some(&map), "{}", map.to_yaml());
     // Our own recording has all joints by their names.
     let recording = Bvh::parse(Path::new("x.bvh"), &seeds::bvh()[2]).expect("one of ours");
-    if let Ok(places) = map.resolve(&recording) {
+    if let Some(places) = read(map.resolve(&recording)) {
         assert_eq!(places.joints(&recording.placed(0), 0.01).len(), 22);
     }
     true
@@ -112,9 +114,9 @@ fn joint_map(bytes: &[u8]) -> bool {
 
 fn npy(bytes: &[u8]) -> bool {
     let file = Path::new("x.npy");
-    let strict = npy::parse(file, bytes, false);
-    let Ok(array) = npy::parse(file, bytes, true) else {
-        assert!(strict.is_err());
+    let strict = read(npy::parse(file, bytes, false));
+    let Some(array) = read(npy::parse(file, bytes, true)) else {
+        assert!(strict.is_none());
         return false;
     };
     assert_eq!(array.shape.iter().product::<usize>(), array.data.len());
@@ -149,7 +151,8 @@ fn texts(bytes: &[u8]) -> bool {
     if let Some(captions) = &beside {
         captions.iter().for_each(survives);
     }
-    if let Ok(found) = text::parse_file(file, content) {
+    let errors = |errors: Vec<text::TextError>| errors.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n");
+    if let Some(found) = read(text::parse_file(file, content).map_err(errors)) {
         for (_, caption) in &found.captions {
             if let Some((from, to)) = caption.frames(20.0) {
                 assert!(from <= to);
@@ -219,7 +222,7 @@ fn tokenizer(bytes: &[u8]) -> bool {
         let Some(tokenizer) = read(Tokenizer::new("x", bytes, &rules, 7)) else { continue };
         accepted = true;
         for caption in ["ab a b \u{1f600}", "", "a person walks forward, turns around & sits\u{2028}down"] {
-            if let Ok(ids) = tokenizer.ids(caption) {
+            if let Some(ids) = read(tokenizer.ids(caption)) {
                 assert!(ids.len() <= rules.most && ids.iter().all(|id| *id < 7), "{ids:?}");
             }
         }
@@ -230,7 +233,9 @@ fn tokenizer(bytes: &[u8]) -> bool {
 /// Opens an encoder's folder and reads all of it.
 fn opened(root: &str, kind: Kind) -> bool {
     let request = Request { kind, ids: TokenIds::HuggingFace, most: 0 };
-    let Some(folder) = read(EncoderFolder::open(&scratch::folder().join(root), &request)) else { return false };
+    let Some(folder) = read(EncoderFolder::open(&DataPath::local(scratch::folder().join(root)), &request)) else {
+        return false;
+    };
     folder.description.check().expect("it was checked");
     // Any answer will do.
     let _ = folder.tokenizer().expect("it was made").ids("ab a b");

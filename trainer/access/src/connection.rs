@@ -152,9 +152,11 @@ pub fn retry_after(answer: &reqwest::Response) -> Duration {
 /// only "error sending request".
 pub fn explain(error: &reqwest::Error) -> String {
     let mut text = error.to_string();
+    let mut root = text.clone();
     let mut cause: Option<&dyn std::error::Error> = std::error::Error::source(error);
     while let Some(error) = cause {
         let more = error.to_string();
+        root.clone_from(&more);
         if !text.contains(&more) {
             text.push_str(": ");
             text.push_str(&more);
@@ -169,6 +171,8 @@ pub fn explain(error: &reqwest::Error) -> String {
     ];
     match advice.iter().find(|(sign, _)| text.contains(sign)) {
         Some((_, advice)) => format!("{text}; {advice}"),
+        // The links between say again that it was a connection to this address.
+        None if error.is_connect() => root,
         None => text,
     }
 }

@@ -9,6 +9,7 @@
 
 mod caller;
 mod connection;
+mod expiry;
 pub mod file;
 pub mod local;
 mod names;
@@ -20,11 +21,12 @@ mod tokens;
 
 pub use caller::Caller;
 pub use connection::{ConnectError, Server, explain, retry_after};
+pub use expiry::Expiry;
 pub use names::Names;
 pub use options::{ConnectionOptions, ServerOptions, TokenOptions};
 pub use scope::{Scope, Scopes};
 pub use secret::{FileError, Token, TokenError};
-pub use tokens::Tokens;
+pub use tokens::{Promoter, Tokens};
 
 /// Where a server listens unless it is told otherwise.
 pub const PORT: u16 = 7700;

@@ -8,11 +8,11 @@ use std::str::FromStr;
 pub enum Scope {
     /// Looking: runs, logs, metrics, models and their files.
     Read,
-    /// Submitting, pausing, resuming and cancelling runs.
+    /// Submitting, pausing, resuming and cancelling runs; importing models.
     Submit,
     /// Computing: joining, polling, uploading.
     Worker,
-    /// Moving aliases.
+    /// Moving aliases, by command or by a pipeline.
     Promote,
     /// What touches everybody's data: collecting, checking, and all of the above.
     Admin,
@@ -44,7 +44,11 @@ impl fmt::Display for Scope {
     }
 }
 
-/// The scopes of one token. `admin` holds all others; one who submits or promotes may also read what came of it.
+/// The bit of [`Scopes::read_all`], above those of the scopes.
+const READ_ALL: u8 = 1 << 7;
+
+/// The scopes of one token. `admin` holds all others. One who submits or promotes may also read its own; one whose line says `read`,
+/// all.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Scopes(u8);
 
@@ -52,9 +56,10 @@ impl Scopes {
     /// These, and what they imply.
     pub fn of(scopes: &[Scope]) -> Self {
         let one = |scope: Scope| match scope {
-            Scope::Read | Scope::Worker => scope.bit(),
+            Scope::Read => scope.bit() | READ_ALL,
+            Scope::Worker => scope.bit(),
             Scope::Submit | Scope::Promote => scope.bit() | Scope::Read.bit(),
-            Scope::Admin => Scope::ALL.iter().fold(0, |all, scope| all | scope.bit()),
+            Scope::Admin => Scope::ALL.iter().fold(READ_ALL, |all, scope| all | scope.bit()),
         };
         Self(scopes.iter().fold(0, |all, scope| all | one(*scope)))
     }
@@ -62,6 +67,11 @@ impl Scopes {
     /// Everything.
     pub fn all() -> Self {
         Self::of(&[Scope::Admin])
+    }
+
+    /// Whether it may read what others own, because its line says `read` and not only what implies it.
+    pub fn read_all(self) -> bool {
+        self.0 & READ_ALL != 0
     }
 
     /// Whether a call of this kind is allowed.
@@ -104,6 +114,11 @@ mod tests {
         assert_eq!(allowed("promote").as_deref(), Ok("read,promote"));
         assert_eq!(allowed("worker,submit").as_deref(), Ok("read,submit,worker"));
         assert_eq!(allowed("admin").as_deref(), Ok("read,submit,worker,promote,admin"));
+        let read_all = |text: &str| text.parse::<Scopes>().map(Scopes::read_all);
+        assert_eq!(
+            ["read", "submit", "promote", "worker", "submit,read", "admin"].map(|text| read_all(text) == Ok(true)),
+            [true, false, false, false, true, true]
+        );
         for wrong in ["", "root", "read,", "Read"] {
             assert!(allowed(wrong).is_err_and(|error| error.contains("read, submit, worker")), "{wrong}");
         }

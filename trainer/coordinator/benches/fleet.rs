@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use coordinator::{Config, Connections, Coordinator};
 use protocol::Seed;
-use protocol::message::{MetricBatch, MetricRow, Submit};
+use protocol::message::{Assignment, MetricBatch, MetricRow, Submit};
 use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::stage::{Backend, DataSynthetic, EncodeLatents, Placement, StageSettings, TrainVae, WorkerRange};
 use registry::{Holder, Store};
@@ -125,7 +125,7 @@ async fn main() -> Result {
                 && assignment.stage.name.as_str() != "latents"
             {
                 let output = worker.output(&assignment).await?;
-                worker.finish(assignment.grant, output).await?;
+                worker.finish(assignment, output).await?;
             }
         }
     }
@@ -137,11 +137,11 @@ async fn main() -> Result {
     for mut worker in workers.drain(..16) {
         let rows = Arc::clone(&rows);
         tasks.push(tokio::spawn(async move {
-            let grant = worker.poll().await?.ok_or("every worker holds a shard")?.grant;
+            let Assignment { grant, secret, .. } = worker.poll().await?.ok_or("every worker holds a shard")?;
             for batch in 0..40u64 {
                 let row = |i: u64| MetricRow { step: batch * 1000 + i, key: "loss".into(), value: 0.5 };
                 let batch = MetricBatch { grant: grant.clone(), rows: (0..1000).map(row).collect() };
-                worker.connection.post::<()>("/v1/metrics", &batch).await?;
+                worker.connection.post::<()>("/v1/metrics", &secret, &batch).await?;
                 rows.fetch_add(1000, Ordering::Relaxed);
             }
             Ok::<_, Box<dyn std::error::Error + Send + Sync>>(worker)
@@ -167,7 +167,7 @@ async fn main() -> Result {
                 for _ in 0..8 {
                     let Some(assignment) = worker.poll().await? else { break };
                     let output = worker.output(&assignment).await?;
-                    worker.finish(assignment.grant, output).await?;
+                    worker.finish(assignment, output).await?;
                     claims.fetch_add(1, Ordering::Relaxed);
                 }
                 Ok::<_, Box<dyn std::error::Error + Send + Sync>>(())

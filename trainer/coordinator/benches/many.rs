@@ -18,6 +18,7 @@ use protocol::message::{
     DesiredAssignments, Grant, Join, Joined, LogBatch, MetricBatch, MetricRow, PROTOCOL_VERSION, Poll, Submit,
 };
 use protocol::pipeline::Pipeline;
+use protocol::proof::SECRET_HEADER;
 use protocol::stage::Backend;
 use registry::cli::Command;
 use registry::{Holder, Store};
@@ -126,6 +127,7 @@ impl Caller {
     /// The status and the answer.
     fn call(&mut self, method: &str, path: &str, body: &[u8]) -> Result<(u16, Vec<u8>)> {
         let head = format!("authorization: Bearer {}\r\ncontent-type: application/json\r\n", self.token);
+        let head = format!("{head}{SECRET_HEADER}: the-secret-of-a-worker-of-this-bench\r\n");
         let length = body.len();
         let head = format!("{method} {path} HTTP/1.1\r\nhost: localhost\r\n{head}content-length: {length}\r\n\r\n");
         self.stream.write_all(&[head.as_bytes(), body].concat())?;

@@ -93,7 +93,7 @@ async fn prepare(runs: u64) -> Result<Size> {
             }
         };
         let output = workers[0].output(&assignment).await?;
-        workers[0].finish(assignment.grant, output).await?;
+        workers[0].finish(assignment, output).await?;
     }
     for i in 1..WORKERS {
         workers.push(Worker::join(address, &token, i).await?);
@@ -128,7 +128,7 @@ async fn round(size: &mut Size) -> Result {
                 while !stop.load(Ordering::Relaxed) {
                     let assignment = worker.poll().await?.ok_or("there is always a shard")?;
                     let output = worker.output(&assignment).await?;
-                    worker.finish(assignment.grant, output).await?;
+                    worker.finish(assignment, output).await?;
                     claims.fetch_add(1, Ordering::Relaxed);
                 }
                 Result::Ok(worker)

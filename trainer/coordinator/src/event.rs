@@ -4,14 +4,15 @@
 //! merely says (a poll, a tick of the clock) is an [`Observation`]; [`observe`](crate::observe) turns it into events when
 //! it means something, so that heartbeats cost no disk write.
 
-use protocol::message::{CommitCheckpoint, Grant, Join, Poll, ReportOutcome};
+use protocol::message::{CommitCheckpoint, Join, Poll, ReportOutcome, TaskOutcome};
 use protocol::pipeline::Pipeline;
 use protocol::stage::Keep;
-use protocol::{Digest, Fence, Incarnation, RunId, StageName, TaskId, WorkerId};
+use protocol::{Alias, Digest, Fence, Incarnation, Owner, RunId, StageName, TaskId, WorkerId};
 use registry::Write;
 
 use crate::state::execution::StageExecution;
 use crate::state::run::{Control, Run};
+use crate::state::worker::Identity;
 use crate::value::{Candidate, Known};
 
 /// Something that happened, or that somebody asks for.
@@ -33,13 +34,17 @@ pub enum Event {
         idempotency_key: Option<String>,
         /// Stop after this stage.
         until: Option<StageName>,
+        /// The token that submitted it.
+        owner: Owner,
     },
     /// A worker process offered itself.
     Join {
         /// What it said.
         join: Join,
+        /// Whose word it is.
+        by: Identity,
     },
-    /// A worker that had lost its lease, or whose peers had lost it, was heard again.
+    /// A worker that had lost its lease, or that had to leave a gang some time ago, was heard again.
     WorkerBack {
         /// Who.
         worker: WorkerId,
@@ -60,17 +65,24 @@ pub enum Event {
         /// Which process.
         incarnation: Incarnation,
     },
-    /// The launcher of the process saw it exit: certain, unlike an expired lease.
+    /// The process has ended: certain, unlike an expired lease.
     WorkerGone {
         /// Who.
         worker: WorkerId,
+        /// Which process said so of itself. `None` is the word of the launcher, which saw the newest one exit.
+        incarnation: Option<Incarnation>,
     },
-    /// A gang member could not reach others.
-    PeersLost {
-        /// The reporter's grant.
-        grant: Grant,
-        /// Whom.
-        lost: Vec<WorkerId>,
+    /// Members of a gang complain of each other, as [`Heard::words`](crate::state::Heard::words) says.
+    GangDivided {
+        task: TaskId,
+        /// The generation.
+        fence: Fence,
+    },
+    /// No member of a gang has had a step more for too long.
+    GangStalled {
+        task: TaskId,
+        /// The generation.
+        fence: Fence,
     },
     /// A checkpoint was uploaded and shall count.
     Checkpoint {
@@ -138,6 +150,36 @@ pub enum Event {
     },
 }
 
+impl Event {
+    /// The artifacts that rows are to name because of it. They are proven whole before it is decided.
+    pub(crate) fn artifacts(&self) -> Vec<Digest> {
+        match self {
+            Self::Checkpoint { commit } => vec![commit.manifest],
+            Self::Outcome { report } => match report.outcome {
+                TaskOutcome::Finished { output, .. } => vec![output],
+                TaskOutcome::Resolved { .. } | TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => Vec::new(),
+            },
+            Self::Bundled { bundles, .. } => bundles.clone(),
+            Self::Started { .. }
+            | Self::Submit { .. }
+            | Self::Join { .. }
+            | Self::WorkerBack { .. }
+            | Self::WorkerReady { .. }
+            | Self::LeaseExpired { .. }
+            | Self::WorkerGone { .. }
+            | Self::GangDivided { .. }
+            | Self::GangStalled { .. }
+            | Self::Control { .. }
+            | Self::WorkerForgotten { .. }
+            | Self::Drain
+            | Self::BackoffOver { .. }
+            | Self::GraceOver { .. }
+            | Self::LookedUp { .. }
+            | Self::RegisterRefused { .. } => Vec::new(),
+        }
+    }
+}
+
 /// What was merely heard.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Observation {
@@ -172,6 +214,10 @@ pub enum Effect {
         key: Digest,
         /// In the order of the stage's `from`.
         candidates: Vec<Candidate>,
+        /// The alias that moves with it.
+        promotes: Option<Alias>,
+        /// On whose behalf.
+        owner: Owner,
     },
     /// Forget a task's checkpoints but those to keep. Never before the newer one is stored.
     Prune {

@@ -7,6 +7,8 @@
 //! serde default that means "as before"; a kind may be added; both raise the minor version of [`FORMAT`](crate::journal::FORMAT).
 //! Anything else raises the major one, which older builds refuse.
 
+use std::collections::BTreeMap;
+
 use protocol::message::{ReportOutcome, RunState};
 use protocol::pipeline::PipelineStage;
 use protocol::stage::Placement;
@@ -44,6 +46,15 @@ pub enum Fact {
         run: u64,
         /// By place.
         stages: Vec<(usize, Status)>,
+    },
+    /// A worker digested the files that a stage reads outside the store.
+    Resolved {
+        /// The run's number.
+        run: u64,
+        /// The stage's place.
+        stage: usize,
+        /// By field; empty for what is to be found again.
+        digests: BTreeMap<String, Digest>,
     },
     /// A sweep made stages, behind those that there are; they wait.
     StagesAdded {

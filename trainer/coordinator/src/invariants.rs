@@ -19,19 +19,21 @@
 //! | C14 | What is known twice agrees: which tasks are held or wait, where a task is, what a worker holds, who holds nothing, which stages are active, who uses an execution, what is served in which order. |
 //! | C15 | Memory holds what may still matter: no ended run, and no execution that no run uses and nobody works on. |
 //! | C16 | What must survive a restart changes only together with a write. |
+//! | C17 | A gang of which a member polls and holds the state keeps such a member, unless a member reports or the gang was asked to drain. |
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use protocol::message::RunState;
+use protocol::message::{Member, RunState};
 
 use crate::schedule;
 use crate::state::State;
+use crate::state::evidence;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::run::Status;
 use crate::state::shared::Map;
 use crate::state::task::{Lease, Part, Task};
-use crate::state::worker::Presence;
+use crate::state::worker::{Presence, Worker};
 
 /// Which invariants `state` breaks, each with its number; empty if all is well.
 pub fn check(state: &State) -> Vec<String> {
@@ -197,7 +199,7 @@ fn check_task(state: &State, execution: &StageExecution, task: &Task, broken: &m
             let fits = holders.len() <= range.max;
             !holders.is_empty() && (fits || drain_by || state.draining)
         }
-        Part::Alone | Part::Shard { .. } | Part::Merge => holders.len() == 1,
+        Part::Alone | Part::Resolve | Part::Shard { .. } | Part::Merge => holders.len() == 1,
     };
     if !fits || names.len() != holders.len() {
         broken.push(format!("C4: `{}` is held by {holders:?}, with room for {range:?}", task.id));
@@ -238,6 +240,7 @@ pub fn check_change(before: &State, after: &State) -> Vec<String> {
             if changed_hands && now.fence == task.fence {
                 broken.push(format!("C5: `{}` changed hands under fence {}", task.id, task.fence));
             }
+            check_state_is_kept(before, after, task, now, &mut broken);
         }
         if let (ExecutionState::Open, ExecutionState::Open) = (&execution.state, &now.state) {
             for task in execution.tasks.iter().filter(|task| task.output().is_some()) {
@@ -258,6 +261,34 @@ pub fn check_change(before: &State, after: &State) -> Vec<String> {
         }
     }
     broken
+}
+
+/// C17.
+fn check_state_is_kept(before: &State, after: &State, task: &Task, now: &Task, broken: &mut Vec<String>) {
+    let Lease::Held { holders, drain_by: None, .. } = &task.lease else { return };
+    let reporter = now.reported.as_ref().filter(|_| now.reported != task.reported).map(|report| &report.grant.worker);
+    let is_left = |member: &&Member| {
+        let is_here = |worker: &Worker| {
+            worker.presence == Presence::Here
+                || matches!(worker.presence, Presence::Suspect { since } if since == after.now)
+        };
+        let process = after.workers.get(&member.worker).filter(|worker| worker.incarnation == member.incarnation);
+        process.is_some_and(is_here) && reporter != Some(&member.worker)
+    };
+    let holds = |member: &&Member| evidence::holds(&before.heard.words, task, member).is_some();
+    if task.part != Part::Gang || now.output().is_some() || !holders.iter().filter(is_left).any(|member| holds(&member))
+    {
+        return;
+    }
+    let goes_on =
+        now.attempt == task.attempt && holders.iter().filter(holds).any(|member| now.holders().contains(member));
+    // A report of the lead that it has yielded, and failures that are final.
+    let reported = reporter.is_some() && (now.attempt == task.attempt && !now.is_held());
+    let execution = after.task(&task.id).map(|(execution, _)| execution);
+    let is_over = execution.is_ok_and(|execution| execution.state != ExecutionState::Open);
+    if !goes_on && !reported && !is_over {
+        broken.push(format!("C17: `{}` goes from {holders:?} to {now:?} and loses its state", task.id));
+    }
 }
 
 /// What of `before` is not in `after` as it was, though it must survive a restart and no event has changed it: an event that is refused, or

@@ -3,13 +3,14 @@
 
 use std::sync::Arc;
 
-use protocol::WorkerId;
-use protocol::message::Poll;
+use protocol::message::{Doing, Poll};
+use protocol::{TaskId, WorkerId};
 
 use crate::event::{Event, Observation};
 use crate::rejected::Rejected;
 use crate::state::State;
-use crate::state::task::Lease;
+use crate::state::evidence::{self, Word};
+use crate::state::task::{Lease, Part, Task};
 use crate::state::worker::{Presence, Worker};
 use crate::time::Millis;
 
@@ -24,8 +25,16 @@ pub fn observe(state: &mut State, at: Millis, observation: Observation) -> Resul
 /// Whether `poll` says no more than that its worker lives and how far it is: nothing follows from it.
 pub fn is_quiet(state: &State, worker: &WorkerId, poll: &Poll) -> Result<bool, Rejected> {
     let known = state.process(worker, poll.incarnation)?;
-    let lost_nobody = poll.doing.iter().all(|doing| doing.lost.is_empty());
-    Ok(known.presence == Presence::Here && lost_nobody && !is_ready_for_more(state, known, poll))
+    let complains = poll.doing.iter().any(|doing| !doing.lost.is_empty());
+    let divided = || poll.doing.iter().any(|doing| is_of_a_divided_gang(state, doing));
+    let may_join = known.presence == Presence::Here && known.shunned.is_none();
+    Ok(may_join && !complains && !is_ready_for_more(state, known, poll) && !divided())
+}
+
+/// Whether a member speaks while its gang is heard about a complaint.
+fn is_of_a_divided_gang(state: &State, doing: &Doing) -> bool {
+    let Ok((_, task)) = state.task(&doing.grant.task) else { return false };
+    task.part == Part::Gang && task.check(&doing.grant).is_ok() && evidence::is_divided(&state.heard.words, task)
 }
 
 /// Whether the worker has what it needs for a task of which that was not known.
@@ -37,11 +46,13 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
     let known = state.process(&worker, poll.incarnation)?;
     let mut events = Vec::new();
     match known.presence {
+        Presence::Here if known.shunned.is_some_and(|until| until <= now) => {
+            events.push(Event::WorkerBack { worker: worker.clone() });
+        }
         Presence::Here => {}
         Presence::Silent => events.push(Event::WorkerBack { worker: worker.clone() }),
         Presence::Suspect { since } => {
-            let penalty = state.policy.penalty_ms << known.suspicions.saturating_sub(1).min(6);
-            if now.since(since) >= penalty {
+            if now.since(since) >= state.policy.penalty_ms {
                 events.push(Event::WorkerBack { worker: worker.clone() });
             }
         }
@@ -57,17 +68,26 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
         events.push(Event::WorkerReady { worker, incarnation, tasks: poll.ready });
     }
     let before = state.heard.workers.get(&worker).copied().unwrap_or_default();
-    state.heard.workers.insert_mut(worker, now.max(before));
-    for doing in poll.doing {
-        let Ok((execution, task)) = state.task(&doing.grant.task) else { continue };
-        let Ok(rank) = task.check(&doing.grant) else { continue };
+    state.heard.workers.insert_mut(worker.clone(), now.max(before));
+    for mut said in poll.doing {
+        if (&said.grant.worker, said.grant.incarnation) != (&worker, poll.incarnation) {
+            // A worker speaks for its own grants alone.
+            continue;
+        }
+        let Ok((execution, task)) = state.task(&said.grant.task) else { continue };
+        let Ok(rank) = task.check(&said.grant) else { continue };
+        let is_gang = task.part == Part::Gang;
         // Shards are counted, not looked into.
         if rank == 0 && execution.tasks.len() == 1 {
-            let progress = Arc::new(doing.progress);
-            state.heard.progress.insert_mut(doing.grant.task.clone(), progress);
+            let progress = Arc::new(std::mem::take(&mut said.progress));
+            state.heard.progress.insert_mut(said.grant.task.clone(), progress);
         }
-        if !doing.lost.is_empty() {
-            events.push(Event::PeersLost { grant: doing.grant, lost: doing.lost });
+        if is_gang {
+            let word = Word::after(state.heard.words.get(&worker), &said, now);
+            Arc::make_mut(&mut state.heard.words).insert(worker.clone(), word);
+            if is_of_a_divided_gang(state, &said) {
+                events.push(Event::GangDivided { task: said.grant.task, fence: said.grant.fence });
+            }
         }
     }
     Ok(events)
@@ -82,6 +102,10 @@ fn tick(state: &mut State, at: Millis, overslept: u64) -> Vec<Event> {
     if overslept > state.policy.lease_ms / 3 {
         let later = |(name, heard): (&WorkerId, &Millis)| (name.clone(), heard.after(overslept).min(at).max(*heard));
         state.heard.workers = state.heard.workers.iter().map(later).collect();
+        for word in Arc::make_mut(&mut state.heard.words).values_mut() {
+            word.complained = word.complained.map(|complained| complained.after(overslept).min(at));
+            word.moved = word.moved.after(overslept).min(at);
+        }
     }
     let mut events = Vec::new();
     let unheard: Vec<WorkerId> =
@@ -111,8 +135,18 @@ fn tick(state: &mut State, at: Millis, overslept: u64) -> Vec<Event> {
             Lease::Held { drain_by: Some(deadline), .. } if deadline <= now => {
                 events.push(Event::GraceOver { task: task.id.clone(), fence: task.fence });
             }
+            Lease::Held { .. } if task.part == Part::Gang => events.extend(gang_event(state, task, now)),
             Lease::Waiting { .. } | Lease::Held { .. } | Lease::Done { .. } => {}
         }
     }
     events
+}
+
+/// What the clock means for a gang: a hearing may be over, and a member may be hung.
+fn gang_event(state: &State, task: &Task, now: Millis) -> Option<Event> {
+    let (id, fence, words): (TaskId, _, _) = (task.id.clone(), task.fence, &state.heard.words);
+    if evidence::is_divided(words, task) {
+        return Some(Event::GangDivided { task: id, fence });
+    }
+    evidence::hung(words, task, now, state.policy.stall_ms).map(|_| Event::GangStalled { task: id, fence })
 }

@@ -3,21 +3,26 @@
 //! | report \ from | rank 0 (or alone) | another member | an old grant |
 //! |---|---|---|---|
 //! | checkpoint | committed | refused | refused: stale fence |
+//! | resolved | done, of a task that resolves | refused | as finished |
 //! | finished | done | refused | refused, unless it is the accepted report sent again |
 //! | yielded | waits | refused | as above |
+//! | failed: infrastructure, fault, damaged, another holds the state | the member leaves the gang | the same | as above |
 //! | failed: infrastructure | tried again | the member leaves the gang | as above |
 //! | failed: fault | tried again | tried again | as above |
 //! | failed: memory, others in the gang | tried without the member | tried without the member | as above |
 //! | failed: an input is damaged | waits until that is made again | the same | as above |
+//! | failed: input, diverged, refused, storage, only another holds the state | the member leaves the gang | the same | as above |
 //! | failed: input, diverged, memory and alone, refused, storage | final | final | as above |
+//!
+//! So a member that fails costs its gang no step while another one holds the state.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use protocol::message::{CommitCheckpoint, FailureClass, Grant, ReportOutcome, TaskOutcome};
+use protocol::message::{CommitCheckpoint, FailureClass, Grant, LossCause, ReportOutcome, TaskOutcome};
 use protocol::stage::{Keep, StageSettings};
 use protocol::sweep::STATE_OUTPUT;
-use protocol::{Digest, WorkerId};
+use protocol::{Digest, WorkerId, canonical};
 use registry::{Write, WriteError};
 
 use crate::decide::attempts::Loss;
@@ -73,7 +78,13 @@ impl Deciding<'_> {
         let rank = task.check(grant)?;
         let (key, i) = self.place(&grant.task)?;
         let worker = grant.worker.clone();
+        let resolves = self.state.executions[&key].resolves;
         match &report.outcome {
+            TaskOutcome::Resolved { digests } => self.resolved(key, i, digests)?,
+            TaskOutcome::Finished { .. } if resolves => {
+                let task = &grant.task;
+                return Err(Rejected::Conflict(format!("task `{task}` digests files; it has no artifact")));
+            }
             TaskOutcome::Finished { output, metrics } => {
                 if rank != 0 {
                     return Err(only_rank_0(&worker, "reports the end"));
@@ -92,6 +103,15 @@ impl Deciding<'_> {
                 });
             }
             TaskOutcome::Failed { class, message } => {
+                let task = &self.state.executions[&key].tasks[i];
+                if *class != FailureClass::OutOfMemory
+                    && self.goes_on_without(task, &worker)
+                    && !(class.is_final() && self.has_state(task, &worker))
+                {
+                    self.leave(key, i, &worker, LossCause::Unreachable);
+                    self.accepted(key, i, &report);
+                    return Ok(true);
+                }
                 let fault = match class {
                     FailureClass::Fault => true,
                     FailureClass::Infrastructure => false,
@@ -119,7 +139,7 @@ impl Deciding<'_> {
                     }
                 };
                 if rank != 0 && !fault {
-                    self.suspect(&grant.task.clone(), &[worker])?;
+                    self.leave(key, i, &worker, LossCause::Unreachable);
                 } else {
                     self.try_again(key, i, message, fault);
                 }
@@ -131,6 +151,23 @@ impl Deciding<'_> {
 
     fn accepted(&mut self, key: Digest, i: usize, report: &ReportOutcome) {
         self.change(key, i, |task| task.reported = Some(report.clone()));
+    }
+
+    /// A worker has digested what a stage reads outside the store, which now has a key.
+    fn resolved(&mut self, key: Digest, i: usize, digests: &BTreeMap<String, Digest>) -> Result<(), Rejected> {
+        let execution = Arc::clone(&self.state.executions[&key]);
+        let named: BTreeSet<String> = execution.settings.folders().into_iter().map(|folder| folder.field).collect();
+        if !execution.resolves || named.iter().ne(digests.keys()) {
+            let stage = &execution.stage;
+            return Err(Rejected::Conflict(format!("stage `{stage}` was not to be resolved, or names other files")));
+        }
+        self.change(key, i, |task| task.finish(canonical::digest(digests)));
+        for (run, stage) in execution.users.iter().copied() {
+            self.record(Fact::Resolved { run, stage, digests: digests.clone() });
+        }
+        let known = Arc::new(Known { outputs: BTreeMap::new(), metrics: BTreeMap::new() });
+        self.record(Fact::ExecutionState { key, state: ExecutionState::Done { known, cached: false } });
+        Ok(())
     }
 
     fn finished(
@@ -198,6 +235,8 @@ pub fn refused_for_good(event: &Event, error: &WriteError) -> Option<Event> {
         WriteError::StaleFence { .. }
         | WriteError::Superseded { .. }
         | WriteError::Storage(_)
+        | WriteError::Unproven { .. }
+        | WriteError::Unreachable(_)
         | WriteError::Internal(_) => return None,
     };
     let failed = |grant: &Grant| {

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use protocol::message::{RunState, StageState};
 use protocol::stage::{Register, Shape};
-use protocol::{Digest, StageName};
+use protocol::{Digest, StageName, canonical};
 
 use crate::decide::deciding::Deciding;
 use crate::event::Effect;
@@ -56,6 +56,7 @@ impl Deciding<'_> {
                 | ExecutionState::Mending { .. }
                 | ExecutionState::Bundling => continue,
                 ExecutionState::Failed { message, .. } => Status::Failed { key, message: message.clone() },
+                ExecutionState::Done { .. } if execution.resolves => Status::Waiting,
                 ExecutionState::Done { known, cached } => {
                     let how = match (cached, execution.resumed) {
                         (true, _) => StageState::Cached,
@@ -86,8 +87,12 @@ impl Deciding<'_> {
             {
                 let status = if run.pipeline.stages[j].sweep.is_some() {
                     self.begin_sweep(number, j)
+                } else if run.is_resolved(j, &inputs) {
+                    let key = run.pipeline.identity(&run.pipeline.stages[j], &inputs).key();
+                    self.attach(&run, j, inputs, key, false)
                 } else {
-                    self.attach(&run, j, inputs)
+                    let key = canonical::digest(&("files of a stage", &run.id, &run.pipeline.stages[j].name));
+                    self.attach(&run, j, inputs, key, true)
                 };
                 stages.push((j, status));
             }
@@ -97,9 +102,9 @@ impl Deciding<'_> {
         }
     }
 
-    fn attach(&mut self, run: &Run, j: usize, inputs: BTreeMap<String, Digest>) -> Status {
+    /// Wants the value of a stage under `key`; one that `resolves` is given no value yet, but the digests that its key needs.
+    fn attach(&mut self, run: &Run, j: usize, inputs: BTreeMap<String, Digest>, key: Digest, resolves: bool) -> Status {
         let stage = &run.pipeline.stages[j];
-        let key = run.pipeline.identity(stage, &inputs).key();
         let registration = match stage.settings.get::<Register>().map(|settings| Registration::gather(run, settings)) {
             Some(Ok(registration)) => Some(registration),
             Some(Err(message)) => return Status::Failed { key, message },
@@ -110,7 +115,7 @@ impl Deciding<'_> {
         };
         match self.state.executions.get(&key).cloned() {
             Some(execution) => {
-                if execution.placement != stage.placement {
+                if execution.placement != stage.placement && self.may_place(run, &execution) {
                     self.record(Fact::ExecutionPlacement { key, placement: stage.placement.clone() });
                 }
                 let lost = match execution.state {
@@ -136,6 +141,7 @@ impl Deciding<'_> {
                     keyed_as: protocol::pipeline::keyed_as(stage).clone(),
                     settings: stage.settings.clone(),
                     inputs,
+                    resolves,
                     seed: run.pipeline.seed,
                     backend: run.pipeline.backend,
                     placement: stage.placement.clone(),
@@ -153,6 +159,12 @@ impl Deciding<'_> {
         }
         self.effects.push(Effect::Lookup { key });
         Status::Active { key }
+    }
+
+    /// Whether `run` says how many workers compute a stage: not while another owner's run waits for the same.
+    fn may_place(&self, run: &Run, execution: &StageExecution) -> bool {
+        let others = execution.users.iter().filter_map(|(number, _)| self.state.runs.get(number));
+        others.filter(|other| other.state == RunState::Running).all(|other| run.owner.controls(&other.owner.group()))
     }
 
     /// Wanted again after it was over: the store is asked first, and budgets are whole again.
@@ -177,7 +189,8 @@ impl Deciding<'_> {
                 continue;
             }
             self.state.visits += 1;
-            let carry_on = !self.state.draining && self.state.is_wanted(&execution);
+            let enough = execution.is_enough();
+            let carry_on = !self.state.draining && enough && self.state.is_wanted(&execution);
             if !execution.tasks.all_draining(!carry_on) {
                 for i in execution.tasks.held() {
                     self.change(key, i, |task| task.drain((!carry_on).then_some(deadline)));

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use checkpoint::model::Parts;
 use protocol::pipeline::PipelineStage;
 use protocol::stage::{Mode, Register, Sampler};
-use protocol::{Alias, Digest, ModelName, RunId, StageName};
+use protocol::{Alias, Digest, ModelName, StageName};
 use registry::Write;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -45,6 +45,9 @@ impl Registration {
             "" => None,
             alias => {
                 let alias = alias.parse::<Alias>().map_err(|e| format!("`promote.to`: {e}"))?;
+                if !run.owner.promotes {
+                    return Err(format!("`promote.to`: the token of `{}` may not promote", run.owner));
+                }
                 Some((alias, settings.promote.require.clone()))
             }
         };
@@ -69,9 +72,9 @@ impl Registration {
         Ok(Self { candidates, metrics, keys, best, model, by, promote })
     }
 
-    /// The stage's value and the writes that make it so, given the stored bundle of each candidate.
-    pub fn writes(&self, run: &RunId, stage: &StageName, bundles: &[Digest]) -> (Known, Vec<Write>) {
-        let mut writes = Vec::new();
+    /// The stage's value and the writes that make it so on behalf of `run`, given the stored bundle of each candidate.
+    pub fn writes(&self, run: &Run, stage: &StageName, bundles: &[Digest]) -> (Known, Vec<Write>) {
+        let mut writes = vec![Write::ModelOwner { model: self.model.clone(), owner: run.owner.clone() }];
         let (metric, mode) = &self.by;
         for (i, artifact) in bundles.iter().enumerate() {
             writes.push(Write::Version {
@@ -79,7 +82,7 @@ impl Registration {
                 artifact: *artifact,
                 metrics: self.metrics[i].clone(),
                 source: json!({
-                    "run": run, "stage": self.candidates[i].stage, "key": self.keys[i], "metric": metric, "mode": mode,
+                    "run": run.id, "stage": self.candidates[i].stage, "key": self.keys[i], "metric": metric, "mode": mode,
                 }),
             });
         }
@@ -90,7 +93,7 @@ impl Registration {
                 artifact: bundles[self.best],
                 require: require.clone(),
                 reason: format!("best of stage `{stage}`"),
-                actor: format!("run {run}"),
+                actor: format!("{}, run {}", run.owner, run.id),
             });
         }
         let outputs = BTreeMap::from([("model".to_owned(), bundles[self.best])]);
@@ -174,7 +177,54 @@ fn best(from: &[String], metrics: &[BTreeMap<String, f64>], settings: &Register)
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
+    use protocol::Owner;
+    use protocol::pipeline::Pipeline;
+
     use super::*;
+
+    fn pipeline() -> Pipeline {
+        let text = "name: p\nseed: 1\ndataset: {format: synthetic}\nstages:\n  vae: {kind: train.vae}\n  latents: {kind: encode.latents}\n  \
+                    mld: {kind: train.mld}\n  fid: {kind: evaluate.latent_fid, model: mld}\n  release: {kind: register, model: m, from: mld, promote: {to: prod}}\n";
+        protocol::pipeline::read("p.yaml", text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"))
+    }
+
+    #[test]
+    fn a_promotion_is_its_submitters_and_bears_token_and_run() {
+        let run = |promotes| {
+            let owner = Owner { name: "alice".into(), project: Some("motion".into()), promotes, admin: false };
+            Run::new(3, owner, Arc::new(pipeline()), None, None)
+        };
+        let release = pipeline().stages.into_iter().next_back().expect("a stage");
+        let settings = release.settings.get::<Register>().expect("`register`").clone();
+        let refused = Registration::gather(&run(false), &settings).unwrap_err();
+        assert_eq!(refused, "`promote.to`: the token of `alice (motion)` may not promote");
+        let without = Register { promote: Default::default(), ..settings.clone() };
+        let other = Registration::gather(&run(false), &without).unwrap_err();
+        assert!(!other.contains("promote"), "without an alias it needs no scope: {other}");
+
+        let candidate = Candidate { stage: "mld".into(), model: Digest::of(b"m"), sampler: None, parts: Parts::new() };
+        let registration = Registration {
+            candidates: vec![candidate],
+            metrics: vec![BTreeMap::new()],
+            keys: vec![Digest::of(b"key")],
+            best: 0,
+            model: "m".into(),
+            by: ("fid".into(), Mode::Min),
+            promote: Some(("prod".into(), Vec::new())),
+        };
+        let run = run(true);
+        let (_, writes) = registration.writes(&run, &"release".into(), &[Digest::of(b"bundle")]);
+        let [Write::ModelOwner { owner, .. }, Write::Version { source, .. }, Write::Promote { actor, .. }] =
+            &writes[..]
+        else {
+            panic!("{writes:?}");
+        };
+        assert_eq!(*owner, run.owner);
+        assert_eq!(source["run"], run.id.as_str());
+        assert_eq!(*actor, format!("alice (motion), run {}", run.id));
+    }
 
     #[test]
     fn a_plain_name_and_its_interval_are_of_one_evaluation() {

@@ -1,19 +1,23 @@
 //! What is refused.
 
-use protocol::{Fence, TaskId};
+use protocol::{Fence, RunId, TaskId};
 
 /// Why an event did not happen. Nothing has changed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Rejected {
     /// The grant has been superseded.
-    #[error("stale fence: task `{task}` is at fence {current}, the call carries {carried}")]
+    #[error("stale fence: the grant of task `{task}` with fence {carried} has been superseded")]
     StaleFence {
         task: TaskId,
-        /// Its fence now.
-        current: Fence,
-        /// The fence of the call.
+        /// The fence of the call. The task's own is not told.
         carried: Fence,
     },
+    /// A worker's name is another process's, whose lease has not ended.
+    #[error("{0}")]
+    NameHeld(String),
+    /// The caller may not ask for it: another token's worker, run or alias.
+    #[error("{0}")]
+    Forbidden(String),
     /// No such thing.
     #[error("{0}")]
     NotFound(String),
@@ -26,4 +30,11 @@ pub enum Rejected {
     /// It cannot be.
     #[error("{0}")]
     Invalid(String),
+}
+
+impl Rejected {
+    /// There is no such run, or none that the caller sees.
+    pub fn unknown_run(run: &RunId) -> Self {
+        Self::NotFound(format!("run `{run}` is not known; `trainer status --all` lists runs"))
+    }
 }

@@ -5,8 +5,8 @@
 //! too large give up members. Then plain tasks, shards and merges
 //! that are ready, one worker each: they are short, and much waits for them. Then gangs that are under way take in those who
 //! is left, up to their `max`; then gangs that wait start with everybody who is left. A gang takes only workers that have said that they
-//! have its inputs: [`State::open_gangs`] says to those who are left for what they should fetch them, and nobody waits for who is slow
-//! at that. All who work on an execution have the same instruction set. A gang does not start while a map
+//! have its inputs and reach its members: [`State::open_gangs`] says to those who are left for what they should fetch them, and nobody
+//! waits for who is slow at that. All who work on an execution have the same instruction set. A gang does not start while a map
 //! stage that its workers could merge is almost done (its last shards are out), or the merge would wait for the whole
 //! training; one that takes a single worker leaves the others to it.
 
@@ -20,6 +20,7 @@ use crate::decide::deciding::Deciding;
 use crate::fact::Fact;
 use crate::policy::GrantOrder;
 use crate::state::State;
+use crate::state::evidence;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::gang::{self, Change};
 use crate::state::queue::{Need, open_member};
@@ -122,13 +123,15 @@ fn idle_that<'a>(state: &'a State, takes: impl Fn(&Worker) -> bool + 'a) -> impl
 }
 
 /// Those of them that have the inputs of a task, and as far as is known the memory for it. All of one instruction set: where nothing
-/// is done yet that binds them to one, that of the most.
+/// is done yet that binds them to one, that of the most. A shunned worker joins nobody; where only such are left, one begins alone, or as
+/// many as are needed.
 fn fit(state: &State, execution: &StageExecution, task: &Task) -> Vec<Member> {
     let fits = |member: &Member| {
         state.workers[&member.worker].ready.contains(&task.id) && !task.too_small.contains(&member.worker)
     };
+    let is_shunned = |member: &Member| state.workers[&member.worker].shunned.is_some();
     let mut by_set: Vec<(&str, Vec<Member>)> = Vec::new();
-    for member in idle(state, execution).filter(fits) {
+    for member in idle(state, execution).filter(fits).filter(|member| !task.is_held() || !is_shunned(member)) {
         let set = state.workers[&member.worker].instruction_set.as_str();
         match by_set.iter_mut().find(|(known, _)| *known == set) {
             Some((_, members)) => members.push(member),
@@ -136,7 +139,12 @@ fn fit(state: &State, execution: &StageExecution, task: &Task) -> Vec<Member> {
         }
     }
     // Of equals the first, which has the worker that is served first.
-    by_set.into_iter().rev().max_by_key(|(_, members)| members.len()).map(|(_, members)| members).unwrap_or_default()
+    let of_most = by_set.into_iter().rev().max_by_key(|(_, members)| members.len());
+    let (shunned, mut welcome): (Vec<Member>, Vec<Member>) =
+        of_most.map(|(_, members)| members).unwrap_or_default().into_iter().partition(is_shunned);
+    let missing = execution.range().min.max(1).saturating_sub(welcome.len());
+    welcome.extend(shunned.into_iter().take(missing));
+    welcome
 }
 
 fn small_tasks(cx: &mut Deciding<'_>, key: Digest) {
@@ -155,7 +163,8 @@ fn change_gangs(cx: &mut Deciding<'_>, key: Digest, joiners: impl Fn(&State, &St
         let execution = &cx.state.executions[&key];
         let task = &execution.tasks[i];
         if matches!(task.lease, Lease::Held { drain_by: None, .. }) {
-            match gang::with(task.holders(), &joiners(cx.state, execution, task), execution.range()) {
+            let holds = |member: &Member| evidence::holds(&cx.state.heard.words, task, member).is_some();
+            match gang::with(task.holders(), &joiners(cx.state, execution, task), execution.range(), holds) {
                 Change::Keep | Change::Disband => {}
                 Change::Regroup(members) => cx.regroup(key, i, members),
             }

@@ -1,10 +1,14 @@
 //! What workers and clients are told. Read-only.
 
+use std::collections::BTreeSet;
+
 use protocol::message::{
     Assignment, DesiredAssignments, Prepare, Progress, Role, RunState, RunView, StageState, StageTask, StageView,
 };
-use protocol::stage::Backend;
-use protocol::{Generation, Incarnation, TaskId, WorkerId, canonical};
+use protocol::pipeline::PipelineStage;
+use protocol::stage::{Backend, Shape};
+use protocol::units::grouped;
+use protocol::{Digest, Generation, Incarnation, TaskId, WorkerId, canonical};
 use serde::{Deserialize, Serialize};
 
 use crate::rejected::Rejected;
@@ -85,19 +89,49 @@ impl State {
         }
         let open = self.open_gangs.iter().filter_map(|(key, i)| {
             let execution = self.executions.get(key).filter(|execution| execution.takes(worker))?;
-            let task = execution.tasks.get(*i)?;
+            let task = execution.tasks.get(*i).filter(|task| !task.is_held() || worker.shunned.is_none())?;
             // A member that joins others is handed their state.
             let resume = if task.is_held() { None } else { task.newest().map(|saved| saved.manifest) };
-            Some(Prepare { task: task.id.clone(), inputs: execution.inputs.clone(), resume })
+            let (inputs, peers) = (execution.artifacts(), task.holders().to_vec());
+            Some(Prepare { task: task.id.clone(), inputs, resume, peers })
         });
         open.take(AT_ONCE).collect()
+    }
+
+    /// The artifacts and checkpoints that a task reads.
+    pub fn read_by(&self, task: &TaskId) -> Result<BTreeSet<Digest>, Rejected> {
+        let (execution, task) = self.task(task)?;
+        let mut read: BTreeSet<Digest> = execution.inputs.values().copied().collect();
+        read.extend(task.checkpoints.iter().map(|saved| saved.manifest));
+        if task.part == Part::Merge {
+            read.extend(execution.shards().unwrap_or_default());
+        }
+        Ok(read)
+    }
+
+    /// The artifacts and checkpoints that a worker may read: those of the task that it holds, or of the tasks that it prepares for.
+    pub fn readable_by(&self, worker: &WorkerId) -> BTreeSet<Digest> {
+        if let Some((_, task)) = self.held_by(worker) {
+            return self.read_by(&task.id).unwrap_or_default();
+        }
+        let prepare = self.workers.get(worker).map(|known| self.to_prepare(known)).unwrap_or_default();
+        prepare.iter().flat_map(|task| task.inputs.values().copied().chain(task.resume)).collect()
     }
 
     /// A run as clients see it at `now`.
     pub fn view(&self, run: &Run, now: Millis) -> RunView {
         let stages = (0..run.stages.len()).map(|i| self.stage_view(run, i, now)).collect();
         let sweeps = run.sweeps.iter().map(|sweep| self.sweep_view(run, sweep)).collect();
-        RunView { run: run.id.clone(), pipeline: run.pipeline.name.clone(), state: run.state, stages, sweeps }
+        RunView {
+            run: run.id.clone(),
+            pipeline: run.pipeline.name.clone(),
+            owner: run.owner.clone(),
+            state: run.state,
+            interrupted: run.is_interrupted(),
+            stages,
+            sweeps,
+            storage: None,
+        }
     }
 
     fn stage_view(&self, run: &Run, i: usize, now: Millis) -> StageView {
@@ -116,6 +150,7 @@ impl State {
             workers: Vec::new(),
             instruction_set: execution.and_then(|execution| execution.instruction_set.clone()),
             message: None,
+            wants_workers: None,
             of: stage.derived.as_ref().map(|derived| derived.of.clone()),
         };
         match status {
@@ -139,6 +174,9 @@ impl State {
                     view.progress = self.progress(execution);
                     view.metrics = view.progress.metrics.clone();
                     (view.state, view.message) = self.active(run, execution);
+                    if view.state == StageState::Ready && self.wants_workers(run, execution) {
+                        view.wants_workers = Some(execution.placement.workers.min.max(1));
+                    }
                 }
             }
             Status::Done { how, known, wall_s, attempt, .. } => {
@@ -146,7 +184,7 @@ impl State {
                 view.outputs = known.outputs.clone();
                 view.metrics = known.metrics.clone();
                 (view.wall_s, view.attempt) = (*wall_s, *attempt);
-                view.progress = execution.map(|execution| self.progress(execution)).unwrap_or_default();
+                view.progress = whole(stage, execution.map(|execution| self.progress(execution)).unwrap_or_default());
             }
             Status::Failed { message, .. } => {
                 view.state = StageState::Failed;
@@ -169,33 +207,41 @@ impl State {
             }
             ExecutionState::Bundling => (StageState::Running, None),
             ExecutionState::Open if held => (StageState::Running, None),
+            ExecutionState::Open if run.is_interrupted() || self.draining => {
+                (StageState::Ready, interrupted_at(execution))
+            }
             ExecutionState::Open if run.state == RunState::Paused => (StageState::Ready, Some("paused".to_owned())),
+            ExecutionState::Open if backs_off(execution) => {
+                (StageState::Ready, Some(format!("tries again soon (attempt {} failed)", execution.attempt())))
+            }
             ExecutionState::Open => {
-                let backing_off =
-                    execution.tasks.iter().any(|task| matches!(task.lease, Lease::Waiting { not_before: Some(_) }));
-                let waits_for = if backing_off {
-                    format!("tries again soon (attempt {} failed)", execution.attempt())
-                } else {
-                    let min = execution.placement.workers.min.max(1);
-                    let set =
-                        execution.bound_to().map(|set| format!(" with {set}, as those before")).unwrap_or_default();
-                    format!("waits for {min} idle `{}` worker(s){set}", execution.backend.name())
-                };
-                (StageState::Ready, Some(waits_for))
+                let min = execution.placement.workers.min.max(1);
+                let workers = if min == 1 { "worker" } else { "workers" };
+                let set = execution.bound_to().map(|set| format!(" with {set}, as those before")).unwrap_or_default();
+                let backend = execution.backend.name();
+                (StageState::Ready, Some(format!("waits for {min} idle `{backend}` {workers}{set}")))
             }
             ExecutionState::Done { .. } | ExecutionState::Failed { .. } => (StageState::Running, None),
         }
     }
 
-    /// How far a work is: its one task, or the sum over its shards while they are done.
+    /// Returns true if a stage could begin and lacks only workers.
+    fn wants_workers(&self, run: &Run, execution: &StageExecution) -> bool {
+        execution.state == ExecutionState::Open
+            && run.state == RunState::Running
+            && !execution.is_busy()
+            && !self.draining
+    }
+
+    /// How far a work is: its one task by the newest report or else by what is saved of it, or the sum over its shards while they are done.
     pub fn progress(&self, execution: &StageExecution) -> Progress {
         let of = |task: &Task| self.heard.progress.get(&task.id).map(|progress| Progress::clone(progress));
         let shards = execution.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. })).count();
         let done =
             execution.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. }) && task.output().is_some());
         match (execution.tasks.len(), execution.tasks.first()) {
-            (1, Some(task)) => of(task).unwrap_or_default(),
             (_, None) => Progress::default(),
+            (1, Some(task)) => of(task).unwrap_or_else(|| saved(task, execution)),
             _ => Progress {
                 done: done.count() as u64,
                 total: shards as u64,
@@ -204,6 +250,52 @@ impl State {
             },
         }
     }
+}
+
+fn backs_off(execution: &StageExecution) -> bool {
+    execution.tasks.iter().any(|task| matches!(task.lease, Lease::Waiting { not_before: Some(_) }))
+}
+
+/// How far a training is by its newest checkpoint.
+fn saved(task: &Task, execution: &StageExecution) -> Progress {
+    match (task.newest(), execution.settings.training()) {
+        (Some(saved), Some(training)) => {
+            Progress { done: saved.step, total: training.end().0, unit: "steps".to_owned(), ..Progress::default() }
+        }
+        (None, _) | (_, None) => Progress::default(),
+    }
+}
+
+/// The place that work which stopped continues from; `None` if it had not begun.
+fn interrupted_at(execution: &StageExecution) -> Option<String> {
+    let shards = execution.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. }));
+    let (total, done) =
+        shards.fold((0, 0), |(total, done), task| (total + 1, done + u64::from(task.output().is_some())));
+    if total > 0 && done > 0 {
+        return Some(format!("interrupted at {done} of {total} shards"));
+    }
+    let saved = execution.tasks.iter().find_map(Task::newest).map(|saved| grouped(saved.step));
+    match (saved, execution.settings.training()) {
+        (Some(step), Some(training)) => Some(format!("interrupted at {step} of {} steps", grouped(training.end().0))),
+        (Some(step), None) => Some(format!("interrupted at step {step}")),
+        (None, _) if execution.attempt().0 > 0 => Some("interrupted before anything was saved".to_owned()),
+        (None, _) => None,
+    }
+}
+
+/// The progress of a finished stage. The newest report of its workers is older than its end, and a stage may end before the first.
+fn whole(stage: &PipelineStage, reported: Progress) -> Progress {
+    let mut progress = reported;
+    if progress.total == 0 {
+        let (total, unit) = match (stage.settings.training(), stage.settings.shape()) {
+            (Some(training), _) => (training.end().0, "steps"),
+            (None, Shape::Map) => (u64::from(stage.settings.shards()), "shards"),
+            (None, Shape::Gang | Shape::Plain | Shape::Registry) => (0, ""),
+        };
+        (progress.total, progress.unit) = (total, unit.to_owned());
+    }
+    progress.done = progress.total;
+    progress
 }
 
 fn workers(execution: &StageExecution) -> Vec<WorkerId> {
@@ -222,6 +314,7 @@ fn assignment(
     }
     let role = match task.part {
         Part::Alone => Role::Alone,
+        Part::Resolve => Role::Resolve,
         Part::Shard { index, of } => Role::Shard { index, of },
         Part::Merge => Role::Merge { shards: execution.shards().unwrap_or_default() },
         Part::Gang => {
@@ -230,6 +323,7 @@ fn assignment(
     };
     Some(Assignment {
         grant: task.grant_of(worker, incarnation),
+        secret: String::new(),
         stage: StageTask {
             run: execution.run.clone(),
             name: execution.keyed_as.clone(),

@@ -63,13 +63,12 @@ fn expected(method: &str, path: &str) -> &'static [Scope] {
         ("GET", "/v1/runs" | "/v1/runs/{run}" | "/v1/runs/{run}/logs" | "/v1/runs/{run}/metrics" | "/v1/workers") => {
             &[Read]
         }
-        ("POST", "/v1/runs" | "/v1/runs/{run}/{action}") => &[Submit],
+        ("POST", "/v1/runs" | "/v1/runs/{run}/{action}" | "/v1/bundles") => &[Submit],
         ("POST", "/v1/workers" | "/v1/workers/{worker}/poll" | "/v1/workers/{worker}/gone") => &[Worker],
         ("POST", "/v1/metrics" | "/v1/logs" | "/v1/checkpoints" | "/v1/outcomes") => &[Worker],
         ("GET", "/v1/blobs/{digest}") => &[Read, Worker],
         ("PUT", "/v1/blobs/{digest}") | ("GET", "/v1/blobs/{digest}/staged") => &[Worker],
         ("POST", "/v1/registry") => &[Read, Promote, Admin],
-        ("POST", "/v1/bundles") => &[Promote],
         other => panic!("{other:?} is not in this table: say who may call it"),
     }
 }

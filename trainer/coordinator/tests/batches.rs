@@ -1,7 +1,7 @@
 //! What is decided together, what the store refuses, and who is answered when, without a disk.
 
 use coordinator::batch::{Ask, Batches, Done, Turn};
-use coordinator::state::worker::Presence;
+use coordinator::state::worker::{Identity, Presence};
 use coordinator::{Effect, Event, Millis, Moment, Observation, Policy, Refused, State};
 use protocol::message::{Join, PROTOCOL_VERSION, Poll};
 use protocol::stage::Backend;
@@ -17,7 +17,13 @@ fn at(now: u64) -> impl FnMut() -> Moment {
 fn submit() -> Ask {
     let pipeline = protocol::pipeline::read("p.yaml", TEXT, &[]).expect("a pipeline");
     let (pipeline, source) = (Box::new(pipeline), TEXT.to_owned());
-    Ask::Event(Box::new(Event::Submit { pipeline, source, idempotency_key: None, until: None }))
+    Ask::Event(Box::new(Event::Submit {
+        pipeline,
+        source,
+        idempotency_key: None,
+        until: None,
+        owner: protocol::Owner::local("me"),
+    }))
 }
 
 fn join(name: &str) -> Ask {
@@ -29,7 +35,8 @@ fn join(name: &str) -> Ask {
         instruction_set: "avx2".into(),
         peer_address: format!("{name}:1"),
     };
-    Ask::Event(Box::new(Event::Join { join }))
+    let by = Identity { caller: "t".into(), secret: Digest::of(name.as_bytes()) };
+    Ask::Event(Box::new(Event::Join { join, by }))
 }
 
 fn poll(incarnation: Incarnation) -> Poll {

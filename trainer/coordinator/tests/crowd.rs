@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 
 use coordinator::{Config, Connections, Coordinator, Handle, Policy};
 use protocol::message::{DesiredAssignments, Join, Joined, PROTOCOL_VERSION, Poll};
+use protocol::proof::SECRET_HEADER;
 use protocol::stage::Backend;
 use registry::{Holder, Store};
 
@@ -19,6 +20,9 @@ async fn start(dir: &std::path::Path, connections: Connections) -> Handle {
     let policy = Policy { poll_ms: 50, ..Policy::default() };
     Coordinator::start(store, Config { policy, connections, ..Config::embedded() }).await.unwrap()
 }
+
+/// What the worker shows.
+const SECRET: &str = "the-secret-of-a-worker-of-this-test";
 
 /// A connection that is kept, of somebody with a token.
 struct Known {
@@ -37,6 +41,7 @@ impl Known {
     fn post<T: serde::de::DeserializeOwned>(&mut self, path: &str, body: &impl serde::Serialize) -> T {
         let body = serde_json::to_string(body).unwrap();
         let head = format!("authorization: Bearer {}\r\ncontent-type: application/json\r\n", self.token);
+        let head = format!("{head}{SECRET_HEADER}: {SECRET}\r\n");
         let head = format!("POST {path} HTTP/1.1\r\nhost: localhost\r\n{head}content-length: {}\r\n\r\n", body.len());
         self.stream.write_all((head + &body).as_bytes()).unwrap();
         let mut answer = Vec::new();

@@ -7,10 +7,11 @@ use axum::body::Body;
 use axum::http::{Request, StatusCode};
 use coordinator::{Config, Control, Coordinator, Handle, Policy};
 use protocol::message::{
-    ApiError, CommitCheckpoint, DesiredAssignments, Doing, Grant, Join, Joined, LogBatch, MetricBatch, MetricRow,
-    PROTOCOL_VERSION, Poll, Progress, ReportOutcome, RunState, StageState, Submit, TaskOutcome,
+    ApiError, Assignment, CommitCheckpoint, DesiredAssignments, Doing, Grant, Join, Joined, LogBatch, MetricBatch,
+    MetricRow, PROTOCOL_VERSION, Poll, Progress, ReportOutcome, RunState, StageState, Submit, TaskOutcome,
 };
 use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
+use protocol::proof::{BlobStored, GRANT_HEADER, RECEIPT_HEADER, SECRET_HEADER, Vouched};
 use protocol::stage::{Backend, DataSynthetic, Placement, StageSettings, TrainVae};
 use protocol::{ArtifactKind, Digest, Manifest, RunId, Seed};
 use registry::{Holder, Store};
@@ -25,9 +26,24 @@ type TestResult<T = ()> = Result<T, Box<dyn std::error::Error>>;
 struct Client {
     address: std::net::SocketAddr,
     token: Option<String>,
+    /// What its calls show: the secret of a process, or of a grant.
+    secret: String,
 }
 
+/// What every process of these tests shows.
+const SECRET: &str = "the-secret-of-each-process-of-these-tests";
+
 impl Client {
+    fn of(handle: &Handle) -> Self {
+        let token = Some(handle.token().secret().to_owned());
+        Self { address: handle.address(), token, secret: SECRET.to_owned() }
+    }
+
+    /// The same, in the name of a grant.
+    fn under(&self, assignment: &Assignment) -> Self {
+        Self { secret: assignment.secret.clone(), token: self.token.clone(), ..*self }
+    }
+
     async fn send(&self, request: Request<Body>) -> TestResult<(StatusCode, Vec<u8>)> {
         let (parts, body) = request.into_parts();
         let body = axum::body::to_bytes(body, usize::MAX).await?;
@@ -36,6 +52,7 @@ impl Client {
         if let Some(token) = &self.token {
             head += &format!("authorization: Bearer {token}\r\n");
         }
+        head += &format!("{SECRET_HEADER}: {}\r\n", self.secret);
         for (name, value) in &parts.headers {
             head += &format!("{name}: {}\r\n", value.to_str()?);
         }
@@ -66,19 +83,27 @@ impl Client {
         Ok((status.as_u16(), serde_json::from_slice(&bytes)?))
     }
 
-    async fn put_blob(&self, grant: &Grant, bytes: &[u8]) -> TestResult<Digest> {
+    /// Uploads a blob; its name with its receipt.
+    async fn put_blob(&self, grant: &Grant, bytes: &[u8]) -> TestResult<Receipt> {
         let request = Request::builder().method("PUT").uri(format!("/v1/blobs/{}", Digest::of(bytes)));
-        let request = request.header("x-stride-grant", serde_json::to_string(grant)?);
+        let request = request.header(GRANT_HEADER, serde_json::to_string(grant)?);
         let request = request.header("x-stride-bytes", bytes.len());
         let (status, answer) = self.send(request.body(Body::from(bytes.to_vec()))?).await?;
         assert!(status.is_success(), "{status} {}", String::from_utf8_lossy(&answer));
-        let stored: coordinator::shell::BlobStored = serde_json::from_slice(&answer)?;
-        Ok(stored.digest)
+        let stored: BlobStored = serde_json::from_slice(&answer)?;
+        Ok((stored.digest, stored.receipt.ok_or("a stored blob has a receipt")?))
     }
 
-    async fn put_manifest(&self, grant: &Grant, kind: ArtifactKind, name: &str) -> TestResult<Digest> {
+    async fn put_manifest(&self, grant: &Grant, kind: ArtifactKind, name: &str) -> TestResult<Receipt> {
         self.put_blob(grant, &Manifest::new(kind, serde_json::json!({"name": name})).to_bytes()).await
     }
+}
+
+/// A blob and the proof that it was uploaded.
+type Receipt = (Digest, String);
+
+fn vouched<T>(what: T, receipt: &Receipt) -> Vouched<T> {
+    Vouched { what, receipts: BTreeMap::from([receipt.clone()]) }
 }
 
 fn pipeline() -> Pipeline {
@@ -122,7 +147,7 @@ async fn start(dir: &std::path::Path) -> TestResult<(Handle, Client)> {
     let policy = Policy { poll_ms: 300, tick_ms: 50, lease_ms: 1000, ..Policy::default() };
     let config = Config { policy, alone: false, park: false, ..Config::embedded() };
     let handle = Coordinator::start(store, config).await?;
-    let client = Client { address: handle.address(), token: Some(handle.token().secret().to_owned()) };
+    let client = Client::of(&handle);
     Ok((handle, client))
 }
 
@@ -139,12 +164,7 @@ async fn join(client: &Client, name: &str) -> TestResult<Joined> {
 }
 
 /// Polls until there is an assignment of `stage`.
-async fn assignment(
-    client: &Client,
-    name: &str,
-    joined: &Joined,
-    stage: &str,
-) -> TestResult<protocol::message::Assignment> {
+async fn assignment(client: &Client, name: &str, joined: &Joined, stage: &str) -> TestResult<Assignment> {
     let (mut version, mut ready) = (0, Vec::new());
     loop {
         let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready, version };
@@ -178,58 +198,58 @@ async fn a_run_goes_through_over_http_and_survives_a_restart() -> TestResult {
     assert_eq!(again.run, run);
 
     let joined = join(&client, "w").await?;
-    let data = assignment(&client, "w", &joined, "dataset").await?.grant;
-    let output = client.put_manifest(&data, ArtifactKind::Dataset, "clips").await?;
+    let data = assignment(&client, "w", &joined, "dataset").await?;
+    let (under, data) = (client.under(&data), data.grant);
+    let receipt = under.put_manifest(&data, ArtifactKind::Dataset, "clips").await?;
+    let output = receipt.0;
     let rows = vec![MetricRow { step: 1, key: "clips".into(), value: 400.0 }];
-    client.call::<()>("POST", "/v1/metrics", MetricBatch { grant: data.clone(), rows }).await?;
+    under.call::<()>("POST", "/v1/metrics", MetricBatch { grant: data.clone(), rows }).await?;
     let logs = LogBatch { grant: data.clone(), first: 0, lines: vec!["hello".into()] };
-    client.call::<()>("POST", "/v1/logs", logs.clone()).await?;
-    client.call::<()>("POST", "/v1/logs", logs).await?;
+    under.call::<()>("POST", "/v1/logs", logs.clone()).await?;
+    under.call::<()>("POST", "/v1/logs", logs).await?;
     let finished = TaskOutcome::Finished { output, metrics: BTreeMap::from([("clips".into(), 400.0)]) };
-    let report = ReportOutcome { grant: data.clone(), outcome: finished };
-    client.call::<()>("POST", "/v1/outcomes", report.clone()).await?;
+    let report = vouched(ReportOutcome { grant: data.clone(), outcome: finished }, &receipt);
+    under.call::<()>("POST", "/v1/outcomes", report.clone()).await?;
     // The answer may have been lost.
-    client.call::<()>("POST", "/v1/outcomes", report).await?;
+    under.call::<()>("POST", "/v1/outcomes", report).await?;
 
     let vae = assignment(&client, "w", &joined, "vae").await?;
+    let under = client.under(&vae);
     assert_eq!(vae.stage.inputs["dataset"], output);
-    let checkpoint = client.put_manifest(&vae.grant, ArtifactKind::Checkpoint, "step 5").await?;
+    let receipt = under.put_manifest(&vae.grant, ArtifactKind::Checkpoint, "step 5").await?;
+    let checkpoint = receipt.0;
     let commit = CommitCheckpoint { grant: vae.grant.clone(), step: 5, manifest: checkpoint, metrics: BTreeMap::new() };
-    client.call::<()>("POST", "/v1/checkpoints", commit.clone()).await?;
-    let missing = CommitCheckpoint { step: 6, manifest: Digest::of(b"nothing"), ..commit };
-    assert_eq!(client.refused("/v1/checkpoints", missing).await?.0, 404, "a manifest that was not uploaded");
+    under.call::<()>("POST", "/v1/checkpoints", vouched(commit.clone(), &receipt)).await?;
+    let receipt = under.put_manifest(&vae.grant, ArtifactKind::Checkpoint, "step 6").await?;
+    std::fs::remove_file(checkpoint::blob_path(dir.path(), receipt.0))?;
+    let missing = CommitCheckpoint { step: 6, manifest: receipt.0, ..commit };
+    let refused = under.refused("/v1/checkpoints", vouched(missing, &receipt)).await?;
+    assert_eq!(refused.0, 404, "a manifest that is not there");
     // That try has failed; the next goes on from what there is.
     let failed = vae;
     let vae = assignment(&client, "w", &joined, "vae").await?;
     assert_eq!((vae.grant.attempt, vae.resume), (failed.grant.attempt.next(), Some(checkpoint)));
-
-    let stale = Grant { fence: protocol::Fence(0), ..vae.grant.clone() };
-    let metrics = MetricBatch { grant: stale, rows: vec![] };
-    let (status, error) = client.refused("/v1/metrics", metrics).await?;
-    assert_eq!((status, error.code.as_str()), (409, "stale-fence"));
-
-    // The fence of now with the attempt of before: refused before the store, which knows fences alone, is asked.
-    let other = Grant { attempt: protocol::Attempt(9), ..vae.grant.clone() };
-    let metrics = MetricBatch { grant: other.clone(), rows: vec![] };
-    let logs = LogBatch { grant: other.clone(), first: 0, lines: vec![] };
+    let metrics = MetricBatch { grant: failed.grant.clone(), rows: vec![] };
+    let logs = LogBatch { grant: failed.grant.clone(), first: 0, lines: vec![] };
     let request = Request::builder().method("PUT").uri(format!("/v1/blobs/{}", Digest::of(b"late")));
-    let request = request.header("x-stride-grant", serde_json::to_string(&other)?).body(Body::from("late"))?;
-    let refused = [
-        client.try_call("POST", "/v1/metrics", metrics).await?.0,
-        client.try_call("POST", "/v1/logs", logs).await?.0,
-        client.send(request).await?.0,
-    ];
-    assert_eq!(refused, [StatusCode::CONFLICT; 3], "metrics, logs, blob");
+    let request = request.header(GRANT_HEADER, serde_json::to_string(&failed.grant)?).body(Body::from("late"))?;
+    let (status, error) = under.refused("/v1/metrics", metrics).await?;
+    assert_eq!((status, error.code.as_str()), (409, "stale-fence"));
+    let carried = format!("with fence {} has been superseded", failed.grant.fence);
+    assert!(error.message.ends_with(&carried), "the fence of now is not told: {}", error.message);
+    let refused = [under.try_call("POST", "/v1/logs", logs).await?.0, under.send(request).await?.0];
+    assert_eq!(refused, [StatusCode::CONFLICT; 2], "logs, blob");
 
-    // As by `kill -9`: the worker goes on and re-attaches with the same incarnation and grant.
+    // As by `kill -9`: the worker goes on and re-attaches with the same incarnation, grant and secret.
     handle.shutdown().await;
     let (handle, client) = start(dir.path()).await?;
     let same = assignment(&client, "w", &joined, "vae").await?;
-    assert_eq!((&same.grant, same.resume), (&vae.grant, Some(checkpoint)));
-    let output = client.put_manifest(&vae.grant, ArtifactKind::Vae, "vae").await?;
-    let finished = TaskOutcome::Finished { output, metrics: BTreeMap::from([("mpjpe".into(), 40.0)]) };
+    assert_eq!((&same.grant, &same.secret, same.resume), (&vae.grant, &vae.secret, Some(checkpoint)));
+    let under = client.under(&vae);
+    let receipt = under.put_manifest(&vae.grant, ArtifactKind::Vae, "vae").await?;
+    let finished = TaskOutcome::Finished { output: receipt.0, metrics: BTreeMap::from([("mpjpe".into(), 40.0)]) };
     let report = ReportOutcome { grant: vae.grant.clone(), outcome: finished };
-    client.call::<()>("POST", "/v1/outcomes", report).await?;
+    under.call::<()>("POST", "/v1/outcomes", vouched(report, &receipt)).await?;
     let view = until_over(&handle, &run).await?;
     assert_eq!(view.state, RunState::Finished);
     assert_eq!(view.stages[1].metrics["mpjpe"], 40.0);
@@ -253,7 +273,8 @@ async fn p2_a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestR
     let (handle, client) = start(dir.path()).await?;
     handle.submit(submission(None)?).await?;
     let first = join(&client, "a").await?;
-    let lost = assignment(&client, "a", &first, "dataset").await?.grant;
+    let lost = assignment(&client, "a", &first, "dataset").await?;
+    let (under, lost) = (client.under(&lost), lost.grant);
     let begun = std::time::Instant::now();
     let second = join(&client, "b").await?;
     let taken = assignment(&client, "b", &second, "dataset").await?.grant;
@@ -261,11 +282,11 @@ async fn p2_a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestR
     assert!(waited > Duration::from_millis(500) && waited < Duration::from_secs(10), "{waited:?}");
     assert!(taken.fence > lost.fence && taken.attempt > lost.attempt);
     let report = ReportOutcome { grant: lost.clone(), outcome: TaskOutcome::Yielded { at: 0 } };
-    let (status, error) = client.refused("/v1/outcomes", report).await?;
+    let (status, error) = under.refused("/v1/outcomes", report).await?;
     assert_eq!((status, error.code.as_str()), (409, "stale-fence"));
     let request = Request::builder().method("PUT").uri(format!("/v1/blobs/{}", Digest::of(b"late")));
-    let request = request.header("x-stride-grant", serde_json::to_string(&lost)?).body(Body::from("late"))?;
-    assert_eq!(client.send(request).await?.0, StatusCode::CONFLICT);
+    let request = request.header(GRANT_HEADER, serde_json::to_string(&lost)?).body(Body::from("late"))?;
+    assert_eq!(under.send(request).await?.0, StatusCode::CONFLICT);
 
     // Another build's worker is told so, and is nobody here.
     let other = Join {
@@ -304,7 +325,7 @@ async fn polls_alone_keep_a_lease_and_show_progress() -> TestResult {
         for (i, (name, joined)) in [("a", &first), ("b", &second)].into_iter().enumerate() {
             done += 1;
             let progress = Progress { done, total: 100, ..Progress::default() };
-            let doing = Doing { grant: held.clone(), progress, lost: vec![] };
+            let doing = Doing::new(held.clone(), progress);
             let doing = if name == "a" { vec![doing] } else { vec![] };
             let poll = Poll { incarnation: joined.incarnation, doing, ready: vec![], version: version[i] };
             let desired: DesiredAssignments = client.call("POST", &format!("/v1/workers/{name}/poll"), poll).await?;
@@ -390,6 +411,7 @@ impl Client {
         if let Some(token) = &self.token {
             text += &format!("authorization: Bearer {token}\r\n");
         }
+        text += &format!("{SECRET_HEADER}: {}\r\n", self.secret);
         for (name, value) in headers {
             text += &format!("{name}: {value}\r\n");
         }
@@ -398,9 +420,10 @@ impl Client {
         Ok(stream)
     }
 
-    async fn staged(&self, grant: &Grant, digest: Digest) -> TestResult<coordinator::shell::BlobStored> {
+    async fn staged(&self, grant: &Grant, digest: Digest, receipt: &str) -> TestResult<BlobStored> {
         let request = Request::builder().method("GET").uri(format!("/v1/blobs/{digest}/staged"));
-        let request = request.header("x-stride-grant", serde_json::to_string(grant)?).body(Body::empty())?;
+        let request = request.header(GRANT_HEADER, serde_json::to_string(grant)?).header(RECEIPT_HEADER, receipt);
+        let request = request.body(Body::empty())?;
         let (status, answer) = self.send(request).await?;
         assert!(status.is_success(), "{status} {}", String::from_utf8_lossy(&answer));
         Ok(serde_json::from_slice(&answer)?)
@@ -431,10 +454,11 @@ async fn a_large_blob_passes_in_little_memory_and_a_cut_upload_goes_on() -> Test
     let dir = tempfile::tempdir()?;
     let store = Store::open(dir.path(), Holder::this_process("a test")).await?;
     let handle = Coordinator::start(store.clone(), Config { park: false, ..Config::embedded() }).await?;
-    let client = Client { address: handle.address(), token: Some(handle.token().secret().to_owned()) };
+    let client = Client::of(&handle);
     handle.submit(submission(None)?).await?;
     let joined = join(&client, "w").await?;
-    let grant = assignment(&client, "w", &joined, "dataset").await?.grant;
+    let assignment = assignment(&client, "w", &joined, "dataset").await?;
+    let (client, grant) = (client.under(&assignment), assignment.grant);
     let mut hasher = protocol::digest::Hasher::default();
     (0..LARGE_PARTS).for_each(|i| hasher.update(&part(i)));
     let digest = hasher.finish();
@@ -442,7 +466,7 @@ async fn a_large_blob_passes_in_little_memory_and_a_cut_upload_goes_on() -> Test
 
     // Without a grant nothing of the body is read: what is on the way fills the sockets' buffers and no more.
     let stale = Grant { fence: protocol::Fence(0), ..grant.clone() };
-    let header = |grant: &Grant| -> TestResult<_> { Ok(("x-stride-grant", serde_json::to_string(grant)?)) };
+    let header = |grant: &Grant| -> TestResult<_> { Ok((GRANT_HEADER, serde_json::to_string(grant)?)) };
     let put = format!("PUT /v1/blobs/{digest}");
     for headers in [vec![], vec![header(&stale)?]] {
         let mut stream = client.begin(&put, &headers, 10 << 30).await?;
@@ -461,7 +485,7 @@ async fn a_large_blob_passes_in_little_memory_and_a_cut_upload_goes_on() -> Test
     }
     drop(stream);
     let staged = loop {
-        let there = client.staged(&grant, digest).await?;
+        let there = client.staged(&grant, digest, "").await?;
         assert!(!there.stored);
         if there.staged > 0 {
             break there.staged;
@@ -479,8 +503,11 @@ async fn a_large_blob_passes_in_little_memory_and_a_cut_upload_goes_on() -> Test
     }
     let mut answer = String::new();
     stream.read_to_string(&mut answer).await?;
-    assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("\"stored\":true"), "{answer}");
-    assert!(client.staged(&grant, digest).await?.stored, "it need not be sent again");
+    assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
+    let stored: BlobStored = serde_json::from_str(answer.split_once("\r\n\r\n").ok_or("no body")?.1)?;
+    let receipt = stored.receipt.filter(|_| stored.stored).ok_or("all of it has arrived")?;
+    assert!(client.staged(&grant, digest, &receipt).await?.stored, "it need not be sent again");
+    assert!(!client.staged(&grant, digest, "").await?.stored, "without a receipt it might be another's");
 
     assert_eq!(client.fetch(digest).await?, (200, LARGE_BYTES, LARGE_BYTES, digest));
     let grown = peak()?.saturating_sub(before);

@@ -76,12 +76,12 @@ fn p15_a_task_that_makes_progress_survives_any_number_of_losses() {
     let mut coordinator = PureCoordinator::new(Policy::default());
     let (run, _) = gang_of_three(&mut coordinator);
     for name in ["b", "c"] {
-        coordinator.happen(Event::WorkerGone { worker: name.into() }).expect("taken");
+        coordinator.happen(Event::WorkerGone { worker: name.into(), incarnation: None }).expect("taken");
     }
     for step in 1..=250 {
         let assignment = coordinator.assignment("a").expect("it trains");
         save(&mut coordinator, &assignment, step, &format!("step {step}"));
-        coordinator.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
+        coordinator.happen(Event::WorkerGone { worker: "a".into(), incarnation: None }).expect("taken");
         assert_eq!(coordinator.run_state(&run), RunState::Running, "after loss {step}");
         coordinator.now += 40_000;
         coordinator.join("a");
@@ -91,7 +91,7 @@ fn p15_a_task_that_makes_progress_survives_any_number_of_losses() {
     let budget = Policy::default().infrastructure_budget;
     for loss in 1..=budget {
         assert_eq!(coordinator.run_state(&run), RunState::Running, "after {loss} losses in a row");
-        coordinator.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
+        coordinator.happen(Event::WorkerGone { worker: "a".into(), incarnation: None }).expect("taken");
         coordinator.now += 40_000;
         coordinator.join("a");
         coordinator.tick();
@@ -153,6 +153,7 @@ fn a_gang_has_no_more_members_than_a_batch_has_slices() {
             source: String::new(),
             idempotency_key: None,
             until: Some("vae".into()),
+            owner: protocol::Owner::local("me"),
         };
         coordinator.happen(submit).expect("submitted");
         for name in ["a", "b", "c", "d"] {
@@ -163,6 +164,34 @@ fn a_gang_has_no_more_members_than_a_batch_has_slices() {
         coordinator.report(&dataset, TaskOutcome::Finished { output, metrics: Default::default() });
         assert_eq!(members(&coordinator, "a").len(), slices, "{slices} slices and {range:?}");
     }
+}
+
+#[test]
+fn another_owners_run_keeps_its_placement() {
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let mut submit = |name: &str, min| {
+        let event = Event::Submit {
+            pipeline: Box::new(pipelines::quickstart(1, WorkerRange { min, max: min }, &[])),
+            source: String::new(),
+            idempotency_key: None,
+            until: Some("dataset".into()),
+            owner: protocol::Owner { name: name.into(), ..Default::default() },
+        };
+        coordinator.happen(event).expect("submitted");
+        let executions: Vec<_> = coordinator.state.executions.values().collect();
+        assert_eq!(executions.len(), 1, "both want the same stage");
+        executions[0].placement.workers.min
+    };
+    assert_eq!(submit("alice", 1), 1);
+    assert_eq!(submit("bob", 9), 1, "he waits for what she has computed");
+    assert_eq!(submit("alice", 2), 1, "his run waits for it as well");
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let run = coordinator.submit("dataset", WorkerRange { min: 1, max: 1 });
+    coordinator.submit("dataset", WorkerRange { min: 2, max: 2 });
+    let placement =
+        |coordinator: &PureCoordinator| coordinator.state.executions.values().next().expect("one").placement.clone();
+    assert_eq!(placement(&coordinator).workers.min, 2, "its owner's newest wish counts");
+    assert_eq!(coordinator.run_state(&run), RunState::Running);
 }
 
 /// A plain task's end, a gang's end and a gang's checkpoint, whose blobs were collected before they were named.
@@ -241,7 +270,7 @@ fn every_generation_has_a_secret_of_its_own() {
                 role => panic!("{role:?}"),
             }
             if coordinator.state.workers.contains_key(&WorkerId::from(next)) {
-                coordinator.happen(Event::WorkerGone { worker: next.into() }).expect("taken");
+                coordinator.happen(Event::WorkerGone { worker: next.into(), incarnation: None }).expect("taken");
             } else {
                 coordinator.join(next);
             }
@@ -259,6 +288,7 @@ fn submit(coordinator: &mut PureCoordinator, seed: u64) -> RunId {
         source: String::new(),
         idempotency_key: None,
         until: None,
+        owner: protocol::Owner::local("me"),
     };
     let effects = coordinator.happen(submit).expect("submitted");
     let run = effects.into_iter().find_map(|effect| match effect {
@@ -346,7 +376,7 @@ fn a_submission_costs_the_same_however_many_runs_have_ended() {
 fn a_worker_that_is_away_for_an_hour_leaves_memory_and_comes_back_as_another_process() {
     let mut coordinator = PureCoordinator::new(Policy::default());
     let old = coordinator.join("a");
-    coordinator.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
+    coordinator.happen(Event::WorkerGone { worker: "a".into(), incarnation: None }).expect("taken");
     coordinator.now += 3_590_000;
     coordinator.tick();
     assert!(coordinator.state.workers.contains_key(&WorkerId::from("a")));
@@ -372,6 +402,7 @@ fn a_pipeline_of_more_than_a_thousand_stages_is_refused() {
             source: String::new(),
             idempotency_key: None,
             until: Some("nowhere".into()),
+            owner: protocol::Owner::local("me"),
         };
         coordinator.happen(event).expect_err("refused").to_string()
     };
@@ -402,8 +433,10 @@ fn what_is_stored_says_of_which_format_it_is() {
         recover(&stored)
     };
     assert!(recover(&coordinator.store.recovery).is_ok());
-    assert!(with("\"format\":[2,0]", "\"format\":[2,7]").is_ok());
-    let refused = with("\"format\":[2,0]", "\"format\":[3,0]").expect_err("another major version");
+    let (major, minor) = journal::FORMAT;
+    let now = format!("\"format\":[{major},{minor}]");
+    assert!(with(&now, "\"format\":[2,7]").is_ok());
+    let refused = with(&now, "\"format\":[3,0]").expect_err("another major version");
     assert!(refused.contains("format 3.0") && refused.contains("2.x") && refused.contains("decision 2"), "{refused}");
     let refused = with("\"execution-state\"", "\"horoscope\"").expect_err("an unknown kind");
     assert!(refused.contains("horoscope") && refused.contains("decision 2"), "{refused}");
@@ -419,7 +452,7 @@ fn what_is_stored_says_of_which_format_it_is() {
         whole.run(&run).is_ok() && whole.executions.values().all(|execution| execution.state == ExecutionState::Open)
     );
     let (_, text) = coordinator.store.recovery.snapshot.as_mut().expect("a snapshot");
-    *text = text.replace("\"format\":[2,0]", "\"format\":[3,1]");
+    *text = text.replace(&now, "\"format\":[3,1]");
     let refused = recover(&coordinator.store.recovery).expect_err("another major version");
     assert!(refused.contains("format 3.1") && refused.contains("snapshot"), "{refused}");
 }

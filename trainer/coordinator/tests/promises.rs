@@ -8,7 +8,8 @@ mod common;
 use coordinator::state::task::{Lease, Part};
 use coordinator::{Control, Event, Millis, Observation, Policy, Rejected, observe};
 use protocol::message::{
-    CommitCheckpoint, Doing, FailureClass, Grant, Poll, Progress, ReportOutcome, RunState, StageState, TaskOutcome,
+    CommitCheckpoint, Doing, FailureClass, Grant, LossCause, LostPeer, Poll, Progress, ReportOutcome, RunState,
+    StageState, TaskOutcome,
 };
 use protocol::stage::WorkerRange;
 use protocol::{Digest, RunId, WorkerId};
@@ -97,9 +98,10 @@ fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
     }
     assert_eq!(gang(&coordinator), ["b", "c"].map(WorkerId::from));
 
-    let lost = vec!["b".into(), "c".into()];
+    let lost = |name: &str| LostPeer { worker: name.into(), cause: LossCause::Unreachable };
     let progress = Progress { done: 999, total: 1000, ..Progress::default() };
-    let doing = vec![Doing { grant: old.clone(), progress, lost: lost.clone() }];
+    let doing = Doing { holds: Some(999), lost: ["b", "c"].map(lost).into(), ..Doing::new(old.clone(), progress) };
+    let doing = vec![doing];
     let poll = Poll { incarnation: a, doing, ready: Vec::new(), version: 0 };
     let heard =
         observe(&mut coordinator.state, Millis(coordinator.now), Observation::Poll { worker: "a".into(), poll });
@@ -109,8 +111,8 @@ fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
     let told: Vec<u64> = view.stages.iter().map(|stage| stage.progress.done).collect();
     assert!(!told.contains(&999), "{told:?}");
 
-    let refused = coordinator.happen(Event::PeersLost { grant: old.clone(), lost });
-    assert!(matches!(refused, Err(Rejected::StaleFence { .. })), "{refused:?}");
+    let event = Event::GangDivided { task: old.task.clone(), fence: old.fence };
+    assert_eq!(coordinator.happen(event), Ok(Vec::new()), "the generation is over");
     assert_eq!(gang(&coordinator), ["b", "c"].map(WorkerId::from));
 }
 
@@ -381,7 +383,7 @@ fn p4_a_gang_waits_for_nobody_who_fetches_its_inputs() {
     assert_eq!(coordinator.assignment("b").expect("it trains").grant.attempt, held.grant.attempt);
     // With nobody left to hand it over, a worker that begins needs the checkpoint too.
     for name in ["a", "b"] {
-        coordinator.happen(Event::WorkerGone { worker: name.into() }).expect("gone");
+        coordinator.happen(Event::WorkerGone { worker: name.into(), incarnation: None }).expect("gone");
     }
     assert_eq!(coordinator.asked("c")[0].resume, Some(Digest::of(b"state")));
 }
@@ -404,7 +406,7 @@ fn p1_all_that_work_on_a_stage_share_an_instruction_set() {
     assert_eq!(vae(&coordinator).instruction_set.as_deref(), Some("avx2"));
     let over = |coordinator: &mut PureCoordinator, names: &[&str]| {
         for name in names {
-            coordinator.happen(Event::WorkerGone { worker: (*name).into() }).expect("gone");
+            coordinator.happen(Event::WorkerGone { worker: (*name).into(), incarnation: None }).expect("gone");
         }
         for _ in 0..5 {
             coordinator.now += 1_000;

@@ -4,9 +4,9 @@
 mod common;
 
 use coordinator::{Event, Policy, journal};
-use protocol::Digest;
 use protocol::message::TaskOutcome;
 use protocol::stage::WorkerRange;
+use protocol::{Digest, Owner};
 
 use crate::common::{PureCoordinator, pipelines};
 
@@ -16,6 +16,7 @@ fn submit(coordinator: &mut PureCoordinator, seed: u64, until: &str) {
         source: String::new(),
         idempotency_key: None,
         until: Some(until.into()),
+        owner: Owner::local("me"),
     };
     coordinator.happen(event).expect("submitted");
 }
@@ -60,7 +61,7 @@ fn gangs(runs: u64) -> Vec<(u64, usize)> {
             claim(&mut coordinator, "b");
         }
     }
-    coordinator.happen(Event::WorkerGone { worker: "b".into() }).expect("taken");
+    coordinator.happen(Event::WorkerGone { worker: "b".into(), incarnation: None }).expect("taken");
     claim(&mut coordinator, "a");
     costs(&mut coordinator)
 }

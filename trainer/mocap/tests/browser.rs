@@ -192,7 +192,7 @@ fn page(file: &Path) {
 #[test]
 fn a_figure_moves_and_nothing_else_does() {
     let Some(program) = program() else {
-        eprintln!("SKIPPED: no Chromium here to show the viewer in; `apt-get install chromium`, or set STRIDE_BROWSER");
+        fixtures::skip("no Chromium here to show the viewer in; `apt-get install chromium`, or set STRIDE_BROWSER");
         return;
     };
     let folder = tempfile::tempdir().expect("a folder");

@@ -96,7 +96,7 @@ fn off(found: &[f32], expected: &[f32]) -> f32 {
 
 fn agrees(backend: Backend) {
     let Ok(device) = device::open(backend, 0) else {
-        eprintln!("SKIPPED: no {} device on this machine", backend.name());
+        fixtures::skip(&format!("no {} device on this machine", backend.name()));
         return;
     };
     let flex = device::open(Backend::Flex, 0).expect("flex is built in");

@@ -8,6 +8,7 @@ use mocap::bvh::Bvh;
 use mocap::detect::Up;
 use mocap::joint_map::JointMap;
 use mocap::take::{self, Reading};
+use motion::DataPath;
 use protocol::Seed;
 use serde_json::json;
 
@@ -75,7 +76,7 @@ fn inspect(args: &InspectArgs) -> Result<u8> {
     if !args.file.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("bvh")) {
         return inspect_array(&args.file, args.output);
     }
-    let bvh = Bvh::read(&args.file).map_err(Problem::usage)?;
+    let bvh = Bvh::read(&DataPath::local(&args.file)).map_err(Problem::usage)?;
     let map = args.map.as_deref().map(JointMap::load).transpose().map_err(Problem::usage)?;
     let seconds = bvh.frames as f64 / bvh.rate;
     let joints = bvh.nodes.iter().filter(|node| !node.end).count();
@@ -108,7 +109,7 @@ fn inspect(args: &InspectArgs) -> Result<u8> {
 }
 
 fn inspect_array(file: &Path, output: Output) -> Result<u8> {
-    let joints = arrays::read(file).map_err(Problem::usage)?;
+    let joints = arrays::read(&DataPath::local(file)).map_err(Problem::usage)?;
     let frames = joints.data.len() / (3 * joints.joints);
     if output == Output::Json {
         print::json(&json!({"file": file, "joints": joints.joints, "frames": frames, "fps": joints.rate}));

@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use mocap::export::{Motion, Outs, numbered};
 use mocap::requests::Request;
-use motion::{Skeleton, npy};
+use motion::vocabulary::Vocabulary;
+use motion::{DataPath, Skeleton, npy};
 use protocol::Seed;
 use protocol::stage::Sampler;
 use serde_json::{Value, json};
@@ -21,6 +22,7 @@ use super::remote::check_parent;
 use super::sampler::SamplerArgs;
 use super::sentences::SentenceArgs;
 use super::stream::{self, Opening, StreamArgs};
+use super::words;
 use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result};
@@ -42,7 +44,7 @@ pub(crate) struct GenerateArgs {
     #[arg(long, default_value = "@last", requires = "stage")]
     run: String,
     /// Sampling steps [default: as the model was measured]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", allow_negative_numbers = true)]
     steps: Option<usize>,
     #[command(flatten)]
     sampler: SamplerArgs,
@@ -81,6 +83,8 @@ struct Row {
     seconds: f64,
     /// Whether the model makes anything of the sentence.
     known: bool,
+    /// Words of the sentence that its training never had.
+    unknown_words: Vec<String>,
     kept: Vec<Range<usize>>,
     timing: Timing,
     missed: Option<Missed>,
@@ -132,21 +136,22 @@ impl GenerateArgs {
 }
 
 /// The model, with the control part that is wanted.
-async fn found(args: &GenerateArgs) -> Result<Found> {
+async fn found(args: &GenerateArgs) -> Result<(Found, Option<Vocabulary>)> {
     let reader = Reader::open(&args.target).await?;
     let found = match (&args.stage, &args.model) {
         (Some(stage), _) => model::stage(&reader, &reader.find(&args.run).await?, stage).await?,
         (None, model) => model::version(&reader, model.as_deref().unwrap_or_default()).await?,
     };
+    let vocabulary = words::vocabulary(&reader, found.artifact).await?;
     let found = args.control.completed(&reader, found).await?;
     reader.close().await;
-    Ok(found)
+    Ok((found, vocabulary))
 }
 
 async fn stream(args: GenerateArgs) -> Result<u8> {
     // Names of files are looked at before the model.
     args.out.files(1)?;
-    let found = found(&args).await?;
+    let (found, _) = found(&args).await?;
     let (device, _) = model::device(args.backend.as_deref())?;
     let GenerateArgs { stream, steps, sampler, sentences, control, out, target, .. } = args;
     let (seed, heed, joints) = (sentences.seed(), control.heed(), control.joints().to_vec());
@@ -166,7 +171,7 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
     args.check(&requests)?;
     let outs = args.out.files(count)?;
     let start = Instant::now();
-    let Found { manifest, blobs, label, measured } = found(&args).await?;
+    let (Found { manifest, blobs, label, measured, .. }, vocabulary) = found(&args).await?;
     let label = label.to_string();
     let (device, _) = model::device(args.backend.as_deref())?;
     let generator = Generator::load(&manifest, &blobs, &device).map_err(Problem::failed)?;
@@ -174,6 +179,12 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
 
     let sampler = args.sampler.sampler(args.steps, generator.sampler(), &measured);
     let sampler = sampler.map_err(|why| Problem::usage(format!("{label}: {why}")))?;
+    if let Some((low, high)) = generator.family().exceeded_range(sampler.guidance) {
+        let guidance = sampler.guidance;
+        print::note(&format!(
+            "note: {label} was trained for guidance {low} to {high}; at {guidance} it may draw anything"
+        ));
+    }
     let edit = args.edit.as_deref().map(|path| Edit::read(path, &args.keep, &generator)).transpose()?;
     let skeleton = Skeleton::of(generator.format());
     let length = |request: &Request| request.length.map(|length| length.frames(skeleton.fps));
@@ -182,7 +193,12 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
 
     let (mut rows, mut motions): (Vec<Row>, Vec<Vec<Motion>>) = (Vec::new(), Vec::new());
     for request in &requests {
-        let known = is_known(&generator, &shared.label, &request.caption)?;
+        let mut known = is_known(&generator, &shared.label, &request.caption)?;
+        let unknown_words = match known {
+            true => words::unknown(vocabulary.as_ref(), &shared.label, &request.caption),
+            false => Vec::new(),
+        };
+        known &= unknown_words.is_empty() || vocabulary.as_ref().is_some_and(|v| v.has_any(&request.caption));
         let mut drawn = Vec::new();
         for seed in &seeds {
             let (motion, kept) = draw(&generator, request, Seed(*seed), &shared.sampler, edit.as_ref(), told.as_ref())?;
@@ -201,6 +217,7 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
                 frames,
                 seconds: frames as f64 / skeleton.fps,
                 known,
+                unknown_words: unknown_words.clone(),
                 kept,
                 timing,
                 missed,
@@ -312,6 +329,7 @@ impl Row {
             "model": label,
             "prompt": self.prompt,
             "known": self.known,
+            "unknown_words": self.unknown_words,
             "frames": self.frames,
             "seconds": self.seconds,
             "kept": self.kept.iter().map(|span| [span.start, span.end]).collect::<Vec<_>>(),
@@ -390,7 +408,7 @@ struct Edit {
 
 impl Edit {
     fn read(path: &Path, keep: &[Span], generator: &Generator) -> Result<Self> {
-        let array = npy::read(path).map_err(|error| Problem::usage(error.to_string()))?;
+        let array = npy::read(&DataPath::local(path)).map_err(|error| Problem::usage(error.to_string()))?;
         let skeleton = Skeleton::of(generator.format());
         let refuse = |what: String| Problem::usage(format!("{}: {what}", path.display()));
         let [frames, width] = array.shape[..] else {

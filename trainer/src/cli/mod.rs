@@ -5,6 +5,7 @@ mod args;
 mod config;
 mod control;
 mod data;
+mod doctor;
 mod door;
 mod export;
 mod gallery;
@@ -17,20 +18,23 @@ mod remote;
 mod sampler;
 mod sentences;
 mod serve;
+mod shell;
 mod spectrum;
 mod stream;
 pub(crate) mod sweep;
 mod time;
+mod words;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use access::ServerOptions;
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use protocol::StageName;
 use registry::{OpenError, ReadStore};
 
 use self::args::{BlobArgs, PipelineArgs};
+use crate::advice::advice;
 use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result, exit};
@@ -39,7 +43,7 @@ use crate::{cost, pipeline_file, plan, run, verify};
 
 /// Trains text-to-motion models across workers and keeps what came out of it
 #[derive(Debug, Parser)]
-#[command(name = "trainer", version, propagate_version = true)]
+#[command(name = "trainer", version = env!("STRIDE_VERSION"), propagate_version = true, after_help = exit::HELP)]
 pub(crate) struct Cli {
     #[command(subcommand)]
     verb: Verb,
@@ -48,45 +52,74 @@ pub(crate) struct Cli {
 #[derive(Debug, Subcommand)]
 enum Verb {
     /// Runs a pipeline on this machine; run it again to go on where it stopped
+    #[command(
+        after_help = "Examples:\n  trainer run configs/quickstart.yaml\n  trainer run configs/smoke.yaml --until vae --workers 2 -o json"
+    )]
     Run(RunArgs),
     /// Shows what `run` would do, and why
+    #[command(
+        after_help = "Examples:\n  trainer plan configs/quickstart.yaml\n  trainer plan configs/motionpcm.yaml --no-time"
+    )]
     Plan(PlanArgs),
     /// Sends a pipeline to a server
+    #[command(after_help = "Example:\n  trainer submit configs/quickstart.yaml --follow")]
     Submit(remote::SubmitArgs),
     /// Coordinates runs for clients and workers elsewhere
     Serve(serve::ServeArgs),
     /// Shows a run, or all runs
+    #[command(after_help = "Examples:\n  trainer status\n  trainer status --all")]
     Status(remote::StatusArgs),
     /// Shows what workers said
+    #[command(after_help = "Example:\n  trainer logs @last --stage vae --follow")]
     Logs(remote::LogsArgs),
     /// What the sweeps of a run have tried, and what came of it
     #[command(subcommand)]
     Sweep(sweep::SweepVerb),
     /// Ends a run
+    #[command(after_help = "Example:\n  trainer cancel @last")]
     Cancel(remote::ControlArgs),
     /// Holds a run back: its workers save and stop
+    #[command(after_help = "Example:\n  trainer pause @last")]
     Pause(remote::ControlArgs),
     /// Takes a paused, failed or cancelled run up again
+    #[command(after_help = "Example:\n  trainer resume @last")]
     Resume(ResumeArgs),
     /// Makes motions from sentences
+    #[command(
+        after_help = "Examples:\n  trainer generate \"a person walks in a circle\" --model quickstart@staging -o walk.gif\n  trainer generate \"a person jumps\" -n 4 --seconds 4s --model quickstart@staging -o jump.html -o json"
+    )]
     Generate(Box<generate::GenerateArgs>),
     /// Recordings of motion
     #[command(subcommand)]
     Data(data::DataVerb),
     /// Makes one page of what a run's models draw, side by side
+    #[command(after_help = "Example:\n  trainer gallery @last -n 2 -o gallery.html")]
     Gallery(Box<gallery::GalleryArgs>),
     /// Turns a motion or a recording into another form: BVH, GLB, a page, a picture, an array
+    #[command(after_help = "Example:\n  trainer export walk.npy -o walk.glb -o walk.mp4")]
     Export(export::ExportArgs),
     /// Makes a version of a model of weights that others have published
+    #[command(
+        after_help = "Example:\n  trainer import motionlcm.ckpt --as motionlcm --part lcm --statistics deps/motionlcm/meta --text sentence-t5=data/sentence-t5-large"
+    )]
     Import(Box<import::ImportArgs>),
     /// Measures how long models take for a sentence (AITS), side by side
+    #[command(after_help = "Example:\n  trainer time quickstart@staging --stage mld --steps 50,4,1")]
     Time(time::TimeArgs),
     /// Lists what this build and machine can compute on
+    #[command(after_help = "Example:\n  trainer devices")]
     Devices(config::DevicesArgs),
+    /// Looks at store, disk, devices and server, and says what to do about what is missing
+    Doctor(doctor::DoctorArgs),
+    /// Prints what a shell needs to complete commands and options
+    Completions(shell::CompletionsArgs),
+    /// Writes manual pages, one for each command
+    Man(shell::ManArgs),
     /// Pipeline files
     #[command(subcommand)]
     Config(config::ConfigVerb),
     /// Prints the JSON Schema of pipelines, for editors
+    #[command(after_help = "Example:\n  trainer schema --markdown")]
     Schema(config::SchemaArgs),
     /// Workers
     #[command(subcommand)]
@@ -184,6 +217,10 @@ pub(crate) fn main(cli: Cli) -> ExitCode {
         };
     }
     init_logging();
+    // What a server says, many read; what another command says, its own user.
+    if !matches!(cli.verb, Verb::Serve(_)) {
+        protocol::show_excerpts();
+    }
     cli.verb.keep_to_oneself();
     let output = cli.verb.output();
     let runtime = match tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build() {
@@ -208,9 +245,11 @@ pub(crate) fn main(cli: Cli) -> ExitCode {
 /// Warnings on stderr, more by `RUST_LOG`. A log line that nobody reads any more is dropped: told of it, the subscriber would print that, fail
 /// again, and panic in the middle of what it logs for.
 fn init_logging() {
+    // The database warns of each statement that waits for a slow disk, in lines of SQL.
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).log_internal_errors(false).init();
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn,sqlx=error"));
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    log.with_ansi(print::on_terminal()).log_internal_errors(false).init();
 }
 
 impl Verb {
@@ -245,8 +284,11 @@ impl Verb {
             Self::Import(args) => args.output,
             Self::Time(args) => args.output,
             Self::Devices(args) => args.output,
+            Self::Doctor(args) => args.output,
             Self::Worker(WorkerVerb::List(args)) => args.output,
             Self::Serve(_)
+            | Self::Completions(_)
+            | Self::Man(_)
             | Self::Config(_)
             | Self::Schema(_)
             | Self::Worker(WorkerVerb::Join(_))
@@ -274,6 +316,9 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Import(args) => import::import(*args, command_line()).await,
         Verb::Time(args) => time::time(args).await,
         Verb::Devices(args) => Ok(config::devices(&args)),
+        Verb::Doctor(args) => doctor::doctor(args).await,
+        Verb::Completions(args) => Ok(shell::completions(&args, Cli::command())),
+        Verb::Man(args) => shell::man(&args, Cli::command()),
         Verb::Config(verb) => config::config(&verb),
         Verb::Schema(args) => Ok(config::schema(&args)),
         Verb::Worker(WorkerVerb::List(args)) => remote::workers(args).await,
@@ -321,6 +366,7 @@ async fn show_plan(args: PlanArgs) -> Result<u8> {
     if !args.no_time && plan.stages.iter().any(|step| step.action != "cached") {
         plan.estimate(&cost::estimates(&file.pipeline));
     }
+    advice(&file.pipeline).iter().for_each(|note| print::note(&format!("note: {note}")));
     match args.output {
         Output::Json => print::json(&plan),
         Output::Table => print::out(&plan.screen(&file.pipeline)),
@@ -367,9 +413,31 @@ mod tests {
         }
     }
 
+    /// The examples of a command's `--help` and of those below it.
+    fn examples(command: &clap::Command) -> Vec<String> {
+        let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
+        let lines = help.lines().filter_map(|line| Some(line[line.find("trainer ")?..].to_owned()));
+        let own = lines.filter(|_| help.starts_with("Example")).collect::<Vec<_>>();
+        own.into_iter().chain(command.get_subcommands().flat_map(examples)).collect()
+    }
+
+    #[test]
+    fn the_examples_of_every_help_parse() {
+        let command = Cli::command();
+        let examples = examples(&command);
+        assert!(examples.len() >= 20, "{examples:#?}");
+        for example in examples {
+            let words = cluster_tests::documented::words(&example);
+            let words: Vec<&String> = words.iter().take_while(|word| *word != ">").collect();
+            if let Err(error) = Cli::try_parse_from(words) {
+                panic!("{example}: {error}");
+            }
+        }
+    }
+
     #[test]
     fn options_are_consistent() {
-        <Cli as clap::CommandFactory>::command().debug_assert();
+        Cli::command().debug_assert();
     }
 
     #[test]

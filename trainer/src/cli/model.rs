@@ -8,9 +8,10 @@ use burn::tensor::Device;
 use checkpoint::model::{Drawn, Model};
 use checkpoint::{BlobError, Blobs};
 use models::device::DeviceInfo;
+use motion::Dataset;
 use protocol::message::RunView;
 use protocol::stage::Sampler;
-use protocol::{Digest, Manifest};
+use protocol::{ArtifactKind, Digest, Manifest};
 use registry::cli::{Command, Data};
 use stages::context::StageError;
 use stages::kinds::REPORT_FILE;
@@ -24,6 +25,8 @@ pub(super) struct Found {
     pub(super) manifest: Manifest,
     pub(super) blobs: Fetched,
     pub(super) label: Label,
+    /// The model's manifest, whose lineage the store has if its training was here.
+    pub(super) artifact: Digest,
     /// Evaluations of it and how they drew, of what a stage gave. A version has its own sampler.
     pub(super) measured: Vec<(String, Sampler)>,
 }
@@ -112,7 +115,8 @@ pub(super) async fn version(reader: &Reader, name: &str) -> Result<Found> {
         }
     };
     let blobs = Fetched::files(reader, &manifest).await?;
-    Ok(Found { manifest, blobs, label: Label::Version(name.to_owned(), version.version), measured: Vec::new() })
+    let (artifact, label) = (version.artifact, Label::Version(name.to_owned(), version.version));
+    Ok(Found { manifest, blobs, label, artifact, measured: Vec::new() })
 }
 
 /// The model that a stage of `run` gave, and how the run's evaluations drew from it.
@@ -138,7 +142,7 @@ pub(super) async fn stage(reader: &Reader, run: &RunView, name: &str) -> Result<
         }
     }
     let blobs = Fetched::files(reader, &manifest).await?;
-    Ok(Found { manifest, blobs, label: Label::Stage(run.run.to_string(), name.to_owned()), measured })
+    Ok(Found { manifest, blobs, label: Label::Stage(run.run.to_string(), name.to_owned()), artifact: *model, measured })
 }
 
 /// Stages of a run that gave a model so far, but for the trials of sweeps.
@@ -165,6 +169,23 @@ async fn manifest(reader: &Reader, digest: Digest) -> Result<Manifest> {
     Ok(manifest)
 }
 
+/// The sentences of a dataset's training entries; `None` for one whose index is too long to read for a hint.
+///
+/// # Errors
+/// A store that does not answer, or an artifact that is no dataset.
+pub(super) async fn training_captions(reader: &Reader, dataset: Digest) -> Result<Option<Vec<String>>> {
+    let manifest = manifest(reader, dataset).await?;
+    let index =
+        manifest.files.get(INDEX).filter(|file| manifest.kind == ArtifactKind::Dataset && file.bytes <= LONGEST_INDEX);
+    let Some(index) = index else { return Ok(None) };
+    let bytes = bytes::Bytes::from(verified(reader, index.digest).await?);
+    let captions = Dataset::training_captions_from_files(&|_| Ok(bytes.clone())).map_err(Problem::failed)?;
+    Ok(Some(captions.into_iter().map(|caption| caption.text).collect()))
+}
+
+/// The file of a dataset that has its captions, and the longest that is read.
+const INDEX: &str = "dataset.json";
+const LONGEST_INDEX: u64 = 64 << 20;
 /// The output of stages that give a model.
 const MODEL: &str = "model";
 /// The output of evaluations.

@@ -9,6 +9,7 @@ use protocol::message::{RunState, RunView, Submit};
 
 use super::args::PipelineArgs;
 use super::spectrum;
+use crate::advice::advice;
 use crate::client::{Client, Target};
 use crate::pipeline_file;
 use crate::print::{self, Output};
@@ -79,6 +80,7 @@ pub(crate) struct LogsArgs {
 #[derive(Debug, Args)]
 pub(crate) struct ControlArgs {
     /// The run, a unique beginning of its name, or `@last`
+    #[arg(default_value = "@last")]
     run: String,
     #[command(flatten)]
     target: Target,
@@ -101,7 +103,7 @@ pub(crate) fn show(view: &RunView, output: Output) {
     match output {
         Output::Json => print::json(&Summary::of(view, false)),
         Output::Table => {
-            print::out(&format!("run {}: {}\n", view.run, summary::run_state(view.state)));
+            print::out(&format!("run {}: {}\n", view.run, summary::run_state(view)));
             print::out(&format!("{}{}", summary::table(view), summary::evaluations(view)));
         }
     }
@@ -115,6 +117,7 @@ pub(crate) async fn submit(args: SubmitArgs) -> Result<u8> {
         let problem = Problem::usage("no server is running on this store, so nobody would do the work");
         return Err(problem.hint("`trainer serve` starts one, `trainer run` needs none; or name one with --server"));
     };
+    advice(&file.pipeline).iter().for_each(|note| print::note(&format!("note: {note}")));
     let pipeline = serde_json::to_value(&file.pipeline).map_err(|error| Problem::new(exit::FAULT, error))?;
     let submit = Submit { pipeline, source: file.source, idempotency_key: args.idempotency_key, until };
     let run = client.submit(&submit).await?;
@@ -125,7 +128,10 @@ pub(crate) async fn submit(args: SubmitArgs) -> Result<u8> {
         }
         return Ok(0);
     }
-    let mut progress = Progress::new(args.output == Output::Table && print::on_terminal());
+    let bars = args.output == Output::Table && print::on_terminal();
+    let for_workers =
+        "`trainer worker join` on a machine gives the server one, `trainer worker list` shows those it has";
+    let mut progress = Progress::new(bars, &file.pipeline, for_workers);
     let view = loop {
         let view = client.run(&run).await?;
         progress.update(&view);
@@ -160,14 +166,19 @@ pub(crate) async fn status(args: StatusArgs) -> Result<u8> {
                 let row = |run: &RunView| {
                     let asked = || run.stages.iter().filter(|stage| stage.of.is_none());
                     let done = asked().filter(|stage| !stage.outputs.is_empty()).count();
-                    let state = summary::run_state(run.state).to_owned();
-                    vec![run.run.to_string(), run.pipeline.clone(), state, format!("{done}/{}", asked().count())]
+                    let state = summary::run_state(run).to_owned();
+                    let stages = format!("{done}/{}", asked().count());
+                    vec![run.run.to_string(), run.pipeline.clone(), run.owner.to_string(), state, stages]
                 };
-                print::out(&print::table(&["RUN", "PIPELINE", "STATE", "STAGES"], runs.iter().map(row).collect()));
+                print::out(&print::table(
+                    &["RUN", "PIPELINE", "OWNER", "STATE", "STAGES"],
+                    runs.iter().map(row).collect(),
+                ));
             }
         }
     } else {
-        let view = reader.find(&args.run).await?;
+        // Asked for by itself: a list says nothing of what stands in a run's way.
+        let view = reader.run(&reader.find(&args.run).await?.run).await?;
         if let Some(path) = &args.spectrum {
             check_parent(path)?;
             spectrum::draw(&reader, &view, args.stage.as_deref(), path).await?;

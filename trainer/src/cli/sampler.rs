@@ -7,7 +7,7 @@ use protocol::stage::{Sampler, Solver, measured_with};
 #[derive(Debug, Args)]
 pub(super) struct SamplerArgs {
     /// Guidance: a teacher's scale g, a student's w = g - 1 [default: as the model was measured]
-    #[arg(long, value_name = "W")]
+    #[arg(long, value_name = "W", value_parser = guidance, allow_negative_numbers = true)]
     guidance: Option<f64>,
     /// Timesteps of an LCM student, noisiest first, such as 999,499 [default: as the model was measured]
     #[arg(long, value_name = "T", value_delimiter = ',')]
@@ -18,6 +18,15 @@ pub(super) struct SamplerArgs {
     /// Whether the root goes where standing feet let it: true or false [default: as the model was measured]
     #[arg(long, value_name = "BOOL")]
     footing: Option<bool>,
+}
+
+/// A scale that classifier-free guidance has.
+fn guidance(text: &str) -> Result<f64, String> {
+    let scale: f64 = text.parse().map_err(|_| "expected a number, such as 2.5".to_owned())?;
+    if scale.is_finite() && scale >= 0.0 {
+        return Ok(scale);
+    }
+    Err("expected 0 or more; the larger it is, the closer a motion follows its sentence".to_owned())
 }
 
 /// A solver by its word in settings.

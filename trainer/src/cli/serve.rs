@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use access::{Scopes, TokenOptions, Tokens};
 use clap::Args;
-use coordinator::{Config, Coordinator};
+use coordinator::{Coordinator, Handle};
 use registry::{Holder, Store};
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -16,7 +16,8 @@ use crate::{client, print};
 
 const TOKENS: &str = "\
 A token file has a line `NAME SCOPES TOKEN` for each caller, such as `alice submit,promote` and what `openssl rand -hex 32`
-prints. Scopes: read, submit, worker, promote, admin. `workers=nodes-*` behind the token limits the names of its workers.
+prints. Scopes: read, submit, worker, promote, admin. Behind the token may stand `workers=nodes-*`, `project=NAME` and
+`expires=2026-12-31`. A line `protect ALIAS=NAME,NAME` has an alias moved by these only. SIGHUP has the file read again.
 A token alone, in a file or as --token, may do everything. Without any, one is made for this user at every start and lies
 in the store's folder; beyond this machine a token is required.";
 
@@ -43,7 +44,7 @@ pub(crate) struct ServeArgs {
 }
 
 impl ServeArgs {
-    fn config(&self) -> Result<Config> {
+    fn tokens(&self) -> Result<Tokens> {
         let mut tokens = match &self.token.token_file {
             Some(path) => Tokens::read(path)?,
             None => Tokens::default(),
@@ -51,9 +52,18 @@ impl ServeArgs {
         if let Some(token) = &self.token.token {
             tokens.add("admin", Scopes::all(), token);
         }
-        let mut config = self.door.config(self.bind, tokens, self.insecure)?;
-        self.allowances.set(&mut config);
-        Ok(config)
+        Ok(tokens)
+    }
+
+    /// Reads the token file again. One that does not read changes nothing.
+    fn reload(&self, handle: &Handle) {
+        match self.tokens() {
+            Ok(tokens) => {
+                handle.replace_tokens(tokens);
+                print::note("read the token file again");
+            }
+            Err(problem) => print::note(&format!("the tokens stay as they were: {:#}", problem.error)),
+        }
     }
 }
 
@@ -61,8 +71,10 @@ pub(crate) async fn serve(args: ServeArgs) -> Result<u8> {
     let failed = |error| Problem::failed(format!("cannot listen for signals: {error}"));
     let mut interrupt = signal(SignalKind::interrupt()).map_err(failed)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(failed)?;
+    let mut hangup = signal(SignalKind::hangup()).map_err(failed)?;
     coordinator::shell::raise_descriptor_limit();
-    let config = args.config()?;
+    let mut config = args.door.config(args.bind, args.tokens()?, args.insecure)?;
+    args.allowances.set(&mut config);
     // Said before the store is made.
     config.check()?;
     let open = config.tokens.is_empty();
@@ -75,10 +87,13 @@ pub(crate) async fn serve(args: ServeArgs) -> Result<u8> {
         "listening on {url} with the store {}\n  trainer worker join {url}{token}\n  trainer submit PIPELINE --server {url}{token}",
         args.store.display(),
     ));
-    let failure = tokio::select! {
-        _ = interrupt.recv() => None,
-        _ = terminate.recv() => None,
-        why = handle.failed() => Some(why),
+    let failure = loop {
+        tokio::select! {
+            _ = interrupt.recv() => break None,
+            _ = terminate.recv() => break None,
+            _ = hangup.recv() => args.reload(&handle),
+            why = handle.failed() => break Some(why),
+        }
     };
     drop(announced);
     // Workers keep training without us and re-attach to the next server.

@@ -106,7 +106,7 @@ async fn status(args: StatusArgs) -> Result<u8> {
     }
     match args.which.output {
         Output::Json => {
-            let state = summary::run_state(run.state);
+            let state = summary::run_state(&run);
             print::json(&json!({"schema_version": 1, "run": run.run, "state": state, "sweeps": sweeps}));
         }
         Output::Table => {

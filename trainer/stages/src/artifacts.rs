@@ -189,7 +189,7 @@ pub fn blob_error(error: BlobError) -> StageError {
         BlobError::Refused(_) => ContextError::GrantEnded(text),
         BlobError::Storage(_) => ContextError::Storage(text),
         BlobError::Unfit(_) => ContextError::Refused(text),
-        BlobError::Unavailable(_) => ContextError::Unavailable(text),
+        BlobError::Unreachable(_) | BlobError::Unavailable(_) => ContextError::Unavailable(text),
     })
 }
 

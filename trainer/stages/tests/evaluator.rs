@@ -2,7 +2,7 @@
 //! refused.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use checkpoint::Blobs;
 use checkpoint::model::{self, Parts};
@@ -330,18 +330,7 @@ fn real_motion_is_found_and_shuffled_captions_are_left_to_chance() {
     assert!(real["mm_dist"] < shuffled["mm_dist"]);
 }
 
-fn shared(part: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("STRIDE_SHARED")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"), PathBuf::from);
-    let path = root.join("data").join(part);
-    if !path.is_dir() {
-        eprintln!("SKIPPED: no fixtures at {} (set STRIDE_SHARED)", path.display());
-        return None;
-    }
-    Some(path)
-}
-
-/// A fixture's evaluator in the published layout.
+/// A fixture's evaluator laid out as published.
 fn published(fixture: &Path, file: &str, features: usize) -> tempfile::TempDir {
     let dir = tempfile::tempdir().expect("a test's own files");
     let model = dir.path().join("text_mot_match/model");
@@ -358,7 +347,7 @@ fn published(fixture: &Path, file: &str, features: usize) -> tempfile::TempDir {
 
 #[test]
 fn a_published_evaluator_is_read_from_its_pickle() {
-    let Some(root) = shared("parity") else { return };
+    let Some(root) = fixtures::data("parity") else { return };
     for (fixture, format, features) in
         [("04_evaluator_humanml", DataFormat::Humanml3d, 263), ("04_evaluator_kit", DataFormat::Kit, 251)]
     {

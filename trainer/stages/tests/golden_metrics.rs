@@ -1,20 +1,12 @@
 //! The metrics against values computed with the reference code, `golden/metrics` and the parity fixture `06_sjpe`.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use serde_json::Value;
 use stages::evaluation::control::ControlErrors;
 use stages::evaluation::frechet::Gaussian;
 use stages::evaluation::jerk::{JerkError, jerk};
 use stages::evaluation::{joints, retrieval, skating, spread};
-
-/// `$STRIDE_SHARED`, or `../shared` beside the workspace.
-fn shared() -> PathBuf {
-    match std::env::var_os("STRIDE_SHARED") {
-        Some(path) => PathBuf::from(path),
-        None => Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"),
-    }
-}
 
 fn array(path: &Path) -> (Vec<u64>, Vec<f32>) {
     let bytes = std::fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
@@ -35,11 +27,8 @@ fn worst(pairs: &[(f64, f64)]) -> f64 {
 
 #[test]
 fn golden_metrics() {
-    let folder = shared().join("data/golden/metrics");
-    let Ok(text) = std::fs::read_to_string(folder.join("expected.json")) else {
-        eprintln!("SKIPPED: no {}; set STRIDE_SHARED to the folder with the golden data", folder.display());
-        return;
-    };
+    let Some(folder) = fixtures::data("golden/metrics") else { return };
+    let text = std::fs::read_to_string(folder.join("expected.json")).expect("expected.json");
     let expected: serde_json::Map<String, Value> = serde_json::from_str(&text).expect("expected.json");
     let mut checked = 0;
     for (name, item) in &expected {
@@ -168,11 +157,7 @@ fn mask(path: &Path, count: usize) -> Vec<bool> {
 
 #[test]
 fn parity_sjpe() {
-    let folder = shared().join("data/parity/06_sjpe");
-    if !folder.is_dir() {
-        eprintln!("SKIPPED: no {}; set STRIDE_SHARED to the folder with the golden data", folder.display());
-        return;
-    }
+    let Some(folder) = fixtures::data("parity/06_sjpe") else { return };
     let read = |name: &str| std::fs::read(folder.join(name)).unwrap_or_else(|e| panic!("{name}: {e}"));
     let json = |name: &str| serde_json::from_slice::<Value>(&read(name)).unwrap_or_else(|e| panic!("{name}: {e}"));
     let (config, expected, io) = (json("config.json"), json("expected.json"), read("io.safetensors"));

@@ -1,30 +1,10 @@
 //! Target positions and their errors, against MotionLCM's loader and metric (fixtures `02_control*` with draws or
 //! sampled motions).
 
-use std::path::{Path, PathBuf};
-
 use protocol::stage::ControlSetting;
 use safetensors::{Dtype, SafeTensors};
 use serde_json::Value;
 use stages::hint::{Hint, NormalisedHints, share, told_frames};
-
-/// The fixtures of groups with this prefix, if they exist.
-fn folders(prefix: &str) -> Vec<PathBuf> {
-    let root = match std::env::var_os("STRIDE_SHARED") {
-        Some(path) => PathBuf::from(path),
-        None => Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"),
-    }
-    .join("data/parity");
-    let Ok(entries) = std::fs::read_dir(&root) else {
-        eprintln!("SKIPPED: no {}; set STRIDE_SHARED to the folder with the golden data", root.display());
-        return Vec::new();
-    };
-    let named = |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(prefix));
-    let mut found: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).filter(named).collect();
-    found.sort();
-    assert!(!found.is_empty(), "no fixture {prefix}* in {}", root.display());
-    found
-}
 
 /// Shape and values of a tensor of any type.
 fn array(file: &SafeTensors<'_>, name: &str) -> Option<(Vec<usize>, Vec<f64>)> {
@@ -52,7 +32,7 @@ fn usizes(value: &Value) -> Vec<usize> {
 #[test]
 fn parity_hints() {
     let (mut draws, mut motions) = (0, 0);
-    let folders = folders("02_control");
+    let folders = fixtures::parity(&["02_control"]);
     for folder in &folders {
         let read = |name: &str| std::fs::read(folder.join(name)).unwrap_or_else(|e| panic!("{name}: {e}"));
         let expected: serde_json::Map<String, Value> = serde_json::from_slice(&read("expected.json")).unwrap();

@@ -1,29 +1,16 @@
 //! The definitions of the reconstruction metrics against rows of the reference table that need no network.
 
-use std::path::{Path, PathBuf};
-
-use motion::Dataset;
+use motion::{DataPath, Dataset};
 use protocol::stage::{DataFormat, Split};
 use stages::evaluation::{joints, reconstruction};
 
-fn shared() -> PathBuf {
-    match std::env::var_os("STRIDE_SHARED") {
-        Some(path) => PathBuf::from(path),
-        None => Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"),
-    }
-}
-
-/// Rows of a reconstruction of a clip: global, aligned and local error in mm, smooth L1 of the features.
+/// Rows of a guess at a clip: global, aligned and local error in mm, smooth-L1 of the features.
 type Row = (&'static str, fn(&[f32], usize) -> Vec<f32>, [f64; 4]);
 
 #[test]
 fn guesses_without_a_network_have_the_errors_of_the_reference_table() {
-    let folder = shared().join("data/humanml3d-mini");
-    if !folder.is_dir() {
-        eprintln!("SKIPPED: no {}; set STRIDE_SHARED to the folder with the data", folder.display());
-        return;
-    }
-    let (dataset, _) = Dataset::open(&folder, DataFormat::Humanml3d).expect("the folder opens");
+    let Some(folder) = fixtures::data("humanml3d-mini") else { return };
+    let (dataset, _) = Dataset::open(&DataPath::local(&folder), DataFormat::Humanml3d).expect("the folder opens");
     let entries = dataset.entries_of(Split::Test);
     let rows: [Row; 3] = [
         ("zeros", |clip, _| vec![0.0; clip.len()], [1840.0, 117.1, 109.7, 0.378]),

@@ -2,7 +2,7 @@
 //! and from an artifact, and models that are trained and sampled with them.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use burn::tensor::Device;
@@ -14,6 +14,7 @@ use protocol::stage::{
 use protocol::{Digest, RunId, Seed, StageName, Steps};
 use serde_json::Value;
 use stages::artifacts::{Embeddings, Tensors};
+use stages::external;
 use stages::generate::Generator;
 use stages::testing::{Bench, MemoryAttempt, MemoryBlobs};
 use stages::text::{self, Named};
@@ -22,23 +23,6 @@ mod common;
 
 /// Gate of one forward pass, from the fixtures' README.
 const GATE: f64 = 3e-6;
-
-/// Folders of fixtures with the prefix `prefix`; none, with a notice, if this checkout has none.
-fn folders(prefix: &str) -> Vec<PathBuf> {
-    let root = std::env::var_os("STRIDE_SHARED")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"), PathBuf::from);
-    let root = root.join("data/parity");
-    let Ok(listed) = std::fs::read_dir(&root) else {
-        eprintln!("SKIPPED: no fixtures at {} (set STRIDE_SHARED)", root.display());
-        return Vec::new();
-    };
-    let paths = listed.map(|entry| entry.expect("fixtures can be listed").path());
-    let named = |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(prefix));
-    let mut found: Vec<PathBuf> = paths.filter(|path| path.is_dir()).filter(named).collect();
-    found.sort();
-    assert!(!found.is_empty(), "no fixture in {} starts with {prefix}", root.display());
-    found
-}
 
 fn captions(folder: &Path) -> Vec<String> {
     let bytes = std::fs::read(folder.join("captions.json")).expect("a file of the fixture");
@@ -67,15 +51,8 @@ fn close(what: &str, found: &[f32], expected: &[f32]) {
     assert!(off <= GATE * largest, "{what}: off by {:e} of the largest", off / largest);
 }
 
-/// Opens the encoder in a folder.
-fn ready(settings: &TextEmbed) -> Box<dyn text::TextEncoder> {
-    let named = Named::open(settings).unwrap_or_else(|e| panic!("{e}"));
-    named.ready(settings, &Device::flex()).unwrap_or_else(|e| panic!("{e}"))
-}
-
-/// Opens the encoder of the artifact made from the folder.
-fn stored(settings: &TextEmbed) -> Box<dyn text::TextEncoder> {
-    let blobs = Arc::new(MemoryBlobs::default());
+/// The encoder in a folder, and an attempt at embedding with it.
+fn named(settings: &TextEmbed, blobs: &Arc<MemoryBlobs>) -> (Named, MemoryAttempt) {
     let task = StageTask {
         run: RunId::new("test-1"),
         name: StageName::new("text"),
@@ -84,8 +61,22 @@ fn stored(settings: &TextEmbed) -> Box<dyn text::TextEncoder> {
         seed: Seed(1),
         checkpoint: CheckpointPolicy::default(),
     };
-    let mut cx = MemoryAttempt::new(task, Device::flex(), Arc::clone(&blobs));
-    let manifest = Named::open(settings).and_then(|named| named.upload(&mut cx)).unwrap_or_else(|e| panic!("{e}"));
+    let mut cx = MemoryAttempt::new(task, Device::flex(), Arc::clone(blobs));
+    let named = external::read(&mut cx, |_, given| Named::open(settings, given)).unwrap_or_else(|e| panic!("{e}"));
+    (named, cx)
+}
+
+/// The encoder in a folder.
+fn ready(settings: &TextEmbed) -> Box<dyn text::TextEncoder> {
+    let (named, _) = named(settings, &Arc::default());
+    named.ready(settings, &Device::flex()).unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// That of the artifact which is made of the folder.
+fn stored(settings: &TextEmbed) -> Box<dyn text::TextEncoder> {
+    let blobs = Arc::new(MemoryBlobs::default());
+    let (named, mut cx) = named(settings, &blobs);
+    let manifest = named.upload(&mut cx).unwrap_or_else(|e| panic!("{e}"));
     text::open(&manifest, &*blobs, &Device::flex()).unwrap_or_else(|e| panic!("{e}"))
 }
 
@@ -98,7 +89,7 @@ fn same_out_of_an_artifact(settings: &TextEmbed, encoder: &dyn text::TextEncoder
 
 #[test]
 fn parity_of_clip_from_its_folder() {
-    for folder in folders("09_text_clip") {
+    for folder in fixtures::parity(&["09_text_clip"]) {
         let owned = captions(&folder);
         let captions: Vec<&str> = owned.iter().map(String::as_str).collect();
         let mut io = arrays(&folder);
@@ -135,7 +126,7 @@ fn parity_of_clip_from_its_folder() {
 
 #[test]
 fn parity_of_t5_from_its_folder() {
-    for folder in folders("09_text_t5") {
+    for folder in fixtures::parity(&["09_text_t5"]) {
         let owned = captions(&folder);
         let captions: Vec<&str> = owned.iter().map(String::as_str).collect();
         let mut io = arrays(&folder);
@@ -186,8 +177,10 @@ fn shards_change_no_byte() {
     let data = DataSynthetic { clips: 12, ..DataSynthetic::default() };
     let dataset = run(&mut bench, "dataset", data.into(), &[]);
     let mut all = vec![TextEmbed::default()];
-    all.extend(folders("09_text_clip").iter().map(|path| clip(path, ClipIds::OpenAi, ClipOutput::Projected, 0)));
-    all.extend(folders("09_text_t5").iter().map(|path| t5(path, TextEncoder::SentenceT5)));
+    all.extend(
+        fixtures::parity(&["09_text_clip"]).iter().map(|path| clip(path, ClipIds::OpenAi, ClipOutput::Projected, 0)),
+    );
+    all.extend(fixtures::parity(&["09_text_t5"]).iter().map(|path| t5(path, TextEncoder::SentenceT5)));
     for settings in all {
         let mut embed = |shards: usize| {
             let settings = TextEmbed { shards, ..settings.clone() };
@@ -211,8 +204,8 @@ fn shards_change_no_byte() {
 /// deleted by then.
 #[test]
 fn models_are_trained_and_drawn_with_encoders_of_folders() {
-    let clips = folders("09_text_clip");
-    let t5s = folders("09_text_t5");
+    let clips = fixtures::parity(&["09_text_clip"]);
+    let t5s = fixtures::parity(&["09_text_t5"]);
     let (Some(clip_folder), Some(t5_folder)) = (clips.first(), t5s.first()) else { return };
     for settings in
         [clip(clip_folder, ClipIds::OpenAi, ClipOutput::Projected, 0), t5(t5_folder, TextEncoder::SentenceT5)]

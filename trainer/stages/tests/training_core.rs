@@ -2,7 +2,6 @@
 //! groups that take turns, a frozen group, and a first step that only gathers sums.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
-use std::path::Path;
 use std::sync::{Arc, Mutex};
 
 use models::optim::{AdamW, LrSchedule};
@@ -379,15 +378,9 @@ fn a_slice_that_breaks_its_plan_is_refused() {
 /// hook's result for sums over slices, one clip per slice.
 #[test]
 fn parity_ema_codebook() {
-    let root = std::env::var_os("STRIDE_SHARED")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"), Into::into);
-    let folder = root.join("data/parity/05_rvq_ema");
-    let (Ok(bytes), Ok(config)) =
-        (std::fs::read(folder.join("io.safetensors")), std::fs::read(folder.join("config.json")))
-    else {
-        eprintln!("SKIPPED: no {}; set STRIDE_SHARED to the folder with the parity fixtures", folder.display());
-        return;
-    };
+    let Some(folder) = fixtures::data("parity/05_rvq_ema") else { return };
+    let bytes = std::fs::read(folder.join("io.safetensors")).unwrap();
+    let config = std::fs::read(folder.join("config.json")).unwrap();
     let io = SafeTensors::deserialize(&bytes).unwrap();
     let config: serde_json::Value = serde_json::from_slice(&config).unwrap();
     let size = |value: &serde_json::Value| value.as_u64().unwrap() as usize;

@@ -93,7 +93,7 @@ impl Endpoint {
 
     fn welcome(&self, number: u64, stream: TcpStream, since: Instant) -> Result<(), HandshakeError> {
         let hurried = &mut Hurried::new(&stream, since)?;
-        let dial = handshake::wanted(hurried)?;
+        let Some(dial) = handshake::wanted(hurried)? else { return Ok(()) };
         let unknown = || HandshakeError::Unknown { task: dial.task.clone(), generation: dial.generation };
         let key = (dial.task.clone(), dial.generation);
         let gang = lock(&self.gangs).get(&key).and_then(Weak::upgrade);

@@ -14,28 +14,30 @@
 //! members stop after the same step.
 
 use std::ops::Range;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use bytemuck::cast_slice;
+use protocol::message::LossCause;
 
 use super::frame::{Frame, Head, Kind, MAX_PAYLOAD, PIECE, Payload};
 use super::mesh::{Halt, Mesh};
 use super::tree::{self, Node};
 
 const DRAIN: u32 = 1;
+const SAVED: u32 = 2;
 
 /// What travels behind a state, namely recorded values that are not known to be stored, is refused if it is larger than this.
 const MAX_BEHIND_STATE: u64 = 256 << 20;
 
 /// Whether to give up, asked often.
-pub(crate) type Interrupt<'a> = &'a dyn Fn() -> Option<Halt>;
+pub(crate) type Interrupt<'a> = &'a (dyn Fn() -> Option<Halt> + Sync);
 
 /// What a rendezvous says to this member.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Met {
     Keep,
-    /// This rank sends its state now.
-    Behind(usize),
+    /// This rank sends its state of so many steps now.
+    Behind(usize, u64),
 }
 
 /// Finds the newest state among members and brings everybody to it.
@@ -66,15 +68,21 @@ pub(crate) fn rendezvous(
         tracing::info!(step = newest, bytes, receivers = behind.len(), "sending the state to members behind");
         for peer in behind {
             mesh.send(peer, &barrier, Head::new(Kind::StateLength, bytes as u64, 0, 0), &[], interrupt)?;
-            let begun = Instant::now();
+            let (begun, mut sent) = (Instant::now(), 0);
             for piece in state.iter().flat_map(|piece| piece.chunks(MAX_PAYLOAD)) {
-                if begun.elapsed() > mesh.timing.start {
-                    // All others wait for this one.
-                    let limit = mesh.timing.start.as_secs_f32();
-                    mesh.lose(peer, format!("{barrier}: it has not taken the state of {bytes} bytes after {limit} s"));
+                // All others wait for this one.
+                let (elapsed, limit) = (begun.elapsed(), mesh.timing.start);
+                let is_slow =
+                    elapsed > mesh.timing.slow && elapsed.mul_f64(bytes as f64 / sent.max(1) as f64) > limit / 5;
+                if elapsed > limit || is_slow {
+                    let elapsed = elapsed.as_secs_f32();
+                    let reason =
+                        format!("{barrier}: it has taken {sent} of the state's {bytes} bytes after {elapsed:.0} s");
+                    mesh.lose(peer, LossCause::Slow, reason);
                     return Err(Halt::Peer);
                 }
                 mesh.send(peer, &barrier, Head::new(Kind::State, newest, 0, 0), piece, interrupt)?;
+                sent += piece.len();
             }
         }
         return Ok(Met::Keep);
@@ -82,7 +90,7 @@ pub(crate) fn rendezvous(
     if applied == Some(newest) {
         return Ok(Met::Keep);
     }
-    Ok(Met::Behind(source))
+    Ok(Met::Behind(source, newest))
 }
 
 /// Receives the state that `source` sends after a rendezvous, into `room`. What follows the state is returned.
@@ -99,10 +107,8 @@ pub(crate) fn adopt(
     let length = expect(mesh.next(source, &barrier, interrupt)?, Kind::StateLength, mesh, source)?.step;
     let wanted: u64 = room.iter().map(|piece| piece.len() as u64).sum();
     if length < wanted || length - wanted > MAX_BEHIND_STATE {
-        return Err(Halt::Disagree(format!(
-            "{barrier}: `{}` offers a state of {length} bytes, expected {wanted} and at most {MAX_BEHIND_STATE} more; is it the same build?",
-            mesh.config.members[source].worker
-        )));
+        let what = format!("offers a state of {length} bytes, expected {wanted} and at most {MAX_BEHIND_STATE} more");
+        return Err(disagree(mesh, &barrier, source, &what));
     }
     let mut room = Room::new(room);
     let (mut pieces, mut there) = (Vec::new(), 0);
@@ -111,9 +117,8 @@ pub(crate) fn adopt(
         there += frame.bytes().len() as u64;
         let Payload::Bytes(piece) = frame.payload else { unreachable!("a state's frames carry bytes") };
         if piece.is_empty() || there > length {
-            return Err(Halt::Disagree(format!(
-                "{barrier}: a state of {length} bytes arrives in pieces of another length"
-            )));
+            let what = format!("sends a state of {length} bytes in pieces of another length");
+            return Err(disagree(mesh, &barrier, source, &what));
         }
         if directly {
             room.fill(&piece);
@@ -169,6 +174,10 @@ pub(crate) struct Contribution<'a> {
     /// The gradients of this member's share, slice by slice; all of one length.
     pub(crate) parts: Vec<(Node, &'a [f32])>,
     pub(crate) drain: bool,
+    /// It has saved since the step before.
+    pub(crate) saved: bool,
+    /// How long its share took.
+    pub(crate) computed: Duration,
     /// The last step of which the lead knows that everything recorded is stored.
     pub(crate) durable: u64,
 }
@@ -193,33 +202,31 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
         return Ok(Total { sum, drain: contribution.drain, durable: contribution.durable });
     }
     let barrier = format!("barrier `exchange` of step {} in generation {}", contribution.step, mesh.config.generation);
-    let disagree = |peer: usize, what: String| {
-        Halt::Disagree(format!("{barrier}: `{}` {what}; is it the same build?", mesh.config.members[peer].worker))
-    };
+    let disagree = |peer: usize, what: String| disagree(mesh, &barrier, peer, &what);
 
-    // Reduce-scatter, our half: everybody's chunk of our nodes.
-    let flags = if contribution.drain { DRAIN } else { 0 };
-    let own_nodes = tree::cover(contribution.slices, &tree::share(contribution.slices, own, size));
-    let mut piece = vec![0.0f32; PIECE];
-    for peer in mesh.others() {
-        let mut greeting = [0u8; 16];
-        greeting[..8].copy_from_slice(&(length.unwrap_or(0) as u64).to_le_bytes());
-        greeting[8..].copy_from_slice(&contribution.durable.to_le_bytes());
-        let head = Head::new(Kind::Begin, contribution.step, number(contribution.slices), flags);
-        mesh.send(peer, &barrier, head, &greeting, interrupt)?;
-        let chunk = length.map_or(0..0, |length| tree::share(length, peer, size));
-        for (n, node) in own_nodes.iter().enumerate() {
-            for (p, range) in pieces(&chunk).enumerate() {
-                let leaves: Vec<(Node, &[f32])> = contribution.parts[within(&contribution.parts, node)]
-                    .iter()
-                    .map(|(slice, part)| (slice.clone(), &part[range.clone()]))
-                    .collect();
-                let out = &mut piece[..range.len()];
-                tree::sum(node, &leaves, out);
-                let head = Head::new(Kind::Part, contribution.step, number(n), number(p));
-                mesh.send(peer, &barrier, head, cast_slice(out), interrupt)?;
-            }
-        }
+    let halt = interrupt;
+    let interrupt: Interrupt<'_> = &|| {
+        mesh.watch_pace();
+        halt()
+    };
+    let own_slices = tree::share(contribution.slices, own, size);
+    mesh.pace.begin(contribution.computed, own_slices.len(), contribution.slices);
+    if contribution.saved {
+        mesh.pace.excuse();
+    }
+
+    // Reduce-scatter, our half: everybody's chunk of our nodes. To all at once, so that one that is slow keeps nobody else waiting.
+    let nodes = tree::cover(contribution.slices, &own_slices);
+    let peers: Vec<usize> = mesh.others().collect();
+    let send = |peer: usize| send_parts(mesh, &barrier, contribution, peer, &nodes, interrupt);
+    if let [peer] = peers[..] {
+        send(peer)?;
+    } else {
+        std::thread::scope(|scope| {
+            let sends: Vec<_> = peers.iter().map(|peer| scope.spawn(|| send(*peer))).collect();
+            let sent = sends.into_iter().map(|thread| thread.join().expect("sending does not panic"));
+            sent.collect::<Vec<_>>().into_iter().collect::<Result<(), Halt>>()
+        })?;
     }
 
     // Reduce-scatter, their half: our chunk of their nodes.
@@ -227,7 +234,8 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
     let mut durable = if own == 0 { contribution.durable } else { 0 };
     let mut theirs: Vec<(Node, Vec<f32>)> = Vec::new();
     for peer in mesh.others() {
-        let begin = expect(mesh.next(peer, &barrier, interrupt)?, Kind::Begin, mesh, peer)?;
+        let (mut came, begin) = mesh.next_timed(peer, &barrier, interrupt)?;
+        let begin = expect(begin, Kind::Begin, mesh, peer)?;
         if begin.step != contribution.step || begin.a != number(contribution.slices) {
             return Err(disagree(
                 peer,
@@ -236,11 +244,15 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
         }
         let (at, stored) = numbers(&begin).ok_or_else(|| disagree(peer, "sends a malformed greeting".to_owned()))?;
         drain |= begin.b & DRAIN != 0;
+        if begin.b & SAVED != 0 {
+            mesh.pace.excuse();
+        }
         if peer == 0 {
             durable = stored;
         }
         let nodes = tree::cover(contribution.slices, &tree::share(contribution.slices, peer, size));
         if nodes.is_empty() {
+            mesh.pace.received(peer, came);
             continue;
         }
         let at = usize::try_from(at).map_err(|_| disagree(peer, format!("has a buffer of {at} numbers")))?;
@@ -252,7 +264,9 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
         for (n, node) in nodes.into_iter().enumerate() {
             let mut numbers = Vec::with_capacity(chunk.len());
             for (p, range) in pieces(&chunk).enumerate() {
-                let frame = expect(mesh.next(peer, &barrier, interrupt)?, Kind::Part, mesh, peer)?;
+                let (at, frame) = mesh.next_timed(peer, &barrier, interrupt)?;
+                let frame = expect(frame, Kind::Part, mesh, peer)?;
+                came = at;
                 let place = (frame.a, frame.b) == (number(n), number(p));
                 let Some(part) = floats(frame).filter(|part| place && part.len() == range.len()) else {
                     return Err(disagree(peer, format!("sends parts out of place at node {n}, piece {p}")));
@@ -261,8 +275,9 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
             }
             theirs.push((node, numbers));
         }
+        mesh.pace.received(peer, came);
     }
-    let length = length.ok_or_else(|| Halt::Disagree(format!("{barrier}: no member has a slice")))?;
+    let length = length.ok_or_else(|| Halt::Fault(format!("{barrier}: no member has a slice")))?;
 
     // Our chunk, to the root of the tree.
     let chunk = tree::share(length, own, size);
@@ -290,7 +305,43 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
             sum[range].copy_from_slice(&part);
         }
     }
+    if let Some(slow) = mesh.pace.end(mesh.others()) {
+        mesh.complain(slow);
+    }
     Ok(Total { sum, drain, durable })
+}
+
+/// Sends a peer its chunk of this member's nodes.
+fn send_parts(
+    mesh: &Mesh,
+    barrier: &str,
+    contribution: &Contribution<'_>,
+    peer: usize,
+    nodes: &[Node],
+    interrupt: Interrupt<'_>,
+) -> Result<(), Halt> {
+    let flags = (if contribution.drain { DRAIN } else { 0 }) | (if contribution.saved { SAVED } else { 0 });
+    let length = contribution.parts.first().map(|(_, part)| part.len());
+    let mut greeting = [0u8; 16];
+    greeting[..8].copy_from_slice(&(length.unwrap_or(0) as u64).to_le_bytes());
+    greeting[8..].copy_from_slice(&contribution.durable.to_le_bytes());
+    let head = Head::new(Kind::Begin, contribution.step, number(contribution.slices), flags);
+    mesh.send(peer, barrier, head, &greeting, interrupt)?;
+    let chunk = length.map_or(0..0, |length| tree::share(length, peer, mesh.size()));
+    let mut piece = vec![0.0f32; PIECE.min(chunk.len())];
+    for (n, node) in nodes.iter().enumerate() {
+        for (p, range) in pieces(&chunk).enumerate() {
+            let parts = &contribution.parts[within(&contribution.parts, node)];
+            let leaves: Vec<(Node, &[f32])> =
+                parts.iter().map(|(slice, part)| (slice.clone(), &part[range.clone()])).collect();
+            let out = &mut piece[..range.len()];
+            tree::sum(node, &leaves, out);
+            let head = Head::new(Kind::Part, contribution.step, number(n), number(p));
+            mesh.send(peer, barrier, head, cast_slice(out), interrupt)?;
+        }
+    }
+    mesh.pace.sent(peer);
+    Ok(())
 }
 
 fn number(n: usize) -> u32 {
@@ -325,6 +376,13 @@ fn expect(frame: Frame, kind: Kind, mesh: &Mesh, peer: usize) -> Result<Frame, H
     if frame.kind == kind {
         return Ok(frame);
     }
-    let (who, found) = (&mesh.config.members[peer].worker, frame.kind);
-    Err(Halt::Disagree(format!("`{who}` sent a frame of kind {found:?} where {kind:?} was due; is it the same build?")))
+    let what = format!("sent a frame of kind {:?} where {kind:?} was due", frame.kind);
+    Err(disagree(mesh, &format!("generation {}", mesh.config.generation), peer, &what))
+}
+
+/// Gives up a peer that speaks of something else.
+pub(crate) fn disagree(mesh: &Mesh, barrier: &str, peer: usize, what: &str) -> Halt {
+    let reason = format!("{barrier}: `{}` {what}; is it the same build?", mesh.config.members[peer].worker);
+    mesh.lose(peer, LossCause::Disagrees, reason.clone());
+    Halt::Disagree(reason)
 }

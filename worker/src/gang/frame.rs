@@ -4,7 +4,7 @@
 //!
 //! | at | bytes | what |
 //! |---|---|---|
-//! | 0 | 4 | magic `STR3`: its last byte is the version of these frames and of what travels in them |
+//! | 0 | 4 | magic `STR4`: its last byte is the version of these frames and of what travels in them |
 //! | 4 | 1 | kind |
 //! | 5 | 3 | zero |
 //! | 8 | 8 | `step`: the training step, or what the kind says |
@@ -22,13 +22,13 @@ use std::io::{self, Read, Write};
 
 use super::seal::{Seal, TAG};
 
-const MAGIC: [u8; 4] = *b"STR3";
+const MAGIC: [u8; 4] = *b"STR4";
 /// What the tag vouches for, of a header.
 const SIGNED: usize = 28;
 const HEADER: usize = SIGNED + TAG;
 
-/// Longest payload. Small enough that on a slow network too every frame is a timely sign of life.
-pub(crate) const MAX_PAYLOAD: usize = 1 << 20;
+/// Longest payload. At 30 KB/s it takes two seconds, so a sign of life does not wait for long behind it.
+pub(crate) const MAX_PAYLOAD: usize = 64 << 10;
 
 /// Longest payload before a peer has proved who it is.
 pub(crate) const MAX_HANDSHAKE: usize = 4096;
@@ -64,6 +64,8 @@ pub(crate) enum Kind {
     Part = 11,
     /// Exchange: piece `b` of the sender's chunk of the sum.
     Sum = 12,
+    /// A stranger asks whether anybody is here, and is answered with the same.
+    Probe = 13,
 }
 
 impl Kind {
@@ -81,6 +83,7 @@ impl Kind {
             10 => Self::Begin,
             11 => Self::Part,
             12 => Self::Sum,
+            13 => Self::Probe,
             _ => return None,
         })
     }
@@ -149,7 +152,7 @@ pub(crate) enum FrameError {
     Closed,
     #[error("the connection failed: {0}")]
     Io(#[source] io::Error),
-    #[error("not a frame of this build: it begins with `{}`, expected `STR3`; do both sides run the same build?", .0.escape_ascii())]
+    #[error("not a frame of this build: it begins with `{}`, expected `STR4`; do both sides run the same build?", .0.escape_ascii())]
     Magic([u8; 4]),
     #[error("a frame of unknown kind {0}; do both sides run the same build?")]
     Kind(u8),

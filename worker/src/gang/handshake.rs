@@ -7,7 +7,7 @@
 //! the two sees the connection leave its machine; the dialer's view is among the names, so nobody on the way can change it.
 
 use std::io::{self, Read, Write};
-use std::net::TcpStream;
+use std::net::{TcpStream, ToSocketAddrs};
 use std::time::{Duration, Instant};
 
 use hmac::{Hmac, Mac};
@@ -200,9 +200,37 @@ pub(crate) fn dial(
     Ok(session(secret, &dial, &answer, true))
 }
 
-/// The first frame of the side that was dialled: what the dialer wants.
-pub(super) fn wanted(stream: &mut Hurried<'_>) -> Result<Dial, HandshakeError> {
-    receive(stream, Kind::Dial)
+/// The first frame of the side that was dialled: what the dialer wants. A [`probe`] is answered, and wants nothing more.
+pub(super) fn wanted(stream: &mut Hurried<'_>) -> Result<Option<Dial>, HandshakeError> {
+    let frame = frame::read(stream)?;
+    match frame.kind {
+        Kind::Dial => Ok(Some(serde_json::from_slice(frame.bytes())?)),
+        Kind::Probe => {
+            send(stream, Kind::Probe, &())?;
+            Ok(None)
+        }
+        found => Err(HandshakeError::Unexpected { expected: Kind::Dial, found }),
+    }
+}
+
+/// Finds out whether a worker listens at `address` and its answers come back. Proves nothing about who it is.
+pub(crate) fn probe(address: &str) -> Result<(), HandshakeError> {
+    let stream = connect(address)?;
+    let stream = &mut Hurried::new(&stream, Instant::now())?;
+    send(stream, Kind::Probe, &())?;
+    receive::<()>(stream, Kind::Probe)
+}
+
+/// A connection to the first address of `address` that takes one.
+pub(crate) fn connect(address: &str) -> Result<TcpStream, HandshakeError> {
+    let mut last = io::Error::new(io::ErrorKind::AddrNotAvailable, format!("`{address}` names no address"));
+    for socket in address.to_socket_addrs()? {
+        match TcpStream::connect_timeout(&socket, PATIENCE) {
+            Ok(stream) => return Ok(stream),
+            Err(error) => last = error,
+        }
+    }
+    Err(last.into())
 }
 
 /// The rest of that side. After it the dialer is known to be of the generation.
@@ -240,7 +268,7 @@ mod tests {
         let (stream, _) = listener.accept()?;
         let stream = &mut Hurried::new(&stream, Instant::now())?;
         let dial = wanted(stream)?;
-        accept(stream, &dial, secret)
+        accept(stream, &dial.expect("a dialer"), secret)
     }
 
     /// Whether what one side sends is what the other receives.

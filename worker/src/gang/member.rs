@@ -20,6 +20,8 @@ pub(crate) struct Timing {
     /// The same for a peer that has only begun: so long it may take to read its inputs, which it fetched before it became a member,
     /// to initialise itself, and to take over a state.
     pub(crate) start: Duration,
+    /// A gang that is slower than one of its members alone is so for at least so long before a peer is named.
+    pub(crate) slow: Duration,
     /// A peer at whose address nothing listens for so long is lost.
     pub(crate) refused: Duration,
 }
@@ -31,6 +33,7 @@ impl Default for Timing {
             keep_alive: Duration::from_secs(3),
             stall: Duration::from_secs(30 * 60),
             start: Duration::from_secs(5 * 60),
+            slow: Duration::from_secs(10),
             refused: Duration::from_secs(3),
         }
     }

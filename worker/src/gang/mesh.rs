@@ -3,32 +3,33 @@
 //! A mesh is opened the moment a generation is known, by threads of its own, so that a member whose stage is deep in a
 //! slice still answers its peers. Each link has a reader thread that queues frames, and one thread sends a sign of life
 //! over every idle link: a peer that computes for minutes is told from one that is gone. Whether a peer is lost is said
-//! when its connection ends without a farewell, or when somebody waits for it and it was silent for too long.
+//! when its connection ends without a farewell, or when somebody waits for it and no byte of it came for too long.
 //!
 //! Not its job: what the frames mean (`exchange`), and what follows from a loss (the coordinator's decision).
 
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::VecDeque;
 use std::io;
-use std::net::{Shutdown, TcpStream, ToSocketAddrs};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::net::{Shutdown, TcpStream};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, Weak};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::message::Member;
+use protocol::message::{LossCause, LostPeer, Member};
 use protocol::{Generation, WorkerId};
 use tokio::sync::Notify;
 
 use super::endpoint::{Endpoint, Gang};
 use super::frame::{self, Frame, FrameError, Head, Kind, MAX_PAYLOAD};
 use super::handshake::{self, HandshakeError, Session};
-use super::link::{BLINK, Link, Writer};
+use super::link::{BLINK, Heard, Link, Pulse, Sign, Writer};
 use super::member::{MeshConfig, Phase, Timing, spawn};
+use super::pace::Pace;
 use super::seal::Seal;
 use crate::event_count::{EventCount, lock};
 
-/// Frames of a state that are queued for a member that takes them more slowly than they come, each of a megabyte at most.
-const STATE_FRAMES: usize = 16;
+/// Frames of a state that are queued for a member that takes them more slowly than they come: 16 MiB of them.
+pub(super) const STATE_FRAMES: usize = (16 << 20) / MAX_PAYLOAD;
 
 /// Why a wait ended without what was waited for.
 #[derive(Debug, Clone, PartialEq)]
@@ -39,8 +40,10 @@ pub(crate) enum Halt {
     Ended(String),
     /// A peer is gone or has moved on; a newer generation will come.
     Peer,
-    /// Peers do not speak of the same thing; a fault.
+    /// A peer speaks of something else; it is given up.
     Disagree(String),
+    /// A fault of this member.
+    Fault(String),
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -52,14 +55,15 @@ enum Standing {
     Left,
     /// It is at a newer generation.
     Moved,
-    Lost(String),
+    Lost(LossCause, String),
 }
 
 #[derive(Debug)]
 struct Peer {
     link: Option<Arc<Link>>,
-    inbox: VecDeque<Frame>,
-    heard: Instant,
+    /// Frames, each with when it came.
+    inbox: VecDeque<(Instant, Frame)>,
+    pulse: Pulse,
     standing: Standing,
     phase: Phase,
 }
@@ -73,6 +77,9 @@ pub(crate) struct Mesh {
     event_count: Arc<EventCount>,
     /// Wakes the poll, which reports what is lost.
     wake: Arc<Notify>,
+    /// The rank that the stage waits for, and one more; 0 while it waits for none.
+    waits_for: AtomicUsize,
+    pub(super) pace: Pace,
     closed: AtomicBool,
 }
 
@@ -87,13 +94,15 @@ impl Mesh {
         let peer = |_: &Member| Peer {
             link: None,
             inbox: VecDeque::new(),
-            heard: Instant::now(),
+            pulse: Pulse::new(),
             standing: Standing::Unmet(None),
             phase: Phase::Working,
         };
         let peers = Mutex::new(config.members.iter().map(peer).collect());
         let timing = endpoint.timing;
-        let mesh = Arc::new(Self { config, timing, peers, event_count, wake, closed: AtomicBool::new(false) });
+        let (waits_for, closed) = (AtomicUsize::new(0), AtomicBool::new(false));
+        let pace = Pace::new(config.members.len(), timing.slow);
+        let mesh = Arc::new(Self { config, timing, peers, event_count, wake, waits_for, pace, closed });
         if mesh.size() > 1 {
             let gang: Arc<dyn Gang> = mesh.clone();
             endpoint.announce(&mesh.config, Arc::downgrade(&gang));
@@ -118,19 +127,51 @@ impl Mesh {
         (1..size).map(move |i| (rank + i) % size)
     }
 
-    /// Who could not be reached in this generation.
-    pub(crate) fn lost(&self) -> BTreeSet<WorkerId> {
+    /// The members that this one cannot go on with in this generation.
+    pub(crate) fn lost(&self) -> Vec<LostPeer> {
         let peers = lock(&self.peers);
-        let lost =
-            peers.iter().zip(&self.config.members).filter(|(peer, _)| matches!(peer.standing, Standing::Lost(_)));
-        lost.map(|(_, member)| member.worker.clone()).collect()
+        let lost = peers.iter().zip(&self.config.members).filter_map(|(peer, member)| match &peer.standing {
+            Standing::Lost(cause, _) => Some(LostPeer { worker: member.worker.clone(), cause: *cause }),
+            Standing::Unmet(_) | Standing::Up | Standing::Left | Standing::Moved => None,
+        });
+        let slow = self.pace.slow().into_iter().filter(|rank| !matches!(peers[*rank].standing, Standing::Lost(..)));
+        let slow = slow.map(|rank| LostPeer { worker: self.name(rank).clone(), cause: LossCause::Slow });
+        lost.chain(slow).collect()
+    }
+
+    fn sign(&self) -> Sign {
+        let head = Head::new(Kind::KeepAlive, 0, self.config.busy.phase() as u32, 0);
+        // A thread that wakes just before a sign is due would let it wait for twice as long.
+        Sign { head, every: self.timing.keep_alive * 3 / 4 }
+    }
+
+    /// Names those that hold up the exchange under way for too long. Nobody does while a member saves.
+    pub(super) fn watch_pace(&self) {
+        if lock(&self.peers).iter().any(|peer| peer.phase != Phase::Working) {
+            return self.pace.excuse();
+        }
+        let waits_for = self.waits_for.load(Ordering::SeqCst).checked_sub(1);
+        self.pace.overdue(self.others(), waits_for).into_iter().for_each(|peer| self.complain(peer));
+    }
+
+    /// Has the next poll say that this gang is slower than its member alone, because of `rank`. The connection stays.
+    pub(super) fn complain(&self, rank: usize) {
+        let (task, generation) = (&self.config.task, self.config.generation);
+        tracing::warn!(%task, %generation, peer = %self.name(rank), "the gang is slower than this member alone; it waits for this peer");
+        self.wake.notify_one();
+    }
+
+    /// The member that the stage waits for now.
+    pub(crate) fn waits_for(&self) -> Option<WorkerId> {
+        let rank = self.waits_for.load(Ordering::SeqCst).checked_sub(1)?;
+        Some(self.name(rank).clone())
     }
 
     /// Who is missing, each with the barrier at which and the reason for which it was given up.
     pub(crate) fn missing(&self) -> Vec<String> {
         let peers = lock(&self.peers);
         let missing = peers.iter().enumerate().filter_map(|(rank, peer)| match &peer.standing {
-            Standing::Lost(reason) => Some(format!("{} (rank {rank}): {reason}", self.name(rank))),
+            Standing::Lost(_, reason) => Some(format!("{} (rank {rank}): {reason}", self.name(rank))),
             Standing::Unmet(_) | Standing::Up | Standing::Left | Standing::Moved => None,
         });
         missing.collect()
@@ -143,12 +184,13 @@ impl Mesh {
             let peers = lock(&self.peers);
             let silent = |(rank, peer): (usize, &Peer)| {
                 let waits = matches!(peer.standing, Standing::Unmet(_) | Standing::Up) && rank != self.config.rank;
-                (waits && now.duration_since(peer.heard.max(awake)) > self.timing.patience).then_some(rank)
+                (waits && now.duration_since(peer.pulse.last().max(awake)) > self.timing.patience).then_some(rank)
             };
             peers.iter().enumerate().filter_map(silent).collect()
         };
         for rank in silent {
-            self.lose(rank, format!("{barrier}: no sign of life for {} s", self.timing.patience.as_secs_f32()));
+            let reason = format!("{barrier}: no sign of life for {} s", self.timing.patience.as_secs_f32());
+            self.lose(rank, LossCause::Unreachable, reason);
         }
     }
 
@@ -197,16 +239,16 @@ impl Mesh {
     }
 
     /// Gives a peer up and has the next poll say so.
-    pub(super) fn lose(&self, rank: usize, reason: String) {
+    pub(super) fn lose(&self, rank: usize, cause: LossCause, reason: String) {
         if self.is_closed() {
             return;
         }
         {
             let peer = &mut lock(&self.peers)[rank];
-            if matches!(peer.standing, Standing::Lost(_) | Standing::Moved) {
+            if matches!(peer.standing, Standing::Lost(..) | Standing::Moved) {
                 return;
             }
-            peer.standing = Standing::Lost(reason.clone());
+            peer.standing = Standing::Lost(cause, reason.clone());
             if let Some(link) = peer.link.take() {
                 let _ = link.socket.shutdown(Shutdown::Write);
             }
@@ -230,7 +272,8 @@ impl Mesh {
                     let since =
                         if error.is_refused() { *refused.get_or_insert_with(Instant::now) } else { Instant::now() };
                     if since.elapsed() > self.timing.refused {
-                        self.lose(rank, format!("nothing listens at {}", self.config.members[rank].peer_address));
+                        let reason = format!("nothing listens at {}", self.config.members[rank].peer_address);
+                        self.lose(rank, LossCause::Unreachable, reason);
                         return;
                     }
                     if !error.is_refused() {
@@ -247,33 +290,32 @@ impl Mesh {
     }
 
     fn connect(&self, rank: usize) -> Result<(TcpStream, Session), HandshakeError> {
-        let address = &self.config.members[rank].peer_address;
-        let mut last = io::Error::new(io::ErrorKind::AddrNotAvailable, format!("`{address}` names no address"));
-        for socket in address.to_socket_addrs()? {
-            match TcpStream::connect_timeout(&socket, Duration::from_secs(5)) {
-                Ok(stream) => {
-                    let MeshConfig { task, generation, rank: from, secret, .. } = &self.config;
-                    let session = handshake::dial(&stream, task, *generation, *from, rank, secret)?;
-                    return Ok((stream, session));
-                }
-                Err(error) => last = error,
-            }
-        }
-        Err(last.into())
+        let stream = handshake::connect(&self.config.members[rank].peer_address)?;
+        let MeshConfig { task, generation, rank: from, secret, .. } = &self.config;
+        let session = handshake::dial(&stream, task, *generation, *from, rank, secret)?;
+        Ok((stream, session))
     }
 
     /// Takes a connection whose other side has proved to be `rank`.
     fn attach(self: &Arc<Self>, rank: usize, stream: TcpStream, session: Session) {
         let Session { sends, receives } = session;
+        let pulse = lock(&self.peers)[rank].pulse.clone();
         let both = stream.try_clone().and_then(|reader| {
             // Signs of life come far more often than this; it only keeps a reader from outliving everything.
             reader.set_read_timeout(Some(self.timing.patience * 3))?;
             stream.set_write_timeout(Some(BLINK))?;
-            Ok((reader, Link { socket: stream.try_clone()?, writer: Mutex::new(Writer { stream, seal: sends }) }))
+            let socket = stream.try_clone()?;
+            Ok((
+                reader,
+                Link {
+                    socket,
+                    writer: Mutex::new(Writer { stream, seal: sends, pulse: pulse.clone(), signed: Instant::now() }),
+                },
+            ))
         });
         let (reader, link) = match both {
             Ok(both) => both,
-            Err(error) => return self.lose(rank, error.to_string()),
+            Err(error) => return self.lose(rank, LossCause::Unreachable, error.to_string()),
         };
         {
             let mut peers = lock(&self.peers);
@@ -282,12 +324,12 @@ impl Mesh {
             }
             let peer = &mut peers[rank];
             peer.link = Some(Arc::new(link));
-            peer.heard = Instant::now();
+            peer.pulse.beat();
             peer.standing = Standing::Up;
         }
         self.event_count.notify();
         let mesh = Arc::downgrade(self);
-        spawn("gang-read", move || read(&mesh, rank, reader, receives));
+        spawn("gang-read", move || read(&mesh, rank, &reader, receives, pulse));
     }
 
     /// Waits while as much of a state is queued as may be: the rest stays with its sender, who sends nothing else meanwhile. Parts of a sum
@@ -297,7 +339,7 @@ impl Mesh {
             let ticket = self.event_count.ticket();
             {
                 let peer = &mut lock(&self.peers)[rank];
-                peer.heard = Instant::now();
+                peer.pulse.beat();
                 if self.is_closed() || peer.standing != Standing::Up || peer.inbox.len() < STATE_FRAMES {
                     return;
                 }
@@ -316,14 +358,13 @@ impl Mesh {
         }
         {
             let peer = &mut lock(&self.peers)[rank];
-            peer.heard = Instant::now();
             match frame.kind {
                 Kind::KeepAlive => {
                     peer.phase = Phase::read(frame.a);
                     return;
                 }
                 Kind::Bye => peer.standing = if frame.step == 0 { Standing::Left } else { Standing::Moved },
-                _ => peer.inbox.push_back(frame),
+                _ => peer.inbox.push_back((Instant::now(), frame)),
             }
         }
         self.event_count.notify();
@@ -339,22 +380,32 @@ impl Mesh {
         interrupt: &dyn Fn() -> Option<Halt>,
     ) -> Result<(), Halt> {
         let link = self.wait(rank, barrier, interrupt, |peer| peer.link.clone())?;
-        link.send(head, payload, self.timing.patience, &|| interrupt().is_some()).map_err(|error| {
+        link.send(head, payload, &self.sign(), self.timing.patience, &|| interrupt().is_some()).map_err(|error| {
             if let Some(halt) = interrupt() {
                 return halt;
             }
-            self.lose(rank, format!("{barrier}: sending failed: {error}"));
+            self.lose(rank, LossCause::Unreachable, format!("{barrier}: sending failed: {error}"));
             Halt::Peer
         })
     }
 
     /// The next frame from `rank`. What came before a connection ended is still handed out.
     pub(crate) fn next(&self, rank: usize, barrier: &str, interrupt: &dyn Fn() -> Option<Halt>) -> Result<Frame, Halt> {
-        let frame = self.wait(rank, barrier, interrupt, |peer| peer.inbox.pop_front())?;
+        self.next_timed(rank, barrier, interrupt).map(|(_, frame)| frame)
+    }
+
+    /// The same with when it came.
+    pub(super) fn next_timed(
+        &self,
+        rank: usize,
+        barrier: &str,
+        interrupt: &dyn Fn() -> Option<Halt>,
+    ) -> Result<(Instant, Frame), Halt> {
+        let (at, frame) = self.wait(rank, barrier, interrupt, |peer| peer.inbox.pop_front())?;
         if frame.kind == Kind::State {
             self.event_count.notify();
         }
-        Ok(frame)
+        Ok((at, frame))
     }
 
     /// Waits for as long as `rank` lives, and after it has left in good order for what the coordinator says about that.
@@ -384,6 +435,10 @@ impl Mesh {
         mut take: impl FnMut(&mut Peer) -> Option<T>,
     ) -> Result<T, Halt> {
         const GLANCE: Duration = Duration::from_millis(250);
+        if let Some(taken) = take(&mut lock(&self.peers)[rank]) {
+            return Ok(taken);
+        }
+        let _waiting = Waiting::on(self, rank);
         let mut begun = Instant::now();
         // If we were stopped ourselves, the peers were not silent: we were deaf.
         let mut awake = begun;
@@ -403,12 +458,12 @@ impl Mesh {
                 if patience == Patience::WhileItLives || peer.phase == Phase::Saving {
                     begun = now;
                 }
-                let (silent, waited) = (now.duration_since(peer.heard.max(awake)), now.duration_since(begun));
+                let (silent, waited) = (now.duration_since(peer.pulse.last().max(awake)), now.duration_since(begun));
                 let too_late = |limit: Duration, how: &str| {
                     (waited > limit).then(|| format!("{barrier}: {how} after {} s", limit.as_secs_f32()))
                 };
                 match &peer.standing {
-                    Standing::Lost(_) | Standing::Moved => return Err(interrupt().unwrap_or(Halt::Peer)),
+                    Standing::Lost(..) | Standing::Moved => return Err(interrupt().unwrap_or(Halt::Peer)),
                     Standing::Left if patience == Patience::WhileItLives => None,
                     Standing::Left => Some(format!("{barrier}: it has left")),
                     Standing::Unmet(why) if silent > self.timing.patience => {
@@ -429,12 +484,28 @@ impl Mesh {
                 return Err(halt);
             }
             if let Some(reason) = verdict {
-                self.lose(rank, reason);
+                self.lose(rank, LossCause::Unreachable, reason);
                 self.lose_the_silent(barrier, awake);
                 return Err(Halt::Peer);
             }
             self.event_count.wait(ticket, GLANCE);
         }
+    }
+}
+
+/// While it lives, the mesh says for whom the stage waits.
+struct Waiting<'a>(&'a Mesh);
+
+impl<'a> Waiting<'a> {
+    fn on(mesh: &'a Mesh, rank: usize) -> Self {
+        mesh.waits_for.store(rank + 1, Ordering::SeqCst);
+        Self(mesh)
+    }
+}
+
+impl Drop for Waiting<'_> {
+    fn drop(&mut self) {
+        self.0.waits_for.store(0, Ordering::SeqCst);
     }
 }
 
@@ -454,8 +525,8 @@ impl Drop for Mesh {
 }
 
 /// Threads that outlive their mesh's owner hold it weakly.
-fn read(mesh: &Weak<Mesh>, rank: usize, mut stream: TcpStream, mut seal: Seal) {
-    let mut buffered = io::BufReader::with_capacity(64 << 10, &mut stream);
+fn read(mesh: &Weak<Mesh>, rank: usize, stream: &TcpStream, mut seal: Seal, pulse: Pulse) {
+    let mut buffered = io::BufReader::with_capacity(64 << 10, Heard { stream, pulse });
     loop {
         let frame = frame::read_sealed(&mut buffered, MAX_PAYLOAD, &mut seal);
         let Some(mesh) = mesh.upgrade() else {
@@ -469,7 +540,7 @@ fn read(mesh: &Weak<Mesh>, rank: usize, mut stream: TcpStream, mut seal: Seal) {
             Err(error) => {
                 let parted = matches!(lock(&mesh.peers)[rank].standing, Standing::Left | Standing::Moved);
                 if !parted {
-                    mesh.lose(rank, error.to_string());
+                    mesh.lose(rank, LossCause::Unreachable, error.to_string());
                 }
                 if !matches!(error, FrameError::Closed) {
                     // The other side must not go on talking into the void.
@@ -490,11 +561,10 @@ fn keep_alive(mesh: &Weak<Mesh>, timing: Timing) {
         }
         let links: Vec<_> = lock(&mesh.peers).iter().map(|peer| peer.link.clone()).collect();
         for link in links.into_iter().flatten() {
-            // A link that is being written to shows that we are alive.
+            // Who writes to a link sends the sign of life along.
             if let Ok(mut writer) = link.writer.try_lock() {
                 // An error shows up where somebody waits for the peer.
-                let head = Head::new(Kind::KeepAlive, 0, mesh.config.busy.phase() as u32, 0);
-                let _ = writer.send(head, &[], timing.patience, &|| mesh.is_closed());
+                let _ = writer.sign(&mesh.sign(), timing.patience, &|| mesh.is_closed());
             }
         }
     }

@@ -3,10 +3,11 @@
 pub(crate) mod endpoint;
 pub(crate) mod exchange;
 mod frame;
-mod handshake;
+pub(crate) mod handshake;
 mod link;
 pub(crate) mod member;
 pub(crate) mod mesh;
+mod pace;
 mod seal;
 pub(crate) mod tree;
 

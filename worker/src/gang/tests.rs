@@ -1,6 +1,7 @@
 //! Gangs of threads over loopback, with a coordinator of a few lines that does what the real one does about losses.
 
 mod eavesdropper;
+mod relay;
 mod silence;
 mod states;
 mod strangers;
@@ -13,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
 use proptest::prelude::*;
-use protocol::message::{Assignment, Grant, Member, Role, StageTask};
+use protocol::message::{Assignment, Grant, LossCause, LostPeer, Member, Role, StageTask};
 use protocol::stage::{CheckpointPolicy, StageSettings, TrainVae};
 use protocol::{Attempt, Fence, Generation, Incarnation, RunId, Seed, StageName, TaskId, WorkerId};
 use stages::context::{Adopted, ContextError, Exchange, GangContext, Rendezvous};
@@ -37,6 +38,7 @@ const QUICK: Timing = Timing {
     keep_alive: Duration::from_millis(200),
     stall: Duration::from_secs(60),
     start: Duration::from_secs(60),
+    slow: Duration::from_secs(60),
     refused: Duration::from_millis(500),
 };
 
@@ -62,7 +64,7 @@ pub(crate) fn assignment(worker: &WorkerId, generation: u64, members: &[Member],
     };
     let role =
         Role::Member { generation: Generation(generation), members: members.to_vec(), secret: secret.to_owned() };
-    Assignment { grant, stage, role, resume: None, drain: false }
+    Assignment { grant, secret: "secret".to_owned(), stage, role, resume: None, drain: false }
 }
 
 /// One worker: where it is dialled, and what it holds once it is a member.
@@ -129,7 +131,7 @@ impl Gang {
         // Nobody is there; nothing in these tests is recorded or uploaded.
         let client = Client::new(crate::tests::server_at("http://127.0.0.1:9"), self.runtime.handle().clone());
         let cache = Arc::new(Cache::new(None, None, Bounds::default()).expect("memory"));
-        HttpContext::new(held, client, cache, Device::default())
+        HttpContext::new(held, client, cache, Arc::default(), Device::default())
     }
 
     /// What the coordinator does: members that somebody cannot reach are dropped. Suspects that are not dead come back.
@@ -138,7 +140,7 @@ impl Gang {
             let mut lost: Vec<WorkerId> = Vec::new();
             for &i in &members {
                 if let (false, Some(held)) = (self.seats[i].dead.load(Ordering::SeqCst), self.held(i)) {
-                    lost.extend(held.doing().lost);
+                    lost.extend(held.doing().lost.into_iter().map(|peer| peer.worker));
                 }
             }
             let before = members.clone();
@@ -427,6 +429,10 @@ fn mesh(gang: &Gang, seats: &[usize], own: usize, secret: &str) -> (Arc<Mesh>, A
     (Mesh::open(config, &gang.seats[seats[own]].endpoint, event_count.clone(), Arc::default()), event_count)
 }
 
+fn unreachable(worker: &str) -> LostPeer {
+    LostPeer { worker: worker.into(), cause: LossCause::Unreachable }
+}
+
 fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !holds() {
@@ -453,7 +459,8 @@ fn members_hold_their_state_until_rank_0_has_saved() {
         assert!(holds.iter().all(|hold| !hold.is_finished()), "rank 0 has not reported");
         gang.held(0).expect("a member").sever();
         wait_until("both miss rank 0", || {
-            [1, 2].iter().all(|&i| gang.held(i).expect("a member").doing().lost == [WorkerId::from("w0")])
+            let misses = |i| gang.held(i).expect("a member").doing().lost == [unreachable("w0")];
+            [1, 2].into_iter().all(misses)
         });
         gang.regroup(&[1, 2], false);
         for hold in holds {

@@ -8,13 +8,14 @@ use std::time::{Duration, Instant};
 use axum::Router;
 use axum::body::Bytes;
 use axum::extract::{DefaultBodyLimit, Json, Path, State};
-use axum::http::StatusCode;
+use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post, put};
 use protocol::message::{
     ApiError, Assignment, CommitCheckpoint, DesiredAssignments, Grant, Join, Joined, LogBatch, MetricBatch,
     PROTOCOL_VERSION, Poll, Prepare, ReportOutcome, TaskOutcome,
 };
+use protocol::proof::{GRANT_HEADER, PROCESS_HEADER, SECRET_HEADER, SHORTEST_SECRET};
 use protocol::{Digest, Incarnation};
 
 use crate::event_count::lock;
@@ -67,6 +68,8 @@ pub(super) const BUSY_S: u64 = 2;
 #[derive(Debug, Default)]
 pub(super) struct Fake {
     pub(super) coordinator: Mutex<FakeState>,
+    /// The next so many joins meet another process of the same name.
+    pub(super) name_held: AtomicU64,
     /// Answers 503 to everything.
     pub(super) away: AtomicBool,
     /// Its disk is full: nothing can be stored.
@@ -146,8 +149,12 @@ impl Fake {
     }
 }
 
-async fn join(State(fake): State<Arc<Fake>>, Json(join): Json<Join>) -> Response {
+async fn join(State(fake): State<Arc<Fake>>, headers: HeaderMap, Json(join): Json<Join>) -> Response {
     assert_eq!(join.protocol, PROTOCOL_VERSION);
+    assert!(headers[SECRET_HEADER].len() >= SHORTEST_SECRET);
+    if fake.name_held.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok() {
+        return refuse(StatusCode::CONFLICT, "name-held");
+    }
     if let Some(response) = fake.no_room() {
         return response;
     }
@@ -239,10 +246,11 @@ async fn outcome(State(fake): State<Arc<Fake>>, Json(report): Json<ReportOutcome
 async fn put_blob(
     State(fake): State<Arc<Fake>>,
     Path(digest): Path<Digest>,
-    headers: axum::http::HeaderMap,
+    headers: HeaderMap,
     body: Bytes,
 ) -> Response {
-    let grant: Grant = serde_json::from_slice(headers["x-stride-grant"].as_bytes()).expect("a grant");
+    let grant: Grant = serde_json::from_slice(headers[GRANT_HEADER].as_bytes()).expect("a grant");
+    assert_eq!(headers[SECRET_HEADER], format!("the-secret-of-fence-{}", grant.fence));
     assert_eq!(headers["authorization"], format!("Bearer {TOKEN}"));
     let number =
         |name: &str| headers[name].to_str().ok().and_then(|text| text.parse::<usize>().ok()).expect("a number");
@@ -283,11 +291,8 @@ async fn staged(State(fake): State<Arc<Fake>>, Path(digest): Path<Digest>) -> Re
 }
 
 /// Sends a blob, or what follows byte N of it. An answer that is to be cut breaks off in its middle.
-async fn get_blob(
-    State(fake): State<Arc<Fake>>,
-    Path(digest): Path<Digest>,
-    headers: axum::http::HeaderMap,
-) -> Response {
+async fn get_blob(State(fake): State<Arc<Fake>>, Path(digest): Path<Digest>, headers: HeaderMap) -> Response {
+    assert!(headers.contains_key(PROCESS_HEADER) && headers.contains_key(SECRET_HEADER), "{headers:?}");
     if fake.away.load(Ordering::SeqCst) {
         return refuse(StatusCode::SERVICE_UNAVAILABLE, "internal");
     }

@@ -3,7 +3,7 @@
 use std::sync::Mutex;
 
 use protocol::Digest;
-use protocol::message::Prepare;
+use protocol::message::{Member, Prepare};
 
 use super::*;
 
@@ -20,7 +20,7 @@ fn artifact(fake: &Fake, bytes: &[u8]) -> (Digest, Digest) {
 }
 
 fn prepare(task: &str, input: Digest, resume: Option<Digest>) -> Prepare {
-    Prepare { task: task.into(), inputs: BTreeMap::from([("dataset".to_owned(), input)]), resume }
+    Prepare { task: task.into(), inputs: BTreeMap::from([("dataset".to_owned(), input)]), resume, peers: Vec::new() }
 }
 
 fn says_ready(coordinator: &FakeState, tasks: &[&str]) -> bool {
@@ -87,4 +87,25 @@ fn fetching_ahead_stops_when_the_task_is_another_s_and_when_the_worker_leaves() 
     let begun = Instant::now();
     worker.leave();
     assert!(begun.elapsed() < Duration::from_secs(5), "it waited for the download");
+}
+
+/// A member that refuses connections: the gang does not see a joiner that could not take part, and other tasks are prepared meanwhile.
+#[test]
+fn a_task_is_ready_only_once_its_members_answer() {
+    let worker = Worker::start(Box::new(finished));
+    let (data, _) = artifact(&worker.fake, b"data");
+    let closed = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port").local_addr().expect("bound");
+    let member = |address: std::net::SocketAddr| Member {
+        worker: "holder".into(),
+        incarnation: protocol::Incarnation(1),
+        peer_address: address.to_string(),
+    };
+    let joined = |address| Prepare { peers: vec![member(address)], ..prepare("run/gang", data, None) };
+    worker.fake.desired(|coordinator| coordinator.prepare = vec![joined(closed), prepare("run/other", data, None)]);
+    worker.wait("the other one", |coordinator| says_ready(coordinator, &["run/other"]));
+    // It comes back there.
+    let timing = crate::gang::member::Timing::default();
+    let _endpoint = crate::gang::endpoint::Endpoint::open(closed, timing).expect("free again");
+    worker.wait("both", |coordinator| says_ready(coordinator, &["run/other", "run/gang"]));
+    worker.leave();
 }

@@ -12,6 +12,7 @@
 //! need not be: equal names are equal bytes. A part that fails is sent again by itself; parts of an upload that was given up
 //! cost space until the bucket's own rule removes them.
 
+mod health;
 mod remote;
 mod touched;
 
@@ -20,6 +21,7 @@ use std::fs::OpenOptions;
 use std::io::{self, Cursor, Read};
 use std::path::Path as FilePath;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use checkpoint::BlobError;
 use fail::fail_point;
@@ -36,21 +38,24 @@ use tokio::task::JoinSet;
 pub use self::remote::Remote;
 pub(super) use self::remote::check_url;
 
-use self::remote::innermost;
+use self::remote::LOCAL;
 use self::touched::Touched;
 use super::disk::{Os, regular};
 use super::staging::{Part, Staging};
-use super::{Backend, Entry, Staged, Stat};
+use super::{Backend, Entry, Problem, Staged, Stat};
 use crate::clock;
 
 /// How much goes out at once. The limit of 10,000 parts to an object allows 80 GB.
 const PART_BYTES: usize = 8 << 20;
-/// Parts that are under way at once, of all blobs together: this bounds the memory that sending takes.
+/// How many such parts are under way at once, of all blobs together, or as many bytes of small ones: this bounds the memory that sending
+/// takes.
 const PARTS: usize = 4;
 /// A blob that is read begins with a request for as little as the reader asked for, at least this much; each further one asks
 /// for twice as much, up to [`READ_BYTES`].
 const FIRST_READ_BYTES: usize = 64 << 10;
 const READ_BYTES: usize = 4 << 20;
+/// How long a removal may take: it begins under a lease, and must not be done after another process has taken that.
+const REMOVAL: Duration = Duration::from_secs(10);
 
 /// Blobs in an object store.
 #[derive(Debug)]
@@ -61,6 +66,7 @@ struct Inner {
     remote: Arc<Remote>,
     staging: Staging,
     touched: Mutex<Touched>,
+    /// Room for what is under way, in KiB.
     parts: Arc<Semaphore>,
 }
 
@@ -80,7 +86,7 @@ impl Objects {
     }
 
     fn with(remote: Arc<Remote>, staging: Staging, touched: Touched) -> Self {
-        let parts = Arc::new(Semaphore::new(PARTS));
+        let parts = Arc::new(Semaphore::new((PARTS * PART_BYTES) >> 10));
         Self(Arc::new(Inner { remote, staging, touched: Mutex::new(touched), parts }))
     }
 }
@@ -131,7 +137,7 @@ impl Inner {
     fn send(&self, path: &Path, bytes: u64, mut source: impl Read + Send + 'static) -> Result<bool, Error> {
         let (store, path, parts) = (self.store(), path.clone(), Arc::clone(&self.parts));
         if bytes > PART_BYTES as u64 {
-            return self.remote.wait(async move {
+            return self.remote.wait_long(async move {
                 let mut upload = store.put_multipart(&path).await?;
                 let sent = send_parts(&mut *upload, parts, source).await;
                 if sent.is_err() {
@@ -142,8 +148,8 @@ impl Inner {
             });
         }
         let whole = read_part(&mut source).map_err(local)?;
-        let put = self.remote.wait(async move {
-            let _one = parts.acquire().await;
+        let put = self.remote.wait_long(async move {
+            let _room = parts.acquire_many(kib(whole.len())).await;
             store.put_opts(&path, PutPayload::from(whole), PutOptions::from(PutMode::Create)).await
         });
         match put {
@@ -180,8 +186,13 @@ impl Inner {
     }
 }
 
+/// How much room bytes take among those that are under way.
+fn kib(bytes: usize) -> u32 {
+    u32::try_from(bytes.div_ceil(1 << 10).max(1)).unwrap_or(u32::MAX)
+}
+
 fn local(source: io::Error) -> Error {
-    Error::Generic { store: "staging", source: source.into() }
+    Error::Generic { store: LOCAL, source: source.into() }
 }
 
 async fn send_parts(
@@ -191,7 +202,8 @@ async fn send_parts(
 ) -> Result<(), Error> {
     let mut under_way = JoinSet::new();
     loop {
-        let slot = Arc::clone(&slots).acquire_owned().await.map_err(|e| local(io::Error::other(e)))?;
+        let slot =
+            Arc::clone(&slots).acquire_many_owned(kib(PART_BYTES)).await.map_err(|e| local(io::Error::other(e)))?;
         let (read, next) = tokio::task::spawn_blocking(move || (read_part(&mut source), source)).await?;
         source = next;
         let part = read.map_err(local)?;
@@ -269,7 +281,11 @@ impl Backend for Objects {
     fn remove(&self, digest: Digest) -> Result<(), BlobError> {
         let (store, path) = (self.0.store(), self.0.remote.blob(digest));
         let wanted = path.clone();
-        match self.0.remote.wait(async move { store.delete(&wanted).await }) {
+        let removing = async move {
+            let late = || Error::Generic { store: "blobs", source: "the removal was not answered in time".into() };
+            tokio::time::timeout(REMOVAL, store.delete(&wanted)).await.unwrap_or_else(|_| Err(late()))
+        };
+        match self.0.remote.wait(removing) {
             Ok(()) | Err(Error::NotFound { .. }) => self.0.touched().forget(digest),
             Err(e) => return Err(self.0.remote.error("remove", &path, &e)),
         }
@@ -314,6 +330,10 @@ impl Backend for Objects {
 
     fn aside(&self) -> Result<Vec<String>, BlobError> {
         Ok(self.0.list("quarantine")?.iter().map(|meta| self.0.remote.shown(&meta.location)).collect())
+    }
+
+    fn problem(&self) -> Option<Problem> {
+        self.0.remote.problem()
     }
 
     fn marker_place(&self) -> String {
@@ -365,12 +385,12 @@ impl Staged for StagedObject {
         fail_point!("blob::after_write");
         let here = |e: io::Error| super::fs::error("read", &self.part.path, &e);
         io::Write::flush(&mut self.part.file).map_err(here)?;
-        if self.objects.head(digest)?.is_some() {
-            return Ok(false);
-        }
-        let here = |e: io::Error| super::fs::error("read", &self.part.path, &e);
         let file = regular(OpenOptions::new().read(true), &self.part.path).map_err(here)?;
         let bytes = file.metadata().map_err(here)?.len();
+        // A put in one request fails if the name is taken.
+        if bytes > PART_BYTES as u64 && self.objects.head(digest)?.is_some() {
+            return Ok(false);
+        }
         // Noted first: a collection that sees the object must see that it is young, whatever the other side's clock says.
         self.objects.note(digest)?;
         let path = self.objects.remote.blob(digest);
@@ -401,9 +421,11 @@ impl Read for Ranges {
         self.next = length.saturating_mul(2);
         let range = self.at..self.end.min(self.at + length as u64);
         let (store, path, wanted) = (Arc::clone(&self.remote.store), self.path.clone(), range.clone());
-        let part = self.remote.wait(async move { store.get_range(&path, wanted).await });
-        let part =
-            part.map_err(|e| io::Error::other(format!("`{}`: {}", self.remote.shown(&self.path), innermost(&e))))?;
+        let part = self.remote.wait_long(async move { store.get_range(&path, wanted).await });
+        let part = part.map_err(|e| match self.remote.error("read", &self.path, &e) {
+            BlobError::Unreachable(message) => io::Error::new(io::ErrorKind::HostUnreachable, message),
+            e => io::Error::other(e.to_string()),
+        })?;
         if part.is_empty() {
             return Err(io::ErrorKind::UnexpectedEof.into());
         }

@@ -14,6 +14,9 @@ use object_store::{BackoffConfig, ClientConfigKey, Error, ObjectStore, RetryConf
 use protocol::Digest;
 use tokio::runtime::Runtime;
 
+use super::health::Health;
+use crate::blob::Problem;
+
 /// A connection that is not there by then is tried again. A machine in the same building answers in milliseconds.
 const CONNECT: &str = "5 seconds";
 /// How long one request may take: a part of 8 MiB at 1.1 Mbit/s.
@@ -21,6 +24,9 @@ const REQUEST: &str = "60 seconds";
 /// For how long a request is tried again. The caller is told then, and decides.
 const RETRY: Duration = Duration::from_secs(30);
 const RETRIES: usize = 6;
+
+/// The store's name in an error that is none of the store's.
+pub(super) const LOCAL: &str = "local";
 
 /// Which object stores there are: how a place in one is written, and where its credentials come from.
 const KINDS: [Kind; 3] = [
@@ -87,6 +93,7 @@ pub struct Remote {
     bucket: String,
     prefix: String,
     pub(super) store: Arc<dyn ObjectStore>,
+    health: Health,
     /// `None` only while it is dropped.
     runtime: Option<Runtime>,
 }
@@ -171,6 +178,7 @@ impl Remote {
             bucket: bucket.to_owned(),
             prefix: prefix.to_owned(),
             store,
+            health: Health::default(),
             runtime: Some(runtime),
         })
     }
@@ -197,12 +205,43 @@ impl Remote {
         format!("{}://{}/{path}", self.kind.scheme, self.bucket)
     }
 
-    /// Runs a request and blocks until it has ended, in whatever thread this is.
+    /// What is wrong with the store, if something is.
+    pub(super) fn problem(&self) -> Option<Problem> {
+        let problem = self.health.problem()?;
+        Some(Problem { what: format!("`{}` cannot be used: {}", self.url, problem.what), ..problem })
+    }
+
+    /// Runs a request that moves few bytes, and blocks until it has ended, in whatever thread this is.
     pub(super) fn wait<T: Send + 'static>(
         &self,
         request: impl Future<Output = Result<T, Error>> + Send + 'static,
     ) -> Result<T, Error> {
-        let ended = || Error::Generic { store: "blobs", source: "the request ended early".into() };
+        let _waiting = self.health.begin();
+        self.wait_long(request)
+    }
+
+    /// The same for a request that may take minutes for all the bytes that it moves.
+    pub(super) fn wait_long<T: Send + 'static>(
+        &self,
+        request: impl Future<Output = Result<T, Error>> + Send + 'static,
+    ) -> Result<T, Error> {
+        let ended = self.run(request);
+        match &ended {
+            Ok(_) | Err(Error::NotFound { .. } | Error::AlreadyExists { .. } | Error::Precondition { .. }) => {
+                self.health.answered();
+            }
+            // Of ours, and not of the store's.
+            Err(Error::Generic { store: LOCAL, .. }) => {}
+            Err(e) => self.health.failed(|| told(&innermost(e))),
+        }
+        ended
+    }
+
+    fn run<T: Send + 'static>(
+        &self,
+        request: impl Future<Output = Result<T, Error>> + Send + 'static,
+    ) -> Result<T, Error> {
+        let ended = || Error::Generic { store: LOCAL, source: "the request ended early".into() };
         let Some(runtime) = &self.runtime else { return Err(ended()) };
         let (answer, answered) = mpsc::sync_channel(1);
         runtime.spawn(async move {
@@ -244,7 +283,7 @@ impl Remote {
             Error::NotImplemented { .. } | Error::NotSupported { .. } => {
                 BlobError::Storage(format!("{what}: the server does not know how ({})", told(&text)))
             }
-            _ => BlobError::Unavailable(format!(
+            _ => BlobError::Unreachable(format!(
                 "{what}: {}; check that the network and {} are right and that the server runs",
                 told(&text),
                 kind.endpoint

@@ -9,6 +9,12 @@ pub(crate) enum Hardship {
     None,
     /// One host is on a slow line all the time.
     Slow,
+    /// One host is on a line of 30 KB/s all the time.
+    Crawl,
+    /// Nobody can connect to one worker; it connects to others.
+    Refuse,
+    /// Now and then what a worker sends does not reach the others, while it hears them.
+    OneWay,
     /// The store's disk is full now and then.
     Full,
     /// The store's disk stands still now and then.
@@ -18,8 +24,15 @@ pub(crate) enum Hardship {
 }
 
 impl Hardship {
-    const ALL: [(&str, Self); 4] =
-        [("slow", Self::Slow), ("full", Self::Full), ("paused", Self::Paused), ("damaged", Self::Damaged)];
+    const ALL: [(&str, Self); 7] = [
+        ("slow", Self::Slow),
+        ("crawl", Self::Crawl),
+        ("refuse", Self::Refuse),
+        ("oneway", Self::OneWay),
+        ("full", Self::Full),
+        ("paused", Self::Paused),
+        ("damaged", Self::Damaged),
+    ];
 
     /// Whether the store needs a disk of its own.
     pub(crate) fn needs_disk(self) -> bool {

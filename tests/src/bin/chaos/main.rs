@@ -47,6 +47,8 @@ const MEAN: f64 = 5.0;
 const STUCK: Duration = Duration::from_secs(60);
 /// What comes to a host on a slow line, in kilobits a second.
 const SLOW: u32 = 4_000;
+/// The same on a line of 30 KB/s.
+const CRAWL: u32 = 240;
 /// A run that takes longer has hung.
 const LIMIT: Duration = Duration::from_secs(3600);
 
@@ -78,6 +80,8 @@ enum Remedy {
     Wake(usize),
     /// A worker's link is mended.
     Mend(usize),
+    /// The others hear a worker again.
+    Unmute(usize),
     Serve,
     WakeServer,
     /// A full disk gets its room back.
@@ -91,6 +95,8 @@ struct Chaos {
     /// The store's own; after the cluster, so that nobody holds it when it goes.
     disk: Option<Disk>,
     hardship: Hardship,
+    /// The worker to which nobody can connect.
+    refuses: Option<usize>,
     network: Option<Network>,
     random: Random,
     begun: Instant,
@@ -110,16 +116,26 @@ impl Chaos {
         let address = network.as_ref().map_or_else(Cluster::free_address, Network::coordinator);
         let cluster = Cluster::listen_on(trainer, address, disk.as_ref().map(Disk::path).as_deref());
         let mut random = Random(number);
-        if let Some(network) = network.as_ref().filter(|_| hardship == Hardship::Slow) {
+        let line = match hardship {
+            Hardship::Slow => Some(SLOW),
+            Hardship::Crawl => Some(CRAWL),
+            _ => None,
+        };
+        if let (Some(network), Some(kilobits)) = (&network, line) {
             let host = random.index(WORKERS.len());
-            if network.slow_down(host, SLOW) {
-                println!("  {} is on a line of {SLOW} kbit/s", WORKERS[host]);
+            if network.slow_down(host, kilobits) {
+                println!("  {} is on a line of {kilobits} kbit/s", WORKERS[host]);
             }
+        }
+        let refuses = (hardship == Hardship::Refuse).then(|| random.index(WORKERS.len()));
+        if let Some(i) = refuses {
+            println!("  nobody can connect to {}", WORKERS[i]);
         }
         let mut chaos = Self {
             cluster,
             disk,
             hardship,
+            refuses,
             network,
             random,
             begun: Instant::now(),
@@ -137,10 +153,12 @@ impl Chaos {
     }
 
     fn join(&mut self, i: usize) {
-        match &self.network {
-            Some(network) => self.cluster.join_by(WORKERS[i], &network.inside(i), &[]),
-            None => self.cluster.join(WORKERS[i]),
-        }
+        let wrap = self.network.as_ref().map(|network| network.inside(i)).unwrap_or_default();
+        // The loopback of each host is its own; on one machine it listens on the other kind of address alone.
+        let nowhere = format!("{}:{}", if self.network.is_some() { "127.0.0.1" } else { "[::1]" }, 7_800 + i);
+        let refuses = ["--peer-address", &nowhere];
+        let more = if self.refuses == Some(i) { &refuses[..] } else { &[] };
+        self.cluster.join_by(WORKERS[i], &wrap, more);
     }
 
     fn say(&mut self, what: &'static str, who: &str, how_long: Duration) {
@@ -157,6 +175,9 @@ impl Chaos {
             0..25 if self.hardship == Hardship::Paused => {
                 ("pause", Remedy::Resume, between(&mut self.random, 0.5, 15.0))
             }
+            0..30 if self.hardship == Hardship::OneWay => {
+                ("mute", Remedy::Unmute(i), between(&mut self.random, 1.0, 60.0))
+            }
             0..40 => ("kill", Remedy::Join(i), between(&mut self.random, 0.0, 4.0)),
             40..55 => ("stop", Remedy::Wake(i), between(&mut self.random, 0.5, 25.0)),
             55..75 => ("kill", Remedy::Serve, between(&mut self.random, 0.0, 6.0)),
@@ -164,11 +185,11 @@ impl Chaos {
             _ => ("cut off", Remedy::Mend(i), between(&mut self.random, 1.0, 30.0)),
         };
         match remedy {
-            Remedy::Join(i) | Remedy::Wake(i) | Remedy::Mend(i) if self.down[i] => return,
+            Remedy::Join(i) | Remedy::Wake(i) | Remedy::Mend(i) | Remedy::Unmute(i) if self.down[i] => return,
             // A process that waits for a paused disk takes no signal.
             Remedy::Serve | Remedy::WakeServer if self.server_down || self.disk_down => return,
             Remedy::Empty | Remedy::Resume if self.disk_down || self.server_down || self.disk.is_none() => return,
-            Remedy::Mend(_) if self.network.is_none() => return,
+            Remedy::Mend(_) | Remedy::Unmute(_) if self.network.is_none() => return,
             _ => {}
         }
         match remedy {
@@ -185,13 +206,14 @@ impl Chaos {
             }
             Remedy::Wake(i) => self.cluster.signal(WORKERS[i], Signal::SIGSTOP),
             Remedy::Mend(i) => self.network.as_ref().expect("looked at above").cut(i),
+            Remedy::Unmute(i) => self.network.as_ref().expect("looked at above").mute(i, true),
             Remedy::Serve => self.cluster.kill_server(),
             Remedy::WakeServer => signal(self.cluster.server().expect("it is up"), Signal::SIGSTOP),
             Remedy::Empty => self.disk.as_ref().expect("looked at above").fill(),
             Remedy::Resume => self.disk.as_mut().expect("looked at above").pause(),
         }
         let who = match remedy {
-            Remedy::Join(i) | Remedy::Wake(i) | Remedy::Mend(i) => {
+            Remedy::Join(i) | Remedy::Wake(i) | Remedy::Mend(i) | Remedy::Unmute(i) => {
                 self.down[i] = true;
                 WORKERS[i]
             }
@@ -223,13 +245,14 @@ impl Chaos {
                 Remedy::Join(i) => self.join(i),
                 Remedy::Wake(i) => self.cluster.signal(WORKERS[i], Signal::SIGCONT),
                 Remedy::Mend(i) => self.network.as_ref().expect("it was cut").mend(i),
+                Remedy::Unmute(i) => self.network.as_ref().expect("it was muted").mute(i, false),
                 Remedy::Serve => self.cluster.serve(),
                 Remedy::WakeServer => signal(self.cluster.server().expect("it is there"), Signal::SIGCONT),
                 Remedy::Empty => self.disk.as_ref().expect("it was filled").empty(),
                 Remedy::Resume => self.disk.as_mut().expect("it was paused").resume(),
             }
             match remedy {
-                Remedy::Join(i) | Remedy::Wake(i) | Remedy::Mend(i) => self.down[i] = false,
+                Remedy::Join(i) | Remedy::Wake(i) | Remedy::Mend(i) | Remedy::Unmute(i) => self.down[i] = false,
                 Remedy::Serve | Remedy::WakeServer => self.server_down = false,
                 Remedy::Empty | Remedy::Resume => self.disk_down = false,
             }

@@ -1,14 +1,15 @@
 //! Callers over TCP, and workers that do not compute.
 #![allow(dead_code, reason = "not every bench uses all of it")]
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, HashMap};
 use std::net::SocketAddr;
 
 use protocol::message::{
-    Assignment, DesiredAssignments, Grant, Join, Joined, PROTOCOL_VERSION, Poll, ReportOutcome, TaskOutcome,
+    Assignment, DesiredAssignments, Join, Joined, PROTOCOL_VERSION, Poll, ReportOutcome, TaskOutcome,
 };
+use protocol::proof::{BlobStored, GRANT_HEADER, SECRET_HEADER, Vouched};
 use protocol::stage::Backend;
-use protocol::{ArtifactKind, Digest, Incarnation, Manifest};
+use protocol::{ArtifactKind, Digest, Incarnation, Manifest, TaskId};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -64,16 +65,24 @@ impl Connection {
         }
     }
 
-    pub(crate) async fn post<T: DeserializeOwned>(&mut self, path: &str, body: &impl Serialize) -> Result<T> {
+    pub(crate) async fn post<T: DeserializeOwned>(
+        &mut self,
+        path: &str,
+        secret: &str,
+        body: &impl Serialize,
+    ) -> Result<T> {
         let body = serde_json::to_vec(body)?;
-        let answer = self.send(&format!("POST {path}"), "content-type: application/json\r\n", &body).await?;
+        let headers = format!("content-type: application/json\r\n{SECRET_HEADER}: {secret}\r\n");
+        let answer = self.send(&format!("POST {path}"), &headers, &body).await?;
         Ok(serde_json::from_slice(&answer)?)
     }
 
-    pub(crate) async fn put(&mut self, grant: &Grant, bytes: &[u8]) -> Result<Digest> {
-        let header = format!("x-stride-grant: {}\r\n", serde_json::to_string(grant)?);
+    /// Uploads a blob; its receipt.
+    pub(crate) async fn put(&mut self, assignment: &Assignment, bytes: &[u8]) -> Result<String> {
+        let grant = serde_json::to_string(&assignment.grant)?;
+        let header = format!("{GRANT_HEADER}: {grant}\r\n{SECRET_HEADER}: {}\r\n", assignment.secret);
         let answer = self.send(&format!("PUT /v1/blobs/{}", Digest::of(bytes)), &header, bytes).await?;
-        Ok(serde_json::from_slice::<coordinator::shell::BlobStored>(&answer)?.digest)
+        Ok(serde_json::from_slice::<BlobStored>(&answer)?.receipt.ok_or("a stored blob has a receipt")?)
     }
 }
 
@@ -82,8 +91,12 @@ pub(crate) struct Worker {
     pub(crate) name: String,
     pub(crate) incarnation: Incarnation,
     pub(crate) connection: Connection,
-    uploaded: HashSet<Digest>,
+    /// Receipts by task and blob.
+    uploaded: HashMap<(TaskId, Digest), String>,
 }
+
+/// What every worker of a bench shows.
+const SECRET: &str = "the-secret-of-each-worker-of-this-bench";
 
 impl Worker {
     pub(crate) async fn join(address: SocketAddr, token: &str, i: usize) -> Result<Self> {
@@ -97,15 +110,15 @@ impl Worker {
             instruction_set: "avx2".into(),
             peer_address: "127.0.0.1:1".into(),
         };
-        let joined: Joined = connection.post("/v1/workers", &join).await?;
-        Ok(Self { name, incarnation: joined.incarnation, connection, uploaded: HashSet::new() })
+        let joined: Joined = connection.post("/v1/workers", SECRET, &join).await?;
+        Ok(Self { name, incarnation: joined.incarnation, connection, uploaded: HashMap::new() })
     }
 
     /// A heartbeat that is answered at once.
     pub(crate) async fn poll(&mut self) -> Result<Option<Assignment>> {
         let poll = Poll { incarnation: self.incarnation, doing: vec![], ready: vec![], version: 0 };
         let desired: DesiredAssignments =
-            self.connection.post(&format!("/v1/workers/{}/poll", self.name), &poll).await?;
+            self.connection.post(&format!("/v1/workers/{}/poll", self.name), SECRET, &poll).await?;
         Ok(desired.assignments.into_iter().next())
     }
 
@@ -117,14 +130,19 @@ impl Worker {
             _ => ArtifactKind::Latents,
         };
         let manifest = Manifest::new(kind, serde_json::json!({}));
-        if self.uploaded.insert(manifest.digest()) {
-            self.connection.put(&assignment.grant, &manifest.to_bytes()).await?;
+        let place = (assignment.grant.task.clone(), manifest.digest());
+        if !self.uploaded.contains_key(&place) {
+            let receipt = self.connection.put(assignment, &manifest.to_bytes()).await?;
+            self.uploaded.insert(place, receipt);
         }
         Ok(manifest.digest())
     }
 
-    pub(crate) async fn finish(&mut self, grant: Grant, output: Digest) -> Result {
+    pub(crate) async fn finish(&mut self, assignment: Assignment, output: Digest) -> Result {
+        let Assignment { grant, secret, .. } = assignment;
+        let receipt = self.uploaded.get(&(grant.task.clone(), output)).map(|receipt| (output, receipt.clone()));
         let outcome = TaskOutcome::Finished { output, metrics: BTreeMap::new() };
-        self.connection.post("/v1/outcomes", &ReportOutcome { grant, outcome }).await
+        let report = Vouched { what: ReportOutcome { grant, outcome }, receipts: receipt.into_iter().collect() };
+        self.connection.post("/v1/outcomes", &secret, &report).await
     }
 }

@@ -25,11 +25,15 @@ impl Deciding<'_> {
         let task = &execution.tasks[i];
         let change = match task.part {
             Part::Gang => gang::without(task.holders(), lost, execution.range()),
-            Part::Alone | Part::Shard { .. } | Part::Merge => Change::Disband,
+            Part::Alone | Part::Resolve | Part::Shard { .. } | Part::Merge => Change::Disband,
         };
         match change {
             Change::Keep => {}
             Change::Regroup(members) => self.regroup(key, i, members),
+            Change::Disband if loss == Loss::Lost && self.saves_first(&task.clone(), lost) => {
+                let members = task.holders().iter().filter(|member| !lost.contains(&member.worker)).cloned().collect();
+                self.regroup(key, i, members);
+            }
             Change::Disband if loss == Loss::Restart => {
                 let fence = self.change(key, i, |task| task.release(None));
                 self.fences.push(fence);
@@ -39,6 +43,12 @@ impl Deciding<'_> {
                 self.try_again(key, i, &format!("lost worker {}", names.join(", ")), false);
             }
         }
+    }
+
+    /// Whether too few members are left of a gang, but one of them has a state that is to be saved before they part.
+    fn saves_first(&self, task: &Task, lost: &[WorkerId]) -> bool {
+        let left: Vec<Member> = task.holders().iter().filter(|m| !lost.contains(&m.worker)).cloned().collect();
+        task.part == Part::Gang && !left.is_empty() && self.may_hold(task, &left)
     }
 
     /// Ends a try. The next begins after a back-off, unless the budget is spent: then the work has failed.

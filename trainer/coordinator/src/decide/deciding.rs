@@ -77,9 +77,10 @@ impl<'a> Deciding<'a> {
                 }
                 self.touched.extend(stages.iter().filter_map(|(_, status)| status.key()));
             }
-            Fact::StagesAdded { run, .. } | Fact::SweepBegun { run, .. } | Fact::SweepMoved { run, .. } => {
-                runs.push(*run)
-            }
+            Fact::Resolved { run, .. }
+            | Fact::StagesAdded { run, .. }
+            | Fact::SweepBegun { run, .. }
+            | Fact::SweepMoved { run, .. } => runs.push(*run),
             Fact::RunForgotten { run } => {
                 let known = self.state.runs.get(run).into_iter();
                 self.touched.extend(known.flat_map(|run| &run.stages).filter_map(Status::key));
@@ -152,6 +153,11 @@ impl<'a> Deciding<'a> {
                 }
                 None => self.record(Fact::SweepBegun { run: number, sweep: Box::new(Clone::clone(&**sweep)) }),
             }
+        }
+        let places: BTreeSet<usize> = before.resolved.keys().chain(after.resolved.keys()).copied().collect();
+        for stage in places.into_iter().filter(|place| before.resolved.get(place) != after.resolved.get(place)) {
+            let digests = after.resolved.get(&stage).cloned().unwrap_or_default();
+            self.record(Fact::Resolved { run: number, stage, digests });
         }
         let is_new = |(i, status): &(usize, &Status)| before.stages.get(*i).unwrap_or(&Status::Waiting) != *status;
         let stages: Vec<(usize, Status)> =

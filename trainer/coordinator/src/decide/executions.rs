@@ -9,6 +9,7 @@ use registry::Write;
 use super::deciding::Deciding;
 use crate::event::Effect;
 use crate::fact::Fact;
+use crate::register::Registration;
 use crate::rejected::Rejected;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::task::Task;
@@ -38,9 +39,9 @@ impl Deciding<'_> {
                 self.record(Fact::ExecutionState { key, state });
             }
             (None, Some(registration)) => {
-                let candidates = registration.candidates.clone();
+                let effect = self.registering(&execution, registration);
                 self.record(Fact::ExecutionState { key, state: ExecutionState::Bundling });
-                self.effects.push(Effect::Register { key, candidates });
+                self.effects.push(effect);
             }
             (None, None) => {
                 let fence = self.state.fence;
@@ -83,6 +84,14 @@ impl Deciding<'_> {
         }
     }
 
+    /// The effect that makes a registration's bundles.
+    pub(crate) fn registering(&self, execution: &StageExecution, registration: &Registration) -> Effect {
+        let owner = self.state.registrant(execution).map(|run| run.owner.clone()).unwrap_or_default();
+        let promotes = registration.promote.as_ref().map(|(alias, _)| alias.clone());
+        let candidates = registration.candidates.clone();
+        Effect::Register { key: execution.key, candidates, promotes, owner }
+    }
+
     pub(crate) fn bundled(&mut self, key: Digest, bundles: &[Digest]) -> Result<bool, Rejected> {
         if self.state.executions.get(&key).is_none_or(|execution| execution.state != ExecutionState::Bundling) {
             return Ok(false);
@@ -93,7 +102,12 @@ impl Deciding<'_> {
         if bundles.len() != registration.candidates.len() {
             return Err(Rejected::Invalid(format!("stage `{}` needs a bundle for each candidate", execution.stage)));
         }
-        let (known, mut writes) = registration.writes(&execution.run, &execution.stage, bundles);
+        let Some(run) = self.state.registrant(&execution).cloned() else {
+            // In whose name it was to happen has been cancelled meanwhile.
+            self.fail_execution(key, "no run waits for this registration".to_owned(), false);
+            return Ok(true);
+        };
+        let (known, mut writes) = registration.writes(&run, &execution.stage, bundles);
         writes.push(result(&execution, None, &known, now));
         let state = ExecutionState::Done { known: Arc::new(known), cached: false };
         self.record(Fact::ExecutionState { key, state });

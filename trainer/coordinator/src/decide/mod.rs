@@ -15,6 +15,7 @@ pub(crate) mod attempts;
 pub(crate) mod deciding;
 pub(crate) mod executions;
 mod forget;
+mod gangs;
 mod mending;
 mod runs;
 mod start;
@@ -67,10 +68,10 @@ impl Deciding<'_> {
     fn happen(&mut self, event: Event) -> Result<bool, Rejected> {
         match event {
             Event::Started { alone, park } => self.started(alone, park),
-            Event::Submit { pipeline, source, idempotency_key, until } => {
-                return self.submit(*pipeline, source, idempotency_key, until);
+            Event::Submit { pipeline, source, idempotency_key, until, owner } => {
+                return self.submit(*pipeline, source, idempotency_key, until, owner);
             }
-            Event::Join { join } => self.join(join)?,
+            Event::Join { join, by } => self.join(join, by)?,
             Event::WorkerBack { worker } => return self.sign(&worker, Sign::Back),
             Event::WorkerReady { worker, incarnation, tasks } => return self.ready(worker, incarnation, tasks),
             Event::LeaseExpired { worker, incarnation } => {
@@ -86,13 +87,17 @@ impl Deciding<'_> {
                 }
                 self.record(Fact::WorkerForgotten { worker });
             }
-            Event::WorkerGone { worker } => {
+            Event::WorkerGone { worker, incarnation } => {
+                if let Some(incarnation) = incarnation {
+                    self.state.process(&worker, incarnation)?;
+                }
                 if !self.sign(&worker, Sign::Gone)? {
                     return Ok(false);
                 }
                 self.drop_worker(&worker, Loss::Lost);
             }
-            Event::PeersLost { grant, lost } => return self.peers_lost(&grant, &lost),
+            Event::GangDivided { task, fence } => return self.gang_divided(&task, fence),
+            Event::GangStalled { task, fence } => return self.gang_stalled(&task, fence),
             Event::Checkpoint { commit } => return self.checkpoint(commit),
             Event::Outcome { report } => return self.outcome(report),
             Event::Control { run, action, archived } => return self.control(&run, action, archived),

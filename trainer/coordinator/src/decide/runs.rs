@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use protocol::message::RunState;
 use protocol::pipeline::Pipeline;
-use protocol::{RunId, StageName, limits};
+use protocol::{Owner, RunId, StageName, limits};
 use registry::Write;
 
 use super::deciding::Deciding;
@@ -22,6 +22,7 @@ impl Deciding<'_> {
         source: String,
         key: Option<String>,
         until: Option<StageName>,
+        owner: Owner,
     ) -> Result<bool, Rejected> {
         // A run that has ended is found in the tables, before the event.
         let twin = key.as_ref().and_then(|key| self.state.idempotent.get(key));
@@ -30,11 +31,17 @@ impl Deciding<'_> {
             return Ok(false);
         }
         check_pipeline(&pipeline, until.as_ref())?;
+        let run = Run::new(self.state.submitted + 1, owner, Arc::new(pipeline), key, until);
+        if let Some(id) = self.interrupted_twin(&run) {
+            self.control(&id, Control::Resume, None)?;
+            self.effects.push(Effect::Submitted(id));
+            return Ok(true);
+        }
         self.check_room()?;
-        let run = Run::new(self.state.submitted + 1, Arc::new(pipeline), key, until);
-        let parked: Vec<u64> = self.state.parked.iter().copied().collect();
-        for old in parked.iter().filter_map(|number| self.state.runs.get(number).cloned()).collect::<Vec<_>>() {
-            if old.state == RunState::Paused && old.submitted.digest() == run.submitted.digest() {
+        for old in self.interrupted() {
+            // Another owner's run waits for its owner.
+            let is_its_own = run.owner.controls(&old.owner.group());
+            if is_its_own && old.submitted.digest() == run.submitted.digest() {
                 self.change_run(old.number, |old| old.skip_rest(&format!("taken over by run `{}`", run.id)));
                 self.set_run_state(old.number, RunState::Cancelled, old.parked);
             }
@@ -46,6 +53,7 @@ impl Deciding<'_> {
             state: word(run.state),
             idempotency_key: run.idempotency_key.clone(),
         });
+        self.writes.push(Write::RunOwner { run: run.id.clone(), owner: run.owner.group() });
         self.effects.push(Effect::Submitted(run.id.clone()));
         self.record(Fact::Run { run: Box::new(run) });
         Ok(true)
@@ -58,6 +66,25 @@ impl Deciding<'_> {
             return Ok(());
         }
         Err(Rejected::Full(format!("{live} runs have not ended; expected at most {most}")))
+    }
+
+    /// Interrupted runs in the order of their submission.
+    fn interrupted(&self) -> Vec<Arc<Run>> {
+        let parked = self.state.parked.iter().filter_map(|number| self.state.runs.get(number));
+        parked.filter(|old| old.is_interrupted()).cloned().collect()
+    }
+
+    /// The newest interrupted run that asks for the same as `run`, which has no client's key.
+    fn interrupted_twin(&self, run: &Run) -> Option<RunId> {
+        if run.idempotency_key.is_some() {
+            return None;
+        }
+        let same = |old: &&Arc<Run>| {
+            run.owner.controls(&old.owner.group())
+                && old.until == run.until
+                && old.submitted.digest() == run.submitted.digest()
+        };
+        self.interrupted().iter().rev().find(same).map(|old| old.id.clone())
     }
 
     pub(crate) fn control(

@@ -32,8 +32,7 @@ impl Deciding<'_> {
                 ExecutionState::Looking => self.effects.push(Effect::Lookup { key }),
                 ExecutionState::Bundling => {
                     let registration = execution.registration.as_ref().expect("bundling is registering");
-                    let candidates = registration.candidates.clone();
-                    self.effects.push(Effect::Register { key, candidates });
+                    self.effects.push(self.registering(&execution, registration));
                 }
                 ExecutionState::Open
                 | ExecutionState::Mending { .. }

@@ -15,6 +15,8 @@ use super::actor_handle::{ActorHandle, Reply};
 use super::allowances::Allowances;
 use super::blocking::blocking;
 use super::effects;
+use super::secrets::Secrets;
+use super::token_table::TokenTable;
 use crate::batch::{Ask, Batches, Done, Turn};
 use crate::journal::{self, Recovered};
 use crate::state::State;
@@ -46,11 +48,18 @@ impl Entropy {
 }
 
 /// Starts the actor on a recovered state.
-pub(crate) fn start(store: Store, recovered: Recovered, allowances: Allowances) -> (Arc<ActorHandle>, JoinHandle<()>) {
+pub(crate) fn start(
+    store: Store,
+    recovered: Recovered,
+    secrets: Secrets,
+    tokens: Arc<TokenTable>,
+    allowances: Allowances,
+) -> (Arc<ActorHandle>, JoinHandle<()>) {
     let Recovered { snapshot, state } = recovered;
     let (now, snapshot_at) = (state.now, state.seq);
     let batches = Batches::new(state);
-    let (actor_handle, queue) = ActorHandle::new(store, now, Arc::clone(batches.front()), snapshot, allowances);
+    let front = Arc::clone(batches.front());
+    let (actor_handle, queue) = ActorHandle::new(store, secrets, now, front, tokens, snapshot, allowances);
     let actor_handle = Arc::new(actor_handle);
     let moments = Moments { actor_handle: Arc::clone(&actor_handle), entropy: Entropy::new() };
     let actor = Actor { actor_handle: Arc::clone(&actor_handle), batches, moments, snapshot_at, snapshot: None };
@@ -102,7 +111,7 @@ impl Actor {
             fail::fail_point!("actor::decide");
             let mut turn = self.batches.decide(|| self.moments.next());
             while let Turn::Store(writes) = turn {
-                let written = self.actor_handle.store.write(writes).await;
+                let written = self.actor_handle.store.write_proven(writes).await;
                 self.actor_handle.wrote(&written);
                 turn = self.batches.stored(written, || self.moments.next());
             }

@@ -5,20 +5,26 @@ use std::panic::AssertUnwindSafe;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use futures::FutureExt as _;
-use protocol::message::{Poll, RunView, Submit};
+use protocol::message::{Poll, RunView, StorageProblem, Submit};
 use protocol::pipeline::Pipeline;
-use protocol::{RunId, WorkerId, limits};
-use registry::{QueryError, ReadStore, Store, WriteError};
+use protocol::stage::Register;
+use protocol::{Alias, Digest, Group, ModelName, Owner, RunId, WorkerId, limits};
+use registry::{Proof, QueryError, ReadStore, Store, WriteError};
 use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 
 use super::allowances::Allowances;
 use super::blocking::blocking;
-use super::clock::Clock;
+use super::clock::{Clock, wall_clock, wall_ms};
 use super::records::{Records, read};
+use super::secrets::Secrets;
+use super::storage::{self, unless_away};
+use super::token_table::TokenTable;
 use super::versions::resolve_versions;
+use super::vouching::Reach;
 use crate::batch::{Ask, Front, Refused};
 use crate::event::{Effect, Event, Observation};
+use crate::outcome::refused_for_good;
 use crate::rejected::Rejected;
 use crate::state::State;
 use crate::state::run::Control;
@@ -46,19 +52,25 @@ pub(crate) struct ActorHandle {
     /// The state of the newest snapshot that is stored.
     pub(super) snapshot: tokio::sync::Mutex<Arc<State>>,
     changed: watch::Sender<u64>,
-    trouble: Mutex<Option<String>>,
+    trouble: Mutex<Option<StorageProblem>>,
     failure: OnceLock<String>,
     stop: watch::Sender<bool>,
     clock: Clock,
+    /// Who may do what now.
+    pub(crate) tokens: Arc<TokenTable>,
     pub(crate) store: Store,
+    pub(crate) secrets: Secrets,
+    pub(crate) reach: Arc<Reach>,
 }
 
 impl ActorHandle {
     /// A handle, and the queue of what is asked through it.
     pub(super) fn new(
         store: Store,
+        secrets: Secrets,
         now: Millis,
         front: Arc<Front>,
+        tokens: Arc<TokenTable>,
         snapshot: State,
         allowances: Allowances,
     ) -> (Self, mpsc::Receiver<(Ask, Reply)>) {
@@ -77,7 +89,10 @@ impl ActorHandle {
             failure: OnceLock::new(),
             stop: watch::Sender::new(false),
             clock: Clock::new(now),
+            tokens,
             store,
+            secrets,
+            reach: Arc::default(),
         };
         (handle, queue)
     }
@@ -99,9 +114,46 @@ impl ActorHandle {
         self.failure.get().map_or(Refused::Stopped, |failure| Refused::Failed(failure.clone()))
     }
 
-    /// Decides an event; returns once it is stored.
+    /// Decides an event; returns once it is stored. What rows are to name is proven whole before it is queued, so that nobody but the
+    /// asker waits for the place where the blobs lie.
     pub(crate) async fn decide(&self, event: Event) -> Result<Vec<Effect>, Refused> {
-        self.ask(Ask::Event(Box::new(event))).await
+        let mut artifacts = event.artifacts();
+        if artifacts.is_empty() {
+            return self.ask(Ask::Event(Box::new(event))).await;
+        }
+        loop {
+            let mut proofs = Vec::with_capacity(artifacts.len());
+            for artifact in &artifacts {
+                match self.prove(*artifact).await {
+                    Ok(proof) => proofs.push(proof),
+                    Err(error) => return Err(self.refused(&event, error).await),
+                }
+            }
+            match self.ask(Ask::Event(Box::new(event.clone()))).await {
+                // It names what was committed before; or a collection has come between.
+                Err(Refused::Write(WriteError::Unproven { artifact })) => {
+                    if !artifacts.contains(&artifact) {
+                        artifacts.push(artifact);
+                    }
+                }
+                decided => return decided,
+            }
+        }
+    }
+
+    async fn prove(&self, artifact: Digest) -> Result<Proof, WriteError> {
+        let proven = unless_away(&self.store, self.store.prove(artifact)).await;
+        proven.map_err(|away| WriteError::Unreachable(away.to_string()))?
+    }
+
+    /// What is decided instead of an event that names what is not whole, and never will be; gives why it was refused.
+    async fn refused(&self, event: &Event, error: WriteError) -> Refused {
+        let Some(instead) = refused_for_good(event, &error) else { return error.into() };
+        tracing::warn!(%error, "refused, for what it names is not whole");
+        match self.ask(Ask::Event(Box::new(instead))).await {
+            Ok(_) => error.into(),
+            Err(refused) => refused,
+        }
     }
 
     /// Takes note of what was heard, and decides what follows from it.
@@ -117,8 +169,9 @@ impl ActorHandle {
         }
     }
 
-    /// Submits a pipeline.
-    pub(crate) async fn submit(&self, submit: Submit) -> Result<RunId, Refused> {
+    /// Submits a pipeline of `owner`, who sees the models of the group `sees`, or all.
+    pub(crate) async fn submit(&self, mut submit: Submit, owner: Owner, sees: Option<Group>) -> Result<RunId, Refused> {
+        submit.idempotency_key = submit.idempotency_key.map(|key| owner.group().key(&key));
         // Beside the threads that answer heartbeats: a large one takes a while.
         let read = blocking(move || {
             let pipeline: Pipeline = serde_json::from_value(submit.pipeline)
@@ -133,7 +186,9 @@ impl ActorHandle {
         {
             return Ok(row.run);
         }
-        resolve_versions(&mut pipeline, &self.store).await.map_err(|error| match error {
+        self.check_registrations(&pipeline, &owner).await?;
+        let seen = self.seen_store(sees.as_ref());
+        resolve_versions(&mut pipeline, &seen).await.map_err(|error| match error {
             QueryError::NotFound(why) | QueryError::Invalid(why) => Refused::from(Rejected::Invalid(why)),
             error => Refused::from(WriteError::from(error)),
         })?;
@@ -142,6 +197,7 @@ impl ActorHandle {
             source: submit.source,
             idempotency_key: submit.idempotency_key.clone(),
             until: submit.until,
+            owner,
         };
         let mut tries = 0;
         loop {
@@ -163,6 +219,54 @@ impl ActorHandle {
                     return Ok(run.expect("a submission gives a run"));
                 }
             }
+        }
+    }
+
+    /// Refuses a pipeline that would move an alias or add to a model that is not its owner's to change.
+    async fn check_registrations(&self, pipeline: &Pipeline, owner: &Owner) -> Result<(), Refused> {
+        for stage in &pipeline.stages {
+            let Some(settings) = stage.settings.get::<Register>() else { continue };
+            let forbidden = |why: &str| Rejected::Forbidden(format!("stage `{}`: {why}", stage.name));
+            let invalid = |e: protocol::id::ParseNameError| Rejected::Invalid(format!("stage `{}`: {e}", stage.name));
+            let model: ModelName = settings.model.parse().map_err(invalid)?;
+            if self.store.model(&model).await.map_err(WriteError::from)?.is_some() {
+                let group = self.model_owner(&model).await?;
+                if !owner.admin && group.as_ref().is_none_or(|group| !owner.controls(group)) {
+                    return Err(forbidden(&format!("model `{model}` belongs to another owner")).into());
+                }
+            }
+            if settings.promote.to.is_empty() {
+                continue;
+            }
+            let alias: Alias = settings.promote.to.parse().map_err(invalid)?;
+            self.may_promote(owner, &alias).map_err(|why| forbidden(&format!("`promote.to: {alias}`: {why}")))?;
+        }
+        Ok(())
+    }
+
+    /// Why the token of a run's owner may not move an alias of its own models now.
+    pub(crate) fn may_promote(&self, owner: &Owner, alias: &Alias) -> Result<(), String> {
+        self.tokens.current().may_move(owner.into(), alias, Some(&owner.group()), wall_clock().0)
+    }
+
+    /// The group that a model belongs to.
+    pub(crate) async fn model_owner(&self, model: &ModelName) -> Result<Option<Group>, WriteError> {
+        Ok(self.store.model_owners(Some(model)).await?.remove(model))
+    }
+
+    /// The group that a run belongs to, whether it is in memory or has ended.
+    pub(crate) async fn run_owner(&self, run: &RunId) -> Result<Option<Group>, WriteError> {
+        match self.state().run(run) {
+            Ok(run) => Ok(Some(run.owner.group())),
+            Err(_) => Ok(self.store.run_owners(std::slice::from_ref(run)).await?.remove(run)),
+        }
+    }
+
+    /// The store as one who sees the group `sees`, or all, sees it.
+    pub(crate) fn seen_store(&self, sees: Option<&Group>) -> ReadStore {
+        match sees {
+            Some(group) => self.store.seen_by(group),
+            None => ReadStore::clone(&self.store),
         }
     }
 
@@ -195,7 +299,13 @@ impl ActorHandle {
     /// What there is to tell of runs now. The state is read before the tables: a run that ends in between is in both, and not in
     /// neither.
     pub(crate) fn records(&self) -> Records {
-        Records::new(ReadStore::clone(&self.store), self.state(), self.now())
+        self.records_for(None)
+    }
+
+    /// The same, for one who sees the group `sees`, or all.
+    pub(crate) fn records_for(&self, sees: Option<Group>) -> Records {
+        let (state, now) = (self.state(), self.now());
+        Records::new(self.seen_store(sees.as_ref()), state, now, sees)
     }
 
     /// The newest stored state.
@@ -215,7 +325,14 @@ impl ActorHandle {
 
     /// Why the store takes no writes, if it does not.
     pub(crate) fn trouble(&self) -> Option<String> {
-        self.trouble.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        let trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner);
+        trouble.as_ref().map(|problem| problem.what.clone())
+    }
+
+    /// What is wrong with the store's disk or with the place where its blobs lie.
+    pub(crate) fn storage(&self) -> Option<StorageProblem> {
+        let trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        trouble.or_else(|| storage::problem(&self.store))
     }
 
     /// What has panicked, if something has.
@@ -253,8 +370,10 @@ impl ActorHandle {
         let mut trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner);
         match result {
             Ok(_) => *trouble = None,
-            Err(WriteError::Storage(message)) => *trouble = Some(message.clone()),
-            Err(error @ WriteError::Superseded { .. }) => *trouble = Some(error.to_string()),
+            Err(error @ (WriteError::Storage(_) | WriteError::Superseded { .. })) => {
+                let since_ms = trouble.as_ref().map_or_else(wall_ms, |problem| problem.since_ms);
+                *trouble = Some(StorageProblem { since_ms, what: error.to_string() });
+            }
             Err(_) => {}
         }
     }

@@ -14,6 +14,7 @@ use axum::{Router, middleware};
 use protocol::limits;
 
 use super::actor_handle::ActorHandle;
+use super::audit;
 use super::auth::{self, Gate};
 use super::failure::Failure;
 use super::route::Route;
@@ -61,7 +62,7 @@ fn table() -> Vec<Entry> {
         entry("GET",  "/v1/runs/{run}/logs",       &[Read],         CALL,                     SHORT, queries::logs),
         entry("GET",  "/v1/runs/{run}/metrics",    &[Read],         CALL,                     SHORT, queries::metrics),
         entry("POST", "/v1/runs/{run}/{action}",   &[Submit],       CALL,                     SHORT, queries::control),
-        entry("POST", "/v1/bundles",               &[Promote],      limits::BUNDLE_BYTES,     LONG,  bundles::import),
+        entry("POST", "/v1/bundles",               &[Submit],       limits::BUNDLE_BYTES,     LONG,  bundles::import),
         entry("POST", "/v1/registry", &[Read, Promote, Admin],      CALL,                     LONG,  queries::registry),
     ]
 }
@@ -84,6 +85,7 @@ pub(crate) fn router(actor_handle: Arc<ActorHandle>, gate: &Arc<Gate>) -> Router
         .fallback(|| async { Failure::new(StatusCode::NOT_FOUND, "not-found", "there is no such address".to_owned()) })
         .layer(middleware::from_fn_with_state(Arc::clone(&actor_handle), until_failed))
         .layer(middleware::from_fn_with_state(Arc::clone(gate), auth::check_host))
+        .layer(middleware::from_fn_with_state(Arc::clone(&gate.audit), audit::note))
         .with_state(actor_handle)
 }
 

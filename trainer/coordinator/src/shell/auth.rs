@@ -7,7 +7,7 @@ use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use access::{Caller, Scope, Tokens};
+use access::{Caller, Scope};
 use axum::body::Body;
 use axum::extract::{Request, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
@@ -16,16 +16,21 @@ use axum::response::{IntoResponse, Response};
 use protocol::limits;
 use tokio::sync::Semaphore;
 
+use super::audit::{Admitted, Audit};
 use super::failure::Failure;
 use super::listener::Peer;
 use super::paced::Paced;
 use super::rate::Rates;
+use super::revocable::Revocable;
 use super::route::Route;
+use super::token_table::{Standing, TokenTable, Unknown};
 
 /// What the door knows.
 #[derive(Debug)]
 pub(crate) struct Gate {
-    tokens: Tokens,
+    pub(crate) tokens: Arc<TokenTable>,
+    /// Calls to be logged.
+    pub(crate) audit: Arc<Audit>,
     /// Names by which this server may be asked; addresses always may.
     hosts: Vec<String>,
     /// Kibibytes of calls that may be in memory.
@@ -34,7 +39,7 @@ pub(crate) struct Gate {
 }
 
 impl Gate {
-    pub(crate) fn new(tokens: Tokens, hosts: &[String], calls: u32) -> Self {
+    pub(crate) fn new(tokens: Arc<TokenTable>, hosts: &[String], calls: u32) -> Self {
         let mut names = vec!["localhost".to_owned()];
         if let Ok(own) = nix::unistd::gethostname()
             && let Ok(own) = own.into_string()
@@ -43,17 +48,15 @@ impl Gate {
             names.push(own);
         }
         names.extend(hosts.iter().cloned());
-        Self {
-            tokens,
-            hosts: names,
-            bodies: Arc::new(Semaphore::new(limits::CALLS_BYTES >> 10)),
-            rates: Rates::new(calls),
-        }
+        let bodies = Arc::new(Semaphore::new(limits::CALLS_BYTES >> 10));
+        Self { tokens, audit: Arc::default(), hosts: names, bodies, rates: Rates::new(calls) }
     }
 
-    fn caller(&self, headers: &HeaderMap) -> Option<&Arc<Caller>> {
-        let (scheme, token) = headers.get(header::AUTHORIZATION)?.to_str().ok()?.split_once(' ')?;
-        scheme.eq_ignore_ascii_case("bearer").then(|| self.tokens.find(token))?
+    /// The caller whose token the headers bear, and its right to be answered.
+    fn caller(&self, headers: &HeaderMap) -> Result<(Arc<Caller>, Standing), Unknown> {
+        let token = bearer(headers).ok_or(Unknown::Nobody)?;
+        let caller = self.tokens.find(token)?;
+        Ok((Arc::clone(&caller), Standing::new(Arc::clone(&self.tokens), token, caller)))
     }
 
     /// Refuses more calls a second than a token may make that is no worker's. Workers are bounded by what they wait for.
@@ -94,6 +97,11 @@ impl Gate {
     }
 }
 
+fn bearer(headers: &HeaderMap) -> Option<&str> {
+    let (scheme, token) = headers.get(header::AUTHORIZATION)?.to_str().ok()?.split_once(' ')?;
+    scheme.eq_ignore_ascii_case("bearer").then_some(token)
+}
+
 /// Refuses what a browser was made to send.
 pub(crate) async fn check_host(State(gate): State<Arc<Gate>>, request: Request, next: Next) -> Response {
     match gate.refuses(request.headers()) {
@@ -103,15 +111,25 @@ pub(crate) async fn check_host(State(gate): State<Arc<Gate>>, request: Request, 
 }
 
 /// Lets a request pass to `route` if it bears a token with one of the route's scopes. Nothing of its body is read before.
-pub(crate) async fn admit(
-    State((gate, route)): State<(Arc<Gate>, Route)>,
+pub(crate) async fn admit(State((gate, route)): State<(Arc<Gate>, Route)>, request: Request, next: Next) -> Response {
+    let admitted = gate.caller(request.headers());
+    let caller = admitted.as_ref().ok().map(|(caller, _)| Arc::clone(caller));
+    let mut response = match admitted {
+        Ok((caller, standing)) => admitted_call(&gate, route, caller, standing, request, next).await,
+        Err(unknown) => closing(unauthorized(&unknown)),
+    };
+    response.extensions_mut().insert(Admitted { caller, route });
+    response
+}
+
+async fn admitted_call(
+    gate: &Arc<Gate>,
+    route: Route,
+    caller: Arc<Caller>,
+    standing: Standing,
     mut request: Request,
     next: Next,
 ) -> Response {
-    let Some(caller) = gate.caller(request.headers()).cloned() else {
-        let failure = Failure::new(StatusCode::UNAUTHORIZED, "unauthorized", "this server wants a token".to_owned());
-        return closing(failure.hint("give it with --token-file, --token, STRIDE_TOKEN_FILE or STRIDE_TOKEN"));
-    };
     if let Some(peer) = request.extensions().get::<Arc<Peer>>()
         && let Err(failure) = peer.is_known(&caller)
     {
@@ -129,12 +147,32 @@ pub(crate) async fn admit(
     }
     let extensions = request.extensions_mut();
     extensions.insert(caller);
-    extensions.insert(Arc::clone(&gate));
+    extensions.insert(Arc::clone(gate));
     extensions.insert(route);
+    extensions.insert(standing.clone());
     let request = request.map(|body| Body::new(Paced::new(body)));
-    match tokio::time::timeout(route.time, next.run(request)).await {
-        Ok(response) => response,
+    let answered = tokio::select! {
+        biased;
+        () = standing.clone().lost() => return closing(unauthorized(&Unknown::Nobody)),
+        answered = tokio::time::timeout(route.time, next.run(request)) => answered,
+    };
+    match answered {
+        Ok(response) => response.map(|body| Body::new(Revocable::new(body, standing))),
         Err(_) => closing(late(route.time)),
+    }
+}
+
+fn unauthorized(unknown: &Unknown) -> Failure {
+    match unknown {
+        Unknown::Nobody => {
+            Failure::new(StatusCode::UNAUTHORIZED, "unauthorized", "this server wants a token".to_owned())
+                .hint("give it with --token-file, --token, STRIDE_TOKEN_FILE or STRIDE_TOKEN")
+        }
+        Unknown::Expired(caller) => {
+            let at = caller.expires.as_ref().map(ToString::to_string).unwrap_or_default();
+            let message = format!("the token of `{}` has expired: its line says `expires={at}`", caller.name);
+            Failure::new(StatusCode::UNAUTHORIZED, "unauthorized", message).hint("ask for another token")
+        }
     }
 }
 
@@ -166,7 +204,8 @@ mod tests {
 
     #[test]
     fn names_must_be_ours_and_addresses_may_be_any() {
-        let gate = Gate::new(Tokens::default(), &["stride.lab".to_owned()], 1);
+        let tokens = Arc::new(TokenTable::new(access::Tokens::default(), Vec::new()));
+        let gate = Gate::new(tokens, &["stride.lab".to_owned()], 1);
         for ours in ["127.0.0.1:7700", "localhost", "LOCALHOST:1", "[::1]:7700", "10.0.0.7", "stride.lab:7700"] {
             assert!(gate.is_ours(ours), "{ours}");
         }

@@ -9,6 +9,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
+use access::Caller;
+use axum::Extension;
 use axum::Json;
 use axum::body::Body;
 use axum::extract::{Query, State};
@@ -45,6 +47,7 @@ impl Drop for Spool {
 
 pub(crate) async fn import(
     State(actor_handle): State<Arc<ActorHandle>>,
+    Extension(caller): Extension<Arc<Caller>>,
     Query(query): Query<BundleQuery>,
     body: Body,
 ) -> Result<Json<registry::cli::Answer>, Failure> {
@@ -56,7 +59,8 @@ pub(crate) async fn import(
     let file = blocking(move || std::fs::create_dir_all(&dir).and_then(|()| File::create(&path))).await;
     receive(file.map_err(stored)?, body).await?;
     // The caller knows what its file is called.
-    Ok(Json(registry::cli::import(&actor_handle.store, &spool.0, "bundle", query.model.as_deref()).await))
+    let model = query.model.as_deref();
+    Ok(Json(registry::cli::import(&actor_handle.store, &spool.0, "bundle", model, caller.owner()).await))
 }
 
 async fn receive(mut file: File, body: Body) -> Result<(), Failure> {

@@ -10,6 +10,11 @@ pub(super) fn wall_clock() -> Millis {
     Millis(u64::try_from(wall).unwrap_or(u64::MAX))
 }
 
+/// The machine's wall clock, as tables and messages say it.
+pub(super) fn wall_ms() -> i64 {
+    i64::try_from(wall_clock().0).unwrap_or(i64::MAX)
+}
+
 /// The machine's wall clock when the process started, and its monotonic clock since: a wall clock that is set while we run
 /// would end every lease.
 #[derive(Debug)]

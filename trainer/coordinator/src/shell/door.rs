@@ -20,6 +20,7 @@ use super::failure::Failure;
 use super::listener::{self, Connections, Listener};
 use super::route::Route;
 use super::start_error::StartError;
+use super::token_table::TokenTable;
 
 /// How long a call may take until its answer begins.
 const TIME: Duration = Duration::from_secs(60);
@@ -52,7 +53,8 @@ impl Door {
         let failed = |cause| StartError::Listen { address: config.listen, cause };
         let listener = Listener::bind(config.listen, config.tls.clone()).await.map_err(failed)?;
         let address = listener.address().map_err(failed)?;
-        let gate = Arc::new(Gate::new(config.tokens.clone(), &config.hosts, config.allowances.calls));
+        let tokens = Arc::new(TokenTable::new(config.tokens.clone(), Vec::new()));
+        let gate = Arc::new(Gate::new(tokens, &config.hosts, config.allowances.calls));
         Ok(Self { listener, address, tls: config.tls.is_some(), connections: config.connections.clone(), gate })
     }
 

@@ -3,15 +3,14 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use checkpoint::model;
+use checkpoint::{BlobError, model};
 use protocol::artifact::Role;
-use protocol::{Digest, RunId, StageName, TaskId};
-use registry::blob::{IDLE, Protected};
+use protocol::{Alias, Digest, Owner, RunId, StageName, TaskId};
+use registry::blob::{IDLE, ManifestError, Protected};
 use registry::{BlobStore, QueryError};
 use tokio::sync::watch;
 
 use super::actor_handle::ActorHandle;
-use super::blocking::blocking;
 use crate::batch::Refused;
 use crate::event::{Effect, Event, Observation};
 use crate::value::{Candidate, Known};
@@ -31,8 +30,8 @@ pub(crate) fn perform(actor_handle: &Arc<ActorHandle>, effect: &Effect) {
             let looking = look_up(Arc::clone(&actor_handle), key);
             drop(actor_handle.spawn("a look for a stage's value", looking));
         }
-        Effect::Register { key, candidates } => {
-            let registering = register(Arc::clone(&actor_handle), key, candidates);
+        Effect::Register { key, candidates, promotes, owner } => {
+            let registering = register(Arc::clone(&actor_handle), key, candidates, promotes, owner);
             drop(actor_handle.spawn("the registration of a model", registering));
         }
         Effect::Prune { task, keep } => drop(tokio::spawn(async move {
@@ -96,43 +95,87 @@ async fn looked_up(actor_handle: &ActorHandle, key: Digest) -> Result<Event, Que
 async fn known(actor_handle: &ActorHandle, key: Digest) -> Result<Option<(Known, (RunId, StageName))>, QueryError> {
     let Some(row) = actor_handle.store.stage_result(key).await? else { return Ok(None) };
     let (blobs, outputs) = (actor_handle.store.blobs().clone(), row.outputs.clone());
-    let flaw = blocking(move || outputs.values().find_map(|output| blobs.flaw(*output).transpose()).transpose());
-    let flaw = flaw.await.map_err(|e| QueryError::Blob(e.to_string()))?;
+    let look = move || outputs.values().find_map(|output| blobs.flaw(*output).transpose()).transpose();
+    let flaw = actor_handle.store.ask_blobs(look).await.map_err(|e| QueryError::Blob(e.to_string()))?;
     if let Some(flaw) = &flaw {
         tracing::warn!(%key, "a stage's value is known but not whole in the store; it is made again: {flaw}");
+        if let Err(error) = actor_handle.store.doubt(flaw).await {
+            tracing::warn!(%key, %error, "what is missing of the value still counts as stored");
+        }
     }
     let known = Known { outputs: row.outputs, metrics: row.metrics };
     Ok(flaw.is_none().then_some((known, (row.run, row.stage))))
 }
 
-async fn register(actor_handle: Arc<ActorHandle>, key: Digest, candidates: Vec<Candidate>) {
-    let blobs = actor_handle.store.blobs().clone();
-    let event = match blocking(move || bundles(&blobs, &candidates)).await {
+async fn register(
+    actor_handle: Arc<ActorHandle>,
+    key: Digest,
+    candidates: Vec<Candidate>,
+    promotes: Option<Alias>,
+    owner: Owner,
+) {
+    // The token may have been revoked, or the alias protected, since the run was submitted.
+    if let Some(alias) = promotes
+        && let Err(why) = actor_handle.may_promote(&owner, &alias)
+    {
+        let message = format!("`promote.to: {alias}`: {why}; nothing was registered");
+        return tell(&actor_handle, Event::RegisterRefused { key, message }).await;
+    }
+    loop {
+        match try_to_register(&actor_handle, key, &candidates).await {
+            Ok(()) => return,
+            Err(away) => tracing::warn!(%key, %away, "cannot register a model; trying again"),
+        }
+        tokio::time::sleep(RETRY).await;
+    }
+}
+
+async fn try_to_register(actor_handle: &ActorHandle, key: Digest, candidates: &[Candidate]) -> Result<(), Unbundled> {
+    let (blobs, candidates) = (actor_handle.store.blobs().clone(), candidates.to_vec());
+    let event = match actor_handle.store.ask_blobs(move || bundles(&blobs, &candidates)).await {
         Ok((bundles, protected)) => {
-            tell(&actor_handle, Event::Bundled { key, bundles }).await;
+            tell(actor_handle, Event::Bundled { key, bundles }).await;
             // Rows name them by now.
             drop(protected);
-            return;
+            return Ok(());
         }
-        Err(message) => Event::RegisterRefused { key, message },
+        Err(Unbundled::Refused(message)) => Event::RegisterRefused { key, message },
+        Err(away @ Unbundled::Away(_)) => return Err(away),
     };
-    tell(&actor_handle, event).await;
+    tell(actor_handle, event).await;
+    Ok(())
+}
+
+/// Why there are no bundles.
+#[derive(Debug, thiserror::Error)]
+enum Unbundled {
+    /// The place where the blobs lie does not answer.
+    #[error("{0}")]
+    Away(String),
+    /// They cannot be made.
+    #[error("{0}")]
+    Refused(String),
 }
 
 /// Stores the bundles, which are kept for as long as what comes with them lives.
-fn bundles(blobs: &BlobStore, candidates: &[Candidate]) -> Result<(Vec<Digest>, Vec<Protected>), String> {
+fn bundles(blobs: &BlobStore, candidates: &[Candidate]) -> Result<(Vec<Digest>, Vec<Protected>), Unbundled> {
     candidates
         .iter()
         .map(|candidate| {
-            let at =
-                |e: &dyn std::fmt::Display| format!("the model of stage `{}` cannot be made: {e}", candidate.stage);
-            let given = blobs.manifest(candidate.model).map_err(|e| at(&e))?;
-            let part =
-                |(role, digest): (&Role, &Digest)| Ok((role.clone(), blobs.manifest(*digest).map_err(|e| at(&e))?));
-            let parts = candidate.parts.iter().map(part).collect::<Result<_, String>>()?;
+            let at = |e: &dyn std::fmt::Display| {
+                Unbundled::Refused(format!("the model of stage `{}` cannot be made: {e}", candidate.stage))
+            };
+            let unread = |e: ManifestError| match e {
+                ManifestError::Blob(BlobError::Unreachable(why)) => Unbundled::Away(why),
+                e => at(&e),
+            };
+            let given = blobs.manifest(candidate.model).map_err(unread)?;
+            let part = |(role, digest): (&Role, &Digest)| Ok((role.clone(), blobs.manifest(*digest).map_err(unread)?));
+            let parts = candidate.parts.iter().map(part).collect::<Result<_, Unbundled>>()?;
             let model = model::extend(&given, candidate.sampler.as_ref(), &parts).map_err(|e| at(&e))?.to_bytes();
             let protected = blobs.protect(Digest::of(&model));
-            Ok((blobs.put(&model).map_err(|e| at(&e))?, protected))
+            let stored = blobs.put(&model).map_err(|e| unread(ManifestError::Blob(e)))?;
+            Ok((stored, protected))
         })
         .collect::<Result<Vec<_>, _>>()
         .map(|bundles| bundles.into_iter().unzip())

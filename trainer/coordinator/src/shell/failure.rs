@@ -69,6 +69,8 @@ impl From<Rejected> for Failure {
     fn from(rejected: Rejected) -> Self {
         let (status, code) = match rejected {
             Rejected::StaleFence { .. } => (StatusCode::CONFLICT, "stale-fence"),
+            Rejected::NameHeld(_) => (StatusCode::CONFLICT, "name-held"),
+            Rejected::Forbidden(_) => (StatusCode::FORBIDDEN, "forbidden"),
             Rejected::NotFound(_) => (StatusCode::NOT_FOUND, "not-found"),
             Rejected::Conflict(_) => (StatusCode::CONFLICT, "conflict"),
             Rejected::Invalid(_) => (StatusCode::BAD_REQUEST, "invalid"),
@@ -91,8 +93,11 @@ impl From<WriteError> for Failure {
             WriteError::NotFound(_) => Self::new(StatusCode::NOT_FOUND, "not-found", message),
             WriteError::Storage(_) => Self::new(StatusCode::INSUFFICIENT_STORAGE, "storage", message)
                 .hint("free some space or make the store writable, then `trainer resume`"),
+            WriteError::Unreachable(_) => Self::new(StatusCode::SERVICE_UNAVAILABLE, "unreachable", message),
             WriteError::Superseded { .. } => Self::new(StatusCode::SERVICE_UNAVAILABLE, "storage", message),
-            WriteError::Internal(_) => Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", message),
+            WriteError::Unproven { .. } | WriteError::Internal(_) => {
+                Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", message)
+            }
         }
     }
 }
@@ -134,6 +139,7 @@ impl From<BlobError> for Failure {
                 .hint("run the pipeline again: the stage that made it is computed anew, which mends it"),
             BlobError::Refused(_) => Self::new(StatusCode::CONFLICT, "stale-fence", message),
             BlobError::Unfit(_) => Self::new(StatusCode::PAYLOAD_TOO_LARGE, "too-large", message),
+            BlobError::Unreachable(_) => Self::new(StatusCode::SERVICE_UNAVAILABLE, "unreachable", message),
             BlobError::Unavailable(_) => Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", message),
         }
     }

@@ -8,7 +8,7 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::convert::Infallible;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
@@ -104,6 +104,7 @@ struct Stranger {
 #[derive(Debug)]
 pub(crate) struct Peer {
     id: u64,
+    from: IpAddr,
     crowd: Arc<Crowd>,
     leave: Arc<Notify>,
     /// The caller whose connections it counts against. Workers have no such limit.
@@ -112,7 +113,7 @@ pub(crate) struct Peer {
 
 impl Crowd {
     /// Takes a connection in, for which a stranger may have to go; `None` if everybody here is known.
-    fn enter(self: &Arc<Self>) -> Option<Arc<Peer>> {
+    fn enter(self: &Arc<Self>, from: IpAddr) -> Option<Arc<Peer>> {
         let mut strangers = self.strangers.lock().unwrap_or_else(PoisonError::into_inner);
         let full = self.open.load(Ordering::Relaxed) >= self.limits.most;
         if full || strangers.len() >= self.limits.strangers {
@@ -125,7 +126,7 @@ impl Crowd {
         self.open.fetch_add(1, Ordering::Relaxed);
         let (id, leave) = (self.next.fetch_add(1, Ordering::Relaxed), Arc::new(Notify::new()));
         strangers.insert(id, Stranger { since: Instant::now(), leave: Arc::clone(&leave) });
-        Some(Arc::new(Peer { id, crowd: Arc::clone(self), leave, client: OnceLock::new() }))
+        Some(Arc::new(Peer { id, from, crowd: Arc::clone(self), leave, client: OnceLock::new() }))
     }
 
     /// Sends the oldest stranger away.
@@ -145,6 +146,11 @@ impl Crowd {
 }
 
 impl Peer {
+    /// The address that it calls from.
+    pub(crate) fn from(&self) -> IpAddr {
+        self.from
+    }
+
     /// A good token was shown: this is no stranger any more.
     ///
     /// # Errors
@@ -236,8 +242,8 @@ pub(crate) async fn serve(
 async fn accept(listener: Listener, router: axum::Router, crowd: Arc<Crowd>) {
     let mut connections = JoinSet::new();
     loop {
-        let stream = match listener.tcp.accept().await {
-            Ok((stream, _)) => stream,
+        let (stream, from) = match listener.tcp.accept().await {
+            Ok(accepted) => accepted,
             Err(error) => {
                 // Mostly that there is no descriptor left.
                 tracing::warn!(%error, "cannot take a connection");
@@ -250,7 +256,7 @@ async fn accept(listener: Listener, router: axum::Router, crowd: Arc<Crowd>) {
         while let Some(wait) = crowd.wait() {
             tokio::time::sleep(wait).await;
         }
-        let Some(peer) = crowd.enter() else {
+        let Some(peer) = crowd.enter(from.ip()) else {
             connections.spawn(async move {
                 let _ = tokio::time::timeout(HANDSHAKE, turn_away(stream)).await;
             });

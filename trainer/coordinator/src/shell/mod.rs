@@ -7,6 +7,7 @@ mod actor;
 mod actor_handle;
 mod allowances;
 mod api;
+mod audit;
 mod auth;
 mod blocking;
 mod body;
@@ -21,18 +22,24 @@ mod polls;
 mod queries;
 mod rate;
 mod records;
+mod revocable;
 mod route;
+mod secrets;
 mod start_error;
+mod storage;
+mod token_table;
 mod uploads;
 mod versions;
+mod vouching;
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 
-use access::{Scopes, Token, Tokens};
-use protocol::message::{RunView, Submit};
-use protocol::{RunId, WorkerId};
+use access::{Caller, Scope, Scopes, Token, Tokens};
+use protocol::message::{FailureClass, ReportOutcome, RunView, Submit, TaskOutcome};
+use protocol::{Owner, RunId, WorkerId};
 use registry::Store;
+use registry::audit::AuditLog;
 use rustls::ServerConfig;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -51,10 +58,13 @@ use self::auth::Gate;
 pub use self::door::Door;
 use self::listener::Listener;
 pub use self::listener::{Connections, raise_descriptor_limit};
-pub use self::queries::{BlobStored, Submitted};
+pub use self::queries::Submitted;
 pub use self::records::{Records, RecordsError, StageMetrics};
 pub use self::route::Route;
+use self::secrets::Secrets;
 pub use self::start_error::StartError;
+pub use self::token_table::Standing;
+use self::token_table::TokenTable;
 pub use self::versions::resolve_versions;
 
 /// How a coordinator is run.
@@ -150,24 +160,37 @@ impl Coordinator {
             local = here.address().map_err(listen(config.listen))?;
             listeners.push(here);
         }
-        let (token, mut tokens) = (Token::random(), config.tokens.clone());
-        tokens.add(user(), Scopes::all(), &token);
+        let token = Token::random();
+        let worker_token = Token::random();
+        let own = vec![
+            (Caller::new(user(), Scopes::all()), token.clone()),
+            (Caller::new(OWN_WORKERS, Scopes::of(&[Scope::Worker])), worker_token.clone()),
+        ];
+        let tokens = Arc::new(TokenTable::new(config.tokens.clone(), own));
 
-        let (actor_handle, actor) = actor::start(store, recovered, config.allowances.clone());
+        let log = AuditLog::of(store.dir());
+        let secrets = Secrets::new(store.server_key().map_err(StartError::Key)?);
+        let (actor_handle, actor) =
+            actor::start(store, recovered, secrets, Arc::clone(&tokens), config.allowances.clone());
         actor_handle.decide(Event::Started { alone: config.alone, park: config.park }).await?;
         effects::let_go(&actor_handle);
         let (stop, stopped) = watch::channel(false);
         let tick = effects::tick(actor_handle.clone(), config.policy.tick_ms, stopped.clone());
         let clock = actor_handle.spawn("the clock", tick);
         let gate = Arc::new(Gate::new(tokens, &config.hosts, config.allowances.calls));
+        let audit = actor_handle.spawn("the audit log", audit::write(Arc::clone(&gate.audit), log, stopped.clone()));
         let router = api::router(actor_handle.clone(), &gate);
         let serve = listener::serve(listeners, router, config.connections.clone(), stopped);
         let server = actor_handle.spawn("the server", serve);
         tracing::info!(%address, "coordinator listens");
         let tls = config.tls.is_some();
-        Ok(Handle { address, local, tls, token, actor_handle, stop, tasks: vec![clock, server, actor] })
+        let tasks = vec![clock, server, audit, actor];
+        Ok(Handle { address, local, tls, token, worker_token, actor_handle, stop, tasks })
     }
 }
+
+/// The name of the token of workers that this process starts; no line of a token file can bear it.
+const OWN_WORKERS: &str = "own workers";
 
 /// The name of the user whom this process belongs to.
 fn user() -> String {
@@ -182,6 +205,7 @@ pub struct Handle {
     local: SocketAddr,
     tls: bool,
     token: Token,
+    worker_token: Token,
     actor_handle: Arc<ActorHandle>,
     stop: watch::Sender<bool>,
     tasks: Vec<JoinHandle<()>>,
@@ -208,9 +232,19 @@ impl Handle {
         &self.token
     }
 
+    /// A token for workers that this process starts: it allows what workers do. It lasts as long as this coordinator.
+    pub fn worker_token(&self) -> &Token {
+        &self.worker_token
+    }
+
     /// Submits a pipeline; durable once this returns.
     pub async fn submit(&self, submit: Submit) -> Result<RunId, Refused> {
-        self.actor_handle.submit(submit).await
+        self.actor_handle.submit(submit, Owner::local(user()), None).await
+    }
+
+    /// Takes another table of tokens. Calls under way whose token is not in it any more end.
+    pub fn replace_tokens(&self, tokens: Tokens) {
+        self.actor_handle.tokens.replace(tokens);
     }
 
     /// Pauses, resumes or cancels a run.
@@ -228,9 +262,18 @@ impl Handle {
         self.actor_handle.state().worker_views()
     }
 
-    /// The launcher saw a worker's process exit.
+    /// The launcher saw a worker's process exit. Its name is free at once.
     pub async fn worker_gone(&self, worker: &WorkerId) -> Result<(), Refused> {
-        self.actor_handle.decide(Event::WorkerGone { worker: worker.clone() }).await.map(drop)
+        self.actor_handle.decide(Event::WorkerGone { worker: worker.clone(), incarnation: None }).await.map(drop)
+    }
+
+    /// Reports for a worker whose process has exited what it can no longer report: how its work ended. Does nothing if it held none.
+    pub async fn fail_for(&self, worker: &WorkerId, class: FailureClass, message: String) -> Result<(), Refused> {
+        let state = self.actor_handle.state();
+        let (Some(known), Some((_, task))) = (state.workers.get(worker), state.held_by(worker)) else { return Ok(()) };
+        let grant = task.grant_of(worker, known.incarnation);
+        let report = ReportOutcome { grant, outcome: TaskOutcome::Failed { class, message } };
+        self.actor_handle.decide(Event::Outcome { report }).await.map(drop)
     }
 
     /// Asks all workers to save what they have and leave; no work is given any more.

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use protocol::message::RunView;
-use protocol::{Digest, RunId, StageName, limits};
+use protocol::{Digest, Group, RunId, StageName, limits};
 use registry::{Curve, LogRow, OpenError, ReadStore, Write, WriteError};
 
 use super::clock::wall_clock;
@@ -16,6 +16,7 @@ use crate::event::{Effect, Event};
 use crate::policy::Policy;
 use crate::rejected::Rejected;
 use crate::state::State;
+use crate::state::run::Run;
 use crate::time::{Millis, Moment};
 use crate::view::WorkerView;
 use crate::{journal, state};
@@ -31,6 +32,8 @@ pub struct Records {
     now: Millis,
     /// Runs that would end if a coordinator started here, as clients would see them. They are in no table yet.
     ending: BTreeMap<RunId, String>,
+    /// The group whose runs are shown; `None` shows all.
+    sees: Option<Group>,
 }
 
 /// Why there is nothing to read.
@@ -45,8 +48,12 @@ pub enum RecordsError {
 }
 
 impl Records {
-    pub(super) fn new(store: ReadStore, state: Arc<State>, now: Millis) -> Self {
-        Self { store, state, now, ending: BTreeMap::new() }
+    pub(super) fn new(store: ReadStore, state: Arc<State>, now: Millis, sees: Option<Group>) -> Self {
+        Self { store, state, now, ending: BTreeMap::new(), sees }
+    }
+
+    fn shows(&self, run: &Run) -> bool {
+        self.sees.as_ref().is_none_or(|group| run.owner.group() == *group)
     }
 
     /// Opens the store in `dir`, which no coordinator holds. It is read as a coordinator would find it that started now: nobody is at
@@ -62,7 +69,7 @@ impl Records {
         // No secret comes of it: nobody is granted anything.
         let moment = Moment { now, entropy: Digest::of(b"") };
         let effects = decide(&mut state, moment, Event::Started { alone: true, park: true });
-        let mut records = Self::new(store, Arc::new(state), now);
+        let mut records = Self::new(store, Arc::new(state), now, None);
         for effect in effects.map_err(StartError::from)? {
             let Effect::Store(writes) = effect else { continue };
             records.ending.extend(writes.into_iter().filter_map(|write| match write {
@@ -96,7 +103,8 @@ impl Records {
         // A run that ended since the state was read, or goes on after an end, is in both.
         let ending = self.ending.iter().map(|(run, view)| (place(run.clone()), view.clone()));
         views.extend(ending.filter(|((number, _), _)| number.is_some_and(|number| number < first_after)));
-        for (_, run) in self.state.runs.range(..first_after).rev().take(limit as usize) {
+        let live = self.state.runs.range(..first_after).rev().filter(|(_, run)| self.shows(run));
+        for (_, run) in live.take(limit as usize) {
             let view = serde_json::to_string(&self.state.view(run, self.now));
             let view = view.map_err(|e| Rejected::Invalid(format!("run `{}`: {e}", run.id)))?;
             views.insert(place(run.id.clone()), view);
@@ -113,7 +121,8 @@ impl Records {
     /// If there is no such run, or what is kept of it does not read.
     pub async fn run_view(&self, run: &RunId) -> Result<RunView, Refused> {
         let unknown = match self.state.run(run) {
-            Ok(run) => return Ok(self.state.view(run, self.now)),
+            Ok(run) if self.shows(run) => return Ok(self.state.view(run, self.now)),
+            Ok(_) => return Err(Rejected::unknown_run(run).into()),
             Err(unknown) => unknown,
         };
         if let Some(view) = self.ending.get(run) {
@@ -125,9 +134,17 @@ impl Records {
         }
     }
 
-    /// All workers.
+    /// All workers. What one works on is shown to those who see its run.
     pub fn workers(&self) -> Vec<WorkerView> {
-        self.state.worker_views()
+        let mut workers = self.state.worker_views();
+        for worker in &mut workers {
+            let task = worker.task.take();
+            worker.task = task.filter(|task| {
+                let run = self.state.task(task).ok().and_then(|(execution, _)| self.state.run(&execution.run).ok());
+                self.sees.is_none() || run.is_some_and(|run| self.shows(run))
+            });
+        }
+        workers
     }
 
     /// Log lines of a run, or of one stage of it, that were stored after line `after`; at most `limit`.

@@ -25,6 +25,9 @@ pub enum StartError {
         /// Why not.
         cause: std::io::Error,
     },
+    /// The key of the store's server cannot be read or made.
+    #[error("cannot read the key by which workers are recognised: {0}")]
+    Key(std::io::Error),
     /// What was decided before cannot be read.
     #[error("cannot read what was decided before: {0}")]
     Read(#[from] QueryError),

@@ -1,9 +1,11 @@
 //! What workers write. Every grant is checked twice: here against what the coordinator knows, which refuses most stale
 //! writers before their bytes are read, and again inside the transaction, which is what counts.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
+use access::Scope;
 use axum::Json;
 use axum::body::Body;
 use axum::extract::{Path, State};
@@ -11,20 +13,19 @@ use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::Response;
 use checkpoint::BlobError;
 use futures::{StreamExt as _, stream};
-use protocol::message::{CommitCheckpoint, Grant, LogBatch, MetricBatch, ReportOutcome};
+use protocol::message::{CommitCheckpoint, Grant, LogBatch, MetricBatch, ReportOutcome, TaskOutcome};
+use protocol::proof::{BlobStored, RECEIPT_HEADER, Vouched};
 use protocol::{Digest, RunId, limits};
 use registry::blob::{Arriving, PART_BYTES, ResumeError};
-use registry::{Write, WriteError};
+use registry::{Store, Write, WriteError};
 
 use super::actor_handle::ActorHandle;
-use super::blocking::blocking;
 use super::body::Message;
 use super::failure::Failure;
-use super::queries::BlobStored;
+use super::secrets::{self, Proof};
+use super::storage::ask;
 use crate::event::Event;
 
-/// The header that carries a blob's grant, as JSON.
-const GRANT_HEADER: &str = "x-stride-grant";
 /// The header with a blob's length.
 const BYTES_HEADER: &str = "x-stride-bytes";
 /// The header that says where in its blob a body begins; 0 without it.
@@ -40,7 +41,7 @@ async fn write(actor_handle: &ActorHandle, write: Write) -> Result<Json<()>, Fai
         let most = limits::BATCHES_WAITING;
         return Err(Failure::busy(format!("{most} batches of values and lines wait for the disk already")));
     };
-    let written = actor_handle.store.write(vec![write]).await;
+    let written = actor_handle.store.write_proven(vec![write]).await;
     actor_handle.wrote(&written);
     written?;
     Ok(Json(()))
@@ -59,8 +60,10 @@ fn used_up(message: String, option: &str) -> Failure {
 
 pub(crate) async fn metrics(
     State(actor_handle): State<Arc<ActorHandle>>,
+    proof: Proof,
     Message(batch, _): Message<MetricBatch>,
 ) -> Result<Json<()>, Failure> {
+    proof.of_grant(&actor_handle.secrets, &batch.grant)?;
     actor_handle.state().check_telemetry(&batch.grant)?;
     let (run, most) = (run_of(&batch.grant), actor_handle.allowances.values);
     if actor_handle.store.usage(&run).await?.values + batch.rows.len() as u64 > most {
@@ -74,8 +77,10 @@ pub(crate) async fn metrics(
 
 pub(crate) async fn logs(
     State(actor_handle): State<Arc<ActorHandle>>,
+    proof: Proof,
     Message(batch, _): Message<LogBatch>,
 ) -> Result<Json<()>, Failure> {
+    proof.of_grant(&actor_handle.secrets, &batch.grant)?;
     actor_handle.state().check_telemetry(&batch.grant)?;
     let (run, most) = (run_of(&batch.grant), actor_handle.allowances.log_bytes);
     let bytes: usize = batch.lines.iter().map(String::len).sum();
@@ -88,26 +93,63 @@ pub(crate) async fn logs(
 
 pub(crate) async fn checkpoint(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Message(commit, _): Message<CommitCheckpoint>,
+    proof: Proof,
+    Message(vouched, _): Message<Vouched<CommitCheckpoint>>,
 ) -> Result<Json<()>, Failure> {
+    let Vouched { what: commit, receipts } = vouched;
+    proof.of_grant(&actor_handle.secrets, &commit.grant)?;
+    check_blobs(&actor_handle, &proof, &commit.grant, commit.manifest, &receipts).await?;
     actor_handle.decide(Event::Checkpoint { commit }).await?;
     Ok(Json(()))
 }
 
 pub(crate) async fn outcome(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Message(report, _): Message<ReportOutcome>,
+    proof: Proof,
+    Message(vouched, _): Message<Vouched<ReportOutcome>>,
 ) -> Result<Json<()>, Failure> {
+    let Vouched { what: report, receipts } = vouched;
+    proof.of_grant(&actor_handle.secrets, &report.grant)?;
+    if let TaskOutcome::Finished { output, .. } = report.outcome {
+        check_blobs(&actor_handle, &proof, &report.grant, output, &receipts).await?;
+    }
     actor_handle.decide(Event::Outcome { report }).await?;
     Ok(Json(()))
 }
 
-/// Whose upload a request is about. Asked of the state before a byte of the body is read.
-fn granted(actor_handle: &ActorHandle, headers: &HeaderMap) -> Result<Grant, Failure> {
-    let grant =
-        headers.get(GRANT_HEADER).ok_or_else(|| Failure::invalid(format!("header `{GRANT_HEADER}` is missing")))?;
-    let grant: Grant = serde_json::from_slice(grant.as_bytes())
-        .map_err(|e| Failure::invalid(format!("header `{GRANT_HEADER}` is no grant: {e}")))?;
+/// Checks that a manifest names no blobs but those that its worker uploaded for this task or reads.
+async fn check_blobs(
+    actor_handle: &ActorHandle,
+    proof: &Proof,
+    grant: &Grant,
+    manifest: Digest,
+    receipts: &BTreeMap<Digest, String>,
+) -> Result<(), Failure> {
+    let state = actor_handle.state();
+    // What comes of another grant is for the decision to say: fences only grow, so it does not become valid meanwhile.
+    let (Ok(()), Ok(roots)) = (state.check_write(grant), state.read_by(&grant.task)) else { return Ok(()) };
+    let caller = &proof.caller.name;
+    let is_own = |(digest, shown): &(&Digest, &String)| actor_handle.secrets.is_receipt(caller, grant, **digest, shown);
+    let own: BTreeSet<Digest> = receipts.iter().filter(is_own).map(|(digest, _)| *digest).collect();
+    let (blobs, reach) = (actor_handle.store.blobs().clone(), Arc::clone(&actor_handle.reach));
+    let looking = move || reach.foreign(&blobs, &roots, |digest| own.contains(&digest), manifest);
+    match ask(&actor_handle.store, looking).await? {
+        None => Ok(()),
+        Some(digest) => Err(Failure::new(
+            StatusCode::CONFLICT,
+            "unvouched",
+            format!(
+                "manifest {manifest} names blob {digest}, which this worker neither uploaded for the task nor reads"
+            ),
+        )
+        .hint("upload every blob under the task's grant and send the receipts")),
+    }
+}
+
+/// Whose upload a request is about. Asked before a byte of the body is read.
+fn granted(actor_handle: &ActorHandle, proof: &Proof, headers: &HeaderMap) -> Result<Grant, Failure> {
+    let grant = secrets::grant(headers)?;
+    proof.of_grant(&actor_handle.secrets, &grant)?;
     actor_handle.state().check_write(&grant)?;
     Ok(grant)
 }
@@ -128,27 +170,37 @@ fn named(digest: &str) -> Result<Digest, Failure> {
 pub(crate) async fn staged(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(digest): Path<String>,
+    proof: Proof,
     headers: HeaderMap,
 ) -> Result<Json<BlobStored>, Failure> {
-    let grant = granted(&actor_handle, &headers)?;
+    let grant = granted(&actor_handle, &proof, &headers)?;
     let digest = named(&digest)?;
-    let blobs = actor_handle.store.blobs().clone();
-    blocking(move || {
-        blobs.hold(&grant.task, digest);
-        let stored = blobs.reuse(digest)?;
-        Ok(Json(BlobStored { digest, stored, staged: blobs.staged(&grant, digest)? }))
-    })
-    .await
+    let receipt = headers.get(RECEIPT_HEADER).and_then(|shown| shown.to_str().ok()).map(str::to_owned);
+    let receipt = receipt.filter(|shown| actor_handle.secrets.is_receipt(&proof.caller.name, &grant, digest, shown));
+    let roots = actor_handle.state().read_by(&grant.task)?;
+    let (blobs, reach) = (actor_handle.store.blobs().clone(), Arc::clone(&actor_handle.reach));
+    let looked = ask(&actor_handle.store, move || -> Result<_, Failure> {
+        // Of others' blobs it is not told whether they are there: it has their bytes, or has no use for them.
+        let is_known = receipt.is_some() || reach.includes(&blobs, &roots, digest)?;
+        if is_known {
+            blobs.hold(&grant.task, digest);
+        }
+        let stored = is_known && blobs.reuse(digest)?;
+        let receipt = receipt.filter(|_| stored);
+        Ok(Json(BlobStored { digest, stored, staged: blobs.staged(&grant, digest)?, receipt }))
+    });
+    looked.await
 }
 
 /// Takes a blob, or the next part of one, as it comes.
 pub(crate) async fn put_blob(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(digest): Path<String>,
+    proof: Proof,
     headers: HeaderMap,
     body: Body,
 ) -> Result<Json<BlobStored>, Failure> {
-    let grant = granted(&actor_handle, &headers)?;
+    let grant = granted(&actor_handle, &proof, &headers)?;
     let digest = named(&digest)?;
     let missing = || Failure::invalid(format!("header `{BYTES_HEADER}` is missing: the blob's length"));
     let bytes = match number(&headers, BYTES_HEADER)? {
@@ -162,12 +214,14 @@ pub(crate) async fn put_blob(
         let failure = Failure::new(StatusCode::PAYLOAD_TOO_LARGE, "too-large", message);
         return Err(failure.hint("train a smaller network: its state is one file"));
     }
-    let blobs = actor_handle.store.blobs().clone();
+    let (store, blobs) = (&actor_handle.store, actor_handle.store.blobs().clone());
+    let receipt = actor_handle.secrets.receipt(&proof.caller.name, &grant, digest);
     let stored = async {
-        let arriving = blocking(move || blobs.take_up(&grant, digest, offset, bytes)).await?;
-        receive(arriving, body, digest).await
+        let arriving = ask(store, move || blobs.take_up(&grant, digest, offset, bytes)).await?;
+        let (stored, staged) = receive(store, arriving, body).await?;
+        Ok(Json(BlobStored { digest, stored, staged, receipt: stored.then_some(receipt) }))
     };
-    stored.await.map_err(|error| {
+    stored.await.map_err(|error: Unstored| {
         if let Unstored::Resume(ResumeError::Blob(BlobError::Storage(message))) = &error {
             actor_handle.wrote::<()>(&Err(WriteError::Storage(message.clone())));
         }
@@ -175,7 +229,8 @@ pub(crate) async fn put_blob(
     })
 }
 
-async fn receive(mut arriving: Arriving, body: Body, digest: Digest) -> Result<Json<BlobStored>, Unstored> {
+/// Takes what comes; says whether the blob is stored, and how much of it has arrived.
+async fn receive(store: &Store, mut arriving: Arriving, body: Body) -> Result<(bool, u64), Unstored> {
     let mut body = body.into_data_stream();
     let mut ended = false;
     while !ended {
@@ -196,7 +251,7 @@ async fn receive(mut arriving: Arriving, body: Body, digest: Digest) -> Result<J
             }
         }
         // Comes back dropped if this request is: what has arrived is kept.
-        arriving = blocking(move || -> Result<Arriving, BlobError> {
+        arriving = ask(store, move || -> Result<Arriving, BlobError> {
             for part in parts {
                 arriving.write(&part)?;
             }
@@ -206,8 +261,8 @@ async fn receive(mut arriving: Arriving, body: Body, digest: Digest) -> Result<J
         .map_err(ResumeError::Blob)?;
     }
     let staged = arriving.written();
-    let stored = blocking(move || arriving.finish()).await.map_err(ResumeError::Blob)?;
-    Ok(Json(BlobStored { digest, stored, staged }))
+    let stored = ask(store, move || arriving.finish()).await.map_err(ResumeError::Blob)?;
+    Ok((stored, staged))
 }
 
 /// Why a blob was not taken.
@@ -249,15 +304,25 @@ impl From<Unstored> for Failure {
 pub(crate) async fn get_blob(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(digest): Path<String>,
+    proof: Proof,
     headers: HeaderMap,
 ) -> Result<Response, Failure> {
     let digest = named(&digest)?;
     let from = from(&headers)?;
+    if !proof.caller.scopes.allow(Scope::Read) {
+        check_read(&actor_handle, &proof, &headers, digest).await?;
+    }
     let blobs = actor_handle.store.blobs().clone();
-    let opened = blocking(move || -> Result<_, BlobError> {
+    let opened = ask(&actor_handle.store, move || -> Result<_, Failure> {
         let mut reader = match from {
             None => blobs.read(digest)?,
-            Some(from) => blobs.read_from(digest, from)?,
+            Some(from) => {
+                let bytes = blobs.verify(digest)?.bytes;
+                if from > bytes {
+                    return Err(past_the_end(digest, from, bytes));
+                }
+                blobs.read_from(digest, from)?
+            }
         };
         // A small blob is whole by now, or refused.
         let first = reader.next_part()?;
@@ -266,9 +331,9 @@ pub(crate) async fn get_blob(
     let (first, reader) = opened.await?;
     let bytes = reader.bytes();
     let length = bytes - from.unwrap_or_default();
-    let rest = stream::try_unfold(reader, |mut reader| async {
-        let (part, reader) = blocking(move || (reader.next_part(), reader)).await;
-        Ok::<_, BlobError>(part?.map(|part| (part, reader)))
+    let rest = stream::try_unfold((reader, actor_handle.store.clone()), |(mut reader, store)| async {
+        let (part, reader) = ask(&store, move || Ok::<_, BlobError>((reader.next_part()?, reader))).await?;
+        Ok::<_, BlobError>(part.map(|part| (part, (reader, store))))
     });
     let body = Body::from_stream(stream::iter(first.map(Ok)).chain(rest));
     let mut response = Response::new(body);
@@ -283,6 +348,33 @@ pub(crate) async fn get_blob(
         *response.status_mut() = StatusCode::PARTIAL_CONTENT;
     }
     Ok(response)
+}
+
+/// Checks that a worker reads no blobs but those of its task's inputs and checkpoints, or of the tasks that it prepares for.
+async fn check_read(
+    actor_handle: &ActorHandle,
+    proof: &Proof,
+    headers: &HeaderMap,
+    digest: Digest,
+) -> Result<(), Failure> {
+    let process = secrets::process(headers)?;
+    let state = actor_handle.state();
+    // Whatever is wrong with it: a worker must not take it for an answer about the blob.
+    proof
+        .of_process(&state, &process)
+        .map_err(|_| secrets::unproven("the call does not show the secret of its worker"))?;
+    let roots = state.readable_by(&process.worker);
+    let (blobs, reach) = (actor_handle.store.blobs().clone(), Arc::clone(&actor_handle.reach));
+    if ask(&actor_handle.store, move || reach.includes(&blobs, &roots, digest)).await? {
+        return Ok(());
+    }
+    let message = format!("blob {digest} is not among what the tasks of worker `{}` read", process.worker);
+    Err(Failure::new(StatusCode::FORBIDDEN, "forbidden", message))
+}
+
+fn past_the_end(digest: Digest, from: u64, bytes: u64) -> Failure {
+    let message = format!("header `range`: blob {digest} has {bytes} bytes; byte {from} is past its end");
+    Failure::new(StatusCode::RANGE_NOT_SATISFIABLE, "invalid", message)
 }
 
 /// Where a download goes on.

@@ -9,8 +9,6 @@ use protocol::stage::VersionInput;
 use protocol::{ArtifactKind, Digest};
 use registry::{BlobStore, QueryError, ReadStore};
 
-use super::blocking::blocking;
-
 /// Fills in what the pipeline's versions stand for: a whole model, or its part of the kind that the stage reads.
 ///
 /// # Errors
@@ -22,7 +20,7 @@ pub async fn resolve_versions(pipeline: &mut Pipeline, store: &ReadStore) -> Res
             let found = match store.resolve(&input.version).await {
                 Ok(version) => {
                     let (blobs, input) = (store.blobs().clone(), input.clone());
-                    blocking(move || part(&blobs, version.artifact, &input)).await
+                    store.ask_blobs(move || part(&blobs, version.artifact, &input)).await
                 }
                 Err(error) => Err(error),
             };

@@ -53,7 +53,8 @@ impl State {
             | Fact::Tasks { key, .. }
             | Fact::Task { key, .. }
             | Fact::ExecutionForgotten { key } => drop(keys.insert(*key)),
-            Fact::StagesAdded { .. }
+            Fact::Resolved { .. }
+            | Fact::StagesAdded { .. }
             | Fact::SweepBegun { .. }
             | Fact::SweepMoved { .. }
             | Fact::ExecutionSource { .. }
@@ -101,6 +102,13 @@ impl State {
                 stages.iter().for_each(|(i, status)| run.set(*i, status.clone()));
                 before.iter().for_each(|(i, status)| self.use_execution(*number, *i, status, false));
                 stages.iter().for_each(|(i, status)| self.use_execution(*number, *i, status, true));
+            }
+            Fact::Resolved { run, stage, digests } => {
+                let run = self.run_mut(*run)?;
+                match digests.is_empty() {
+                    true => drop(run.resolved.remove(stage)),
+                    false => drop(run.resolved.insert(*stage, digests.clone())),
+                }
             }
             Fact::StagesAdded { run, stages } => self.run_mut(*run)?.add_stages(stages.clone()),
             Fact::SweepBegun { run, sweep } => self.run_mut(*run)?.sweeps.push(Arc::new((**sweep).clone())),
@@ -275,6 +283,13 @@ impl State {
         if before != after {
             let after = after.to_vec();
             before.iter().for_each(|member| self.set_held(&member.worker, None));
+            if before.iter().any(|member| !after.contains(member) && self.heard.words.contains_key(&member.worker)) {
+                let words = Arc::make_mut(&mut self.heard.words);
+                before
+                    .iter()
+                    .filter(|member| !after.contains(member))
+                    .for_each(|member| drop(words.remove(&member.worker)));
+            }
             after.iter().for_each(|member| self.set_held(&member.worker, Some((key, i))));
         }
     }

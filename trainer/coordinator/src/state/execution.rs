@@ -78,6 +78,10 @@ pub struct StageExecution {
     pub seed: Seed,
     /// Where it must be computed.
     pub backend: Backend,
+    /// It only digests what the settings name outside the store, so that the stage gets a key. No value is stored under its own, which is
+    /// that of one stage of one run.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub resolves: bool,
     /// Workers and checkpoints, as the run that wanted it last asks.
     pub placement: Placement,
     /// What a register stage registers.
@@ -104,6 +108,10 @@ impl StageExecution {
     /// The tasks that it consists of. Their fences begin above `fence`, so that a name that was used before and forgotten never bears a
     /// fence again that somebody may still hold.
     pub fn new_tasks(&self, fence: Fence) -> Vec<Task> {
+        if self.resolves {
+            let id = TaskId::of_resolving(&self.run, &self.stage);
+            return vec![Task { fence, ..Task::new(id, Part::Resolve) }];
+        }
         let task = |shard, part| Task { fence, ..Task::new(TaskId::of(&self.run, &self.stage, shard), part) };
         match self.settings.shape() {
             Shape::Plain => vec![task(None, Part::Alone)],
@@ -118,6 +126,14 @@ impl StageExecution {
         }
     }
 
+    /// Its inputs that are in the store.
+    pub fn artifacts(&self) -> BTreeMap<String, Digest> {
+        let folders = self.settings.folders();
+        let is_stored = |field: &String| folders.iter().all(|folder| folder.field != *field);
+        let stored = self.inputs.iter().filter(|(field, _)| is_stored(field));
+        stored.map(|(field, digest)| (field.clone(), *digest)).collect()
+    }
+
     /// How many workers may train it together: a member without a slice of the batch would have nothing to do.
     pub fn range(&self) -> WorkerRange {
         let WorkerRange { min, max } = self.placement.workers;
@@ -125,6 +141,12 @@ impl StageExecution {
         let slices = training.batch.slices.max(1);
         let max = if max == 0 { slices } else { max.max(min).min(slices) };
         WorkerRange { min: min.min(slices), max }
+    }
+
+    /// Whether its gang, if it has one, has as many members as it needs. One that has fewer saves and ends its try.
+    pub fn is_enough(&self) -> bool {
+        let min = self.range().min.max(1);
+        self.tasks.held().all(|i| self.tasks[i].part != Part::Gang || self.tasks[i].holders().len() >= min)
     }
 
     /// The instruction set that all who work on it must have: that of those who work on it now, or of what an earlier try left.
@@ -147,7 +169,7 @@ impl StageExecution {
         match task.part {
             // All but the merge itself.
             Part::Merge => self.tasks.open() == 1,
-            Part::Alone | Part::Gang | Part::Shard { .. } => true,
+            Part::Alone | Part::Resolve | Part::Gang | Part::Shard { .. } => true,
         }
     }
 

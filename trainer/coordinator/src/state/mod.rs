@@ -12,6 +12,7 @@
 //! that nothing that was forgotten is mistaken for something new.
 
 mod apply;
+pub mod evidence;
 pub mod execution;
 pub mod gang;
 pub mod queue;
@@ -28,6 +29,7 @@ use protocol::message::{Grant, Progress};
 use protocol::{Digest, Fence, Incarnation, RunId, StageName, TaskId, WorkerId};
 
 pub use self::apply::Misfit;
+use self::evidence::Words;
 use self::execution::{ExecutionState, StageExecution};
 use self::queue::Queue;
 use self::run::Run;
@@ -45,6 +47,8 @@ pub struct Heard {
     pub workers: Map<WorkerId, Millis>,
     /// What was last said about each task that is all of its work.
     pub progress: Map<TaskId, Arc<Progress>>,
+    /// What members of gangs have said about their state and about each other. A worker that loses its task loses its word.
+    pub words: Arc<Words>,
 }
 
 /// All that the coordinator knows. A copy is cheap: it shares what is in the maps.
@@ -103,7 +107,7 @@ impl State {
         run::number_of(run)
             .and_then(|number| self.runs.get(&number))
             .filter(|known| known.id == *run)
-            .ok_or_else(|| Rejected::NotFound(format!("run `{run}` is not known; `trainer status --all` lists runs")))
+            .ok_or_else(|| Rejected::unknown_run(run))
     }
 
     /// The execution and the task that a grant is about.
@@ -141,11 +145,16 @@ impl State {
             .ok_or_else(|| Rejected::NotFound(format!("worker `{worker}` is not known; join first")))?;
         if known.incarnation != incarnation {
             return Err(Rejected::Conflict(format!(
-                "worker `{worker}` is now another process (incarnation {}, the call is from {incarnation})",
-                known.incarnation
+                "worker `{worker}` is another process than incarnation {incarnation}"
             )));
         }
         Ok(known)
+    }
+
+    /// The run on whose behalf an execution registers: the one that began it, or the oldest other that waits for it.
+    pub fn registrant(&self, execution: &StageExecution) -> Option<&Arc<Run>> {
+        let users = || execution.users.iter().filter_map(|(number, _)| self.runs.get(number));
+        users().find(|run| run.id == execution.run).or_else(|| users().next())
     }
 
     /// The task that a worker holds.

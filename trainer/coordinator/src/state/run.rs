@@ -14,10 +14,10 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
-use protocol::message::{RunState, StageState};
+use protocol::message::{RunState, StageState, StageView};
 use protocol::pipeline::{Pipeline, PipelineStage};
 use protocol::sweep::STATE_OUTPUT;
-use protocol::{ArtifactKind, Attempt, Digest, RunId, StageName};
+use protocol::{ArtifactKind, Attempt, Digest, Owner, RunId, StageName};
 use serde::{Deserialize, Serialize};
 
 use crate::search::Search;
@@ -113,6 +113,8 @@ pub struct Run {
     pub id: RunId,
     /// Its place in the order of submission.
     pub number: u64,
+    /// The token that submitted it, and what that allowed then.
+    pub owner: Owner,
     /// What it was asked to execute.
     pub submitted: Arc<Pipeline>,
     /// What it executes: what was submitted, and behind it the stages that sweeps made.
@@ -129,6 +131,8 @@ pub struct Run {
     pub stages: Vec<Status>,
     /// Sweeps that have begun.
     pub sweeps: Vec<Arc<Sweeping>>,
+    /// Digests that a worker found of what stages read outside the store, by place and field: of stages that were submitted without them.
+    pub resolved: BTreeMap<usize, BTreeMap<String, Digest>>,
     /// Places by name. Follows from the pipeline.
     places: Arc<HashMap<StageName, usize>>,
     /// Places of active stages. Follows from the stages.
@@ -140,6 +144,8 @@ pub struct Run {
 struct Stored {
     id: RunId,
     number: u64,
+    #[serde(default)]
+    owner: Owner,
     submitted: Pipeline,
     /// Stages that sweeps made.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -154,6 +160,8 @@ struct Stored {
     stages: Vec<Status>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     sweeps: Vec<Sweeping>,
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    resolved: BTreeMap<usize, BTreeMap<String, Digest>>,
 }
 
 impl From<Run> for Stored {
@@ -162,6 +170,7 @@ impl From<Run> for Stored {
         Self {
             id: run.id,
             number: run.number,
+            owner: run.owner,
             submitted: Arc::unwrap_or_clone(run.submitted),
             made,
             idempotency_key: run.idempotency_key,
@@ -170,6 +179,7 @@ impl From<Run> for Stored {
             parked: run.parked,
             stages: run.stages,
             sweeps: run.sweeps.into_iter().map(Arc::unwrap_or_clone).collect(),
+            resolved: run.resolved,
         }
     }
 }
@@ -180,6 +190,7 @@ impl From<Stored> for Run {
         let mut run = Self {
             id: stored.id,
             number: stored.number,
+            owner: stored.owner,
             pipeline: Arc::clone(&submitted),
             submitted,
             idempotency_key: stored.idempotency_key,
@@ -188,6 +199,7 @@ impl From<Stored> for Run {
             parked: stored.parked,
             stages: Vec::new(),
             sweeps: stored.sweeps.into_iter().map(Arc::new).collect(),
+            resolved: stored.resolved,
             places: Arc::default(),
             active: BTreeSet::new(),
         };
@@ -212,7 +224,13 @@ fn places(stages: &[PipelineStage], first: usize) -> impl Iterator<Item = (Stage
 
 impl Run {
     /// A run that has just been submitted.
-    pub fn new(number: u64, pipeline: Arc<Pipeline>, key: Option<String>, until: Option<StageName>) -> Self {
+    pub fn new(
+        number: u64,
+        owner: Owner,
+        pipeline: Arc<Pipeline>,
+        key: Option<String>,
+        until: Option<StageName>,
+    ) -> Self {
         let digest = pipeline.digest();
         let id = RunId::new(format!("{}-{}-{number}", pipeline.name, &digest.hex()[..8]));
         let wanted = wanted(&pipeline, until.as_ref());
@@ -222,6 +240,7 @@ impl Run {
         Self {
             id,
             number,
+            owner,
             submitted: Arc::clone(&pipeline),
             places: Arc::new(places(&pipeline.stages, 0).collect()),
             pipeline,
@@ -231,6 +250,7 @@ impl Run {
             parked: false,
             stages,
             sweeps: Vec::new(),
+            resolved: BTreeMap::new(),
             active: BTreeSet::new(),
         }
     }
@@ -285,8 +305,11 @@ impl Run {
 
     /// The values of a stage's inputs by the field that names them, or `None` while one is missing.
     pub fn inputs(&self, stage: usize) -> Option<BTreeMap<String, Digest>> {
+        let resolved = self.resolved.get(&stage);
         let stage = &self.pipeline.stages[stage];
-        let mut inputs = stage.external.clone();
+        let mut inputs = resolved.cloned().unwrap_or_default();
+        // What the submission expects stays expected.
+        inputs.extend(stage.external.iter().map(|(field, digest)| (field.clone(), *digest)));
         for input in &stage.inputs {
             let known = self.status(&input.stage)?.known()?;
             let output = match input.kind {
@@ -296,6 +319,12 @@ impl Run {
             inputs.insert(input.field.clone(), *output?);
         }
         Some(inputs)
+    }
+
+    /// True if `inputs` of a stage have a digest of each file that it reads outside the store.
+    pub fn is_resolved(&self, stage: usize, inputs: &BTreeMap<String, Digest>) -> bool {
+        let folders = self.pipeline.stages[stage].settings.folders();
+        folders.iter().all(|folder| inputs.contains_key(&folder.field))
     }
 
     /// What `action` makes of the run's state; `None` if it is refused.
@@ -327,6 +356,11 @@ impl Run {
             }
             RunState::Finished | RunState::Failed | RunState::Cancelled => self.state,
         }
+    }
+
+    /// Returns true if a restart of the coordinator paused it, not a user.
+    pub fn is_interrupted(&self) -> bool {
+        self.parked && self.state == RunState::Paused
     }
 
     /// The stages of the pipeline as submitted: what counts for the run. A failed trial is a result of its sweep.
@@ -369,7 +403,11 @@ impl Run {
         }
         for i in 0..self.stages.len() {
             match self.stages[i] {
-                Status::Failed { .. } | Status::Skipped { .. } if wanted.contains(&i) => self.set(i, Status::Waiting),
+                Status::Failed { .. } | Status::Skipped { .. } if wanted.contains(&i) => {
+                    // What it reads may have been mended since.
+                    self.resolved.remove(&i);
+                    self.set(i, Status::Waiting);
+                }
                 Status::Failed { .. }
                 | Status::Skipped { .. }
                 | Status::Waiting
@@ -387,7 +425,7 @@ pub(crate) fn value(known: &Known) -> Option<&Digest> {
 }
 
 fn not_asked_for() -> Status {
-    Status::Skipped { key: None, reason: "not asked for".to_owned() }
+    Status::Skipped { key: None, reason: StageView::NOT_ASKED_FOR.to_owned() }
 }
 
 /// `until` and all that it needs; everything without it.
@@ -430,7 +468,7 @@ mod tests {
             stages: vec![stage],
             code_versions: BTreeMap::new(),
         };
-        Run::new(1, Arc::new(pipeline), None, None)
+        Run::new(1, Owner::local("me"), Arc::new(pipeline), None, None)
     }
 
     #[test]

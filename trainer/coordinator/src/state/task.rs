@@ -38,6 +38,8 @@ pub enum Part {
     },
     /// The merge of a map stage's shards.
     Merge,
+    /// Digesting what a stage's settings name outside the store.
+    Resolve,
 }
 
 /// Who has the right to a task.
@@ -262,7 +264,7 @@ impl Task {
     /// Checks only that a grant has not been superseded: what a worker says about work that it has just ended still counts.
     pub fn check_fence(&self, grant: &Grant) -> Result<(), Rejected> {
         if grant.fence != self.fence || grant.attempt != self.attempt {
-            return Err(Rejected::StaleFence { task: self.id.clone(), current: self.fence, carried: grant.fence });
+            return Err(Rejected::StaleFence { task: self.id.clone(), carried: grant.fence });
         }
         Ok(())
     }

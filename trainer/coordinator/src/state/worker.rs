@@ -10,15 +10,19 @@
 //! Unknown is not dead: a silent worker may well be computing, and its next poll brings it back. Only the launcher of
 //! the process can say that it is gone, and only a new process (a join, with the next incarnation) returns from that.
 //! Whatever a worker held it loses on leaving `Here`; that is the business of `decide`.
+//!
+//! A name belongs to the token that joined under it, for as long as it is remembered. While its process may be at work (`Here`,
+//! `Suspect`), only that process joins under it again: it shows the same secret.
 
 use std::collections::BTreeSet;
 
 use protocol::message::{Join, Member};
 use protocol::stage::Backend;
-use protocol::{Digest, Incarnation, TaskId};
+use protocol::{Digest, Incarnation, TaskId, WorkerId};
 
 use serde::{Deserialize, Serialize};
 
+use crate::rejected::Rejected;
 use crate::time::Millis;
 
 /// Whether a worker can be given work.
@@ -79,11 +83,23 @@ impl Presence {
     }
 }
 
+/// Whose word a join is.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Identity {
+    /// The name of the token's line.
+    pub caller: String,
+    /// The digest of the secret that the process shows; the secret itself is stored nowhere.
+    pub secret: Digest,
+}
+
 /// A worker's newest process.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Worker {
     /// Which process of that name.
     pub incarnation: Incarnation,
+    /// Whose it is. `None`: it joined before names belonged to tokens, and gives way to everyone.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub identity: Option<Identity>,
     /// Its process id, for people.
     pub pid: u32,
     /// Where it computes.
@@ -95,8 +111,15 @@ pub struct Worker {
     pub peer_address: String,
     /// Whether it can be given work.
     pub presence: Presence,
-    /// How often peers could not reach this process; each time it stays out for longer.
+    /// How often this process was taken out of a gang, or complained alone of a member that left; each time it is shunned for longer.
+    /// Fades with time.
     pub suspicions: u32,
+    /// When it was last suspected.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub suspected: Option<Millis>,
+    /// Until when it does not join other members of a gang. It may do what it does alone.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub shunned: Option<Millis>,
     /// Gang tasks whose inputs it has said that it has. Some may be over.
     #[serde(default, skip_serializing_if = "BTreeSet::is_empty")]
     pub ready: BTreeSet<TaskId>,
@@ -107,15 +130,18 @@ pub struct Worker {
 
 impl Worker {
     /// The process that `join` announces.
-    pub fn joined(join: &Join, incarnation: Incarnation) -> Self {
+    pub fn joined(join: &Join, by: Identity, incarnation: Incarnation) -> Self {
         Self {
             incarnation,
+            identity: Some(by),
             pid: join.pid,
             backend: join.backend,
             instruction_set: join.instruction_set.clone(),
             peer_address: join.peer_address.clone(),
             presence: Presence::Here,
             suspicions: 0,
+            suspected: None,
+            shunned: None,
             ready: BTreeSet::new(),
             holds: None,
         }
@@ -129,8 +155,25 @@ impl Worker {
         }
     }
 
+    /// Checks that a process of identity `by` may take its name.
+    pub fn gives_way_to(&self, name: &WorkerId, by: &Identity) -> Result<(), Rejected> {
+        let Some(own) = &self.identity else { return Ok(()) };
+        if own.caller != by.caller {
+            return Err(Rejected::Forbidden(format!(
+                "worker name `{name}` belongs to another token; choose another name with `--name`"
+            )));
+        }
+        match self.presence {
+            Presence::Silent | Presence::Gone => Ok(()),
+            Presence::Here | Presence::Suspect { .. } if own.secret == by.secret => Ok(()),
+            Presence::Here | Presence::Suspect { .. } => Err(Rejected::NameHeld(format!(
+                "a process has joined as worker `{name}` and has not left; the name is free once it leaves or its lease ends"
+            ))),
+        }
+    }
+
     /// The worker as a holder of a task.
-    pub fn member(&self, name: &protocol::WorkerId) -> Member {
+    pub fn member(&self, name: &WorkerId) -> Member {
         Member { worker: name.clone(), incarnation: self.incarnation, peer_address: self.peer_address.clone() }
     }
 }

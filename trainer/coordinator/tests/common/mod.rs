@@ -5,7 +5,7 @@ pub(crate) mod pipelines;
 #[path = "../simulation/store.rs"]
 pub(crate) mod store;
 
-use coordinator::state::worker::Worker;
+use coordinator::state::worker::{Identity, Worker};
 use coordinator::{
     Control, Effect, Event, Millis, Moment, Observation, Policy, Rejected, State, decide, invariants, journal, observe,
 };
@@ -94,6 +94,7 @@ impl PureCoordinator {
             source: String::new(),
             idempotency_key: None,
             until: Some(until.into()),
+            owner: protocol::Owner::local("me"),
         };
         let effects = self.happen(event).expect("submitted");
         let run = effects.into_iter().find_map(|effect| match effect {
@@ -116,7 +117,9 @@ impl PureCoordinator {
             instruction_set: instruction_set.into(),
             peer_address: format!("{name}:1"),
         };
-        let effects = self.happen(Event::Join { join }).expect("joined");
+        // The same process each time: it shows the same secret.
+        let by = Identity { caller: "t".into(), secret: Digest::of(name.as_bytes()) };
+        let effects = self.happen(Event::Join { join, by }).expect("joined");
         let joined = effects.into_iter().find_map(|effect| match effect {
             Effect::Joined(incarnation) => Some(incarnation),
             _ => None,

@@ -10,6 +10,9 @@ use registry::{Holder, Store};
 
 pub(crate) type TestResult<T = ()> = Result<T, Box<dyn std::error::Error + Send + Sync>>;
 
+/// What worker `a` shows.
+pub(crate) const SECRET: &str = "the-secret-of-worker-a-of-the-tests";
+
 const TEXT: &str = "name: p\nseed: 1\ndataset: {format: synthetic}\nstages: {vae: {kind: train.vae}}\n";
 
 /// A server whose polls wait for `poll_ms`, and a client of it.

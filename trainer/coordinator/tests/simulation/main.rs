@@ -146,7 +146,13 @@ fn a_damaged_input_is_made_again_within_the_run() {
     let mut world = World::new(7);
     world.now = Millis(CHAOS_MS);
     let pipeline = Box::new(pipelines::quickstart(9, WorkerRange::default(), &[]));
-    let submit = Event::Submit { pipeline, source: String::new(), idempotency_key: None, until: None };
+    let submit = Event::Submit {
+        pipeline,
+        source: String::new(),
+        idempotency_key: None,
+        until: None,
+        owner: protocol::Owner::local("me"),
+    };
     world.submissions = vec![(Millis(0), submit)];
     let damaged = loop {
         world.step();
@@ -182,6 +188,7 @@ fn two_runs_of_one_pipeline_compute_once_and_a_third_finds_everything() {
         source: String::new(),
         idempotency_key: None,
         until: None,
+        owner: protocol::Owner::local("me"),
     };
     world.submissions = vec![(Millis(0), submit()), (Millis(0), submit())];
     world.run();

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::stage::{
     Backend, CheckpointPolicy, DataSynthetic, DistillLcm, DistillPcm, EncodeLatents, EvaluateLatentFid, Keep,
-    Placement, Promote, Register, StageSettings, TextEmbed, TrainMld, TrainVae, WorkerRange,
+    Placement, Promote, Register, StageSettings, TextEmbed, TextEncoder, TrainMld, TrainVae, WorkerRange,
 };
 use protocol::{ArtifactKind, Seed, Steps};
 
@@ -60,6 +60,15 @@ pub(crate) fn quickstart(seed: u64, workers: WorkerRange, require: &[&str]) -> P
     });
     let (name, stages) = ("quickstart".into(), stages.to_vec());
     Pipeline { name, seed: Seed(seed), backend: Backend::Flex, stages, code_versions: BTreeMap::new() }
+}
+
+/// The same with a text encoder of a folder, of which no digest is known.
+#[allow(dead_code, reason = "not every test that shares this file reads files")]
+pub(crate) fn reading_files(mut pipeline: Pipeline) -> Pipeline {
+    let text = pipeline.stages.iter_mut().find(|stage| stage.name.as_str() == "text").expect("a stage `text`");
+    let encoder = TextEmbed { encoder: TextEncoder::Clip, path: "models/clip".into(), ..TextEmbed::default() };
+    text.settings = encoder.into();
+    pipeline
 }
 
 /// A sweep of `trials` trials with three rungs, and what goes on from its best.

@@ -24,7 +24,13 @@ fn sized(workers: usize, seed: u64, trials: u64) -> World {
     world.workers = (0..workers).map(|i| FakeWorker::new(&format!("w{i}"))).collect();
     let pipeline = Box::new(pipelines::swept(3, trials));
     let idempotency_key = Some("once".to_owned());
-    let submit = Event::Submit { pipeline, source: String::new(), idempotency_key, until: None };
+    let submit = Event::Submit {
+        pipeline,
+        source: String::new(),
+        idempotency_key,
+        until: None,
+        owner: protocol::Owner::local("me"),
+    };
     world.submissions = vec![(Millis(0), submit)];
     world
 }
@@ -84,6 +90,7 @@ fn a_sweep_is_found_again_and_shows_what_became_of_its_trials() {
         source: String::new(),
         idempotency_key: None,
         until: None,
+        owner: protocol::Owner::local("me"),
     };
     world.submissions = vec![(Millis(0), again)];
     world.run();
@@ -116,8 +123,13 @@ fn a_metric_that_nobody_reports_ends_the_run_at_once() {
     let mut pipeline = pipelines::swept(3, TRIALS);
     let stage = pipeline.stages.iter_mut().find(|stage| stage.sweep.is_some()).expect("the swept stage");
     stage.sweep.as_mut().expect("a sweep").metric = "fdi".into();
-    let submit =
-        Event::Submit { pipeline: Box::new(pipeline), source: String::new(), idempotency_key: None, until: None };
+    let submit = Event::Submit {
+        pipeline: Box::new(pipeline),
+        source: String::new(),
+        idempotency_key: None,
+        until: None,
+        owner: protocol::Owner::local("me"),
+    };
     world.submissions = vec![(Millis(0), submit)];
     while !world.is_over() {
         world.step();

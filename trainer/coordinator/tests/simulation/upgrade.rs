@@ -41,7 +41,13 @@ fn holds_with_a_checkpoint(state: &State) -> bool {
 fn make_the_store() {
     let mut world = world(3);
     let pipeline = Box::new(pipelines::swept(3, TRIALS));
-    let submit = Event::Submit { pipeline, source: String::new(), idempotency_key: Some("once".into()), until: None };
+    let submit = Event::Submit {
+        pipeline,
+        source: String::new(),
+        idempotency_key: Some("once".into()),
+        until: None,
+        owner: protocol::Owner::local("me"),
+    };
     world.submissions = vec![(world.now, submit)];
     let trials_done =
         |world: &World| world.state().runs.values().flat_map(|run| &run.sweeps).any(|s| s.search.score(14).is_some());
@@ -52,7 +58,7 @@ fn make_the_store() {
         }
     }
     let lost = world.state().workers.iter().find(|(_, worker)| worker.holds.is_some()).expect("one works").0.clone();
-    world.happen(Event::WorkerGone { worker: lost }).expect("taken");
+    world.happen(Event::WorkerGone { worker: lost, incarnation: None }).expect("taken");
     while !holds_with_a_checkpoint(world.state()) {
         world.step();
     }

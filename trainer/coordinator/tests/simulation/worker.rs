@@ -5,8 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use coordinator::Millis;
 use protocol::message::{
-    Assignment, CommitCheckpoint, DesiredAssignments, Doing, FailureClass, Grant, Join, PROTOCOL_VERSION, Poll,
-    Progress, ReportOutcome, Role, TaskOutcome,
+    Assignment, CommitCheckpoint, DesiredAssignments, Doing, FailureClass, Grant, Join, LossCause, LostPeer, Member,
+    PROTOCOL_VERSION, Poll, Prepare, Progress, ReportOutcome, Role, TaskOutcome,
 };
 use protocol::stage::Backend;
 use protocol::{Attempt, Digest, Incarnation, TaskId, WorkerId};
@@ -33,7 +33,7 @@ impl Call {
             Self::Commit(commit) => Some(commit.manifest),
             Self::Report(report) => match report.outcome {
                 TaskOutcome::Finished { output, .. } => Some(output),
-                TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => None,
+                TaskOutcome::Resolved { .. } | TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => None,
             },
         }
     }
@@ -68,6 +68,12 @@ pub(crate) struct FakeWorker {
     pub(crate) alive: bool,
     /// Stopped by a signal until then.
     pub(crate) hung_until: Millis,
+    /// Its stage hangs until then, while it polls.
+    pub(crate) stuck_until: Millis,
+    /// Nothing listens at its peer address until then.
+    pub(crate) refuses_until: Millis,
+    /// It complains of all its peers, whom it reaches.
+    pub(crate) lies: bool,
     pub(crate) process: u32,
     incarnation: Option<Incarnation>,
     desired: Option<DesiredAssignments>,
@@ -91,6 +97,9 @@ impl FakeWorker {
             name: name.into(),
             alive: false,
             hung_until: Millis(0),
+            stuck_until: Millis(0),
+            refuses_until: Millis(0),
+            lies: false,
             process: 0,
             incarnation: None,
             desired: None,
@@ -118,12 +127,23 @@ impl FakeWorker {
             quick @ 0..128 => u64::from(quick),
             slow => u64::from(slow) * 100,
         };
-        *self = Self { process: self.process + 1, alive: true, fetches_ms, ..Self::new(self.name.as_str()) };
+        let lies = lot(&format!("lies {} {}", self.name, self.process)) < 26;
+        *self = Self { process: self.process + 1, alive: true, fetches_ms, lies, ..Self::new(self.name.as_str()) };
         fetches_ms >= 10_000
     }
 
     pub(crate) fn runs(&self, now: Millis) -> bool {
         self.alive && self.hung_until <= now
+    }
+
+    /// Whether it is the process that is a member.
+    pub(crate) fn is(&self, member: &Member) -> bool {
+        self.alive && self.name == member.worker && self.incarnation == Some(member.incarnation)
+    }
+
+    /// Whether the stage hangs, though the process polls.
+    pub(crate) fn is_stuck(&self, now: Millis) -> bool {
+        self.stuck_until > now
     }
 
     fn assignment(&self) -> Option<&Assignment> {
@@ -136,7 +156,11 @@ impl FakeWorker {
 
     /// Steps in memory, if they are of this try.
     pub(crate) fn live(&self, grant: &Grant) -> Option<u64> {
-        self.live.as_ref().filter(|(task, attempt, _)| (task, attempt) == (&grant.task, &grant.attempt)).map(|l| l.2)
+        self.live_of(&grant.task, grant.attempt)
+    }
+
+    pub(crate) fn live_of(&self, task: &TaskId, attempt: Attempt) -> Option<u64> {
+        self.live.as_ref().filter(|(of, at, _)| (of, *at) == (task, attempt)).map(|live| live.2)
     }
 
     pub(crate) fn hear(&mut self, process: u32, answer: Answer) {
@@ -150,6 +174,9 @@ impl FakeWorker {
             Answer::DesiredAssignments(desired) => {
                 let held = self.grant().cloned();
                 self.desired = Some(desired);
+                if self.grant().is_none_or(|grant| held.as_ref().is_some_and(|held| held.task != grant.task)) {
+                    self.live = None;
+                }
                 if let Some(Assignment { grant, role: Role::Member { .. }, .. }) = self.assignment() {
                     assert!(self.said_ready.contains(&grant.task), "`{}` got {grant:?} without its inputs", self.name);
                 }
@@ -180,8 +207,8 @@ impl FakeWorker {
         self.saving = Saving::No;
     }
 
-    /// What it sends now, if anything.
-    pub(crate) fn speak(&mut self, now: Millis, unreachable: &[WorkerId]) -> Vec<Call> {
+    /// What it sends now, if anything, given whom it does not reach and which peers hang.
+    pub(crate) fn speak(&mut self, now: Millis, unreachable: &[WorkerId], stuck: &[WorkerId], lies: bool) -> Vec<Call> {
         if !self.runs(now) || now < self.next_call {
             return Vec::new();
         }
@@ -196,18 +223,23 @@ impl FakeWorker {
                 peer_address: format!("{}:{}", self.name, self.process),
             })];
         };
-        let doing = self.assignment().map(|assignment| Doing {
-            grant: assignment.grant.clone(),
-            progress: Progress { done: self.live.as_ref().map_or(0, |l| l.2), total: STEPS, ..Default::default() },
-            lost: match (&assignment.role, self.silent_peers_since) {
-                (Role::Member { members, .. }, Some(since)) if now.since(since) > 2500 => {
-                    members.iter().map(|m| &m.worker).filter(|w| unreachable.contains(w)).cloned().collect()
-                }
-                _ => Vec::new(),
-            },
+        let doing = self.assignment().map(|assignment| {
+            let members = match &assignment.role {
+                Role::Member { members, .. } => members.as_slice(),
+                Role::Alone | Role::Shard { .. } | Role::Merge { .. } | Role::Resolve => &[],
+            };
+            let peers = members.iter().map(|member| &member.worker).filter(|worker| **worker != self.name);
+            let misses = self.silent_peers_since.is_some_and(|since| now.since(since) > 2500);
+            let lost = peers.clone().filter(|worker| lies || (misses && unreachable.contains(worker)));
+            let lost = lost.map(|worker| LostPeer { worker: worker.clone(), cause: LossCause::Unreachable });
+            let waits_for = peers.clone().find(|worker| stuck.contains(worker) && !self.is_stuck(now)).cloned();
+            let progress = Progress { done: self.live.as_ref().map_or(0, |l| l.2), total: STEPS, ..Default::default() };
+            let grant = assignment.grant.clone();
+            Doing { holds: self.live(&grant), waits_for, lost: lost.collect(), ..Doing::new(grant, progress) }
         });
-        let asked = self.desired.iter().flat_map(|desired| &desired.prepare).map(|prepare| prepare.task.clone());
-        let asked: BTreeSet<TaskId> = asked.collect();
+        let reaches = |prepare: &&Prepare| !prepare.peers.iter().any(|peer| unreachable.contains(&peer.worker));
+        let asked = self.desired.iter().flat_map(|desired| &desired.prepare).filter(reaches);
+        let asked: BTreeSet<TaskId> = asked.map(|prepare| prepare.task.clone()).collect();
         self.fetching.retain(|task, _| asked.contains(task));
         for task in asked {
             self.fetching.entry(task).or_insert(now.after(self.fetches_ms));
@@ -255,12 +287,20 @@ impl FakeWorker {
         }
         let Some(assignment) = self.assignment().cloned() else { return };
         let grant = assignment.grant.clone();
+        if self.is_stuck(now) && matches!(assignment.role, Role::Member { .. }) {
+            return;
+        }
         if chaos && random.chance(1) {
             let class = if random.chance(50) { FailureClass::Fault } else { FailureClass::Infrastructure };
             return self.report(grant, TaskOutcome::Failed { class, message: "made up".into() });
         }
         let rank = match &assignment.role {
             Role::Member { members, .. } => members.iter().position(|member| member.worker == self.name),
+            Role::Resolve => {
+                let folders = assignment.stage.settings.folders().into_iter();
+                let digests = folders.map(|folder| (folder.field, Digest::of(folder.path.as_bytes()))).collect();
+                return self.report(grant, TaskOutcome::Resolved { digests });
+            }
             Role::Alone | Role::Shard { .. } | Role::Merge { .. } => {
                 if random.chance(40) {
                     self.report(grant.clone(), finished(&assignment));

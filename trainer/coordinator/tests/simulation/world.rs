@@ -9,9 +9,9 @@ use std::sync::Arc;
 use coordinator::batch::{Ask, Batches};
 use coordinator::state::run::Run;
 use coordinator::{Control, Effect, Event, Millis, Policy, Refused, State, journal};
-use protocol::message::RunState;
+use protocol::message::{Member, RunState};
 use protocol::stage::WorkerRange;
-use protocol::{Digest, Incarnation, RunId, WorkerId};
+use protocol::{Attempt, Digest, Incarnation, RunId, TaskId, WorkerId};
 
 use self::disk::{Disk, Ticket};
 use crate::pipelines;
@@ -20,12 +20,16 @@ use crate::store::FakeStore;
 use crate::worker::{Answer, Call, FakeWorker};
 
 /// Everything that goes wrong in some seed. What is never counted has silently gone missing from the simulation.
-pub(crate) const INJECTED: [&str; 25] = [
+pub(crate) const INJECTED: [&str; 29] = [
     "a call that was lost",
     "a call that came twice",
     "a worker that died",
     "a worker that was stopped",
     "a cut between peers that both reach the coordinator",
+    "a cut that only one of two peers notices",
+    "a refused peer port",
+    "a false complaint",
+    "a stage that hangs while its worker polls",
     "a member whom its peers could not reach",
     "a slow joiner",
     "a late tick of a clock that overslept",
@@ -52,6 +56,16 @@ pub(crate) const INJECTED: [&str; 25] = [
 pub(crate) const CHAOS_MS: u64 = 180_000;
 const LIMIT_MS: u64 = 3_000_000;
 
+/// A pair of workers that cannot work together.
+#[derive(Debug, Clone)]
+pub(crate) struct Cut {
+    pub(crate) from: WorkerId,
+    pub(crate) to: WorkerId,
+    /// Only `from` notices.
+    pub(crate) one_way: bool,
+    pub(crate) until: Millis,
+}
+
 pub(crate) struct World {
     pub(crate) policy: Policy,
     pub(crate) random: Random,
@@ -72,6 +86,8 @@ pub(crate) struct World {
     heard_then: BTreeMap<(WorkerId, Incarnation), Millis>,
     /// The processes that had a lease after the newest batch.
     present: BTreeMap<WorkerId, Incarnation>,
+    /// The gangs after the newest batch: their tries and members.
+    gangs: BTreeMap<TaskId, (Attempt, Vec<Member>)>,
     /// What went wrong, and how often.
     pub(crate) injected: BTreeMap<&'static str, u64>,
     /// The coordinator runs.
@@ -81,8 +97,8 @@ pub(crate) struct World {
     pub(crate) calls: Vec<(Millis, usize, u32, Call)>,
     pub(crate) answers: Vec<(Millis, usize, u32, Answer)>,
     pub(crate) workers: Vec<FakeWorker>,
-    /// Pairs of workers that cannot reach each other, and until when; the coordinator reaches both.
-    pub(crate) cuts: Vec<(WorkerId, WorkerId, Millis)>,
+    /// Workers that cannot reach each other, while the coordinator reaches them.
+    pub(crate) cuts: Vec<Cut>,
     pub(crate) submissions: Vec<(Millis, Event)>,
     pub(crate) checkpoint_steps: BTreeMap<Digest, u64>,
     pub(crate) events: u64,
@@ -102,13 +118,14 @@ pub(crate) struct World {
 }
 
 fn policy() -> Policy {
-    Policy { grace_ms: 10_000, fault_budget: 1000, infrastructure_budget: 1000, ..Policy::default() }
+    let budgets = Policy { fault_budget: 1000, infrastructure_budget: 1000, ..Policy::default() };
+    Policy { grace_ms: 10_000, stall_ms: 30_000, ..budgets }
 }
 
 impl World {
     pub(crate) fn new(seed: u64) -> Self {
         let mut random = Random::new(seed);
-        let workers = (0..1 + random.below(4)).map(|i| FakeWorker::new(&format!("w{i}"))).collect();
+        let workers = (0..1 + random.below(6)).map(|i| FakeWorker::new(&format!("w{i}"))).collect();
         let submissions = (0..1 + random.below(3))
             .map(|i| {
                 let max = random.below(4) as usize;
@@ -116,13 +133,17 @@ impl World {
                 let gates: &[&str] = if random.chance(15) { &["never <= 0"] } else { &["latent_fid <= 1"] };
                 let pipeline = match random.below(4) {
                     0 => pipelines::swept(random.below(2), 4 + random.below(8)),
-                    _ => pipelines::quickstart(random.below(2), range, gates),
+                    _ => match random.below(2) {
+                        0 => pipelines::quickstart(0, range, gates),
+                        seed => pipelines::reading_files(pipelines::quickstart(seed, range, gates)),
+                    },
                 };
                 let event = Event::Submit {
                     pipeline: Box::new(pipeline),
                     source: String::new(),
                     idempotency_key: random.chance(30).then(|| format!("key-{i}")),
                     until: random.chance(20).then(|| "mld".into()),
+                    owner: protocol::Owner::local("me"),
                 };
                 (Millis(random.below(CHAOS_MS / 2)), event)
             })
@@ -141,6 +162,7 @@ impl World {
             heard: BTreeMap::new(),
             heard_then: BTreeMap::new(),
             present: BTreeMap::new(),
+            gangs: BTreeMap::new(),
             injected: BTreeMap::new(),
             up: true,
             back_at: Millis(0),
@@ -225,6 +247,7 @@ impl World {
             assert_eq!(durable(&recovered), durable(self.state()), "recovery gives what was");
         }
         self.batches = Batches::new(recovered);
+        self.gangs.clear();
         self.present = self.present_now();
     }
 

@@ -1,25 +1,20 @@
 //! Finds, reads and compares the fixtures.
-#![allow(dead_code, unreachable_pub, reason = "each test binary compiles its own copy and uses a part of it")]
+#![allow(
+    dead_code,
+    unused_imports,
+    unreachable_pub,
+    reason = "each test binary compiles its own copy and uses a part of it"
+)]
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+
+pub use fixtures::{data as shared, folders};
 
 use burn::tensor::{Device, Tensor, TensorData};
 use protocol::stage::Backend;
 use safetensors::{Dtype, SafeTensors};
 use serde_json::Value;
-
-/// The folder of fixtures, or `None` with a notice if this checkout has none.
-pub fn shared(part: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("STRIDE_SHARED")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"), PathBuf::from);
-    let path = root.join("data").join(part);
-    if path.is_dir() {
-        return Some(path);
-    }
-    eprintln!("SKIPPED: no fixtures at {} (set STRIDE_SHARED)", path.display());
-    None
-}
 
 /// The backend of the tests: `STRIDE_TEST_BACKEND`, or flex.
 fn backend() -> Backend {
@@ -41,18 +36,6 @@ pub fn tracked() -> Device {
 /// summation orders.
 fn slack() -> f64 {
     if backend() == Backend::Flex { 1.0 } else { 5.0 }
-}
-
-/// Folders of fixtures that start with one of `prefixes`, sorted. Finding none is a failure.
-pub fn folders(root: &Path, prefixes: &[&str]) -> Vec<PathBuf> {
-    let mut found: Vec<PathBuf> = std::fs::read_dir(root)
-        .expect("fixtures can be listed")
-        .map(|entry| entry.expect("fixtures can be listed").path())
-        .filter(|path| path.is_dir() && prefixes.iter().any(|p| name(path).starts_with(p)))
-        .collect();
-    found.sort();
-    assert!(!found.is_empty(), "no fixture in {} starts with any of {prefixes:?}", root.display());
-    found
 }
 
 pub fn name(path: &Path) -> String {

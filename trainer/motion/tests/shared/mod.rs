@@ -2,26 +2,16 @@
 
 #![allow(dead_code, reason = "each test binary uses its own part of this module")]
 
+use motion::DataPath;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+pub(crate) use fixtures::data;
 use motion::npy::{self, Array};
 
-/// The folder of reference data, or `None` with a notice on a machine without it.
-pub(crate) fn data(part: &str) -> Option<PathBuf> {
-    let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
-    let shared = std::env::var_os("STRIDE_SHARED").map_or_else(|| workspace.join("../shared"), PathBuf::from);
-    let folder = shared.join("data").join(part);
-    if folder.is_dir() {
-        return Some(folder);
-    }
-    eprintln!("SKIPPED: {} is missing; set STRIDE_SHARED to the folder of reference data", folder.display());
-    None
-}
-
-/// Reads an f32 or f64 array.
+/// Reads f32 or f64.
 pub(crate) fn load(file: &Path) -> Array {
-    npy::read_any_float(file).unwrap_or_else(|e| panic!("{e}"))
+    npy::read_any_float(&DataPath::local(file)).unwrap_or_else(|e| panic!("{e}"))
 }
 
 /// Folders in `folder`, sorted by name.

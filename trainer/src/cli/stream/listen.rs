@@ -1,12 +1,14 @@
 //! Streams over WebSockets: `GET /v1/stream` with a token of scope `read`, then a message a sentence in, a message a frame out.
 //!
-//! Nothing is computed before the token is checked and a place is free. What a client may cost is bounded: places, the size of a message, sentences
+//! Nothing is computed before the token is checked and a place is free. A connection takes its place with its first sentence: those that say nothing
+//! hold none, are few, and the oldest of them leaves for a new one. What a client may cost is bounded: places, the size of a message, sentences
 //! that wait (more are not read, so that TCP holds the sender back), one segment of frames (the next is drawn when it has been sent), the time that a frame may take to
 //! be sent and that the first sentence may take to come. A message that is no sentence is answered by `{"error": ...}`, and the sentence before goes on.
 //! The last message is `{"end": REPORT}`.
 
 use std::borrow::Cow;
-use std::sync::Arc;
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use access::{Scope, Tokens};
@@ -22,7 +24,7 @@ use protocol::message::ApiError;
 use serde_json::json;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc::error::TryRecvError;
-use tokio::sync::{Semaphore, mpsc, watch};
+use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore, mpsc, watch};
 use tokio::task::JoinHandle;
 use tokio::time::{sleep, timeout};
 
@@ -41,6 +43,8 @@ const WAITING: usize = 16;
 const SLOW: Duration = Duration::from_secs(10);
 /// How long the first sentence may take to come.
 const SILENCE: Duration = Duration::from_secs(60);
+/// Connections that have said nothing yet.
+const SILENT: usize = 32;
 /// Bytes of messages that wait for the network.
 const WRITE_BYTES: usize = 256 << 10;
 
@@ -54,6 +58,31 @@ struct Hall {
     rate: f64,
     places: Arc<Semaphore>,
     streams: usize,
+    silent: Silent,
+}
+
+/// Connections that have said nothing yet, the oldest first.
+#[derive(Debug, Default)]
+struct Silent(Mutex<VecDeque<Arc<Notify>>>);
+
+impl Silent {
+    /// Takes one more in, for which the oldest may have to leave.
+    fn enter(&self) -> Arc<Notify> {
+        let leave = Arc::new(Notify::new());
+        let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if all.len() >= SILENT
+            && let Some(oldest) = all.pop_front()
+        {
+            oldest.notify_one();
+        }
+        all.push_back(Arc::clone(&leave));
+        leave
+    }
+
+    /// One has said something, or is gone.
+    fn leave(&self, which: &Arc<Notify>) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).retain(|one| !Arc::ptr_eq(one, which));
+    }
 }
 
 /// Why a connection ends.
@@ -106,7 +135,16 @@ pub(super) async fn listen(
         door.address()
     ));
     let (bound, places) = (bound(skeleton.fps)?, Arc::new(Semaphore::new(streams)));
-    let hall = Arc::new(Hall { engine: engine.clone(), beginning, real, bound, rate, places, streams });
+    let hall = Arc::new(Hall {
+        engine: engine.clone(),
+        beginning,
+        real,
+        bound,
+        rate,
+        places,
+        streams,
+        silent: Silent::default(),
+    });
     let handler = get(move |upgrade: WebSocketUpgrade| std::future::ready(Arc::clone(&hall).admit(upgrade)));
     let (_stop, stopped) = watch::channel(false);
     tokio::select! {
@@ -161,19 +199,25 @@ async fn tell(sink: &mut Sink, what: String) -> std::result::Result<(), End> {
     send(sink, json!({"error": what}).to_string()).await
 }
 
+async fn close(sink: &mut Sink, end: End) {
+    let End::Told(code, reason) = end else { return };
+    let close = CloseFrame { code, reason: reason.as_ref().into() };
+    // One who is gone does not hear it.
+    let _ = timeout(SLOW, sink.send(Message::Close(Some(close)))).await;
+}
+
 impl Hall {
     /// Takes a connection in, if there is a place.
     fn admit(self: Arc<Self>, upgrade: WebSocketUpgrade) -> Response {
-        let Ok(place) = Arc::clone(&self.places).try_acquire_owned() else {
+        if self.places.available_permits() == 0 {
             let message = format!("this server draws {} streams at once, and does", self.streams);
             let hint = Some("try again when one has ended; `--streams N` takes more".to_owned());
             let error = ApiError { code: "busy".to_owned(), message, hint };
             return (StatusCode::SERVICE_UNAVAILABLE, Json(error)).into_response();
-        };
+        }
         let upgrade = upgrade.max_message_size(MOST_BYTES).max_frame_size(MOST_BYTES);
         upgrade.max_write_buffer_size(WRITE_BYTES).on_upgrade(move |socket| async move {
             self.converse(socket).await;
-            drop(place);
         })
     }
 
@@ -182,7 +226,14 @@ impl Hall {
         let (sender, mut lines) = mpsc::channel(WAITING);
         let _reading = Ends(tokio::spawn(read(source, sender, self.beginning.form.clone())));
         let mut course = self.beginning.course(self.bound, self.real.clone());
-        let end = match self.give(&mut sink, &mut lines, &mut course).await {
+        let leave = self.silent.enter();
+        let first = self.first(&mut sink, &mut lines, &leave).await;
+        self.silent.leave(&leave);
+        let (first, _place) = match first {
+            Ok(begun) => begun,
+            Err(end) => return close(&mut sink, end).await,
+        };
+        let end = match self.give(&mut sink, &mut lines, &mut course, first).await {
             Ok(()) | Err(End::Over) => {
                 let report = json!({"end": course.meter.json()}).to_string();
                 let _ = send(&mut sink, report).await;
@@ -191,10 +242,34 @@ impl Hall {
             Err(End::Gone) => return,
             Err(End::Told(code, why)) => (code, why),
         };
-        let (code, reason) = end;
-        let close = CloseFrame { code, reason: reason.as_ref().into() };
-        // Whoever is gone is not told.
-        let _ = timeout(SLOW, sink.send(Message::Close(Some(close)))).await;
+        close(&mut sink, End::Told(end.0, end.1)).await;
+    }
+
+    /// The first sentence, and the place that it takes.
+    async fn first(
+        &self,
+        sink: &mut Sink,
+        lines: &mut Lines,
+        leave: &Notify,
+    ) -> std::result::Result<(Line, OwnedSemaphorePermit), End> {
+        let silence = sleep(SILENCE);
+        tokio::pin!(silence);
+        let line = loop {
+            let next = tokio::select! {
+                next = lines.recv() => next,
+                () = leave.notified() => return Err(End::Told(close_code::AGAIN, "others wait to begin".into())),
+                () = &mut silence => return Err(End::Told(close_code::POLICY, "no sentence came within a minute".into())),
+            };
+            match next {
+                Some(Ok(line)) => break line,
+                Some(Err(what)) => tell(sink, what).await?,
+                None => return Err(End::Gone),
+            }
+        };
+        let Ok(place) = Arc::clone(&self.places).try_acquire_owned() else {
+            return Err(End::Told(close_code::AGAIN, "every place was taken meanwhile".into()));
+        };
+        Ok((line, place))
     }
 
     /// Gives frames until the client leaves.
@@ -203,10 +278,11 @@ impl Hall {
         sink: &mut Sink,
         lines: &mut Lines,
         course: &mut super::course::Course,
+        first: Line,
     ) -> std::result::Result<(), End> {
         let mut stream = self.beginning.stream.clone();
         let mut pace = Pace::new(self.rate);
-        let mut next = None;
+        let mut next = Some(first);
         let mut text = String::new();
         loop {
             while !course.is_pinned() {

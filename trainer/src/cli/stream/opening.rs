@@ -100,7 +100,7 @@ impl Beginning {
 impl Opening {
     /// Loads the model.
     pub(super) fn open(self, overlap: Option<u16>, blend: u16) -> Result<(Generator, Beginning)> {
-        let Found { manifest, blobs, label, measured } = self.found;
+        let Found { manifest, blobs, label, measured, .. } = self.found;
         let label = label.to_string();
         let generator = Generator::load(&manifest, &blobs, &self.device).map_err(Problem::failed)?;
         let sampler = self.sampler.sampler(self.steps, generator.sampler(), &measured);

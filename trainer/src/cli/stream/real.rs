@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use motion::{Skeleton, files, npy};
+use motion::{DataPath, Skeleton, npy};
 use stages::evaluation::junction::{Jump, jumps, usual};
 
 use super::report::Real;
@@ -20,7 +20,8 @@ pub(super) fn read(path: &Path, skeleton: &'static Skeleton) -> Result<Real> {
     let mut all: Vec<Jump> = Vec::new();
     let name = if path.is_dir() {
         let list = path.join("train.txt");
-        let bytes = files::read(&list, LIST_BYTES)
+        let bytes = DataPath::local(&list)
+            .read(LIST_BYTES)
             .map_err(|error| Problem::usage(format!("`{}`: {error}; expected a dataset folder", list.display())))?;
         let text = String::from_utf8_lossy(&bytes).into_owned();
         let ids = text.lines().map(str::trim).filter(|id| motion::dataset::is_clip_id(id)).take(CLIPS);
@@ -50,7 +51,7 @@ pub(super) fn read(path: &Path, skeleton: &'static Skeleton) -> Result<Real> {
 
 fn of_file(file: &Path, skeleton: &'static Skeleton) -> Result<Vec<Jump>> {
     let refuse = |what: String| Problem::usage(format!("`{}`: {what}", file.display()));
-    let array = npy::read_any_float(file).map_err(|error| Problem::usage(error.to_string()))?;
+    let array = npy::read_any_float(&DataPath::local(file)).map_err(|error| Problem::usage(error.to_string()))?;
     let joints = match array.shape[..] {
         [_, count, 3] if count == skeleton.joints => array.data.iter().map(|v| f64::from(*v)).collect(),
         [_, width] if width == skeleton.features => motion::features::recover_joints_wide(&array.data, skeleton),

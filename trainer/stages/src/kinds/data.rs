@@ -5,7 +5,6 @@
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
-use std::path::Path;
 
 use motion::Dataset;
 use motion::dataset::{OpenReport, PackError, Split};
@@ -15,14 +14,17 @@ use protocol::stage::{DataFormat, DataOpen, DataSynthetic};
 use super::Plain;
 use crate::artifacts::{DatasetMeta, Draft, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
+use crate::external;
 
 /// The file that lists the clips and captions left out.
 const REPORT_FILE: &str = "report.txt";
 
 impl Plain for DataOpen {
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
-        let opened = Dataset::open_while(Path::new(&self.path), self.format, &|_| !cx.interrupted());
-        let opened = opened.map_err(|e| StageError::Input(e.to_string()))?;
+        let opened = external::read(cx, |cx, given| {
+            let opened = Dataset::open_while(given.path("path")?, self.format, &|_| !cx.interrupted());
+            opened.map_err(|e| StageError::Input(e.to_string()))
+        })?;
         let Some((dataset, report)) = opened else { return Ok(Outcome::Yielded { at: 0 }) };
         log_report(cx, &report);
         pack(cx, &dataset, report.skips.len(), report.to_string(), vec![])

@@ -15,6 +15,7 @@ use super::Map;
 use super::encode::shard_range;
 use crate::artifacts::{self, Draft, EMBEDDINGS_FILE, EmbeddingsMeta, Tensors, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
+use crate::external;
 use crate::text::{Named, TextEncoderMeta};
 
 /// Number of texts between progress reports.
@@ -49,7 +50,7 @@ impl Map for TextEmbed {
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
         let (texts, _) = texts(cx)?;
         let range = shard_range(texts.len(), index, of);
-        let named = Named::open(self)?;
+        let named = external::read(cx, |_, given| Named::open(self, given))?;
         let encoder_digest = named.digest();
         let encoder = named.ready(self, &cx.device())?;
         let dim = encoder.dim();
@@ -71,7 +72,7 @@ impl Map for TextEmbed {
 
     fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError> {
         let (texts, of) = texts(cx)?;
-        let named = Named::open(self)?;
+        let named = external::read(cx, |_, given| Named::open(self, given))?;
         let encoder = named.digest();
         let mut rows: Vec<f32> = Vec::new();
         let mut dim = 0;
@@ -97,8 +98,7 @@ impl Map for TextEmbed {
             return Err(StageError::Fault(format!("{} numbers for {} texts of {dim}", rows.len(), texts.len())));
         }
         if let Some(bad) = rows.iter().position(|v| !v.is_finite()) {
-            let text = texts[bad / dim].chars().take(40).collect::<String>();
-            let text = text.escape_debug();
+            let text = protocol::excerpt(&texts[bad / dim]);
             return Err(StageError::Input(format!(
                 "the encoder makes no finite numbers of `{text}`; its weights are damaged"
             )));

@@ -216,8 +216,16 @@ pub fn train(
         save_is_due |= every > 0 && state.step.is_multiple_of(every);
         stop = drain;
         if cx.leads() && state.step < steps && save_is_due && !stop && cx.can_save() {
-            save(&mut state, config, &recent, cx)?;
-            (saved_at, save_is_due) = (Some(state.step), false);
+            cx.may_postpone(true);
+            let saved = save(&mut state, config, &recent, cx);
+            cx.may_postpone(false);
+            match saved {
+                Ok(()) => (saved_at, save_is_due) = (Some(state.step), false),
+                Err(StageError::Context(ContextError::Unavailable(why))) if !cx.can_save() => {
+                    cx.log(&format!("the checkpoint after step {} is put off: {why}", state.step));
+                }
+                Err(error) => return Err(error),
+            }
         }
     }
 }
@@ -418,6 +426,17 @@ fn keep(state: &mut TrainState, accelerator: Option<&Device>) {
     }
 }
 
+/// What a checkpoint's manifest says. Workers of two builds may save one step, so it names none of them.
+fn meta(state: &TrainState, config: protocol::Digest, seed: protocol::Seed) -> serde_json::Value {
+    json!({
+        "step": state.step,
+        "settings": config,
+        "seed": seed,
+        "groups": state.groups.iter().map(|g| json!({"name": g.name, "parameters": g.params.len()})).collect::<Vec<_>>(),
+        "buffers": state.buffers.iter().map(|(name, v)| json!({"name": name, "values": v.len()})).collect::<Vec<_>>(),
+    })
+}
+
 fn save(
     state: &mut TrainState,
     config: protocol::Digest,
@@ -425,14 +444,7 @@ fn save(
     cx: &mut dyn GangContext,
 ) -> Result<(), StageError> {
     state.fetch();
-    let meta = json!({
-        "step": state.step,
-        "settings": config,
-        "seed": cx.task().seed,
-        "groups": state.groups.iter().map(|g| json!({"name": g.name, "parameters": g.params.len()})).collect::<Vec<_>>(),
-        "buffers": state.buffers.iter().map(|(name, v)| json!({"name": name, "values": v.len()})).collect::<Vec<_>>(),
-        "build": env!("CARGO_PKG_VERSION"),
-    });
+    let meta = meta(state, config, cx.task().seed);
     let mut draft = Draft::new(cx, ArtifactKind::Checkpoint, meta);
     state.saved(|pieces| draft.add_pieces(STATE_FILE, pieces))?;
     let digest = draft.finish(cx)?;
@@ -479,5 +491,15 @@ mod tests {
         assert_eq!(class, protocol::message::FailureClass::Input);
         assert!(message.contains("9.0 GiB") && message.contains("at most 8.0 GiB"), "{message}");
         assert!(check_size(7 << 30, 8 << 30).is_ok());
+    }
+
+    /// In a rolling upgrade a member of one build may save a step again that one of another build has saved: those are not two states.
+    #[test]
+    fn a_checkpoint_says_nothing_of_the_build_that_saved_it() {
+        let state = TrainState::new(Vec::new(), Vec::new());
+        let meta = meta(&state, protocol::Digest::of(b"settings"), protocol::Seed(1));
+        let keys: Vec<&str> = meta.as_object().expect("an object").keys().map(String::as_str).collect();
+        assert_eq!(keys, ["buffers", "groups", "seed", "settings", "step"]);
+        assert!(!meta.to_string().contains(env!("CARGO_PKG_VERSION")), "{meta}");
     }
 }

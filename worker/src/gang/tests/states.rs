@@ -5,6 +5,7 @@ use std::thread;
 use super::{Gang, Halt, Head, Kind, QUICK, exchange, mesh, wait_until};
 use crate::gang::exchange::Met;
 use crate::gang::frame::MAX_PAYLOAD;
+use crate::gang::mesh::STATE_FRAMES;
 
 const BARRIER: &str = "barrier `rendezvous` of generation 7";
 
@@ -23,7 +24,7 @@ fn a_state_arrives_where_it_belongs_however_it_is_cut() {
                 let pieces = [&state[..8], &state[8..], b"rows behind it"];
                 assert_eq!(exchange::rendezvous(&ahead, Some(5), &pieces, &|| None), Ok(Met::Keep));
             });
-            assert_eq!(exchange::rendezvous(&behind, applied, &[], &|| None), Ok(Met::Behind(0)));
+            assert_eq!(exchange::rendezvous(&behind, applied, &[], &|| None), Ok(Met::Behind(0, 5)));
             let mut room = vec![0; state.len()];
             let mut rest = room.as_mut_slice();
             let mut pieces = Vec::new();
@@ -41,7 +42,7 @@ fn a_state_arrives_where_it_belongs_however_it_is_cut() {
     // Of another build, say.
     thread::scope(|scope| {
         scope.spawn(|| exchange::rendezvous(&ahead, Some(5), &[&state[..100]], &|| None).expect("sent"));
-        assert_eq!(exchange::rendezvous(&behind, None, &[], &|| None), Ok(Met::Behind(0)));
+        assert_eq!(exchange::rendezvous(&behind, None, &[], &|| None), Ok(Met::Behind(0, 5)));
         let refused = exchange::adopt(&behind, 0, &mut [&mut [0; 101]], true, &|| None);
         assert!(matches!(&refused, Err(Halt::Disagree(why)) if why.contains("100 bytes, expected 101")), "{refused:?}");
     });
@@ -69,13 +70,13 @@ fn a_state_that_is_cut_short_takes_the_place_of_none() {
 fn a_state_is_queued_within_bounds() {
     let gang = Gang::new(2, QUICK);
     let [ahead, behind] = [0, 1].map(|own| mesh(&gang, &[0, 1], own, "s").0);
-    let state = bytes(96 * MAX_PAYLOAD);
+    let state = bytes(96 << 20);
     thread::scope(|scope| {
         let sending = scope.spawn(|| exchange::rendezvous(&ahead, Some(5), &[&state], &|| None));
-        assert_eq!(exchange::rendezvous(&behind, None, &[], &|| None), Ok(Met::Behind(0)));
-        wait_until("as much as may be is queued", || behind.queued(0) == 16);
+        assert_eq!(exchange::rendezvous(&behind, None, &[], &|| None), Ok(Met::Behind(0, 5)));
+        wait_until("as much as may be is queued", || behind.queued(0) == STATE_FRAMES);
         thread::sleep(QUICK.patience / 4);
-        assert!(behind.queued(0) <= 17 && !sending.is_finished(), "{} frames are here", behind.queued(0));
+        assert!(behind.queued(0) <= STATE_FRAMES + 1 && !sending.is_finished(), "{} frames are here", behind.queued(0));
         let mut room = vec![0; state.len()];
         assert_eq!(exchange::adopt(&behind, 0, &mut [&mut room], true, &|| None), Ok(Vec::new()));
         assert!(room == state);

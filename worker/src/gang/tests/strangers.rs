@@ -150,7 +150,15 @@ fn members_at_different_steps_or_with_other_slices_add_nothing_up() {
                         let numbers = [1.0f32; 10];
                         let own = tree::share(slices, mesh.config.rank, 2);
                         let parts = own.map(|slice| (slice..slice + 1, &numbers[..])).collect();
-                        let contribution = exchange::Contribution { step, slices, parts, drain: false, durable: 0 };
+                        let contribution = exchange::Contribution {
+                            step,
+                            slices,
+                            parts,
+                            drain: false,
+                            saved: false,
+                            computed: Duration::ZERO,
+                            durable: 0,
+                        };
                         exchange::exchange(mesh, &contribution, &|| None)
                     })
                 })

@@ -5,9 +5,10 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use coordinator::batch::{Ask, Done, Turn};
+use coordinator::state::task::Part;
 use coordinator::state::worker::Presence;
 use coordinator::{Effect, Event, Millis, Moment, Refused};
-use protocol::message::TaskOutcome;
+use protocol::message::{Member, TaskOutcome};
 use protocol::{Digest, Incarnation, WorkerId};
 use registry::{Write, WriteError};
 
@@ -228,6 +229,7 @@ impl World {
         self.events += answers.len() as u64;
         self.check_leases(&answers);
         self.present = self.present_now();
+        self.check_steps();
         let state = self.state();
         let suspected = |presence| matches!(presence, Presence::Suspect { since } if since == state.now);
         if done.durable && state.workers.values().any(|worker| suspected(worker.presence)) {
@@ -251,6 +253,45 @@ impl World {
         }
         for (ticket, answer) in answers {
             self.answer(ticket, answer);
+        }
+    }
+
+    /// A member that polls and has to leave its gang leaves its steps behind, all but the one that is under way.
+    fn check_steps(&mut self) {
+        let state = Arc::clone(self.batches.state());
+        let mut gangs = BTreeMap::new();
+        for task in state.executions.values().flat_map(|execution| &execution.tasks) {
+            if task.part == Part::Gang && task.is_held() {
+                gangs.insert(task.id.clone(), (task.attempt, task.holders().to_vec()));
+            }
+        }
+        for (task, (attempt, before)) in std::mem::replace(&mut self.gangs, gangs) {
+            let Some((now, after)) = self.gangs.get(&task).filter(|(now, _)| *now == attempt) else { continue };
+            let process = |member: &Member| self.workers.iter().find(|worker| worker.is(member));
+            // It may have died since it spoke.
+            if !after.iter().all(|member| process(member).is_some()) {
+                continue;
+            }
+            let live = |member: &Member| process(member).and_then(|worker| worker.live_of(&task, *now));
+            let reported =
+                state.task(&task).ok().and_then(|(_, task)| Some(task.reported.as_ref()?.grant.worker.clone()));
+            let had_to_leave = |member: &&Member| {
+                if reported.as_ref() == Some(&member.worker) {
+                    return false;
+                }
+                let process = state.workers.get(&member.worker).filter(|w| w.incarnation == member.incarnation);
+                let is_out =
+                    matches!(process.map(|w| w.presence), Some(Presence::Suspect { since }) if since == state.now);
+                let heard = state.heard.workers.get(&member.worker);
+                is_out && heard.is_some_and(|heard| state.now.since(*heard) < state.policy.hearing_ms)
+            };
+            let left =
+                before.iter().filter(|member| !after.contains(member)).filter(had_to_leave).filter_map(live).max();
+            let kept = after.iter().filter_map(live).max();
+            assert!(
+                left.is_none_or(|left| kept.is_some_and(|kept| kept + 1 >= left)),
+                "`{task}` went from step {left:?} to {kept:?}: {before:?} to {after:?}"
+            );
         }
     }
 

@@ -5,13 +5,14 @@ use std::sync::Arc;
 use coordinator::batch::Ask;
 use coordinator::state::execution::StageExecution;
 use coordinator::state::run::Status;
+use coordinator::state::worker::Identity;
 use coordinator::{Control, Effect, Event, Millis, Moment, Observation, Refused, Rejected, State, decide, invariants};
 use protocol::message::{Poll, RunState};
 use protocol::{Digest, Incarnation, WorkerId};
 use registry::WriteError;
 
 use super::disk::{Disk, Ticket};
-use super::{World, durable};
+use super::{Cut, World, durable};
 use crate::wild;
 use crate::worker::{Answer, Call, FakeWorker, Saving};
 
@@ -19,7 +20,11 @@ impl World {
     fn deliver(&mut self, i: usize, process: u32, call: Call) {
         let name = self.workers[i].name.clone();
         let ask = match &call {
-            Call::Join(join) => Ask::Event(Box::new(Event::Join { join: join.clone() })),
+            Call::Join(join) => {
+                let secret = Digest::of(format!("{name} {process}").as_bytes());
+                let by = Identity { caller: "t".into(), secret };
+                Ask::Event(Box::new(Event::Join { join: join.clone(), by }))
+            }
             Call::Poll(poll) => match self.poll(&name, poll) {
                 Ok(Some(ask)) => ask,
                 Ok(None) => return self.send_desired(i, process, poll.incarnation),
@@ -152,16 +157,29 @@ impl World {
                 if was_alive && self.up && self.random.chance(50) {
                     let worker = self.workers[i].name.clone();
                     // The launcher tells what it saw; if that is lost, the lease does.
-                    self.ask(Ask::Event(Box::new(Event::WorkerGone { worker })), Ticket::Nobody);
+                    self.ask(Ask::Event(Box::new(Event::WorkerGone { worker, incarnation: None })), Ticket::Nobody);
                 }
             }
             40..48 => {
                 let other = self.random.below(self.workers.len() as u64) as usize;
                 if other != i {
                     let until = self.now.after(self.random.below(20_000));
-                    self.cuts.push((self.workers[i].name.clone(), self.workers[other].name.clone(), until));
-                    self.count("a cut between peers that both reach the coordinator");
+                    let (from, to) = (self.workers[i].name.clone(), self.workers[other].name.clone());
+                    let one_way = self.random.chance(50);
+                    self.cuts.push(Cut { from, to, one_way, until });
+                    self.count(match one_way {
+                        true => "a cut that only one of two peers notices",
+                        false => "a cut between peers that both reach the coordinator",
+                    });
                 }
+            }
+            60..66 => {
+                self.workers[i].refuses_until = self.now.after(self.random.below(40_000));
+                self.count("a refused peer port");
+            }
+            66..70 => {
+                self.workers[i].stuck_until = self.now.after(self.random.below(80_000));
+                self.count("a stage that hangs while its worker polls");
             }
             12..20 => {
                 self.workers[i].hung_until = self.now.after(self.random.below(40_000));
@@ -312,7 +330,7 @@ impl World {
     fn perform(&mut self, effect: Effect) {
         let event = match &effect {
             Effect::Lookup { key } => self.store.look_up(*key),
-            Effect::Register { key, candidates } => Event::Bundled {
+            Effect::Register { key, candidates, .. } => Event::Bundled {
                 key: *key,
                 bundles: candidates.iter().map(|c| Digest::of(c.stage.as_str().as_bytes())).collect(),
             },
@@ -337,18 +355,30 @@ impl World {
 
     fn workers_step(&mut self) {
         let now = self.now;
-        self.cuts.retain(|(_, _, until)| *until > now);
+        self.cuts.retain(|cut| cut.until > now);
         let cuts = self.cuts.clone();
-        let is_cut = |a: &WorkerId, b: &WorkerId| cuts.iter().any(|(x, y, _)| (x, y) == (a, b) || (x, y) == (b, a));
+        let refusing: Vec<WorkerId> =
+            self.workers.iter().filter(|worker| worker.refuses_until > now).map(|worker| worker.name.clone()).collect();
+        let notices = |a: &WorkerId, b: &WorkerId| {
+            let cut = |cut: &Cut| (&cut.from, &cut.to) == (a, b) || (!cut.one_way && (&cut.to, &cut.from) == (a, b));
+            a != b && (refusing.contains(b) || cuts.iter().any(cut))
+        };
+        let is_cut = |a: &WorkerId, b: &WorkerId| notices(a, b) || notices(b, a);
+        let is_stuck = |worker: &&FakeWorker| worker.is_stuck(now);
+        let stuck: Vec<WorkerId> = self.workers.iter().filter(is_stuck).map(|worker| worker.name.clone()).collect();
         for i in 0..self.workers.len() {
             let (process, own) = (self.workers[i].process, self.workers[i].name.clone());
             let unreachable: Vec<WorkerId> = self
                 .workers
                 .iter()
-                .filter(|other| !other.runs(now) || is_cut(&own, &other.name))
+                .filter(|other| !other.runs(now) || notices(&own, &other.name))
                 .map(|other| other.name.clone())
                 .collect();
-            for call in self.workers[i].speak(now, &unreachable) {
+            let lies = self.chaos() && self.workers[i].lies;
+            for call in self.workers[i].speak(now, &unreachable, &stuck, lies) {
+                if lies && matches!(&call, Call::Poll(poll) if poll.doing.iter().any(|doing| !doing.lost.is_empty())) {
+                    self.count("a false complaint");
+                }
                 let twice = self.chaos() && self.random.chance(8);
                 if twice {
                     self.count("a call that came twice");
@@ -368,9 +398,9 @@ impl World {
             let peers: Vec<&FakeWorker> =
                 self.workers.iter().filter(|w| members.iter().any(|member| member.worker == w.name)).collect();
             let apart = |peer: &&FakeWorker| peers.iter().any(|other| is_cut(&peer.name, &other.name));
-            let together = !peers.is_empty()
-                && !peers.iter().any(apart)
-                && peers.iter().all(|peer| peer.runs(now) && peer.grant().is_some_and(|g| g.fence == grant.fence));
+            let hangs = peers.len() > 1 && peers.iter().any(|peer| peer.is_stuck(now));
+            let in_step = |peer: &&FakeWorker| peer.runs(now) && peer.grant().is_some_and(|g| g.fence == grant.fence);
+            let together = !hangs && !peers.is_empty() && !peers.iter().any(apart) && peers.iter().all(in_step);
             let furthest = together.then(|| peers.iter().filter_map(|peer| peer.live(&grant)).max());
             let saved = task.and_then(|task| task.newest()).map_or(0, |saved| saved.step);
             let chaos = self.chaos();

@@ -1,0 +1,9 @@
+//! One valid worker token, or one mistaken worker, against the others: names, grants, manifests and blobs.
+#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a test may panic, and prints what it counted")]
+
+mod blobs;
+mod bystanders;
+mod fuzz;
+mod grants;
+mod matrix;
+mod names;
