@@ -111,7 +111,7 @@ mutation only-whole-frames-count worker/src/gang/link.rs 's/if count > 0 \{/if c
 mutation signs-behind-frames worker/src/gang/link.rs 's/writer\.sign\(sign, patience, abort\)\?;/let _ = sign;/' worker
 mutation slow-is-not-named worker/src/gang/pace.rs 's/const FAR_OVER: u32 = 3;/const FAR_OVER: u32 = 3_000_000;/' worker
 mutation finished-as-last-reported trainer/coordinator/src/view.rs 's/    progress\.done = progress\.total;\n//' coordinator
-mutation new-run-with-each-start trainer/coordinator/src/decide/runs.rs 's/old\.is_interrupted\(\) && old\.until/false \&\& old.until/' coordinator
+mutation new-run-with-each-start trainer/coordinator/src/decide/runs.rs 's/&& old\.until == run\.until/\&\& false/' coordinator
 mutation paused-if-interrupted trainer/coordinator/src/state/run.rs 's/self\.parked && self\.state == RunState::Paused/false/' coordinator
 mutation every-word-is-known trainer/motion/src/vocabulary.rs 's/!self\.words\.contains_key\(&word\) && //; s/!unknown\.contains\(&word\)/false \&\& !unknown.contains(\&word)/' motion
 exit $missed
