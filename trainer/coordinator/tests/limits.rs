@@ -13,11 +13,12 @@ use std::time::{Duration, Instant};
 use access::{Scope, Scopes, Tokens};
 use coordinator::{Allowances, Config, Connections, Coordinator, Handle};
 use protocol::message::{ApiError, Assignment, DesiredAssignments, Joined, LogBatch, MetricBatch, MetricRow, Poll};
+use protocol::proof::SECRET_HEADER;
 use registry::{Holder, Store};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use self::shell::{offer, submission};
+use self::shell::{SECRET, offer, submission};
 
 const READER: &str = "token-of-one-who-may-read";
 const WORKER: &str = "token-of-one-who-may-work";
@@ -38,17 +39,21 @@ async fn start(dir: &Path, connections: Connections, allowances: Allowances) -> 
 struct Caller {
     stream: TcpStream,
     token: &'static str,
+    /// Of the process, or of a grant.
+    secret: String,
 }
 
 impl Caller {
     fn connect(address: SocketAddr, token: &'static str) -> Self {
         let stream = TcpStream::connect(address).unwrap();
         stream.set_read_timeout(Some(Duration::from_secs(30))).unwrap();
-        Self { stream, token }
+        Self { stream, token, secret: SECRET.to_owned() }
     }
 
     fn call(&mut self, method: &str, path: &str, body: &[u8]) -> (u16, Vec<u8>) {
-        let head = format!("authorization: Bearer {}\r\ncontent-type: application/json\r\n", self.token);
+        let (token, secret) = (self.token, &self.secret);
+        let head = format!("authorization: Bearer {token}\r\n{SECRET_HEADER}: {secret}\r\n");
+        let head = format!("{head}content-type: application/json\r\n");
         let length = body.len();
         let head = format!("{method} {path} HTTP/1.1\r\nhost: localhost\r\n{head}content-length: {length}\r\n\r\n");
         self.stream.write_all(&[head.as_bytes(), body].concat()).unwrap();
@@ -204,7 +209,8 @@ async fn short_log_lines_take_no_more_of_the_store_than_they_say() {
     let dir = tempfile::tempdir().unwrap();
     let allowances = Allowances { log_bytes: 4 << 20, values: 15_000, ..Allowances::default() };
     let handle = start(dir.path(), Connections::default(), allowances).await;
-    let (mut worker, Assignment { grant, .. }) = working(&handle);
+    let (mut worker, Assignment { grant, secret, .. }) = working(&handle);
+    worker.secret = secret;
     let run = grant.task.as_str().split('/').next().unwrap().to_owned();
     let before = bytes_of(dir.path());
     // A megabyte as it is sent, in lines of one byte.
