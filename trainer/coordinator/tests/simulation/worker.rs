@@ -43,7 +43,8 @@ impl Call {
 #[derive(Debug, Clone)]
 pub(crate) enum Answer {
     Joined(Incarnation),
-    DesiredAssignments(DesiredAssignments),
+    /// What is decided after so many decisions.
+    DesiredAssignments(DesiredAssignments, u64),
     /// To this commit or report: stored.
     Done(Saving),
     /// To this commit or report: never.
@@ -77,8 +78,13 @@ pub(crate) struct FakeWorker {
     pub(crate) process: u32,
     incarnation: Option<Incarnation>,
     desired: Option<DesiredAssignments>,
+    /// After how many decisions the newest answer was sent that it has heard.
+    newest: u64,
     /// Steps of the state in memory, and of which try.
     live: Option<(TaskId, Attempt, u64)>,
+    /// The state that it let go because an answer said so which a newer one had overtaken. A real worker hears no such answer: it has one
+    /// poll under way and does not read what comes to one that it gave up.
+    misled: Option<(TaskId, Attempt, u64)>,
     saved_at: u64,
     saving: Saving,
     next_call: Millis,
@@ -103,7 +109,9 @@ impl FakeWorker {
             process: 0,
             incarnation: None,
             desired: None,
+            newest: 0,
             live: None,
+            misled: None,
             saved_at: 0,
             saving: Saving::No,
             next_call: Millis(0),
@@ -163,6 +171,12 @@ impl FakeWorker {
         self.live.as_ref().filter(|(of, at, _)| (of, *at) == (task, attempt)).map(|live| live.2)
     }
 
+    /// Steps that it said it has, or would have if it had not obeyed an answer that was overtaken.
+    pub(crate) fn has_or_was_misled_out_of(&self, task: &TaskId, attempt: Attempt) -> Option<u64> {
+        let misled = self.misled.as_ref().filter(|(of, at, _)| (of, *at) == (task, attempt));
+        self.live_of(task, attempt).max(misled.map(|misled| misled.2))
+    }
+
     pub(crate) fn hear(&mut self, process: u32, answer: Answer) {
         if !self.alive || process != self.process {
             return;
@@ -171,11 +185,18 @@ impl FakeWorker {
             Answer::Joined(incarnation) => {
                 self.incarnation.get_or_insert(incarnation);
             }
-            Answer::DesiredAssignments(desired) => {
+            Answer::DesiredAssignments(desired, decisions) => {
+                let is_overtaken = decisions < self.newest;
+                self.newest = self.newest.max(decisions);
                 let held = self.grant().cloned();
                 self.desired = Some(desired);
                 if self.grant().is_none_or(|grant| held.as_ref().is_some_and(|held| held.task != grant.task)) {
-                    self.live = None;
+                    let dropped = self.live.take();
+                    if !is_overtaken {
+                        self.misled = None;
+                    } else if dropped.is_some() {
+                        self.misled = dropped;
+                    }
                 }
                 if let Some(Assignment { grant, role: Role::Member { .. }, .. }) = self.assignment() {
                     assert!(self.said_ready.contains(&grant.task), "`{}` got {grant:?} without its inputs", self.name);
@@ -204,6 +225,7 @@ impl FakeWorker {
         self.incarnation = None;
         self.desired = None;
         self.live = None;
+        self.misled = None;
         self.saving = Saving::No;
     }
 

@@ -273,6 +273,9 @@ impl World {
                 continue;
             }
             let live = |member: &Member| process(member).and_then(|worker| worker.live_of(&task, *now));
+            // A member that said what it holds is believed. That it lets it go when an old answer comes late, nobody can know.
+            let kept =
+                |member: &Member| process(member).and_then(|worker| worker.has_or_was_misled_out_of(&task, *now));
             let reported =
                 state.task(&task).ok().and_then(|(_, task)| Some(task.reported.as_ref()?.grant.worker.clone()));
             let had_to_leave = |member: &&Member| {
@@ -287,7 +290,7 @@ impl World {
             };
             let left =
                 before.iter().filter(|member| !after.contains(member)).filter(had_to_leave).filter_map(live).max();
-            let kept = after.iter().filter_map(live).max();
+            let kept = after.iter().filter_map(kept).max();
             assert!(
                 left.is_none_or(|left| kept.is_some_and(|kept| kept + 1 >= left)),
                 "`{task}` went from step {left:?} to {kept:?}: {before:?} to {after:?}"
@@ -352,7 +355,7 @@ impl World {
         let (synced, told) = (self.synced(), self.batches.front().state());
         assert!(told.seq <= synced.seq(), "decision {} is told and not stored", told.seq);
         match answer {
-            Answer::DesiredAssignments(desired) => {
+            Answer::DesiredAssignments(desired, _) => {
                 for assignment in &desired.assignments {
                     let (task, fence) = (&assignment.grant.task, assignment.grant.fence);
                     let stored = synced.fences.get(task);

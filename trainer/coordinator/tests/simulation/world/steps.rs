@@ -114,7 +114,7 @@ impl World {
         let desired = self.batches.front().state().desired(&name, incarnation);
         match desired {
             Ok(desired) => {
-                let answer = Answer::DesiredAssignments(desired);
+                let answer = Answer::DesiredAssignments(desired, self.batches.front().state().seq);
                 self.acknowledge(&answer);
                 self.send_answer(i, process, answer);
             }
