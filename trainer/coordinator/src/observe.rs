@@ -98,14 +98,15 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
 fn tick(state: &mut State, at: Millis, overslept: u64) -> Vec<Event> {
     let now = at.max(state.now);
     // Who sleeps through his own alarm was not listening either: that is not the workers' fault. Who was heard meanwhile all the same
-    // gets no more than a lease from now.
+    // gets no more than a lease from now. What was heard after the clock was looked at, while that waited for the disk, stays.
+    let later = |then: Millis| then.after(overslept).min(at).max(then);
     if overslept > state.policy.lease_ms / 3 {
         for heard in Arc::make_mut(&mut state.heard.workers).values_mut() {
-            *heard = heard.after(overslept).min(at);
+            *heard = later(*heard);
         }
         for word in Arc::make_mut(&mut state.heard.words).values_mut() {
-            word.complained = word.complained.map(|complained| complained.after(overslept).min(at));
-            word.moved = word.moved.after(overslept).min(at);
+            word.complained = word.complained.map(later);
+            word.moved = later(word.moved);
         }
     }
     let mut events = Vec::new();
