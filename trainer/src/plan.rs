@@ -289,7 +289,7 @@ pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&ReadStore>) -> Resu
     })
 }
 
-/// Where each unfinished training stage would resume, for people. Stages of runs that ended are found by key; only runs that have not
+/// The run, step and checkpoint that each unfinished training stage would resume from, for people. Stages of runs that ended are found by key; only runs that have not
 /// ended are read, each once.
 async fn checkpoints(
     pipeline: &Pipeline,
