@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Runs a pipeline and writes what came of it: NAME.json, as `trainer run -o json` prints it, and NAME.md, the template NAME.in.md filled from it and
-# from the pipeline. The text also takes the place of README's part of that name, if there is one.
+# Runs a pipeline and writes its results: NAME.json, as `trainer run -o json` prints it, and NAME.md, the template NAME.in.md filled from it and
+# from the pipeline. The text also replaces README's section of that name, if there is one.
 #
 #   docs/results/regenerate.sh docs/results/mini.yaml --set dataset.path=PATH/TO/humanml3d-mini
 #
-# Arguments behind the pipeline are those of `trainer run`. What a store has already is not computed again: run it twice and only the text is made.
-# TRAINER and TABLES name binaries that are built already; README another file than this repository's.
+# Arguments after the pipeline are those of `trainer run`. Results in the store are not computed again: a second run only writes the text.
+# TRAINER and TABLES name existing binaries; README names another file than this repository's.
 set -euo pipefail
 
 [ $# -ge 1 ] && [ -f "$1" ] || { echo "usage: $0 PIPELINE.yaml [options of trainer run]" >&2; exit 2; }
