@@ -88,11 +88,10 @@ pub fn read<M: Module>(module: &M) -> Vec<f32> {
 /// # Panics
 /// If `flat` has another length than the module has parameters.
 pub fn write<M: Module>(module: M, mut flat: &[f32]) -> M {
-    let Ok(module) = replace(module, |values| {
-        let (head, tail) = flat.split_at(values.len());
-        values.copy_from_slice(head);
+    let Ok(module) = renew(module, |count| {
+        let (head, tail) = flat.split_at(count);
         flat = tail;
-        Ok::<_, Infallible>(())
+        Ok::<_, Infallible>(head.to_vec())
     });
     assert!(flat.is_empty(), "the buffer is longer than the module");
     module
@@ -103,22 +102,33 @@ pub fn write<M: Module>(module: M, mut flat: &[f32]) -> M {
 ///
 /// # Errors
 /// The first error of `fill`.
-pub fn replace<M: Module, E>(module: M, fill: impl FnMut(&mut [f32]) -> Result<(), E>) -> Result<M, E> {
-    struct Replace<F, E> {
-        fill: F,
+pub fn replace<M: Module, E>(module: M, mut fill: impl FnMut(&mut [f32]) -> Result<(), E>) -> Result<M, E> {
+    renew(module, |count| {
+        let mut values = vec![0.0; count];
+        fill(&mut values)?;
+        Ok(values)
+    })
+}
+
+/// Replaces the module's parameters, each by as many values as `next` is asked for.
+fn renew<M: Module, E>(module: M, next: impl FnMut(usize) -> Result<Vec<f32>, E>) -> Result<M, E> {
+    struct Renew<F, E> {
+        next: F,
         failed: Option<E>,
     }
-    impl<F: FnMut(&mut [f32]) -> Result<(), E>, E> ModuleMapper for Replace<F, E> {
+    impl<F: FnMut(usize) -> Result<Vec<f32>, E>, E> ModuleMapper for Renew<F, E> {
         fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
             if self.failed.is_some() {
                 return param;
             }
             let shape = param.dims();
-            let mut values = vec![0.0; shape.iter().product()];
-            if let Err(error) = (self.fill)(&mut values) {
-                self.failed = Some(error);
-                return param;
-            }
+            let values = match (self.next)(shape.iter().product()) {
+                Ok(values) => values,
+                Err(error) => {
+                    self.failed = Some(error);
+                    return param;
+                }
+            };
             let data = TensorData::new(values, shape);
             param.map(|old| {
                 let tracked = old.is_require_grad();
@@ -126,7 +136,7 @@ pub fn replace<M: Module, E>(module: M, fill: impl FnMut(&mut [f32]) -> Result<(
             })
         }
     }
-    let mut mapper = Replace { fill, failed: None };
+    let mut mapper = Renew { next, failed: None };
     let module = module.map(&mut mapper);
     mapper.failed.map_or(Ok(module), Err)
 }

@@ -9,6 +9,8 @@
 
 use protocol::stage::{Decay, Optimizer, Training};
 
+use crate::kernels::simd::multiversion;
+
 /// Constants of the AdamW optimizer.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdamW {
@@ -72,12 +74,37 @@ impl AdamW {
     /// # Panics
     /// If the buffers differ in length, or `t` is 0.
     pub fn step(&self, t: u64, lr: f64, params: &mut [f32], grads: &[f32], m: &mut [f32], v: &mut [f32]) {
+        self.step_by(1.0, t, lr, params, grads, m, v);
+    }
+
+    /// Like [`step`](Self::step), with `factor` times the gradients.
+    ///
+    /// # Panics
+    /// As [`step`](Self::step).
+    #[expect(clippy::too_many_arguments, reason = "an update has four buffers and three numbers")]
+    pub fn step_by(
+        &self,
+        factor: f32,
+        t: u64,
+        lr: f64,
+        params: &mut [f32],
+        grads: &[f32],
+        m: &mut [f32],
+        v: &mut [f32],
+    ) {
         let len = params.len();
         assert_eq!((grads.len(), m.len(), v.len()), (len, len, len), "lengths of gradients and moments");
-        let Rates { keep, rate, unbias, new1, beta2, new2, eps } = self.rates(t, lr);
+        update(self.rates(t, lr), factor, params, grads, m, v);
+    }
+}
+
+multiversion! {
+    fn update(rates: Rates, factor: f32, params: &mut [f32], grads: &[f32], m: &mut [f32], v: &mut [f32]) {
+        let Rates { keep, rate, unbias, new1, beta2, new2, eps } = rates;
         for (((p, g), m), v) in params.iter_mut().zip(grads).zip(m).zip(v) {
-            *m += new1 * (*g - *m);
-            *v = beta2 * *v + new2 * *g * *g;
+            let g = *g * factor;
+            *m += new1 * (g - *m);
+            *v = beta2 * *v + new2 * g * g;
             *p = keep * *p - rate * *m / (v.sqrt() * unbias + eps);
         }
     }
@@ -89,26 +116,37 @@ impl AdamW {
 /// If the lengths differ.
 pub fn ema(target: &mut [f32], source: &[f32], decay: f64) {
     assert_eq!(target.len(), source.len(), "lengths of the average and its source");
-    let (keep, take) = (decay as f32, (1.0 - decay) as f32);
-    for (t, s) in target.iter_mut().zip(source) {
-        *t = keep * *t + take * s;
+    blend(target, source, decay as f32, (1.0 - decay) as f32);
+}
+
+multiversion! {
+    fn blend(target: &mut [f32], source: &[f32], keep: f32, take: f32) {
+        for (t, s) in target.iter_mut().zip(source) {
+            *t = keep * *t + take * s;
+        }
     }
 }
 
 /// L2 norm in f64. Eight running sums over every eighth element are added in order: fast, and the same bits everywhere.
 pub fn global_norm(values: &[f32]) -> f64 {
-    let mut sums = [0.0_f64; 8];
-    let chunks = values.chunks_exact(8);
-    let rest = chunks.remainder();
-    for chunk in chunks {
-        for (sum, value) in sums.iter_mut().zip(chunk) {
+    sum_of_squares(values).sqrt()
+}
+
+multiversion! {
+    fn sum_of_squares(values: &[f32]) -> f64 {
+        let mut sums = [0.0_f64; 8];
+        let chunks = values.chunks_exact(8);
+        let rest = chunks.remainder();
+        for chunk in chunks {
+            for (sum, value) in sums.iter_mut().zip(chunk) {
+                *sum += f64::from(*value) * f64::from(*value);
+            }
+        }
+        for (sum, value) in sums.iter_mut().zip(rest) {
             *sum += f64::from(*value) * f64::from(*value);
         }
+        sums.iter().sum::<f64>()
     }
-    for (sum, value) in sums.iter_mut().zip(rest) {
-        *sum += f64::from(*value) * f64::from(*value);
-    }
-    sums.iter().sum::<f64>().sqrt()
 }
 
 /// The factor that scales gradients of this norm to at most `max`; 1 if the norm is below it, or `max` is 0.

@@ -149,9 +149,61 @@ fn norms_are_the_stock_norms() {
 }
 
 #[test]
+fn leaky_norms_are_the_stock_norms() {
+    for (rows, width) in [(3, 5), (40, 96), (17, 263)] {
+        for residual in [false, true] {
+            agree(&format!("leaky norm {rows}x{width}, residual {residual}"), 8e-6, || {
+                let (x, y) = (leaf([2, rows, width], 1), leaf([2, rows, width], 2));
+                let (gamma, beta) = (leaf([width], 3), leaf([width], 4));
+                let onto = residual.then(|| y.clone());
+                let out = kernels::leaky_layer_norm(x.clone(), onto, gamma.clone(), beta.clone(), 1e-5, 0.01);
+                let gradients = weighted(out.clone()).backward();
+                let mut all = vec![values(out), values(x.grad(&gradients).unwrap())];
+                all.extend(residual.then(|| values(y.grad(&gradients).unwrap())));
+                all.extend([gamma, beta].map(|p| values(p.grad(&gradients).unwrap())));
+                all
+            });
+        }
+    }
+}
+
+#[test]
+fn a_leaky_norm_has_the_bits_of_its_parts() {
+    let run = |whole: bool| {
+        let (x, y) = (leaf([2, 9, 96], 1), leaf([2, 9, 96], 2));
+        let (gamma, beta) = (leaf([96], 3), leaf([96], 4));
+        let out = if whole {
+            kernels::leaky_layer_norm(x.clone(), Some(y.clone()), gamma.clone(), beta.clone(), 1e-5, 0.2)
+        } else {
+            let norm = kernels::layer_norm(x.clone(), gamma.clone(), beta.clone(), 1e-5);
+            y.clone() + burn::tensor::activation::leaky_relu(norm, 0.2)
+        };
+        let gradients = weighted(out.clone()).backward();
+        let [gamma, beta] = [gamma, beta].map(|p| values(p.grad(&gradients).unwrap()));
+        [values(out), values(x.grad(&gradients).unwrap()), values(y.grad(&gradients).unwrap()), gamma, beta]
+    };
+    assert_eq!(run(true), run(false));
+}
+
+#[test]
+fn gradients_that_are_shared_stay_whole() {
+    // The gradient of a residual norm goes to both of its inputs; what one makes of it must not reach the other.
+    agree("a residual norm of two activations", 8e-6, || {
+        let (x, y) = (leaf([2, 7, 24], 1), leaf([2, 7, 24], 2));
+        let (gamma, beta) = (leaf([24], 3), leaf([24], 4));
+        let out = kernels::add_layer_norm(kernels::gelu(x.clone()), kernels::mish(y.clone()), gamma, beta, 1e-5);
+        let gradients = weighted(out.clone() + kernels::gelu(out)).backward();
+        vec![values(x.grad(&gradients).unwrap()), values(y.grad(&gradients).unwrap())]
+    });
+}
+
+/// Batch, items, heads, width of a head: sizes of both ways of computing attention.
+const SIZES: [(usize, usize, usize, usize); 7] =
+    [(1, 1, 1, 1), (2, 7, 2, 3), (3, 18, 4, 24), (2, 37, 4, 32), (2, 64, 2, 8), (2, 65, 2, 8), (1, 132, 2, 64)];
+
+#[test]
 fn attention_is_the_stock_attention() {
-    // Batch, items, heads, width of a head.
-    for (batch, len, heads, head) in [(1, 1, 1, 1), (2, 7, 2, 3), (2, 37, 4, 32), (1, 132, 2, 64)] {
+    for (batch, len, heads, head) in SIZES {
         let lengths: Vec<usize> = (0..batch).map(|b| len - b.min(len - 1)).collect();
         for (mask, probability) in [(false, 0.0), (true, 0.0), (true, 0.3)] {
             let width = heads * head;
@@ -172,6 +224,28 @@ fn attention_is_the_stock_attention() {
                 vec![values(y), values(q.grad(&gradients).unwrap()), values(kv.grad(&gradients).unwrap())]
             });
         }
+    }
+}
+
+#[test]
+fn a_sequence_has_the_same_bits_in_any_company() {
+    for (batch, len, heads, head) in SIZES {
+        let (triple, lengths) = (3 * heads * head, [len, 1, len.div_ceil(2)]);
+        let run = |from: usize, count: usize| {
+            let mask = KeyMask::new(&lengths[from..from + count], 0);
+            let all = wave(3 * len * triple, 1);
+            let own = all[from * len * triple..(from + count) * len * triple].to_vec();
+            let x = Tensor::<3>::from_data(TensorData::new(own, [count, len, triple]), &Device::flex().autodiff());
+            let x = x.require_grad();
+            let y = kernels::self_attention(x.clone(), heads, Some(&mask), &mut Dropout::off());
+            let gradients = (y.clone() * y.clone()).sum().backward();
+            (values(y), values(x.grad(&gradients).unwrap()))
+        };
+        let (out, gradient) = run(0, 3);
+        let alone: Vec<_> = (0..3).map(|b| run(b, 1)).collect();
+        let name = format!("{batch}x{len}, {heads} heads of {head}");
+        assert_eq!(out, alone.iter().flat_map(|(y, _)| y.clone()).collect::<Vec<_>>(), "{name}");
+        assert_eq!(gradient, alone.iter().flat_map(|(_, g)| g.clone()).collect::<Vec<_>>(), "{name}");
     }
 }
 

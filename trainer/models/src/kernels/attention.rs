@@ -1,27 +1,19 @@
 //! Scaled dot-product attention with a key mask (Vaswani et al., arXiv:1706.03762). Heads are packed as in published
 //! checkpoints: one projection returns q, k and v side by side, head after head.
 //!
-//! The fused path never splits heads in memory: matrix products run on strided views of the packed projections, over
-//! the valid keys only. The whole computation is one node of the tape.
+//! The fused path never splits heads in memory, leaves out keys of padding, and is one node of the tape.
+
+#[cfg(feature = "flex")]
+mod large;
+#[cfg(feature = "flex")]
+mod small;
 
 use burn::tensor::activation::softmax;
 use burn::tensor::{Tensor, TensorData};
 
 use super::Dropout;
 #[cfg(feature = "flex")]
-use super::raw::{self, Place, Tracked, View, contiguous, make, matmul, slice};
-#[cfg(feature = "flex")]
-use super::simd::{exp, multiversion};
-#[cfg(feature = "flex")]
-use burn::backend::Flex;
-#[cfg(feature = "flex")]
-use burn::backend::autodiff::{
-    checkpoint::{base::Checkpointer, strategy::NoCheckpointing},
-    grads::Gradients,
-    ops::{Backward, Ops, OpsKind},
-};
-#[cfg(feature = "flex")]
-use burn::backend::flex::FlexTensor;
+use super::fused;
 
 /// Number of leading valid keys of each sequence; the rest is padding.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -50,20 +42,13 @@ pub fn self_attention(qkv: Tensor<3>, heads: usize, mask: Option<&KeyMask>, drop
     let [batch, len, triple] = qkv.dims();
     let width = triple / 3;
     let sizes = Sizes { batch, queries: len, keys: len, heads, width };
-    let key = dropout.next_key();
+    let dropout = dropout.next_key().map(|key| (key, dropout.clone()));
     #[cfg(feature = "flex")]
-    match raw::place(&qkv, false) {
-        Place::Tracked => return fused::tracked_self(qkv, sizes, mask, key.map(|k| (k, dropout.clone()))),
-        Place::Plain => {
-            let x = contiguous(raw::plain(qkv));
-            let packed = fused::Packed::own(slice(&x), width);
-            let (out, _) = fused::forward(&packed, sizes, mask, key.map(|k| (k, &*dropout)));
-            return Tensor::from_primitive::<Flex>(make(out, &[batch, len, width]));
-        }
-        Place::Other => {}
+    if fused::takes(&qkv) {
+        return fused::run(kernel::Attend::new(sizes, mask, dropout), [qkv.into()]);
     }
     let part = |i: usize| qkv.clone().slice([0..batch, 0..len, i * width..(i + 1) * width]);
-    stock(part(0), part(1), part(2), sizes, mask, key.map(|k| (k, &*dropout)))
+    composed(part(0), part(1), part(2), sizes, mask, dropout.as_ref())
 }
 
 /// Cross-attention. `q` [B, Q, H]; `kv` [B, K, 2H], keys and values side by side -> [B, Q, H].
@@ -77,20 +62,13 @@ pub fn cross_attention(
     let [batch, queries, width] = q.dims();
     let keys = kv.dims()[1];
     let sizes = Sizes { batch, queries, keys, heads, width };
-    let key = dropout.next_key();
+    let dropout = dropout.next_key().map(|key| (key, dropout.clone()));
     #[cfg(feature = "flex")]
-    match raw::place(&q, raw::on_tape(&kv)) {
-        Place::Tracked => return fused::tracked_cross(q, kv, sizes, mask, key.map(|k| (k, dropout.clone()))),
-        Place::Plain => {
-            let (q, kv) = (contiguous(raw::plain(q)), contiguous(raw::plain(kv)));
-            let packed = fused::Packed::cross(slice(&q), slice(&kv), width);
-            let (out, _) = fused::forward(&packed, sizes, mask, key.map(|k| (k, &*dropout)));
-            return Tensor::from_primitive::<Flex>(make(out, &[batch, queries, width]));
-        }
-        Place::Other => {}
+    if fused::takes(&q) {
+        return fused::run(kernel::Attend::new(sizes, mask, dropout), [q.into(), kv.into()]);
     }
     let part = |i: usize| kv.clone().slice([0..batch, 0..keys, i * width..(i + 1) * width]);
-    stock(q, part(0), part(1), sizes, mask, key.map(|k| (k, &*dropout)))
+    composed(q, part(0), part(1), sizes, mask, dropout.as_ref())
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -113,13 +91,13 @@ impl Sizes {
     }
 }
 
-fn stock(
+fn composed(
     q: Tensor<3>,
     k: Tensor<3>,
     v: Tensor<3>,
     sizes: Sizes,
     mask: Option<&KeyMask>,
-    dropout: Option<(u64, &Dropout)>,
+    dropout: Option<&(u64, Dropout)>,
 ) -> Tensor<3> {
     let Sizes { batch, queries, keys, heads, width } = sizes;
     let device = q.device();
@@ -133,359 +111,119 @@ fn stock(
     }
     let mut weights = softmax(scores, 3);
     if let Some((key, dropout)) = dropout {
-        let kept = (0..batch * heads * queries * keys).map(|i| dropout.mask(key, i)).collect::<Vec<_>>();
+        let kept = (0..batch * heads * queries * keys).map(|i| dropout.mask(*key, i)).collect::<Vec<_>>();
         weights = weights * Tensor::from_data(TensorData::new(kept, [batch, heads, queries, keys]), &device);
     }
     weights.matmul(split(v, keys)).swap_dims(1, 2).reshape([batch, queries, width])
 }
 
 #[cfg(feature = "flex")]
-mod fused {
-    use super::{
-        Backward, Checkpointer, Dropout, Flex, FlexTensor, Gradients, KeyMask, NoCheckpointing, Ops, OpsKind, Sizes,
-        Tensor, Tracked, View, contiguous, exp, make, matmul, multiversion, raw, slice,
-    };
+mod kernel {
+    use burn::backend::flex::FlexTensor;
+
+    use super::{Dropout, KeyMask, Sizes, large, small};
+    use crate::kernels::fused::{Fused, make, slice};
+
+    /// Attention of one call: among the tokens of one tensor, or from a tensor to another.
+    #[derive(Debug, Clone)]
+    pub(super) struct Attend {
+        pub(super) sizes: Sizes,
+        mask: Option<KeyMask>,
+        /// Key and probability of the dropout of weights.
+        pub(super) dropout: Option<(u64, Dropout)>,
+    }
 
     /// Queries, keys and values inside one or two slices.
     pub(super) struct Packed<'a> {
-        q: &'a [f32],
-        q_row: usize,
-        kv: &'a [f32],
-        kv_row: usize,
-        k_at: usize,
-        v_at: usize,
+        pub(super) q: &'a [f32],
+        /// Length of a row of `q`.
+        pub(super) q_row: usize,
+        pub(super) kv: &'a [f32],
+        pub(super) kv_row: usize,
+        /// Offset of the keys in a row of `kv`.
+        pub(super) k_at: usize,
+        pub(super) v_at: usize,
     }
 
     impl<'a> Packed<'a> {
-        pub(super) fn own(qkv: &'a [f32], width: usize) -> Self {
+        fn own(qkv: &'a [f32], width: usize) -> Self {
             Self { q: qkv, q_row: 3 * width, kv: qkv, kv_row: 3 * width, k_at: width, v_at: 2 * width }
         }
 
-        pub(super) fn cross(q: &'a [f32], kv: &'a [f32], width: usize) -> Self {
+        fn cross(q: &'a [f32], kv: &'a [f32], width: usize) -> Self {
             Self { q, q_row: width, kv, kv_row: 2 * width, k_at: 0, v_at: width }
         }
 
-        fn q_view(&self, s: Sizes, b: usize, h: usize) -> View {
-            View { offset: b * s.queries * self.q_row + h * s.head(), row: self.q_row, col: 1 }
-        }
-
-        fn k_view(&self, s: Sizes, b: usize, h: usize) -> View {
-            View { offset: b * s.keys * self.kv_row + self.k_at + h * s.head(), row: self.kv_row, col: 1 }
-        }
-
-        fn v_view(&self, s: Sizes, b: usize, h: usize) -> View {
-            View { offset: b * s.keys * self.kv_row + self.v_at + h * s.head(), row: self.kv_row, col: 1 }
+        /// Returns true if queries, keys and values lie in one tensor.
+        pub(super) fn is_own(&self) -> bool {
+            self.k_at > 0
         }
     }
 
-    fn out_view(s: Sizes, b: usize, h: usize) -> View {
-        View { offset: b * s.queries * s.width + h * s.head(), row: s.width, col: 1 }
-    }
+    impl Attend {
+        pub(super) fn new(sizes: Sizes, mask: Option<&KeyMask>, dropout: Option<(u64, Dropout)>) -> Self {
+            Self { sizes, mask: mask.cloned(), dropout }
+        }
 
-    fn weight_view(s: Sizes, b: usize, h: usize) -> View {
-        View { offset: (b * s.heads + h) * s.queries * s.keys, row: s.keys, col: 1 }
-    }
+        /// Number of keys that sequence `b` attends to.
+        pub(super) fn valid(&self, b: usize) -> usize {
+            self.mask.as_ref().map_or(self.sizes.keys, |mask| mask.of(b).min(self.sizes.keys))
+        }
 
-    fn valid(s: Sizes, mask: Option<&KeyMask>, b: usize) -> usize {
-        mask.map_or(s.keys, |m| m.of(b).min(s.keys))
-    }
+        /// The output, and the softmax weights before dropout if they are to be kept.
+        fn values(&self, packed: &Packed<'_>, keep: bool) -> (FlexTensor, Vec<f32>) {
+            let Sizes { batch, queries, width, .. } = self.sizes;
+            let (out, weights) =
+                if small::fits(self.sizes) { small::forward(self, packed, keep) } else { large::forward(self, packed) };
+            (make(out, &[batch, queries, width]), if keep { weights } else { Vec::new() })
+        }
 
-    multiversion! {
-        /// Softmax of the first `valid` columns of each row; the rest becomes 0.
-        fn softmax_rows(scores: &mut [f32], keys: usize, valid: usize) {
-            for row in scores.chunks_exact_mut(keys) {
-                let (live, dead) = row.split_at_mut(valid);
-                dead.fill(0.0);
-                let mut top = [f32::NEG_INFINITY; 16];
-                let mut chunks = live.chunks_exact(16);
-                for chunk in &mut chunks {
-                    for (t, v) in top.iter_mut().zip(chunk) {
-                        *t = if *v > *t { *v } else { *t };
-                    }
-                }
-                let mut most = f32::NEG_INFINITY;
-                for v in chunks.remainder().iter().chain(&top) {
-                    most = if *v > most { *v } else { most };
-                }
-                for v in live.iter_mut() {
-                    *v = exp(*v - most);
-                }
-                let mut lane = [0.0_f32; 16];
-                let mut chunks = live.chunks_exact(16);
-                for chunk in &mut chunks {
-                    for (l, v) in lane.iter_mut().zip(chunk) {
-                        *l += *v;
-                    }
-                }
-                let total = lane.iter().sum::<f32>() + chunks.remainder().iter().sum::<f32>();
-                let inverse = 1.0 / total;
-                for v in live.iter_mut() {
-                    *v *= inverse;
-                }
+        /// The gradients of queries, and of keys and values. The first holds all of them if they lie in one tensor.
+        fn gradients(&self, packed: &Packed<'_>, weights: &[f32], dout: &[f32]) -> (Vec<f32>, Vec<f32>) {
+            if small::fits(self.sizes) {
+                small::backward(self, packed, weights, dout)
+            } else {
+                large::backward(self, packed, weights, dout)
             }
         }
     }
 
-    multiversion! {
-        /// `ds = p (dp - sum(dp p))` by row, in place of `dp`.
-        fn softmax_backward_rows(p: &[f32], dp: &mut [f32], keys: usize) {
-            for (p, dp) in p.chunks_exact(keys).zip(dp.chunks_exact_mut(keys)) {
-                let mut lane = [0.0_f32; 16];
-                let whole = keys / 16 * 16;
-                let mut i = 0;
-                while i < whole {
-                    for (l, slot) in lane.iter_mut().enumerate() {
-                        *slot += p[i + l] * dp[i + l];
-                    }
-                    i += 16;
-                }
-                let mut dot = 0.0;
-                while i < keys {
-                    dot += p[i] * dp[i];
-                    i += 1;
-                }
-                dot += lane.iter().sum::<f32>();
-                for (p, dp) in p.iter().zip(dp.iter_mut()) {
-                    *dp = p * (*dp - dot);
-                }
-            }
+    impl Fused<1> for Attend {
+        type Kept = (FlexTensor, Vec<f32>);
+
+        fn forward(&self, [qkv]: [FlexTensor; 1]) -> (FlexTensor, Self::Kept) {
+            let (out, weights) = self.values(&Packed::own(slice(&qkv), self.sizes.width), true);
+            (out, (qkv, weights))
+        }
+
+        fn value(&self, [qkv]: [FlexTensor; 1]) -> FlexTensor {
+            self.values(&Packed::own(slice(&qkv), self.sizes.width), false).0
+        }
+
+        fn backward(&self, (qkv, weights): Self::Kept, dy: FlexTensor, _: [bool; 1]) -> [Option<FlexTensor>; 1] {
+            let Sizes { batch, queries, width, .. } = self.sizes;
+            let (dx, _) = self.gradients(&Packed::own(slice(&qkv), width), &weights, slice(&dy));
+            [Some(make(dx, &[batch, queries, 3 * width]))]
         }
     }
 
-    /// The output [B, Q, H] and the softmax weights [B, heads, Q, K] before dropout.
-    pub(super) fn forward(
-        packed: &Packed<'_>,
-        s: Sizes,
-        mask: Option<&KeyMask>,
-        dropout: Option<(u64, &Dropout)>,
-    ) -> (Vec<f32>, Vec<f32>) {
-        let mut weights = vec![0.0; s.batch * s.heads * s.queries * s.keys];
-        let mut out = vec![0.0; s.batch * s.queries * s.width];
-        let mut dropped = Vec::new();
-        for b in 0..s.batch {
-            let valid = valid(s, mask, b);
-            for h in 0..s.heads {
-                let at = weight_view(s, b, h);
-                matmul(
-                    (s.queries, valid, s.head()),
-                    packed.q,
-                    packed.q_view(s, b, h),
-                    packed.kv,
-                    packed.k_view(s, b, h).t(),
-                    &mut weights,
-                    at,
-                    0.0,
-                    s.scale(),
-                );
-                let range = at.offset..at.offset + s.queries * s.keys;
-                softmax_rows(&mut weights[range.clone()], s.keys, valid);
-                let (p, pv) = match dropout {
-                    None => (&weights[..], at),
-                    Some((key, dropout)) => {
-                        dropped.clear();
-                        dropped.extend(range.map(|i| weights[i] * dropout.mask(key, i)));
-                        (&dropped[..], View::rows(s.keys))
-                    }
-                };
-                matmul(
-                    (s.queries, s.head(), valid),
-                    p,
-                    pv,
-                    packed.kv,
-                    packed.v_view(s, b, h),
-                    &mut out,
-                    out_view(s, b, h),
-                    0.0,
-                    1.0,
-                );
-            }
-        }
-        (out, weights)
-    }
+    impl Fused<2> for Attend {
+        type Kept = (FlexTensor, FlexTensor, Vec<f32>);
 
-    /// The inputs of the backward pass: the packed projections, the softmax weights, the gradient of the output, and
-    /// the mask and dropout of the forward pass.
-    struct Backprop<'a> {
-        packed: Packed<'a>,
-        weights: &'a [f32],
-        dout: &'a [f32],
-        s: Sizes,
-        mask: Option<&'a KeyMask>,
-        dropout: Option<(u64, &'a Dropout)>,
-    }
-
-    impl Backprop<'_> {
-        /// Calls `write` for each head with the gradient of its scores (already scaled) and its weights after dropout.
-        fn each_head(&self, mut write: impl FnMut(usize, usize, usize, &[f32], &[f32])) {
-            let s = self.s;
-            let mut scores = vec![0.0; s.queries * s.keys];
-            let mut dropped = vec![0.0; s.queries * s.keys];
-            for b in 0..s.batch {
-                let valid = valid(s, self.mask, b);
-                for h in 0..s.heads {
-                    let at = weight_view(s, b, h);
-                    let p = &self.weights[at.offset..at.offset + s.queries * s.keys];
-                    scores.fill(0.0);
-                    matmul(
-                        (s.queries, valid, s.head()),
-                        self.dout,
-                        out_view(s, b, h),
-                        self.packed.kv,
-                        self.packed.v_view(s, b, h).t(),
-                        &mut scores,
-                        View::rows(s.keys),
-                        0.0,
-                        1.0,
-                    );
-                    match self.dropout {
-                        None => dropped.copy_from_slice(p),
-                        Some((key, dropout)) => {
-                            for (i, (d, score)) in dropped.iter_mut().zip(&mut scores).enumerate() {
-                                let kept = dropout.mask(key, at.offset + i);
-                                *d = p[i] * kept;
-                                *score *= kept;
-                            }
-                        }
-                    }
-                    softmax_backward_rows(p, &mut scores, s.keys);
-                    write(b, h, valid, &scores, &dropped);
-                }
-            }
+        fn forward(&self, [q, kv]: [FlexTensor; 2]) -> (FlexTensor, Self::Kept) {
+            let (out, weights) = self.values(&Packed::cross(slice(&q), slice(&kv), self.sizes.width), true);
+            (out, (q, kv, weights))
         }
 
-        fn queries(&self, b: usize, h: usize, valid: usize, ds: &[f32], dq: &mut [f32]) {
-            let s = self.s;
-            let (k, to) = (self.packed.k_view(s, b, h), self.packed.q_view(s, b, h));
-            matmul((s.queries, s.head(), valid), ds, View::rows(s.keys), self.packed.kv, k, dq, to, 0.0, s.scale());
+        fn value(&self, [q, kv]: [FlexTensor; 2]) -> FlexTensor {
+            self.values(&Packed::cross(slice(&q), slice(&kv), self.sizes.width), false).0
         }
 
-        fn keys_values(&self, b: usize, h: usize, valid: usize, ds: &[f32], p: &[f32], dkv: &mut [f32]) {
-            let s = self.s;
-            let (q, to) = (self.packed.q_view(s, b, h), self.packed.k_view(s, b, h));
-            matmul((valid, s.head(), s.queries), ds, View::rows(s.keys).t(), self.packed.q, q, dkv, to, 0.0, s.scale());
-            let (o, to) = (out_view(s, b, h), self.packed.v_view(s, b, h));
-            matmul((valid, s.head(), s.queries), p, View::rows(s.keys).t(), self.dout, o, dkv, to, 0.0, 1.0);
+        fn backward(&self, (q, kv, weights): Self::Kept, dy: FlexTensor, _: [bool; 2]) -> [Option<FlexTensor>; 2] {
+            let Sizes { batch, queries, keys, width, .. } = self.sizes;
+            let packed = Packed::cross(slice(&q), slice(&kv), width);
+            let (dq, dkv) = self.gradients(&packed, &weights, slice(&dy));
+            [Some(make(dq, &[batch, queries, width])), Some(make(dkv, &[batch, keys, 2 * width]))]
         }
-    }
-
-    #[derive(Debug, Clone)]
-    struct State {
-        q: FlexTensor,
-        kv: Option<FlexTensor>,
-        weights: FlexTensor,
-        sizes: Sizes,
-        mask: Option<KeyMask>,
-        dropout: Option<(u64, Dropout)>,
-    }
-
-    #[derive(Debug)]
-    struct SelfOp;
-
-    impl Backward<Flex, 1> for SelfOp {
-        type State = State;
-
-        fn backward(self, ops: Ops<State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
-            let dout = contiguous(grads.consume::<Flex>(&ops.node));
-            let [parent] = ops.parents;
-            let Some(node) = parent else { return };
-            let state = ops.state;
-            let s = state.sizes;
-            let back = Backprop {
-                packed: Packed::own(slice(&state.q), s.width),
-                weights: slice(&state.weights),
-                dout: slice(&dout),
-                s,
-                mask: state.mask.as_ref(),
-                dropout: state.dropout.as_ref().map(|(k, d)| (*k, d)),
-            };
-            let mut dx = vec![0.0; slice(&state.q).len()];
-            back.each_head(|b, h, valid, ds, p| {
-                back.queries(b, h, valid, ds, &mut dx);
-                back.keys_values(b, h, valid, ds, p, &mut dx);
-            });
-            raw::register(grads, node.id, dx, &[s.batch, s.queries, 3 * s.width]);
-        }
-    }
-
-    #[derive(Debug)]
-    struct CrossOp;
-
-    impl Backward<Flex, 2> for CrossOp {
-        type State = State;
-
-        fn backward(self, ops: Ops<State, 2>, grads: &mut Gradients, _: &mut Checkpointer) {
-            let dout = contiguous(grads.consume::<Flex>(&ops.node));
-            let [pq, pkv] = ops.parents;
-            let state = ops.state;
-            let s = state.sizes;
-            let kv = state.kv.as_ref().expect("cross-attention keeps keys and values");
-            let back = Backprop {
-                packed: Packed::cross(slice(&state.q), slice(kv), s.width),
-                weights: slice(&state.weights),
-                dout: slice(&dout),
-                s,
-                mask: state.mask.as_ref(),
-                dropout: state.dropout.as_ref().map(|(k, d)| (*k, d)),
-            };
-            let (mut dq, mut dkv) = (vec![0.0; slice(&state.q).len()], vec![0.0; slice(kv).len()]);
-            back.each_head(|b, h, valid, ds, p| {
-                back.queries(b, h, valid, ds, &mut dq);
-                back.keys_values(b, h, valid, ds, p, &mut dkv);
-            });
-            if let Some(node) = pq {
-                raw::register(grads, node.id, dq, &[s.batch, s.queries, s.width]);
-            }
-            if let Some(node) = pkv {
-                raw::register(grads, node.id, dkv, &[s.batch, s.keys, 2 * s.width]);
-            }
-        }
-    }
-
-    fn weights_of(weights: Vec<f32>, s: Sizes) -> FlexTensor {
-        make(weights, &[s.batch, s.heads, s.queries, s.keys])
-    }
-
-    pub(super) fn tracked_self(
-        qkv: Tensor<3>,
-        s: Sizes,
-        mask: Option<&KeyMask>,
-        dropout: Option<(u64, Dropout)>,
-    ) -> Tensor<3> {
-        let x = raw::track(qkv);
-        let node = x.node();
-        let q = contiguous(x.into_primitive());
-        let (out, weights) = forward(&Packed::own(slice(&q), s.width), s, mask, dropout.as_ref().map(|(k, d)| (*k, d)));
-        let out = make(out, &[s.batch, s.queries, s.width]);
-        let out = match SelfOp.prepare::<NoCheckpointing>([node]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let weights = weights_of(weights, s);
-                prep.finish(State { q, kv: None, weights, sizes: s, mask: mask.cloned(), dropout }, out)
-            }
-            OpsKind::UnTracked(prep) => prep.finish(out),
-        };
-        Tensor::from_primitive::<Tracked>(out)
-    }
-
-    pub(super) fn tracked_cross(
-        q: Tensor<3>,
-        kv: Tensor<3>,
-        s: Sizes,
-        mask: Option<&KeyMask>,
-        dropout: Option<(u64, Dropout)>,
-    ) -> Tensor<3> {
-        let (q, kv) = (raw::track(q), raw::track(kv));
-        let nodes = [q.node(), kv.node()];
-        let (q, kv) = (contiguous(q.into_primitive()), contiguous(kv.into_primitive()));
-        let packed = Packed::cross(slice(&q), slice(&kv), s.width);
-        let (out, weights) = forward(&packed, s, mask, dropout.as_ref().map(|(k, d)| (*k, d)));
-        let out = make(out, &[s.batch, s.queries, s.width]);
-        let out = match CrossOp.prepare::<NoCheckpointing>(nodes).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let weights = weights_of(weights, s);
-                prep.finish(State { q, kv: Some(kv), weights, sizes: s, mask: mask.cloned(), dropout }, out)
-            }
-            OpsKind::UnTracked(prep) => prep.finish(out),
-        };
-        Tensor::from_primitive::<Tracked>(out)
     }
 }

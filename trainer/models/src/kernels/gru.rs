@@ -11,19 +11,7 @@
 use burn::tensor::{Tensor, TensorData, activation::sigmoid};
 
 #[cfg(feature = "flex")]
-use super::raw::{self, Place, Tracked, View, contiguous, make, matmul, slice};
-#[cfg(feature = "flex")]
-use super::simd::{add_rows, exp, fill_rows, multiversion};
-#[cfg(feature = "flex")]
-use burn::backend::Flex;
-#[cfg(feature = "flex")]
-use burn::backend::autodiff::{
-    checkpoint::{base::Checkpointer, strategy::NoCheckpointing},
-    grads::Gradients,
-    ops::{Backward, Ops, OpsKind},
-};
-#[cfg(feature = "flex")]
-use burn::backend::flex::FlexTensor;
+use super::fused;
 
 /// Returns the states [B, T, g] after each token. `input` [B, T, 3g] holds the input's part of the gates and `start`
 /// [B, g] the first states. `weight` [3g, g] and `bias` [3g] compute the state's part. The first `lengths[b]` tokens of
@@ -42,20 +30,9 @@ pub fn gru(
     assert!(start.dims() == [batch, width] && lengths.len() == batch, "gru: a state and a length for each sequence");
     assert!(lengths.iter().all(|l| *l <= tokens), "gru: a length beyond the tokens");
     #[cfg(feature = "flex")]
-    match raw::place(&input, raw::on_tape(&weight) || raw::on_tape(&bias) || raw::on_tape(&start)) {
-        Place::Tracked => return tracked(input, start, weight, bias, lengths, reverse),
-        Place::Plain => {
-            let [a, h, w, c] = [
-                contiguous(raw::plain(input)),
-                contiguous(raw::plain(start)),
-                contiguous(raw::plain(weight)),
-                contiguous(raw::plain(bias)),
-            ];
-            let shape = Shape { batch, tokens, width, reverse, lengths: lengths.to_vec() };
-            let run = forward(&shape, slice(&a), slice(&h), slice(&w), slice(&c));
-            return Tensor::from_primitive::<Flex>(make(shape.by_sequence(&run.states), &[batch, tokens, width]));
-        }
-        Place::Other => {}
+    if fused::takes(&input) {
+        let unit = kernel::Gru { batch, tokens, width, reverse, lengths: lengths.to_vec() };
+        return fused::run(unit, [input.into(), start.into(), weight.into(), bias.into()]);
     }
     composed(input, start, weight, bias, lengths, reverse)
 }
@@ -92,219 +69,196 @@ fn composed(
 }
 
 #[cfg(feature = "flex")]
-#[derive(Debug, Clone)]
-struct Shape {
-    batch: usize,
-    tokens: usize,
-    width: usize,
-    reverse: bool,
-    lengths: Vec<usize>,
-}
+mod kernel {
+    use burn::backend::flex::FlexTensor;
 
-#[cfg(feature = "flex")]
-impl Shape {
-    /// The token that turn `i` processes.
-    fn token(&self, i: usize) -> usize {
-        if self.reverse { self.tokens - 1 - i } else { i }
+    use crate::kernels::fused::{Fused, make, slice};
+    use crate::kernels::raw::{View, matmul, product};
+    use crate::kernels::simd::{add_rows, exp, multiversion};
+
+    /// One direction over a batch.
+    #[derive(Debug, Clone)]
+    pub(super) struct Gru {
+        pub(super) batch: usize,
+        pub(super) tokens: usize,
+        pub(super) width: usize,
+        pub(super) reverse: bool,
+        pub(super) lengths: Vec<usize>,
     }
 
-    /// Reorders states from [turn, B, g] to [B, T, g].
-    fn by_sequence(&self, states: &[f32]) -> Vec<f32> {
-        let (size, width) = (self.batch * self.width, self.width);
-        let mut out = vec![0.0; states.len()];
-        for i in 0..self.tokens {
-            for b in 0..self.batch {
-                let to = (b * self.tokens + self.token(i)) * width;
-                out[to..to + width].copy_from_slice(&states[i * size + b * width..][..width]);
+    impl Gru {
+        /// The token that turn `i` processes.
+        fn token(&self, i: usize) -> usize {
+            if self.reverse { self.tokens - 1 - i } else { i }
+        }
+
+        /// Reorders states from [turn, B, g] to [B, T, g].
+        fn by_sequence(&self, states: &[f32]) -> Vec<f32> {
+            let (size, width) = (self.batch * self.width, self.width);
+            let mut out = vec![0.0; states.len()];
+            for i in 0..self.tokens {
+                for b in 0..self.batch {
+                    let to = (b * self.tokens + self.token(i)) * width;
+                    out[to..to + width].copy_from_slice(&states[i * size + b * width..][..width]);
+                }
             }
-        }
-        out
-    }
-}
-
-/// The results of a forward pass by turn: states after it [turn, B, g], and r, z, n, u_n [turn, B, 4g].
-#[cfg(feature = "flex")]
-#[derive(Debug, Clone)]
-struct Run {
-    states: Vec<f32>,
-    gates: Vec<f32>,
-}
-
-#[cfg(feature = "flex")]
-fn forward(shape: &Shape, input: &[f32], start: &[f32], weight: &[f32], bias: &[f32]) -> Run {
-    let &Shape { batch, tokens, width, .. } = shape;
-    let size = batch * width;
-    let mut run = Run { states: vec![0.0; tokens * size], gates: vec![0.0; tokens * size * 4] };
-    let mut u = vec![0.0; 3 * size];
-    for i in 0..tokens {
-        let t = shape.token(i);
-        let (before, after) = run.states.split_at_mut(i * size);
-        let old = if i == 0 { start } else { &before[(i - 1) * size..] };
-        fill_rows(&mut u, bias);
-        let (by_row, by_gate) = (View::rows(width), View::rows(3 * width));
-        matmul((batch, 3 * width, width), old, by_row, weight, by_row.t(), &mut u, by_gate, 1.0, 1.0);
-        for b in 0..batch {
-            let (old, new) = (&old[b * width..][..width], &mut after[b * width..][..width]);
-            if t < shape.lengths[b] {
-                let a = &input[(b * tokens + t) * 3 * width..][..3 * width];
-                let gates = &mut run.gates[(i * batch + b) * 4 * width..][..4 * width];
-                unit(a, &u[b * 3 * width..][..3 * width], old, gates, new);
-            } else {
-                new.copy_from_slice(old);
-            }
+            out
         }
     }
-    run
-}
 
-#[cfg(feature = "flex")]
-#[inline(always)]
-fn logistic(x: f32) -> f32 {
-    let e = exp(-x.abs());
-    let s = 1.0 / (1.0 + e);
-    if x >= 0.0 { s } else { e * s }
-}
-
-#[cfg(feature = "flex")]
-#[inline(always)]
-fn tanh(x: f32) -> f32 {
-    let e = exp(-2.0 * x.abs());
-    ((1.0 - e) / (1.0 + e)).copysign(x)
-}
-
-#[cfg(feature = "flex")]
-multiversion! {
-    /// Computes one token of one sequence.
-    fn unit(a: &[f32], u: &[f32], old: &[f32], gates: &mut [f32], new: &mut [f32]) {
-        let g = old.len();
-        let (a_r, a_z, a_n) = (&a[..g], &a[g..2 * g], &a[2 * g..3 * g]);
-        let (u_r, u_z, u_n) = (&u[..g], &u[g..2 * g], &u[2 * g..3 * g]);
-        let (gate_r, rest) = gates.split_at_mut(g);
-        let (gate_z, rest) = rest.split_at_mut(g);
-        let (gate_n, kept) = rest.split_at_mut(g);
-        let (new, kept) = (&mut new[..g], &mut kept[..g]);
-        for k in 0..g {
-            let r = logistic(a_r[k] + u_r[k]);
-            let z = logistic(a_z[k] + u_z[k]);
-            let n = tanh(a_n[k] + r * u_n[k]);
-            new[k] = (1.0 - z) * n + z * old[k];
-            gate_r[k] = r;
-            gate_z[k] = z;
-            gate_n[k] = n;
-            kept[k] = u_n[k];
-        }
+    /// The results of a forward pass by turn: states after it [turn, B, g], and r, z, n, u_n [turn, B, 4g].
+    #[derive(Debug, Clone)]
+    pub(super) struct Run {
+        states: Vec<f32>,
+        gates: Vec<f32>,
     }
-}
 
-#[cfg(feature = "flex")]
-multiversion! {
-    /// The backward pass of [`unit`]. `dh` enters as the gradient of the state after the token. It leaves as the direct
-    /// part of the gradient of the state before it, without the part through the gates.
-    fn unit_back(gates: &[f32], old: &[f32], dh: &mut [f32], da: &mut [f32], du: &mut [f32]) {
-        let g = old.len();
-        let (gate_r, gate_z) = (&gates[..g], &gates[g..2 * g]);
-        let (gate_n, kept) = (&gates[2 * g..3 * g], &gates[3 * g..4 * g]);
-        let (da_r, rest) = da.split_at_mut(g);
-        let (da_z, da_n) = rest.split_at_mut(g);
-        let (du_r, rest) = du.split_at_mut(g);
-        let (du_z, du_n) = rest.split_at_mut(g);
-        let (dh, da_n, du_n) = (&mut dh[..g], &mut da_n[..g], &mut du_n[..g]);
-        for k in 0..g {
-            let (r, z, n) = (gate_r[k], gate_z[k], gate_n[k]);
-            let pre_n = dh[k] * (1.0 - z) * (1.0 - n * n);
-            let pre_z = dh[k] * (old[k] - n) * z * (1.0 - z);
-            let pre_r = pre_n * kept[k] * r * (1.0 - r);
-            da_r[k] = pre_r;
-            da_z[k] = pre_z;
-            da_n[k] = pre_n;
-            du_r[k] = pre_r;
-            du_z[k] = pre_z;
-            du_n[k] = pre_n * r;
-            dh[k] *= z;
-        }
-    }
-}
-
-#[cfg(feature = "flex")]
-#[derive(Debug)]
-struct GruOp;
-
-#[cfg(feature = "flex")]
-impl Backward<Flex, 4> for GruOp {
-    type State = (Shape, Run, FlexTensor, FlexTensor);
-
-    fn backward(self, ops: Ops<Self::State, 4>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let dy = contiguous(grads.consume::<Flex>(&ops.node));
-        let (shape, run, start, weight) = ops.state;
-        let [input_node, start_node, weight_node, bias_node] = ops.parents;
-        let &Shape { batch, tokens, width, .. } = &shape;
-        let (dy, start, weight) = (slice(&dy), slice(&start), slice(&weight));
+    fn forward(shape: &Gru, input: &[f32], start: &[f32], weight: &[f32], bias: &[f32]) -> Run {
+        let &Gru { batch, tokens, width, .. } = shape;
         let size = batch * width;
-        let mut dh = vec![0.0; size];
-        let mut da = vec![0.0; 3 * size * tokens];
-        let mut du = vec![0.0; 3 * size * tokens];
-        // The states before each turn.
-        let mut olds = Vec::with_capacity(size * tokens);
-        olds.extend_from_slice(start);
-        olds.extend_from_slice(&run.states[..size * tokens.saturating_sub(1)]);
-        for i in (0..tokens).rev() {
+        let mut run = Run { states: vec![0.0; tokens * size], gates: vec![0.0; tokens * size * 4] };
+        let mut u = Vec::with_capacity(3 * size);
+        for i in 0..tokens {
             let t = shape.token(i);
-            let du = &mut du[i * 3 * size..][..3 * size];
+            let (before, after) = run.states.split_at_mut(i * size);
+            let old = if i == 0 { start } else { &before[(i - 1) * size..] };
+            u.clear();
+            (0..batch).for_each(|_| u.extend_from_slice(bias));
+            let (by_row, by_gate) = (View::rows(width), View::rows(3 * width));
+            matmul((batch, 3 * width, width), old, by_row, weight, by_row.t(), &mut u, by_gate, 1.0, 1.0);
             for b in 0..batch {
-                let dh = &mut dh[b * width..][..width];
-                for (d, y) in dh.iter_mut().zip(&dy[(b * tokens + t) * width..][..width]) {
-                    *d += y;
-                }
+                let (old, new) = (&old[b * width..][..width], &mut after[b * width..][..width]);
                 if t < shape.lengths[b] {
-                    let da = &mut da[(b * tokens + t) * 3 * width..][..3 * width];
-                    let gates = &run.gates[(i * batch + b) * 4 * width..][..4 * width];
-                    let old = &olds[i * size + b * width..][..width];
-                    unit_back(gates, old, dh, da, &mut du[b * 3 * width..][..3 * width]);
+                    let a = &input[(b * tokens + t) * 3 * width..][..3 * width];
+                    let gates = &mut run.gates[(i * batch + b) * 4 * width..][..4 * width];
+                    unit(a, &u[b * 3 * width..][..3 * width], old, gates, new);
+                } else {
+                    new.copy_from_slice(old);
                 }
             }
-            let (by_row, by_gate) = (View::rows(width), View::rows(3 * width));
-            matmul((batch, width, 3 * width), du, by_gate, weight, by_row, &mut dh, by_row, 1.0, 1.0);
         }
-        if let Some(node) = weight_node {
-            let mut dw = vec![0.0; 3 * width * width];
-            let (by_row, by_gate) = (View::rows(width), View::rows(3 * width));
-            let sizes = (3 * width, width, tokens * batch);
-            matmul(sizes, &du, by_gate.t(), &olds, by_row, &mut dw, by_row, 0.0, 1.0);
-            raw::register(grads, node.id, dw, &[3 * width, width]);
-        }
-        if let Some(node) = bias_node {
-            let mut db = vec![0.0; 3 * width];
-            add_rows(&mut db, &du);
-            raw::register(grads, node.id, db, &[3 * width]);
-        }
-        if let Some(node) = start_node {
-            raw::register(grads, node.id, dh, &[batch, width]);
-        }
-        if let Some(node) = input_node {
-            raw::register(grads, node.id, da, &[batch, tokens, 3 * width]);
+        run
+    }
+
+    #[inline(always)]
+    fn logistic(x: f32) -> f32 {
+        let e = exp(-x.abs());
+        let s = 1.0 / (1.0 + e);
+        if x >= 0.0 { s } else { e * s }
+    }
+
+    #[inline(always)]
+    fn tanh(x: f32) -> f32 {
+        let e = exp(-2.0 * x.abs());
+        ((1.0 - e) / (1.0 + e)).copysign(x)
+    }
+
+    multiversion! {
+        /// Computes one token of one sequence.
+        fn unit(a: &[f32], u: &[f32], old: &[f32], gates: &mut [f32], new: &mut [f32]) {
+            let g = old.len();
+            let (a_r, a_z, a_n) = (&a[..g], &a[g..2 * g], &a[2 * g..3 * g]);
+            let (u_r, u_z, u_n) = (&u[..g], &u[g..2 * g], &u[2 * g..3 * g]);
+            let (gate_r, rest) = gates.split_at_mut(g);
+            let (gate_z, rest) = rest.split_at_mut(g);
+            let (gate_n, kept) = rest.split_at_mut(g);
+            let (new, kept) = (&mut new[..g], &mut kept[..g]);
+            for k in 0..g {
+                let r = logistic(a_r[k] + u_r[k]);
+                let z = logistic(a_z[k] + u_z[k]);
+                let n = tanh(a_n[k] + r * u_n[k]);
+                new[k] = (1.0 - z) * n + z * old[k];
+                gate_r[k] = r;
+                gate_z[k] = z;
+                gate_n[k] = n;
+                kept[k] = u_n[k];
+            }
         }
     }
-}
 
-#[cfg(feature = "flex")]
-fn tracked(
-    input: Tensor<3>,
-    start: Tensor<2>,
-    weight: Tensor<2>,
-    bias: Tensor<1>,
-    lengths: &[usize],
-    reverse: bool,
-) -> Tensor<3> {
-    let [batch, tokens, gates] = input.dims();
-    let shape = Shape { batch, tokens, width: gates / 3, reverse, lengths: lengths.to_vec() };
-    let (a, h, w, c) = (raw::track(input), raw::track(start), raw::track(weight), raw::track(bias));
-    let nodes = [a.node(), h.node(), w.node(), c.node()];
-    let [a, h, w, c] = [a, h, w, c].map(|x| contiguous(x.into_primitive()));
-    let run = forward(&shape, slice(&a), slice(&h), slice(&w), slice(&c));
-    let y = make(shape.by_sequence(&run.states), &[batch, tokens, shape.width]);
-    let y = match GruOp.prepare::<NoCheckpointing>(nodes).compute_bound().stateful() {
-        OpsKind::Tracked(prep) => prep.finish((shape, run, h, w), y),
-        OpsKind::UnTracked(prep) => prep.finish(y),
-    };
-    Tensor::from_primitive::<Tracked>(y)
+    multiversion! {
+        /// The backward pass of [`unit`]. `dh` enters as the gradient of the state after the token. It leaves as the direct
+        /// part of the gradient of the state before it, without the part through the gates.
+        fn unit_back(gates: &[f32], old: &[f32], dh: &mut [f32], da: &mut [f32], du: &mut [f32]) {
+            let g = old.len();
+            let (gate_r, gate_z) = (&gates[..g], &gates[g..2 * g]);
+            let (gate_n, kept) = (&gates[2 * g..3 * g], &gates[3 * g..4 * g]);
+            let (da_r, rest) = da.split_at_mut(g);
+            let (da_z, da_n) = rest.split_at_mut(g);
+            let (du_r, rest) = du.split_at_mut(g);
+            let (du_z, du_n) = rest.split_at_mut(g);
+            let (dh, da_n, du_n) = (&mut dh[..g], &mut da_n[..g], &mut du_n[..g]);
+            for k in 0..g {
+                let (r, z, n) = (gate_r[k], gate_z[k], gate_n[k]);
+                let pre_n = dh[k] * (1.0 - z) * (1.0 - n * n);
+                let pre_z = dh[k] * (old[k] - n) * z * (1.0 - z);
+                let pre_r = pre_n * kept[k] * r * (1.0 - r);
+                da_r[k] = pre_r;
+                da_z[k] = pre_z;
+                da_n[k] = pre_n;
+                du_r[k] = pre_r;
+                du_z[k] = pre_z;
+                du_n[k] = pre_n * r;
+                dh[k] *= z;
+            }
+        }
+    }
+
+    impl Fused<4> for Gru {
+        type Kept = (Run, FlexTensor, FlexTensor);
+
+        fn forward(&self, [input, start, weight, bias]: [FlexTensor; 4]) -> (FlexTensor, Self::Kept) {
+            let run = forward(self, slice(&input), slice(&start), slice(&weight), slice(&bias));
+            let states = make(self.by_sequence(&run.states), &[self.batch, self.tokens, self.width]);
+            (states, (run, start, weight))
+        }
+
+        fn backward(
+            &self,
+            (run, start, weight): Self::Kept,
+            dy: FlexTensor,
+            wanted: [bool; 4],
+        ) -> [Option<FlexTensor>; 4] {
+            let shape = self;
+            let &Gru { batch, tokens, width, .. } = shape;
+            let (dy, start, weight) = (slice(&dy), slice(&start), slice(&weight));
+            let size = batch * width;
+            let mut dh = vec![0.0; size];
+            let mut da = vec![0.0; 3 * size * tokens];
+            let mut du = vec![0.0; 3 * size * tokens];
+            // The states before each turn.
+            let mut olds = Vec::with_capacity(size * tokens);
+            olds.extend_from_slice(start);
+            olds.extend_from_slice(&run.states[..size * tokens.saturating_sub(1)]);
+            for i in (0..tokens).rev() {
+                let t = shape.token(i);
+                let du = &mut du[i * 3 * size..][..3 * size];
+                for b in 0..batch {
+                    let dh = &mut dh[b * width..][..width];
+                    for (d, y) in dh.iter_mut().zip(&dy[(b * tokens + t) * width..][..width]) {
+                        *d += y;
+                    }
+                    if t < shape.lengths[b] {
+                        let da = &mut da[(b * tokens + t) * 3 * width..][..3 * width];
+                        let gates = &run.gates[(i * batch + b) * 4 * width..][..4 * width];
+                        let old = &olds[i * size + b * width..][..width];
+                        unit_back(gates, old, dh, da, &mut du[b * 3 * width..][..3 * width]);
+                    }
+                }
+                let (by_row, by_gate) = (View::rows(width), View::rows(3 * width));
+                matmul((batch, width, 3 * width), du, by_gate, weight, by_row, &mut dh, by_row, 1.0, 1.0);
+            }
+            let by_weight = || {
+                let (by_row, by_gate) = (View::rows(width), View::rows(3 * width));
+                make(product((3 * width, width, tokens * batch), &du, by_gate.t(), &olds, by_row), &[3 * width, width])
+            };
+            let by_bias = || {
+                let mut db = vec![0.0; 3 * width];
+                add_rows(&mut db, &du);
+                make(db, &[3 * width])
+            };
+            let (weight, bias) = (wanted[2].then(by_weight), wanted[3].then(by_bias));
+            [Some(make(da, &[batch, tokens, 3 * width])), Some(make(dh, &[batch, width])), weight, bias]
+        }
+    }
 }

@@ -3,39 +3,20 @@
 use burn::tensor::Tensor;
 
 #[cfg(feature = "flex")]
-use super::raw::{self, Place, Tracked, View, contiguous, make, matmul, slice};
-#[cfg(feature = "flex")]
-use super::simd::{add_rows, fill_rows};
-#[cfg(feature = "flex")]
-use burn::backend::Flex;
-#[cfg(feature = "flex")]
-use burn::backend::autodiff::{
-    checkpoint::{base::Checkpointer, strategy::NoCheckpointing},
-    grads::Gradients,
-    ops::{Backward, Ops, OpsKind},
-};
-#[cfg(feature = "flex")]
-use burn::backend::flex::FlexTensor;
+use super::fused;
 
 /// `x` [..., in], `weight` [out, in], `bias` [out] -> [..., out].
 pub fn linear<const D: usize>(x: Tensor<D>, weight: Tensor<2>, bias: Option<Tensor<1>>) -> Tensor<D> {
-    #[cfg(feature = "flex")]
-    match raw::place(&x, raw::on_tape(&weight) || bias.as_ref().is_some_and(raw::on_tape)) {
-        Place::Tracked => return tracked(x, weight, bias),
-        Place::Plain => {
-            let shape = x.dims();
-            let [out, _] = weight.dims();
-            let (x, w) = (contiguous(raw::plain(x)), contiguous(raw::plain(weight)));
-            let b = bias.map(|b| contiguous(raw::plain(b)));
-            let y = forward(slice(&x), slice(&w), b.as_ref().map(slice), shape[D - 1], out);
-            let mut to = shape;
-            to[D - 1] = out;
-            return Tensor::from_primitive::<Flex>(make(y, &to));
-        }
-        Place::Other => {}
-    }
     let shape = x.dims();
     let [out, inner] = weight.dims();
+    assert_eq!(shape[D - 1], inner, "linear: input width against weight");
+    #[cfg(feature = "flex")]
+    if fused::takes(&x) {
+        return match bias {
+            Some(bias) => fused::run(kernel::Linear, [x.into(), weight.into(), bias.into()]),
+            None => fused::run(kernel::Linear, [x.into(), weight.into()]),
+        };
+    }
     let rows = shape.iter().product::<usize>() / inner;
     let y = x.reshape([rows, inner]).matmul(weight.transpose());
     let y = match bias {
@@ -48,81 +29,77 @@ pub fn linear<const D: usize>(x: Tensor<D>, weight: Tensor<2>, bias: Option<Tens
 }
 
 #[cfg(feature = "flex")]
-fn forward(x: &[f32], w: &[f32], b: Option<&[f32]>, inner: usize, out: usize) -> Vec<f32> {
-    let rows = x.len() / inner;
-    let mut y = vec![0.0; rows * out];
-    if let Some(b) = b {
-        fill_rows(&mut y, b);
-    }
-    let keep = if b.is_some() { 1.0 } else { 0.0 };
-    matmul((rows, out, inner), x, View::rows(inner), w, View::rows(inner).t(), &mut y, View::rows(out), keep, 1.0);
-    y
-}
+mod kernel {
+    use burn::backend::flex::FlexTensor;
 
-#[cfg(feature = "flex")]
-#[derive(Debug)]
-struct LinearOp {
-    biased: bool,
-}
+    use crate::kernels::fused::{Fused, make, shape, slice};
+    use crate::kernels::raw::{View, matmul, product};
+    use crate::kernels::simd::{add_rows, repeat_row};
 
-#[cfg(feature = "flex")]
-impl Backward<Flex, 3> for LinearOp {
-    type State = (FlexTensor, FlexTensor, Vec<usize>);
+    /// The product with a weight, and a bias if there are three inputs.
+    #[derive(Debug, Clone)]
+    pub(super) struct Linear;
 
-    fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let dy = contiguous(grads.consume::<Flex>(&ops.node));
-        let (x, w, shape) = ops.state;
-        let [px, pw, pb] = ops.parents;
-        let inner = shape[shape.len() - 1];
-        let (x, w, dy) = (slice(&x), slice(&w), slice(&dy));
+    fn forward(x: &FlexTensor, w: &FlexTensor, bias: Option<&FlexTensor>) -> FlexTensor {
+        let mut to = shape(x);
+        let inner = to[to.len() - 1];
+        let (x, w) = (slice(x), slice(w));
         let (rows, out) = (x.len() / inner, w.len() / inner);
-        if let Some(node) = px {
-            let mut dx = vec![0.0; x.len()];
-            matmul((rows, inner, out), dy, View::rows(out), w, View::rows(inner), &mut dx, View::rows(inner), 0.0, 1.0);
-            raw::register(grads, node.id, dx, &shape);
+        let sizes = (rows, out, inner);
+        let y = match bias {
+            Some(bias) => {
+                let mut y = repeat_row(slice(bias), rows);
+                matmul(sizes, x, View::rows(inner), w, View::rows(inner).t(), &mut y, View::rows(out), 1.0, 1.0);
+                y
+            }
+            None => product(sizes, x, View::rows(inner), w, View::rows(inner).t()),
+        };
+        *to.last_mut().expect("an axis of inputs") = out;
+        make(y, &to)
+    }
+
+    /// The gradients of input and weight.
+    fn backward(x: &FlexTensor, w: &FlexTensor, dy: &[f32], wanted: [bool; 2]) -> [Option<FlexTensor>; 2] {
+        let (to, weight) = (shape(x), shape(w));
+        let inner = to[to.len() - 1];
+        let (x, w) = (slice(x), slice(w));
+        let (rows, out) = (x.len() / inner, w.len() / inner);
+        let (wide, narrow) = (View::rows(inner), View::rows(out));
+        [
+            wanted[0].then(|| make(product((rows, inner, out), dy, narrow, w, wide), &to)),
+            wanted[1].then(|| make(product((out, inner, rows), dy, narrow.t(), x, wide), &weight)),
+        ]
+    }
+
+    impl Fused<2> for Linear {
+        type Kept = (FlexTensor, FlexTensor);
+
+        fn forward(&self, [x, w]: [FlexTensor; 2]) -> (FlexTensor, Self::Kept) {
+            (forward(&x, &w, None), (x, w))
         }
-        if let Some(node) = pw {
-            let mut dw = vec![0.0; w.len()];
-            matmul(
-                (out, inner, rows),
-                dy,
-                View::rows(out).t(),
-                x,
-                View::rows(inner),
-                &mut dw,
-                View::rows(inner),
-                0.0,
-                1.0,
-            );
-            raw::register(grads, node.id, dw, &[out, inner]);
-        }
-        if let (Some(node), true) = (pb, self.biased) {
-            let mut db = vec![0.0; out];
-            add_rows(&mut db, dy);
-            raw::register(grads, node.id, db, &[out]);
+
+        fn backward(&self, (x, w): Self::Kept, dy: FlexTensor, wanted: [bool; 2]) -> [Option<FlexTensor>; 2] {
+            backward(&x, &w, slice(&dy), wanted)
         }
     }
-}
 
-#[cfg(feature = "flex")]
-fn tracked<const D: usize>(x: Tensor<D>, weight: Tensor<2>, bias: Option<Tensor<1>>) -> Tensor<D> {
-    let device = x.device();
-    let (shape, [out, inner]) = (x.dims(), weight.dims());
-    assert_eq!(shape[D - 1], inner, "linear: input width against weight");
-    let biased = bias.is_some();
-    // Without a bias the third parent is an unused constant.
-    let bias = bias.unwrap_or_else(|| Tensor::zeros([1], &device));
-    let x = raw::track(x);
-    let w = raw::track(weight);
-    let b = raw::track(bias);
-    let nodes = [x.node(), w.node(), b.node()];
-    let (x, w, b) = (contiguous(x.into_primitive()), contiguous(w.into_primitive()), contiguous(b.into_primitive()));
-    let mut to = shape;
-    to[D - 1] = out;
-    let y = make(forward(slice(&x), slice(&w), biased.then(|| slice(&b)), inner, out), &to);
-    let y = match (LinearOp { biased }).prepare::<NoCheckpointing>(nodes).compute_bound().stateful() {
-        OpsKind::Tracked(prep) => prep.finish((x, w, shape.to_vec()), y),
-        OpsKind::UnTracked(prep) => prep.finish(y),
-    };
-    Tensor::from_primitive::<Tracked>(y)
+    impl Fused<3> for Linear {
+        type Kept = (FlexTensor, FlexTensor);
+
+        fn forward(&self, [x, w, bias]: [FlexTensor; 3]) -> (FlexTensor, Self::Kept) {
+            (forward(&x, &w, Some(&bias)), (x, w))
+        }
+
+        fn backward(&self, (x, w): Self::Kept, dy: FlexTensor, wanted: [bool; 3]) -> [Option<FlexTensor>; 3] {
+            let dy = slice(&dy);
+            let [dx, dw] = backward(&x, &w, dy, [wanted[0], wanted[1]]);
+            let out = shape(&w)[0];
+            let bias = || {
+                let mut sum = vec![0.0; out];
+                add_rows(&mut sum, dy);
+                make(sum, &[out])
+            };
+            [dx, dw, wanted[2].then(bias)]
+        }
+    }
 }

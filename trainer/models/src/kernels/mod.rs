@@ -11,13 +11,18 @@
 
 mod attention;
 mod dropout;
+#[cfg(feature = "flex")]
+mod fused;
 mod gelu;
 mod gru;
 mod linear;
 mod mish;
 mod norm;
+#[cfg(feature = "flex")]
 mod raw;
 pub(crate) mod simd;
+#[cfg(feature = "flex")]
+mod tile;
 
 pub use attention::{KeyMask, cross_attention, self_attention};
 pub use dropout::{Dropout, dropout};
@@ -25,13 +30,13 @@ pub use gelu::gelu;
 pub use gru::gru;
 pub use linear::linear;
 pub use mish::mish;
-pub use norm::{add_layer_norm, layer_norm};
+pub use norm::{add_layer_norm, layer_norm, leaky_layer_norm};
 
 /// Runs `body` with Burn's operations instead of the fused kernels on this thread, as the reference for comparisons.
 pub fn stock<T>(body: impl FnOnce() -> T) -> T {
     #[cfg(feature = "flex")]
     {
-        raw::stock(body)
+        fused::stock(body)
     }
     #[cfg(not(feature = "flex"))]
     {

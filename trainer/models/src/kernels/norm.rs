@@ -1,25 +1,19 @@
-//! Layer normalisation over the last axis (Ba et al., arXiv:1607.06450), alone or after a residual addition.
+//! Layer normalisation over the last axis (Ba et al., arXiv:1607.06450): alone, after a residual addition, or before a
+//! leaky ReLU and a residual addition.
 
 use burn::tensor::Tensor;
+use burn::tensor::activation::leaky_relu;
 
 #[cfg(feature = "flex")]
-use super::raw::{self, Place, Tracked, contiguous, make, slice};
-#[cfg(feature = "flex")]
-use super::simd::multiversion;
-#[cfg(feature = "flex")]
-use burn::backend::Flex;
-#[cfg(feature = "flex")]
-use burn::backend::autodiff::{
-    checkpoint::{base::Checkpointer, strategy::NoCheckpointing},
-    grads::Gradients,
-    ops::{Backward, Ops, OpsKind},
-};
-#[cfg(feature = "flex")]
-use burn::backend::flex::FlexTensor;
+use super::fused;
 
 /// `gamma (x - mean) / sqrt(var + eps) + beta` over the last axis, with the population variance.
 pub fn layer_norm<const D: usize>(x: Tensor<D>, gamma: Tensor<1>, beta: Tensor<1>, eps: f64) -> Tensor<D> {
-    normalise(x, None, gamma, beta, eps)
+    #[cfg(feature = "flex")]
+    if fused::takes(&x) {
+        return fused::run(kernel::Norm { eps, slope: 1.0 }, [x.into(), gamma.into(), beta.into()]);
+    }
+    composed(x, gamma, beta, eps)
 }
 
 /// `layer_norm(x + y)`: the residual addition and the norm in one pass.
@@ -30,198 +24,264 @@ pub fn add_layer_norm<const D: usize>(
     beta: Tensor<1>,
     eps: f64,
 ) -> Tensor<D> {
-    normalise(x, Some(y), gamma, beta, eps)
+    #[cfg(feature = "flex")]
+    if fused::takes(&x) {
+        let norm = kernel::Norm { eps, slope: 1.0 };
+        return fused::run(kernel::After(norm), [x.into(), y.into(), gamma.into(), beta.into()]);
+    }
+    composed(x + y, gamma, beta, eps)
 }
 
-fn normalise<const D: usize>(
+/// A leaky ReLU of `layer_norm(x)`, added to `y` if there is one. The ReLU multiplies negative values by `slope`.
+pub fn leaky_layer_norm<const D: usize>(
     x: Tensor<D>,
     y: Option<Tensor<D>>,
     gamma: Tensor<1>,
     beta: Tensor<1>,
     eps: f64,
+    slope: f64,
 ) -> Tensor<D> {
     #[cfg(feature = "flex")]
-    match raw::place(&x, raw::on_tape(&gamma) || raw::on_tape(&beta) || y.as_ref().is_some_and(raw::on_tape)) {
-        Place::Tracked => return tracked(x, y, gamma, beta, eps),
-        Place::Plain => {
-            let shape = x.dims();
-            let (x, gamma, beta) =
-                (contiguous(raw::plain(x)), contiguous(raw::plain(gamma)), contiguous(raw::plain(beta)));
-            let mut hat = match y {
-                Some(y) => sum(slice(&x), slice(&contiguous(raw::plain(y)))),
-                None => slice(&x).to_vec(),
-            };
-            let width = shape[D - 1];
-            let mut scales = vec![0.0; hat.len() / width];
-            standardise(&mut hat, &mut scales, eps);
-            scale_shift(&mut hat, slice(&gamma), slice(&beta));
-            return Tensor::from_primitive::<Flex>(make(hat, &shape));
-        }
-        Place::Other => {}
+    if fused::takes(&x) {
+        #[expect(clippy::cast_possible_truncation, reason = "a constant of a network")]
+        let norm = kernel::Norm { eps, slope: slope as f32 };
+        return match y {
+            Some(y) => fused::run(kernel::Before(norm), [x.into(), y.into(), gamma.into(), beta.into()]),
+            None => fused::run(norm, [x.into(), gamma.into(), beta.into()]),
+        };
     }
-    let x = match y {
-        Some(y) => x + y,
-        None => x,
-    };
+    let out = leaky_relu(composed(x, gamma, beta, eps), slope);
+    match y {
+        Some(y) => y + out,
+        None => out,
+    }
+}
+
+fn composed<const D: usize>(x: Tensor<D>, gamma: Tensor<1>, beta: Tensor<1>, eps: f64) -> Tensor<D> {
     let centred = x.clone() - x.mean_dim(D - 1);
     let variance = centred.clone().powi_scalar(2).mean_dim(D - 1);
     centred / (variance + eps).sqrt() * gamma.unsqueeze() + beta.unsqueeze()
 }
 
 #[cfg(feature = "flex")]
-multiversion! {
-    fn sum(x: &[f32], y: &[f32]) -> Vec<f32> {
-        x.iter().zip(y).map(|(x, y)| x + y).collect()
-    }
-}
+mod kernel {
+    use burn::backend::flex::FlexTensor;
 
-/// Sums in 16 lanes, then adds the lanes in order. It vectorises and has one order for all widths.
-#[cfg(feature = "flex")]
-#[inline(always)]
-fn lanes(mut items: impl FnMut(usize) -> f32, width: usize) -> f32 {
-    let mut lane = [0.0_f32; 16];
-    let whole = width / 16 * 16;
-    let mut i = 0;
-    while i < whole {
-        for (l, slot) in lane.iter_mut().enumerate() {
-            *slot += items(i + l);
-        }
-        i += 16;
-    }
-    let mut rest = 0.0;
-    while i < width {
-        rest += items(i);
-        i += 1;
-    }
-    lane.iter().sum::<f32>() + rest
-}
+    use crate::kernels::fused::{Fused, make, overwrite, shape, slice};
+    use crate::kernels::simd::multiversion;
 
-#[cfg(feature = "flex")]
-multiversion! {
-    /// Each row of `x` becomes `(x - mean) / sqrt(var + eps)`; `scales` gets `1 / sqrt(var + eps)`.
-    fn standardise(x: &mut [f32], scales: &mut [f32], eps: f64) {
-        let width = x.len() / scales.len();
-        #[expect(clippy::cast_precision_loss, clippy::cast_possible_truncation, reason = "a width is small; eps is a setting")]
-        let (count, eps) = (width as f32, eps as f32);
-        for (row, scale) in x.chunks_exact_mut(width).zip(scales) {
-            let mean = lanes(|i| row[i], width) / count;
-            for v in row.iter_mut() {
-                *v -= mean;
+    /// The norm of a tensor, and the slope of what follows below 0; 1 is no ReLU.
+    #[derive(Debug, Clone)]
+    pub(super) struct Norm {
+        pub(super) eps: f64,
+        pub(super) slope: f32,
+    }
+
+    /// The norm of the sum of two tensors.
+    #[derive(Debug, Clone)]
+    pub(super) struct After(pub(super) Norm);
+
+    /// The norm of the first tensor, added to the second.
+    #[derive(Debug, Clone)]
+    pub(super) struct Before(pub(super) Norm);
+
+    /// Results of a forward pass that the backward pass reads.
+    #[derive(Debug, Clone)]
+    pub(super) struct Kept {
+        /// Rows with mean 0 and variance 1.
+        hat: FlexTensor,
+        /// `1 / sqrt(var + eps)` of each row.
+        scales: Vec<f32>,
+        gamma: FlexTensor,
+        beta: FlexTensor,
+    }
+
+    /// Sums in 16 lanes, then adds the lanes in order. It vectorises and has one order for all widths.
+    #[inline(always)]
+    fn lanes(mut items: impl FnMut(usize) -> f32, width: usize) -> f32 {
+        let mut lane = [0.0_f32; 16];
+        let whole = width / 16 * 16;
+        let mut i = 0;
+        while i < whole {
+            for (l, slot) in lane.iter_mut().enumerate() {
+                *slot += items(i + l);
             }
-            let variance = lanes(|i| row[i] * row[i], width) / count;
-            *scale = 1.0 / (variance + eps).sqrt();
-            for v in row.iter_mut() {
-                *v *= *scale;
+            i += 16;
+        }
+        let mut rest = 0.0;
+        while i < width {
+            rest += items(i);
+            i += 1;
+        }
+        lane.iter().sum::<f32>() + rest
+    }
+
+    /// Operands of a forward pass; those that a norm does not have are empty.
+    struct Rows<'a> {
+        x: &'a [f32],
+        /// Added to `x` before the norm.
+        before: &'a [f32],
+        /// Added to the result.
+        after: &'a [f32],
+        gamma: &'a [f32],
+        beta: &'a [f32],
+    }
+
+    multiversion! {
+        /// Appends to `hat` the normed rows, to `scales` what they were multiplied by, and to `out` the results. Without
+        /// `keep` the first two hold only the last row.
+        fn forward(rows: &Rows<'_>, eps: f32, slope: f32, keep: bool, hat: &mut Vec<f32>, scales: &mut Vec<f32>, out: &mut Vec<f32>) {
+            let width = rows.gamma.len();
+            #[expect(clippy::cast_precision_loss, reason = "a width is small")]
+            let count = width as f32;
+            for start in (0..rows.x.len()).step_by(width) {
+                if !keep {
+                    hat.clear();
+                    scales.clear();
+                }
+                let x = &rows.x[start..start + width];
+                let from = hat.len();
+                if rows.before.is_empty() {
+                    hat.extend_from_slice(x);
+                } else {
+                    hat.extend(x.iter().zip(&rows.before[start..start + width]).map(|(x, y)| x + y));
+                }
+                let row = &mut hat[from..];
+                let mean = lanes(|i| row[i], width) / count;
+                let variance = lanes(|i| (row[i] - mean) * (row[i] - mean), width) / count;
+                let scale = 1.0 / (variance + eps).sqrt();
+                for v in row.iter_mut() {
+                    *v = (*v - mean) * scale;
+                }
+                scales.push(scale);
+                let scaled = row.iter().zip(rows.gamma).zip(rows.beta).map(|((v, g), b)| {
+                    let z = v * g + b;
+                    if z < 0.0 { z * slope } else { z }
+                });
+                if rows.after.is_empty() {
+                    out.extend(scaled);
+                } else {
+                    out.extend(scaled.zip(&rows.after[start..start + width]).map(|(z, y)| y + z));
+                }
             }
         }
     }
-}
 
-#[cfg(feature = "flex")]
-multiversion! {
-    fn scale_shift(x: &mut [f32], gamma: &[f32], beta: &[f32]) {
-        for row in x.chunks_exact_mut(gamma.len()) {
-            for ((v, g), b) in row.iter_mut().zip(gamma).zip(beta) {
-                *v = *v * g + b;
+    multiversion! {
+        /// `dx = scale (g - mean(g) - hat mean(g hat))` in place of `dy`, with `g = dy gamma` and `dy` behind the ReLU;
+        /// adds to `dgamma` and `dbeta`.
+        fn backward(hat: &[f32], scales: &[f32], gamma: &[f32], beta: &[f32], slope: f32, dy: &mut [f32], dgamma: &mut [f32], dbeta: &mut [f32]) {
+            let width = gamma.len();
+            #[expect(clippy::cast_precision_loss, reason = "a width is small")]
+            let count = width as f32;
+            let (beta, dgamma, dbeta) = (&beta[..width], &mut dgamma[..width], &mut dbeta[..width]);
+            for ((hat, dy), scale) in hat.chunks_exact(width).zip(dy.chunks_exact_mut(width)).zip(scales) {
+                if slope != 1.0 {
+                    for i in 0..width {
+                        let z = hat[i] * gamma[i] + beta[i];
+                        dy[i] = if z < 0.0 { dy[i] * slope } else { dy[i] };
+                    }
+                }
+                for i in 0..width {
+                    dgamma[i] += dy[i] * hat[i];
+                    dbeta[i] += dy[i];
+                }
+                let first = lanes(|i| dy[i] * gamma[i], width) / count;
+                let second = lanes(|i| dy[i] * gamma[i] * hat[i], width) / count;
+                for i in 0..width {
+                    dy[i] = scale * (dy[i] * gamma[i] - first - hat[i] * second);
+                }
             }
         }
     }
-}
 
-#[cfg(feature = "flex")]
-multiversion! {
-    /// `dx = scale (g - mean(g) - hat mean(g hat))` with `g = dy gamma`; adds to `dgamma` and `dbeta`.
-    fn backward(hat: &[f32], scales: &[f32], gamma: &[f32], dy: &[f32], dx: &mut [f32], dgamma: &mut [f32], dbeta: &mut [f32]) {
-        let width = gamma.len();
-        #[expect(clippy::cast_precision_loss, reason = "a width is small")]
-        let count = width as f32;
-        for (((hat, dy), dx), scale) in
-            hat.chunks_exact(width).zip(dy.chunks_exact(width)).zip(dx.chunks_exact_mut(width)).zip(scales)
-        {
-            for i in 0..width {
-                dgamma[i] += dy[i] * hat[i];
-                dbeta[i] += dy[i];
-            }
-            let first = lanes(|i| dy[i] * gamma[i], width) / count;
-            let second = lanes(|i| dy[i] * gamma[i] * hat[i], width) / count;
-            for i in 0..width {
-                dx[i] = scale * (dy[i] * gamma[i] - first - hat[i] * second);
-            }
+    impl Norm {
+        /// The result, the normed rows and their scales.
+        fn rows(&self, rows: &Rows<'_>, keep: bool) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
+            let (count, width) = (rows.x.len(), rows.gamma.len());
+            let kept = if keep { count } else { width };
+            let mut out = Vec::with_capacity(count);
+            let (mut hat, mut scales) = (Vec::with_capacity(kept), Vec::with_capacity(kept / width));
+            #[expect(clippy::cast_possible_truncation, reason = "a setting")]
+            forward(rows, self.eps as f32, self.slope, keep, &mut hat, &mut scales, &mut out);
+            (out, hat, scales)
+        }
+
+        /// The result, and what the backward pass reads of it.
+        fn kept(&self, rows: &Rows<'_>, to: &[usize], gamma: &FlexTensor, beta: &FlexTensor) -> (FlexTensor, Kept) {
+            let (out, hat, scales) = self.rows(rows, true);
+            (make(out, to), Kept { hat: make(hat, to), scales, gamma: gamma.clone(), beta: beta.clone() })
+        }
+
+        /// The gradients of the normed tensor, of gamma and of beta.
+        fn gradients(&self, kept: Kept, dy: FlexTensor) -> [Option<FlexTensor>; 3] {
+            let Kept { hat, scales, gamma, beta } = kept;
+            let width = slice(&gamma).len();
+            let (mut dgamma, mut dbeta) = (vec![0.0; width], vec![0.0; width]);
+            let dx = overwrite(dy, |dy| {
+                let (hat, gamma, beta) = (slice(&hat), slice(&gamma), slice(&beta));
+                backward(hat, &scales, gamma, beta, self.slope, dy, &mut dgamma, &mut dbeta);
+            });
+            [Some(dx), Some(make(dgamma, &[width])), Some(make(dbeta, &[width]))]
         }
     }
-}
 
-#[cfg(feature = "flex")]
-#[derive(Debug)]
-struct NormOp {
-    residual: bool,
-}
-
-#[cfg(feature = "flex")]
-#[derive(Debug, Clone)]
-struct NormState {
-    hat: FlexTensor,
-    scales: FlexTensor,
-    gamma: FlexTensor,
-    shape: Vec<usize>,
-}
-
-#[cfg(feature = "flex")]
-impl Backward<Flex, 4> for NormOp {
-    type State = NormState;
-
-    fn backward(self, ops: Ops<Self::State, 4>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let dy = contiguous(grads.consume::<Flex>(&ops.node));
-        let NormState { hat, scales, gamma, shape } = ops.state;
-        let [px, py, pg, pb] = ops.parents;
-        let width = slice(&gamma).len();
-        let (mut dx, mut dgamma, mut dbeta) = (vec![0.0; slice(&hat).len()], vec![0.0; width], vec![0.0; width]);
-        backward(slice(&hat), slice(&scales), slice(&gamma), slice(&dy), &mut dx, &mut dgamma, &mut dbeta);
-        if let (Some(node), true) = (py, self.residual) {
-            raw::register(grads, node.id, dx.clone(), &shape);
-        }
-        if let Some(node) = px {
-            raw::register(grads, node.id, dx, &shape);
-        }
-        if let Some(node) = pg {
-            raw::register(grads, node.id, dgamma, &[width]);
-        }
-        if let Some(node) = pb {
-            raw::register(grads, node.id, dbeta, &[width]);
+    impl<'a> Rows<'a> {
+        fn of(x: &'a FlexTensor, gamma: &'a FlexTensor, beta: &'a FlexTensor) -> Self {
+            Self { x: slice(x), before: &[], after: &[], gamma: slice(gamma), beta: slice(beta) }
         }
     }
-}
 
-#[cfg(feature = "flex")]
-fn tracked<const D: usize>(
-    x: Tensor<D>,
-    y: Option<Tensor<D>>,
-    gamma: Tensor<1>,
-    beta: Tensor<1>,
-    eps: f64,
-) -> Tensor<D> {
-    let shape = x.dims();
-    let residual = y.is_some();
-    // Without a residual its parent is an unused constant.
-    let y = y.unwrap_or_else(|| Tensor::zeros([1; D], &x.device()));
-    let (x, y, gamma, beta) = (raw::track(x), raw::track(y), raw::track(gamma), raw::track(beta));
-    let nodes = [x.node(), y.node(), gamma.node(), beta.node()];
-    let x = contiguous(x.into_primitive());
-    let (gamma, beta) = (contiguous(gamma.into_primitive()), contiguous(beta.into_primitive()));
-    let mut hat = if residual { sum(slice(&x), slice(&contiguous(y.into_primitive()))) } else { slice(&x).to_vec() };
-    let mut scales = vec![0.0; hat.len() / shape[D - 1]];
-    standardise(&mut hat, &mut scales, eps);
-    let mut out = hat.clone();
-    scale_shift(&mut out, slice(&gamma), slice(&beta));
-    let out = make(out, &shape);
-    let out = match (NormOp { residual }).prepare::<NoCheckpointing>(nodes).compute_bound().stateful() {
-        OpsKind::Tracked(prep) => {
-            let rows = scales.len();
-            let state =
-                NormState { hat: make(hat, &shape), scales: make(scales, &[rows]), gamma, shape: shape.to_vec() };
-            prep.finish(state, out)
+    impl Fused<3> for Norm {
+        type Kept = Kept;
+
+        fn forward(&self, [x, gamma, beta]: [FlexTensor; 3]) -> (FlexTensor, Kept) {
+            self.kept(&Rows::of(&x, &gamma, &beta), &shape(&x), &gamma, &beta)
         }
-        OpsKind::UnTracked(prep) => prep.finish(out),
-    };
-    Tensor::from_primitive::<Tracked>(out)
+
+        fn value(&self, [x, gamma, beta]: [FlexTensor; 3]) -> FlexTensor {
+            make(self.rows(&Rows::of(&x, &gamma, &beta), false).0, &shape(&x))
+        }
+
+        fn backward(&self, kept: Kept, dy: FlexTensor, _: [bool; 3]) -> [Option<FlexTensor>; 3] {
+            self.gradients(kept, dy)
+        }
+    }
+
+    impl Fused<4> for After {
+        type Kept = Kept;
+
+        fn forward(&self, [x, y, gamma, beta]: [FlexTensor; 4]) -> (FlexTensor, Kept) {
+            let rows = Rows { before: slice(&y), ..Rows::of(&x, &gamma, &beta) };
+            self.0.kept(&rows, &shape(&x), &gamma, &beta)
+        }
+
+        fn value(&self, [x, y, gamma, beta]: [FlexTensor; 4]) -> FlexTensor {
+            make(self.0.rows(&Rows { before: slice(&y), ..Rows::of(&x, &gamma, &beta) }, false).0, &shape(&x))
+        }
+
+        fn backward(&self, kept: Kept, dy: FlexTensor, _: [bool; 4]) -> [Option<FlexTensor>; 4] {
+            let [dx, dgamma, dbeta] = self.0.gradients(kept, dy);
+            [dx.clone(), dx, dgamma, dbeta]
+        }
+    }
+
+    impl Fused<4> for Before {
+        type Kept = Kept;
+
+        fn forward(&self, [x, y, gamma, beta]: [FlexTensor; 4]) -> (FlexTensor, Kept) {
+            let rows = Rows { after: slice(&y), ..Rows::of(&x, &gamma, &beta) };
+            self.0.kept(&rows, &shape(&x), &gamma, &beta)
+        }
+
+        fn value(&self, [x, y, gamma, beta]: [FlexTensor; 4]) -> FlexTensor {
+            make(self.0.rows(&Rows { after: slice(&y), ..Rows::of(&x, &gamma, &beta) }, false).0, &shape(&x))
+        }
+
+        fn backward(&self, kept: Kept, dy: FlexTensor, wanted: [bool; 4]) -> [Option<FlexTensor>; 4] {
+            let own = wanted[1].then(|| dy.clone());
+            let [dx, dgamma, dbeta] = self.0.gradients(kept, dy);
+            [dx, own, dgamma, dbeta]
+        }
+    }
 }

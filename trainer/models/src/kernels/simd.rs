@@ -4,23 +4,45 @@
 //! bits. Another instruction set may contract multiply-adds differently, so all workers of a gang must have the same
 //! one (`crate::instruction_set`).
 
-/// Defines `fn name(args)` that runs `body` compiled for AVX-512, AVX2 or the baseline.
+/// Instruction sets for which the bodies are compiled, as numbers so that a body can have one as a parameter.
+pub(crate) mod set {
+    /// The baseline of the platform.
+    pub(crate) const BASE: u8 = 0;
+    /// AVX2 and FMA: 16 registers of 8 numbers.
+    pub(crate) const MIDDLE: u8 = 1;
+    /// AVX-512: 32 registers of 16 numbers.
+    pub(crate) const WIDE: u8 = 2;
+}
+
+/// Defines `fn name(args)` that runs `body` compiled for AVX-512, AVX2 or the baseline. A body that is defined as
+/// `fn name<const SET>(args)` knows which one.
 macro_rules! multiversion {
     ($(#[$doc:meta])* $vis:vis fn $name:ident($($arg:ident: $ty:ty),* $(,)?) $(-> $ret:ty)? $body:block) => {
+        $crate::kernels::simd::multiversion! {
+            $(#[$doc])* $vis fn $name<const SET>($($arg: $ty),*) $(-> $ret)? $body
+        }
+    };
+    ($(#[$doc:meta])* $vis:vis fn $name:ident<const $set:ident>($($arg:ident: $ty:ty),* $(,)?) $(-> $ret:ty)? $body:block) => {
         $(#[$doc])*
+        #[allow(clippy::too_many_arguments, reason = "a kernel takes its slices and sizes one by one")]
         $vis fn $name($($arg: $ty),*) $(-> $ret)? {
+            use $crate::kernels::simd::set;
+
             #[inline(always)]
-            fn body($($arg: $ty),*) $(-> $ret)? $body
+            #[allow(clippy::too_many_arguments, reason = "a kernel takes its slices and sizes one by one")]
+            fn body<const $set: u8>($($arg: $ty),*) $(-> $ret)? $body
 
             #[cfg(target_arch = "x86_64")]
             {
                 #[target_feature(enable = "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma")]
+                #[allow(clippy::too_many_arguments, reason = "a kernel takes its slices and sizes one by one")]
                 fn wide($($arg: $ty),*) $(-> $ret)? {
-                    body($($arg),*)
+                    body::<{ set::WIDE }>($($arg),*)
                 }
                 #[target_feature(enable = "avx2,fma")]
+                #[allow(clippy::too_many_arguments, reason = "a kernel takes its slices and sizes one by one")]
                 fn middle($($arg: $ty),*) $(-> $ret)? {
-                    body($($arg),*)
+                    body::<{ set::MIDDLE }>($($arg),*)
                 }
                 if $crate::kernels::simd::has_wide() {
                     #[expect(unsafe_code, reason = "the features were detected")]
@@ -33,11 +55,11 @@ macro_rules! multiversion {
                     return unsafe { middle($($arg),*) };
                 }
             }
-            body($($arg),*)
+            body::<{ set::BASE }>($($arg),*)
         }
     };
 }
-pub(super) use multiversion;
+pub(crate) use multiversion;
 
 /// Returns true if the processor supports the AVX-512 version.
 #[cfg(target_arch = "x86_64")]
@@ -55,22 +77,35 @@ pub(crate) fn has_middle() -> bool {
     is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma")
 }
 
+/// `a b + c`, rounded once where the instruction set has that: everywhere but on x86 without FMA.
+#[inline(always)]
+pub(super) fn mul_add<const SET: u8>(a: f32, b: f32, c: f32) -> f32 {
+    if SET > set::BASE || cfg!(target_arch = "aarch64") { a.mul_add(b, c) } else { a * b + c }
+}
+
 /// e^x for x <= 0, within 2 units in the last place; 0 below -87.
 ///
-/// Splits x into n ln 2 + r and takes a polynomial of degree 6 in r (Taylor, |r| <= ln 2 / 2).
+/// Splits x into n ln 2 + r and takes a polynomial of degree 7 in r (Taylor, |r| <= ln 2 / 2).
 #[inline(always)]
 pub(super) fn exp(x: f32) -> f32 {
+    exp_by::<{ set::BASE }>(x)
+}
+
+/// Like [`exp`], with the multiplications of an instruction set.
+#[inline(always)]
+pub(super) fn exp_by<const SET: u8>(x: f32) -> f32 {
     let clamped = if x < -87.0 { -87.0 } else { x };
     let n = (clamped * std::f32::consts::LOG2_E).round_ties_even();
-    let r = clamped - n * 0.693_359_4 + n * 2.121_944_4e-4;
+    let r = mul_add::<SET>(n, -0.693_359_4, clamped);
+    let r = mul_add::<SET>(n, 2.121_944_4e-4, r);
     let p = 1.0 / 5040.0;
-    let p = p * r + 1.0 / 720.0;
-    let p = p * r + 1.0 / 120.0;
-    let p = p * r + 1.0 / 24.0;
-    let p = p * r + 1.0 / 6.0;
-    let p = p * r + 0.5;
-    let p = p * r + 1.0;
-    let p = p * r + 1.0;
+    let p = mul_add::<SET>(p, r, 1.0 / 720.0);
+    let p = mul_add::<SET>(p, r, 1.0 / 120.0);
+    let p = mul_add::<SET>(p, r, 1.0 / 24.0);
+    let p = mul_add::<SET>(p, r, 1.0 / 6.0);
+    let p = mul_add::<SET>(p, r, 0.5);
+    let p = mul_add::<SET>(p, r, 1.0);
+    let p = mul_add::<SET>(p, r, 1.0);
     #[expect(clippy::cast_possible_truncation, reason = "n lies in -126..=0")]
     let scale = f32::from_bits((((n as i32) + 127) as u32) << 23);
     if x < -87.0 { 0.0 } else { p * scale }
@@ -79,21 +114,21 @@ pub(super) fn exp(x: f32) -> f32 {
 /// erf(x) within about 1e-7, as the odd rational function x P(x^2) / Q(x^2) on |x| < 4 whose coefficients Eigen publishes
 /// (`generic_fast_erf_float`, degrees 13 and 8).
 #[inline(always)]
-pub(super) fn erf(x: f32) -> f32 {
+pub(super) fn erf_by<const SET: u8>(x: f32) -> f32 {
     let x = x.clamp(-4.0, 4.0);
     let s = x * x;
     let p = -2.726_142e-10;
-    let p = p * s + 2.770_681_4e-8;
-    let p = p * s - 2.101_024e-6;
-    let p = p * s - 5.692_506_4e-5;
-    let p = p * s - 7.349_906_3e-4;
-    let p = p * s - 2.954_6e-3;
-    let p = p * s - 1.609_603_3e-2;
+    let p = mul_add::<SET>(p, s, 2.770_681_4e-8);
+    let p = mul_add::<SET>(p, s, -2.101_024e-6);
+    let p = mul_add::<SET>(p, s, -5.692_506_4e-5);
+    let p = mul_add::<SET>(p, s, -7.349_906_3e-4);
+    let p = mul_add::<SET>(p, s, -2.954_6e-3);
+    let p = mul_add::<SET>(p, s, -1.609_603_3e-2);
     let q = -1.456_607_2e-5;
-    let q = q * s - 2.133_740_6e-4;
-    let q = q * s - 1.682_827e-3;
-    let q = q * s - 7.373_329_2e-3;
-    let q = q * s - 1.426_474e-2;
+    let q = mul_add::<SET>(q, s, -2.133_740_6e-4);
+    let q = mul_add::<SET>(q, s, -1.682_827e-3);
+    let q = mul_add::<SET>(q, s, -7.373_329_2e-3);
+    let q = mul_add::<SET>(q, s, -1.426_474e-2);
     x * p / q
 }
 
@@ -109,13 +144,13 @@ multiversion! {
     }
 }
 
-multiversion! {
-    /// `row[i] = bias[i]` for every row of `rows`.
-    pub(super) fn fill_rows(rows: &mut [f32], bias: &[f32]) {
-        for row in rows.chunks_exact_mut(bias.len()) {
-            row.copy_from_slice(bias);
-        }
+/// `count` rows, each equal to `row`.
+pub(super) fn repeat_row(row: &[f32], count: usize) -> Vec<f32> {
+    let mut rows = Vec::with_capacity(row.len() * count);
+    for _ in 0..count {
+        rows.extend_from_slice(row);
     }
+    rows
 }
 
 #[cfg(test)]
@@ -127,7 +162,9 @@ mod tests {
         for i in 0..=8700_i16 {
             let x = -f32::from(i) / 100.0;
             let exact = f64::from(x).exp();
-            assert!((f64::from(exp(x)) - exact).abs() <= 4e-7 * exact, "exp({x})");
+            for found in [exp(x), exp_by::<{ set::MIDDLE }>(x)] {
+                assert!((f64::from(found) - exact).abs() <= 4e-7 * exact, "exp({x})");
+            }
         }
         assert_eq!(exp(-200.0), 0.0);
         // Abramowitz and Stegun, table 7.1.
@@ -139,8 +176,13 @@ mod tests {
             (2.0, 0.995_322_3),
             (3.5, 0.999_999_3),
         ] {
-            assert!((erf(x) - y).abs() < 2e-7, "erf({x}) = {} against {y}", erf(x));
-            assert!((erf(-x) + y).abs() < 2e-7, "erf(-{x})");
+            for (plus, minus) in [
+                (erf_by::<{ set::BASE }>(x), erf_by::<{ set::BASE }>(-x)),
+                (erf_by::<{ set::MIDDLE }>(x), erf_by::<{ set::MIDDLE }>(-x)),
+            ] {
+                assert!((plus - y).abs() < 2e-7, "erf({x}) = {plus} against {y}");
+                assert!((minus + y).abs() < 2e-7, "erf(-{x}) = {minus}");
+            }
         }
     }
 }

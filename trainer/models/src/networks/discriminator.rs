@@ -8,7 +8,6 @@
 
 use burn::module::Module;
 use burn::tensor::Tensor;
-use burn::tensor::activation::leaky_relu;
 
 use super::{Init, Linear, Norm};
 
@@ -50,9 +49,9 @@ impl Discriminator {
         const SLOPE: f64 = 0.01;
         const EPS: f64 = 1e-5;
         let one = |(head, f): (&Head, Tensor<3>)| {
-            let h1 = leaky_relu(head.norm1.forward(head.linear1.forward(f), EPS), SLOPE);
-            let h2 = leaky_relu(head.norm2.forward(head.linear2.forward(h1.clone()), EPS), SLOPE);
-            head.score.forward(h1 + h2)
+            let h1 = head.norm1.leaky(head.linear1.forward(f), None, EPS, SLOPE);
+            let h2 = head.norm2.leaky(head.linear2.forward(h1.clone()), Some(h1), EPS, SLOPE);
+            head.score.forward(h2)
         };
         self.heads.iter().zip(features).map(one).collect()
     }

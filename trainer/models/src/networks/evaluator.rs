@@ -277,7 +277,7 @@ impl MotionEncoder {
     /// Maps movements [B, N, movement] to embeddings [B, embedding]; the first `lengths[b]` movements are valid.
     pub fn forward(&self, movements_bnc: Tensor<3>, lengths: &[usize]) -> Tensor<2> {
         let last = self.gru.last(self.input_emb.forward(movements_bnc), lengths, &self.hidden);
-        let x = leaky_relu(self.output_net_1.forward(self.output_net_0.forward(last), EPS), SLOPE);
+        let x = self.output_net_1.leaky(self.output_net_0.forward(last), None, EPS, SLOPE);
         self.output_net_3.forward(x)
     }
 }
@@ -320,7 +320,7 @@ impl TextEncoder {
     pub fn forward(&self, words_bwc: Tensor<3>, classes_bwc: Tensor<3>, lengths: &[usize]) -> Tensor<2> {
         let words = words_bwc + self.pos_emb.forward(classes_bwc);
         let last = self.gru.last(self.input_emb.forward(words), lengths, &self.hidden);
-        let x = leaky_relu(self.output_net_1.forward(self.output_net_0.forward(last), EPS), SLOPE);
+        let x = self.output_net_1.leaky(self.output_net_0.forward(last), None, EPS, SLOPE);
         self.output_net_3.forward(x)
     }
 }

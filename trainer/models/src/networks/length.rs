@@ -5,7 +5,7 @@
 //! is a motion of c movements of four frames. Dropout precedes the second and the third linear layer.
 
 use burn::module::{Module, Param};
-use burn::tensor::activation::{leaky_relu, log_softmax};
+use burn::tensor::activation::log_softmax;
 use burn::tensor::{Tensor, TensorData};
 use motion::Stream;
 
@@ -65,8 +65,7 @@ impl LengthEstimator {
 
     /// As [`forward`](Self::forward), with `drop` called before the second and before the third linear layer.
     pub fn forward_dropping(&self, text_bc: Tensor<2>, mut drop: impl FnMut(Tensor<2>) -> Tensor<2>) -> Tensor<2> {
-        let hidden =
-            |x: Tensor<2>, linear: &Linear, norm: &Norm| leaky_relu(norm.forward(linear.forward(x), EPS), SLOPE);
+        let hidden = |x: Tensor<2>, linear: &Linear, norm: &Norm| norm.leaky(linear.forward(x), None, EPS, SLOPE);
         let x = hidden(text_bc, &self.output_0, &self.output_1);
         let x = hidden(drop(x), &self.output_4, &self.output_5);
         let x = hidden(drop(x), &self.output_8, &self.output_9);

@@ -78,6 +78,11 @@ impl Norm {
         kernels::layer_norm(x, self.weight.val(), self.bias.val(), eps)
     }
 
+    /// Computes a leaky ReLU of `LN(x)`, added to `y` if there is one, in one pass.
+    pub fn leaky<const D: usize>(&self, x: Tensor<D>, y: Option<Tensor<D>>, eps: f64, slope: f64) -> Tensor<D> {
+        kernels::leaky_layer_norm(x, y, self.weight.val(), self.bias.val(), eps, slope)
+    }
+
     /// Computes `LN(x + y)` in one pass.
     pub fn after<const D: usize>(&self, x: Tensor<D>, y: Tensor<D>, eps: f64) -> Tensor<D> {
         kernels::add_layer_norm(x, y, self.weight.val(), self.bias.val(), eps)

@@ -1,0 +1,255 @@
+//! Attention over up to [`MOST`] tokens, all heads of all sequences in one call.
+//!
+//! The weights of a head are kept transposed, [K, Q rounded up], so that lanes of a register hold neighbouring queries:
+//! the softmax over keys then needs no sum across lanes, and all products are those of [`tile`]. A head's operands stay
+//! in the nearest cache. Weights of queries that are only rounding have no influence.
+
+use super::Sizes;
+use super::kernel::{Attend, Packed};
+use crate::kernels::simd::{exp_by, mul_add, multiversion};
+use crate::kernels::tile::{LANES, Left, multiply, transpose};
+
+/// The longest sequence, of queries or of keys.
+const MOST: usize = 64;
+
+/// Returns true if attention of these sizes is computed here.
+pub(super) fn fits(s: Sizes) -> bool {
+    s.queries <= MOST && s.keys <= MOST && s.head().is_multiple_of(LANES)
+}
+
+/// The output [B, Q, H] and, if they are kept, the softmax weights before dropout: for each sequence and head [valid K,
+/// Q rounded up].
+pub(super) fn forward(attend: &Attend, packed: &Packed<'_>, keep: bool) -> (Vec<f32>, Vec<f32>) {
+    let s = attend.sizes;
+    let lanes = s.queries.next_multiple_of(LANES);
+    let mut out = Vec::with_capacity(s.batch * s.queries * s.width);
+    let kept = (0..s.batch).map(|b| attend.valid(b)).sum::<usize>() * s.heads * lanes;
+    let mut weights = Vec::with_capacity(if keep { kept } else { 0 });
+    let mut scratch = Scratch::new(s);
+    for b in 0..s.batch {
+        for h in 0..s.heads {
+            let valid = attend.valid(b);
+            head_forward(s, packed, (b, h), valid, &mut scratch);
+            if keep {
+                weights.extend_from_slice(&scratch.weights[..valid * lanes]);
+            }
+            let dropped = dropped(attend, (b, h), valid, &mut scratch);
+            head_out(s, packed, (b, h), valid, dropped, &mut scratch);
+        }
+        out.extend_from_slice(&scratch.out);
+    }
+    (out, weights)
+}
+
+/// The gradients of queries, and of keys and values. The first holds all of them if they lie in one tensor.
+pub(super) fn backward(attend: &Attend, packed: &Packed<'_>, weights: &[f32], dout: &[f32]) -> (Vec<f32>, Vec<f32>) {
+    let s = attend.sizes;
+    let lanes = s.queries.next_multiple_of(LANES);
+    let mut dq = Vec::with_capacity(packed.q.len());
+    let mut dkv = Vec::with_capacity(if packed.is_own() { 0 } else { packed.kv.len() });
+    let mut scratch = Scratch::new(s);
+    // Gradients of one sequence.
+    let mut own_q = vec![0.0; s.queries * packed.q_row];
+    let mut own_kv = vec![0.0; if packed.is_own() { 0 } else { s.keys * packed.kv_row }];
+    let mut at = 0;
+    for b in 0..s.batch {
+        let valid = attend.valid(b);
+        if valid < s.keys {
+            // Keys of padding have no gradient, and a longer sequence may have left one.
+            if packed.is_own() { &mut own_q } else { &mut own_kv }.fill(0.0);
+        }
+        for h in 0..s.heads {
+            scratch.weights[..valid * lanes].copy_from_slice(&weights[at..at + valid * lanes]);
+            at += valid * lanes;
+            head_scores(s, packed, (b, h), valid, dout, &mut scratch);
+            let has_dropout = dropped(attend, (b, h), valid, &mut scratch);
+            head_softmax(s, valid, has_dropout, &mut scratch);
+            head_queries(s, packed, (b, h), valid, &scratch, &mut own_q);
+            let to = if packed.is_own() { &mut own_q } else { &mut own_kv };
+            head_keys_values(s, packed, (b, h), valid, dout, has_dropout, &scratch, to);
+        }
+        dq.extend_from_slice(&own_q);
+        dkv.extend_from_slice(&own_kv);
+    }
+    (dq, dkv)
+}
+
+/// Memory of one head at a time, and the output of one sequence.
+struct Scratch {
+    /// Queries, or gradients of the output, by column.
+    turned: Vec<f32>,
+    /// Softmax weights [K, Q rounded up].
+    weights: Vec<f32>,
+    /// Weights after dropout.
+    dropped: Vec<f32>,
+    /// Factors of dropout.
+    factors: Vec<f32>,
+    /// Gradients of the scores.
+    scores: Vec<f32>,
+    /// [Q, H].
+    out: Vec<f32>,
+}
+
+impl Scratch {
+    fn new(s: Sizes) -> Self {
+        let lanes = s.queries.next_multiple_of(LANES);
+        let table = || vec![0.0; s.keys * lanes];
+        Self {
+            turned: vec![0.0; s.head() * lanes],
+            weights: table(),
+            dropped: table(),
+            factors: table(),
+            scores: table(),
+            out: vec![0.0; s.queries * s.width],
+        }
+    }
+}
+
+/// Places of a head in the operands.
+struct Places {
+    /// The first query of the sequence.
+    q: usize,
+    k: usize,
+    v: usize,
+    /// The first output of the sequence.
+    out: usize,
+}
+
+impl Places {
+    fn of(s: Sizes, packed: &Packed<'_>, (b, h): (usize, usize)) -> Self {
+        let column = h * s.head();
+        Self {
+            q: b * s.queries * packed.q_row + column,
+            k: b * s.keys * packed.kv_row + packed.k_at + column,
+            v: b * s.keys * packed.kv_row + packed.v_at + column,
+            out: b * s.queries * s.width + column,
+        }
+    }
+}
+
+/// Fills the factors and the dropped weights of a head if there is dropout.
+fn dropped(attend: &Attend, (b, h): (usize, usize), valid: usize, scratch: &mut Scratch) -> bool {
+    let Some((key, dropout)) = &attend.dropout else { return false };
+    let s = attend.sizes;
+    let lanes = s.queries.next_multiple_of(LANES);
+    // The place of a weight is that in [B, heads, Q, K].
+    let base = (b * s.heads + h) * s.queries * s.keys;
+    for j in 0..valid {
+        for i in 0..s.queries {
+            let factor = dropout.mask(*key, base + i * s.keys + j);
+            scratch.factors[j * lanes + i] = factor;
+            scratch.dropped[j * lanes + i] = scratch.weights[j * lanes + i] * factor;
+        }
+    }
+    true
+}
+
+multiversion! {
+    /// The softmax weights of a head.
+    fn head_forward<const SET>(s: Sizes, packed: &Packed<'_>, place: (usize, usize), valid: usize, scratch: &mut Scratch) {
+        let at = Places::of(s, packed, place);
+        let lanes = s.queries.next_multiple_of(LANES);
+        transpose(&packed.q[at.q..], packed.q_row, (s.queries, s.head()), s.scale(), &mut scratch.turned);
+        let keys = Left { values: &packed.kv[at.k..], row: packed.kv_row, col: 1 };
+        let weights = &mut scratch.weights[..valid * lanes];
+        multiply::<SET>((valid, lanes, s.head()), keys, (&scratch.turned, lanes), (weights, lanes));
+        for column in (0..lanes).step_by(LANES) {
+            let mut most = [f32::NEG_INFINITY; LANES];
+            for row in weights.chunks_exact(lanes) {
+                for (most, v) in most.iter_mut().zip(&row[column..column + LANES]) {
+                    *most = if *v > *most { *v } else { *most };
+                }
+            }
+            let mut sum = [0.0_f32; LANES];
+            for row in weights.chunks_exact_mut(lanes) {
+                for ((v, most), sum) in row[column..column + LANES].iter_mut().zip(&most).zip(&mut sum) {
+                    *v = exp_by::<SET>(*v - most);
+                    *sum += *v;
+                }
+            }
+            let inverse = sum.map(|sum| 1.0 / sum);
+            for row in weights.chunks_exact_mut(lanes) {
+                for (v, inverse) in row[column..column + LANES].iter_mut().zip(&inverse) {
+                    *v *= inverse;
+                }
+            }
+        }
+    }
+}
+
+multiversion! {
+    /// The output of a head.
+    fn head_out<const SET>(s: Sizes, packed: &Packed<'_>, place: (usize, usize), valid: usize, dropped: bool, scratch: &mut Scratch) {
+        let at = Places::of(s, packed, place);
+        let lanes = s.queries.next_multiple_of(LANES);
+        let values = if dropped { &scratch.dropped } else { &scratch.weights };
+        let weights = Left { values, row: 1, col: lanes };
+        let to = &mut scratch.out[place.1 * s.head()..];
+        multiply::<SET>((s.queries, s.head(), valid), weights, (&packed.kv[at.v..], packed.kv_row), (to, s.width));
+    }
+}
+
+multiversion! {
+    /// The gradients of a head's weights.
+    fn head_scores<const SET>(s: Sizes, packed: &Packed<'_>, place: (usize, usize), valid: usize, dout: &[f32], scratch: &mut Scratch) {
+        let at = Places::of(s, packed, place);
+        let lanes = s.queries.next_multiple_of(LANES);
+        transpose(&dout[at.out..], s.width, (s.queries, s.head()), 1.0, &mut scratch.turned);
+        let values = Left { values: &packed.kv[at.v..], row: packed.kv_row, col: 1 };
+        multiply::<SET>((valid, lanes, s.head()), values, (&scratch.turned, lanes), (&mut scratch.scores, lanes));
+    }
+}
+
+multiversion! {
+    /// `ds = scale p (dp - sum(dp p))`, in place of the gradients of the weights.
+    fn head_softmax<const SET>(s: Sizes, valid: usize, dropped: bool, scratch: &mut Scratch) {
+        let lanes = s.queries.next_multiple_of(LANES);
+        let (weights, scores) = (&scratch.weights[..valid * lanes], &mut scratch.scores[..valid * lanes]);
+        if dropped {
+            for (score, factor) in scores.iter_mut().zip(&scratch.factors) {
+                *score *= factor;
+            }
+        }
+        let scale = s.scale();
+        for column in (0..lanes).step_by(LANES) {
+            let mut dot = [0.0_f32; LANES];
+            for (p, dp) in weights.chunks_exact(lanes).zip(scores.chunks_exact(lanes)) {
+                let (p, dp) = (&p[column..column + LANES], &dp[column..column + LANES]);
+                for ((dot, p), dp) in dot.iter_mut().zip(p).zip(dp) {
+                    *dot = mul_add::<SET>(*p, *dp, *dot);
+                }
+            }
+            for (p, dp) in weights.chunks_exact(lanes).zip(scores.chunks_exact_mut(lanes)) {
+                let (p, dp) = (&p[column..column + LANES], &mut dp[column..column + LANES]);
+                for ((dot, p), dp) in dot.iter().zip(p).zip(dp) {
+                    *dp = p * scale * (*dp - dot);
+                }
+            }
+        }
+    }
+}
+
+multiversion! {
+    /// The gradients of a head's queries.
+    fn head_queries<const SET>(s: Sizes, packed: &Packed<'_>, place: (usize, usize), valid: usize, scratch: &Scratch, to: &mut [f32]) {
+        let at = Places::of(s, packed, place);
+        let scores = Left { values: &scratch.scores, row: 1, col: s.queries.next_multiple_of(LANES) };
+        let to = &mut to[place.1 * s.head()..];
+        multiply::<SET>((s.queries, s.head(), valid), scores, (&packed.kv[at.k..], packed.kv_row), (to, packed.q_row));
+    }
+}
+
+multiversion! {
+    /// The gradients of a head's keys and values.
+    fn head_keys_values<const SET>(s: Sizes, packed: &Packed<'_>, place: (usize, usize), valid: usize, dout: &[f32], dropped: bool, scratch: &Scratch, to: &mut [f32]) {
+        let at = Places::of(s, packed, place);
+        let lanes = s.queries.next_multiple_of(LANES);
+        let by_key = |values| Left { values, row: lanes, col: 1 };
+        let (sizes, column) = ((valid, s.head(), s.queries), place.1 * s.head());
+        let keys = &mut to[packed.k_at + column..];
+        multiply::<SET>(sizes, by_key(&scratch.scores), (&packed.q[at.q..], packed.q_row), (keys, packed.kv_row));
+        let weights = if dropped { &scratch.dropped } else { &scratch.weights };
+        let values = &mut to[packed.v_at + column..];
+        multiply::<SET>(sizes, by_key(weights), (&dout[at.out..], s.width), (values, packed.kv_row));
+    }
+}

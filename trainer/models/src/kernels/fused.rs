@@ -1,0 +1,163 @@
+//! The side of a fused kernel that faces Burn: where its tensors live, and how its gradient joins the backward pass.
+
+use std::cell::Cell;
+use std::fmt::Debug;
+
+use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::NoCheckpointing};
+use burn::backend::autodiff::grads::Gradients;
+use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::flex::FlexTensor;
+use burn::backend::{Autodiff, BackendTypes, Flex};
+use burn::tensor::{Tensor, TensorData};
+
+/// The CPU backend under autodiff.
+type Tracked = Autodiff<Flex, NoCheckpointing>;
+
+/// A function of N tensors with a hand-written gradient. Its tensors are contiguous and f32.
+pub(super) trait Fused<const N: usize>: Clone + Debug + Send + 'static {
+    /// Tensors that the backward pass reads.
+    type Kept: Clone + Debug + Send + 'static;
+
+    /// The function's value, and what its backward pass reads.
+    fn forward(&self, inputs: [FlexTensor; N]) -> (FlexTensor, Self::Kept);
+
+    /// The value alone, with the bits of [`forward`](Self::forward).
+    fn value(&self, inputs: [FlexTensor; N]) -> FlexTensor {
+        self.forward(inputs).0
+    }
+
+    /// The gradients of the inputs that are `wanted`, from the output's gradient `dy`.
+    fn backward(&self, kept: Self::Kept, dy: FlexTensor, wanted: [bool; N]) -> [Option<FlexTensor>; N];
+}
+
+/// An input of a kernel.
+pub(super) enum Input {
+    /// A tensor on the tape.
+    Tracked(<Tracked as BackendTypes>::FloatTensorPrimitive),
+    /// A tensor without a tape, which takes part as a constant.
+    Plain(FlexTensor),
+}
+
+impl<const D: usize> From<Tensor<D>> for Input {
+    fn from(x: Tensor<D>) -> Self {
+        match x.clone().try_into_primitive::<Tracked>() {
+            Ok(tracked) => Self::Tracked(tracked),
+            Err(_) => Self::Plain(x.try_into_primitive::<Flex>().expect("tensors of one call live on one backend")),
+        }
+    }
+}
+
+/// A kernel as an operation of the tape.
+#[derive(Debug)]
+struct Taped<K>(K);
+
+impl<K: Fused<N>, const N: usize> Backward<Flex, N> for Taped<K> {
+    type State = K::Kept;
+
+    fn backward(self, ops: Ops<Self::State, N>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let dy = contiguous(grads.consume::<Flex>(&ops.node));
+        let wanted = ops.parents.each_ref().map(Option::is_some);
+        let found = self.0.backward(ops.state, dy, wanted);
+        for (parent, gradient) in ops.parents.into_iter().zip(found) {
+            if let (Some(parent), Some(gradient)) = (parent, gradient) {
+                grads.register::<Flex>(parent.id, gradient);
+            }
+        }
+    }
+}
+
+/// Computes `kernel` of `inputs`: one node of the tape if any of them is on it.
+pub(super) fn run<const N: usize, const D: usize, K: Fused<N>>(kernel: K, inputs: [Input; N]) -> Tensor<D> {
+    if inputs.iter().all(|input| matches!(input, Input::Plain(_))) {
+        let inputs = inputs.map(|input| match input {
+            Input::Plain(x) => contiguous(x),
+            Input::Tracked(x) => contiguous(x.into_primitive()),
+        });
+        return Tensor::from_primitive::<Flex>(kernel.value(inputs));
+    }
+    let inputs = inputs.map(|input| match input {
+        Input::Tracked(x) => x,
+        Input::Plain(x) => <Tracked as BackendTypes>::FloatTensorPrimitive::new(x),
+    });
+    let nodes = inputs.each_ref().map(|x| x.node());
+    let inputs = inputs.map(|x| contiguous(x.into_primitive()));
+    let out = match Taped(kernel.clone()).prepare::<NoCheckpointing>(nodes).compute_bound().stateful() {
+        OpsKind::Tracked(prep) => {
+            let (out, kept) = kernel.forward(inputs);
+            prep.finish(kept, out)
+        }
+        OpsKind::UnTracked(prep) => prep.finish(kernel.value(inputs)),
+    };
+    Tensor::from_primitive::<Tracked>(out)
+}
+
+thread_local! {
+    static STOCK: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Runs `body` without fused kernels on this thread.
+pub(super) fn stock<T>(body: impl FnOnce() -> T) -> T {
+    struct Restore(bool);
+    impl Drop for Restore {
+        fn drop(&mut self) {
+            STOCK.set(self.0);
+        }
+    }
+    let _restore = Restore(STOCK.replace(true));
+    body()
+}
+
+/// Returns true if a call with `x` runs fused: `x` is on flex, with or without a tape.
+pub(super) fn takes<const D: usize>(x: &Tensor<D>) -> bool {
+    !STOCK.get()
+        && (x.clone().try_into_primitive::<Tracked>().is_ok() || x.clone().try_into_primitive::<Flex>().is_ok())
+}
+
+/// The elements of `x` in row-major order; copies only if `x` is a view.
+fn contiguous(x: FlexTensor) -> FlexTensor {
+    if x.as_slice::<f32>().is_some() { x } else { x.to_contiguous() }
+}
+
+/// The elements of a contiguous tensor.
+pub(super) fn slice(x: &FlexTensor) -> &[f32] {
+    x.as_slice::<f32>().expect("made contiguous, f32 throughout")
+}
+
+/// Has `change` overwrite the elements of a contiguous tensor: in place, unless another tensor shares them.
+pub(super) fn overwrite(x: FlexTensor, change: impl FnOnce(&mut [f32])) -> FlexTensor {
+    let count = slice(&x).len();
+    let mut x = if x.storage::<f32>().len() == count { x } else { make(slice(&x).to_vec(), &shape(&x)) };
+    change(x.storage_mut::<f32>());
+    x
+}
+
+/// The sizes of a tensor's axes.
+pub(super) fn shape(x: &FlexTensor) -> Vec<usize> {
+    x.layout().shape().to_vec()
+}
+
+/// Makes a tensor of `values` in `shape`.
+pub(super) fn make(values: Vec<f32>, shape: &[usize]) -> FlexTensor {
+    FlexTensor::from_data(TensorData::new(values, shape.to_vec()))
+}
+
+/// A function of every element, whose gradient follows from the input.
+#[derive(Debug, Clone)]
+pub(super) struct Elementwise {
+    /// The function of each element.
+    pub(super) forward: fn(&[f32]) -> Vec<f32>,
+    /// Multiplies the second slice by the slope at the first.
+    pub(super) backward: fn(&[f32], &mut [f32]),
+}
+
+impl Fused<1> for Elementwise {
+    type Kept = FlexTensor;
+
+    fn forward(&self, [x]: [FlexTensor; 1]) -> (FlexTensor, FlexTensor) {
+        (make((self.forward)(slice(&x)), &shape(&x)), x)
+    }
+
+    fn backward(&self, x: FlexTensor, dy: FlexTensor, _: [bool; 1]) -> [Option<FlexTensor>; 1] {
+        [Some(overwrite(dy, |dy| (self.backward)(slice(&x), dy)))]
+    }
+}
